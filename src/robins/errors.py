@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import TypeVar
+
+T = TypeVar("T")
 
 
 class RobinsError(Exception):
@@ -40,6 +43,19 @@ def require(holds: object, sentence: str, got: object = _NOTHING) -> None:
     """
     if not holds:
         raise ValueError(sentence if got is _NOTHING else f"{sentence}, got {got}")
+
+
+def require_kind(given: T, kinds: type | tuple[type, ...], whose: str, fix: str = "") -> None:
+    """Refuse an argument that is of none of some types.
+
+    Raises:
+        TypeError: ``whose takes a Dataset, got an ImuTable; fix``.
+    """
+    if not isinstance(given, kinds):
+        known = [k.__name__ for k in (kinds if isinstance(kinds, tuple) else (kinds,))]
+        among = " or ".join([", ".join(known[:-1]), known[-1]] if known[1:] else known)
+        sentence = f"{whose} takes {among}, got {type(given).__name__}"
+        raise TypeError(f"{sentence}; {fix}" if fix else sentence)
 
 
 def hint(word: str, among: Iterable[str]) -> str:

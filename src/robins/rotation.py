@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
@@ -32,6 +33,7 @@ else:
 _SMALL = 1e-3  # rad^2; below it the series, of which no dropped term exceeds 1e-18
 _SMALL_TURN = 1e-2  # rad^2; below it those of `turn_coefficients`: 1e-16 of the first term
 
+_SKEWED = 0.05  # of a direction cosine matrix: one that is written with two digits is one still
 _LOCK = 1e-14  # rad from the vertical, about; a unit quaternion is rounded to 3e-16
 
 
@@ -164,7 +166,12 @@ def from_dcm(C: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
     """Quaternion of a direction cosine matrix, scalar part not negative (Shepperd 1978).
 
     Shepperd's method divides by the largest of the four components, so no case is ill-conditioned.
+
+    Raises:
+        ValueError: C is no rotation: a reflection, or not orthogonal to 0.05. In compiled code,
+            which cannot raise, a reflection gives NaN.
     """
+    reflected = _refuse_no_rotation(C)
     c = [[C[..., i, j] for j in range(3)] for i in range(3)]
     trace = c[0][0] + c[1][1] + c[2][2]
     d = jnp.stack([trace, c[0][0], c[1][1], c[2][2]], -1)
@@ -178,7 +185,28 @@ def from_dcm(C: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
     best = jnp.argmax(d, -1)
     q = jnp.take_along_axis(table, best[..., None, None], -2)[..., 0, :]
     q = normalise(q)
-    return jnp.where(q[..., :1] < 0.0, -q, q)
+    q = jnp.where(q[..., :1] < 0.0, -q, q)
+    return q if reflected is None else jnp.where(reflected[..., None], jnp.nan, q)
+
+
+def _refuse_no_rotation(C: Array) -> Array | None:
+    """Refuse a matrix that is no rotation; where it is a stand-in, those that are reflections."""
+    if isinstance(C, Tracer):
+        return jnp.sum(jnp.cross(C[..., 0, :], C[..., 1, :]) * C[..., 2, :], axis=-1) <= 0.0
+    with np.errstate(all="ignore"):
+        M = np.asarray(C)
+        off = np.abs(M @ np.swapaxes(M, -1, -2) - np.eye(3))
+        if np.any(off > _SKEWED):  # not of NaN, which stays NaN
+            raise ValueError(
+                "no direction cosine matrix: C C' differs from the identity by "
+                f"{np.nanmax(off):.3g}"
+            )
+        if np.any(np.linalg.det(M) < 0.0):
+            raise ValueError(
+                "no direction cosine matrix: its determinant is -1, so it is a reflection; one "
+                "axis, or the order of two, is the wrong way round"
+            )
+    return None
 
 
 def from_euler(roll_rad, pitch_rad, heading_rad) -> Float[Array, "*b 4"]:

@@ -97,6 +97,16 @@ def test_two_steps_suffice_from_deep_below_to_high_orbits():
         assert error.max() <= 4 * np.spacing(wgs84.A_M + max(alt, 0.0)), alt
 
 
+@pytest.mark.parametrize(
+    "r_e", [np.zeros(3), np.array([[7e6, 0.0, 0.0], [6378.0, 0.0, 0.0]]), np.array([0.0, 0.0, 5e6])]
+)
+def test_a_place_deep_in_the_earth_has_no_geodetic_coordinates(r_e):
+    with pytest.raises(ValueError, match="m from the centre of the Earth"):
+        wgs84.geodetic_from_ecef(r_e)
+    with pytest.raises(ValueError, match="give metres, 5"):
+        wgs84.Geodetic.from_ecef(jnp.asarray(r_e))
+
+
 def test_gradient_of_geodetic_coordinates_is_the_inverse_of_the_other():
     p = np.array([0.7, -2.0, 250.0])
     forward = jax.jit(jax.jacfwd(lambda p: wgs84.ecef_from_geodetic(*p)))(p)

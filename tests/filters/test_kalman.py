@@ -278,6 +278,22 @@ def test_a_step_that_would_break_the_belief_is_not_taken(form, read, y):
     assert not np.any(info.used)
 
 
+def test_a_noise_whose_square_is_no_number_is_refused_or_the_step_not_taken():
+    """The largest double as a sigma made the state known exactly."""
+    with pytest.raises(ValueError, match=r"noise of sensor 'y' holds a number above 1.34e\+154"):
+        Sensor(lambda x, aux: x, np.full(4, np.finfo(float).max), 4, "y")
+    huge = Partial(lambda s, x, aux: s, jnp.full(4, np.finfo(float).max))
+    one, start = EKF["sqrt"], Belief.of(jnp.zeros(4), np.eye(4))
+    after, info = one.update(
+        one.init(start, {"y": 4}), Sensor(lambda x, aux: x, huge, 4, "y"), np.ones(4)
+    )
+    assert int(info.code) == Code.NOT_FINITE
+    np.testing.assert_array_equal(after.belief.factor, np.eye(4))
+    loud = Partial(lambda s, x, u: s, jnp.full(4, np.finfo(float).max))
+    _, prediction = one.predict(one.init(start, {}), Motion(lambda x, u: x, loud))
+    assert int(prediction.code) == Code.NOT_FINITE
+
+
 def test_a_large_but_possible_measurement_is_used():
     _, _, after, info = one_step(EKF["sqrt"], 1e100)
     assert int(info.code) == Code.DONE

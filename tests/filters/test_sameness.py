@@ -27,7 +27,7 @@ from robins.filters.sameness import same, same_model
 EYE = np.eye(2)
 # How to make a thing, arguments, and others that must tell.
 MADE = {
-    "gate": (gate, [(0.99,), (0.999,), (0.99, 5), (0.99, 10, "inflate")]),
+    "gate": (gate, [(0.99,), (0.999,), (0.99, 5), (0.99, 10, "accept")]),
     "huber": (huber, [(0.9,), (0.95,)]),
     "student_t": (student_t, [(), (4.0,)]),
     "fading_memory": (fading_memory, [(1.0,), (1.1,)]),

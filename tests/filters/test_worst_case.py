@@ -1,5 +1,6 @@
 """gamma_min and the worst-case gain: what an H-infinity filter promises, without a Riccati."""
 
+import inspect
 from functools import cache
 
 import jax.numpy as jnp
@@ -254,6 +255,33 @@ def test_the_scalar_of_the_textbook_in_closed_form():
         steady_h_infinity(one, one, one, one, one, 0.9)
     with pytest.raises(ValueError, match="gamma must be positive"):
         steady_h_infinity(one, one, one, one, one, np.nan)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words", "error"),
+    [
+        ({"R": np.zeros((1, 1))}, "R is singular", ValueError),
+        (
+            {"R": -np.eye(1)},
+            r"its variance at \(0, 0\), .* is -1",
+            ValueError,
+        ),
+        ({"R": np.eye(2)}, r"R is \(2, 2\), must be \(1, 1\)", ValueError),
+        ({"R": 1.0}, r"R has shape \(\), a matrix", ValueError),
+        ({"F": np.ones((2, 3))}, r"F is \(2, 3\), must be \(2, 2\)", ValueError),
+        ({"F": [[1.0, 2.0], [3.0]]}, "F is no matrix: its rows differ", ValueError),
+        ({"F": np.diag([1.0, np.inf])}, r"F\[1, 1\] is inf", ValueError),
+        ({"H": np.ones((1, 3))}, r"H is \(1, 3\), must be \(1, 2\)", ValueError),
+        ({"Q": np.ones((2, 2)) * 1j}, "Q holds complex128", TypeError),
+        ({"weight": np.ones(2)}, "weight has shape", ValueError),
+        ({"gamma": 1e-320}, "no steady H-infinity filter with gamma", ValueError),
+    ],
+)
+def test_matrices_of_which_there_is_no_steady_filter(wrong, words, error):
+    given = {"F": 0.9 * np.eye(2), "Q": np.eye(2), "H": np.eye(1, 2), "R": np.eye(1)}
+    with pytest.raises(error, match=words) as told:
+        inspect.unwrap(steady_h_infinity)(**given | {"weight": np.eye(2), "gamma": 9.0} | wrong)
+    assert type(told.value) is error  # none of NumPy's own
 
 
 def test_an_unseen_drift_has_no_steady_filter():

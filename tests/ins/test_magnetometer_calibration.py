@@ -146,6 +146,22 @@ def test_where_the_directions_do_not_tell_soft_iron_the_offset_alone_is_found():
         calibrate(z, soft_iron=True)
 
 
+def test_axes_that_differ_by_more_than_two_are_found_where_the_samples_lie_on_them():
+    for axes in ([1.9, 1.0, 0.8], [3.0, 1.0, 1.0], [8.0, 1.0, 1.0]):
+        found = calibrate(samples(TURNED, soft=np.diag(axes), sigma=2e-7), strength_t=STRENGTH)
+        assert found.soft_iron
+        assert found.after_t < 0.02 * STRENGTH
+        np.testing.assert_allclose(found.matrix, np.diag(1.0 / np.array(axes)), atol=0.01)
+
+
+def test_no_sphere_stands_in_for_an_ellipsoid_without_a_look_at_what_is_left():
+    """Stretched axes, and a sample in ten disturbed by most of the field."""
+    gross = np.where(np.random.default_rng(1).random(COUNT) < 0.1, 3e-5, 0.0)[:, None]
+    gross = gross + samples(TURNED, soft=np.diag([2.5, 1.0, 1.0]))
+    with pytest.raises(CalibrationError, match=r"a sphere.* off, .*differ by a factor of 2"):
+        calibrate(gross)
+
+
 def test_a_sphere_may_be_asked_for():
     found = calibrate(samples(TURNED), soft_iron=False)
     assert not found.soft_iron

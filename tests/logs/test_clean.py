@@ -1,6 +1,7 @@
 """Bad samples anywhere (F01-F04, F06, F07, F10): refused, counted, then absent."""
 
 import dataclasses
+import inspect
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ from hypothesis import strategies as st
 from made_logs import rows_of, with_gnss, with_imu
 
 from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
-from robins.logs import LogError, Mounting, clean, load_dataset
+from robins.ins.increments import from_imu
+from robins.logs import LogError, Mounting, clean, examine, load_dataset, write_log
 
 N = 200
 IMU = ImuTable(
@@ -373,3 +375,14 @@ def test_arrays_that_are_no_table(change, message):
 def test_velocities_without_their_sigmas():
     with pytest.raises(LogError, match="belong together; give sigma_v as well"):
         clean(with_gnss(DATA, sigma_v=None))
+
+
+def test_what_is_no_dataset_or_no_table_is_named(drive):
+    imu = drive.imu
+    with pytest.raises(TypeError, match=r"clean takes Dataset, got ImuTable; .*Dataset\(name, imu="):
+        inspect.unwrap(clean)(imu)
+    with pytest.raises(TypeError, match="from_imu takes ImuTable, got Dataset"):
+        inspect.unwrap(from_imu)(drive)
+    for call, *first in ((examine,), (write_log, "nowhere.csv")):
+        with pytest.raises(TypeError, match=f"{call.__name__} takes Dataset, .*, got ndarray"):
+            inspect.unwrap(call)(*first, np.zeros((3, 3)))

@@ -18,10 +18,12 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.errors import require
 from robins.manifold import wrap
 from robins.rotation import Real
 
@@ -59,6 +61,7 @@ def _alternating(x, coefficients):
 
 
 _Q0 = _q(_EP2)
+_DEEPEST = 5.3e6  # m from the centre, some 1060 km deep at the poles
 
 
 def _floats(*values: ArrayLike) -> list[Array]:
@@ -97,8 +100,19 @@ def geodetic_from_ecef(r_e: ArrayLike) -> tuple[Array, Array, Array]:
     error (3e-3 rad at the start in the worst case), so what is left is rounding for every height
     above -1000 km. It is carried as sine and cosine, which keeps the poles regular. The height is
     that of Bowring (1985), stationary in latitude. The gradient is finite off the polar axis.
+
+    Raises:
+        ValueError: a position is deeper than that, as the centre of the Earth is, or one in
+            kilometres; not in compiled code, where the centre gives NaN.
     """
     (r,) = _floats(r_e)
+    if not isinstance(r, Tracer):
+        nearest = np.min(np.linalg.norm(np.asarray(r), axis=-1), initial=np.inf)
+        require(
+            not nearest < _DEEPEST,
+            f"a position {nearest:.6g} m from the centre of the Earth has no geodetic coordinates: "
+            f"give metres, {_DEEPEST:g} m or more from it",
+        )
     x, y, z = r[..., 0], r[..., 1], r[..., 2]
     p = jnp.sqrt(x * x + y * y)
     sin_lat, cos_lat = _unit(z, (1.0 - E2) * p)

@@ -32,6 +32,33 @@ def sensor_names(what: str, given: str | Sequence[str]) -> tuple[str, ...]:
     return names
 
 
+def matrix(
+    what: str, given: Any, rows: int | None = None, columns: int | None = None
+) -> np.ndarray:
+    """A matrix of finite floats, with so many rows and columns where these are given.
+
+    Raises:
+        TypeError: it is not of real numbers.
+        ValueError: it is no matrix, of another shape or not finite; the message names the place.
+    """
+    try:
+        numbers = np.asarray(given)
+    except ValueError as error:
+        raise ValueError(f"{what} is no matrix: its rows differ in length") from error
+    if numbers.dtype.kind not in "iuf":
+        raise TypeError(f"{what} holds {numbers.dtype}, real numbers are wanted")
+    if numbers.ndim != 2:
+        raise ValueError(f"{what} has shape {numbers.shape}, a matrix (rows of numbers) is wanted")
+    n, m = numbers.shape
+    wanted = (n if rows is None else rows, m if columns is None else columns)
+    require(numbers.shape == wanted, f"{what} is {numbers.shape}, must be {wanted}")
+    numbers = numbers.astype(float)
+    if not np.isfinite(numbers).all():
+        row, column = np.argwhere(~np.isfinite(numbers))[0]
+        raise ValueError(f"{what}[{row}, {column}] is {numbers[row, column]}, not a finite number")
+    return numbers
+
+
 def finite_numbers(what: str, given: Any) -> np.ndarray:
     """An array of floats from real and finite numbers.
 

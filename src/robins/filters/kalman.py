@@ -143,8 +143,9 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
     S = prior.factor
     if form == "sqrt":
         S_y, cross, S_post = linalg.block_factor(spread, (excess, noise), S, deficit)
-        sound = finite(S_y)
+        sound = finite(S_y * S_y)  # of a number without a finite square the rest is nonsense
         S_y, cross = _aside(sound, S_y), jnp.where(sound, cross, 0.0)
+        S_post = jnp.where(sound, S_post, jnp.nan)
         # After an exact measurement nothing is left in its direction, not even rounding: that
         # would be a covariance of its own to measurements yet to come.
         exact = jnp.any(used & ~jnp.any(noise != 0.0, axis=1) & ~jnp.any(excess != 0.0, axis=1))
@@ -283,7 +284,7 @@ def kalman(
         belief = Belief(transition.mean, predicted_factor(transition, form))
         points = () if transition.points is None else transition.points
         new = FilterState(belief, tuple(memory), points)
-        ok = finite(new)
+        ok = finite(new) & finite(belief.factor * belief.factor)
         why = _failure(transition, belief.factor)
         if settled is not None:
             why = jnp.where(settled == int(Code.DONE), why, settled)
@@ -309,12 +310,14 @@ def kalman(
                 seen = again._replace(noise=seen.noise, accepted=seen.accepted, notes=seen.notes)
         seen = seen._replace(accepted=seen.accepted & seen.present)
         posterior, info = updated(prior, seen, form)
+        # A contradiction alone has an infinite NIS that is no overflow.
+        ok = finite(info.nis) | (info.code == int(Code.CONTRADICTED))
         for i, rule in enumerate(rules):
             memory[i], posterior, info = rule.after(memory[i], posterior, info, seen)
         new = FilterState(posterior, tuple(memory), drawn(posterior))
-        # A contradiction alone has an infinite NIS that is no overflow.
-        ok = finite(new) & (finite(info.nis) | (info.code == int(Code.CONTRADICTED)))
-        inputs = (prior, jnp.where(info.used, seen.residual, 0.0), *left_out(seen)[:3])
+        ok = finite(new) & ok
+        squares = (block * block for block in left_out(seen)[:3])
+        inputs = (prior, jnp.where(info.used, seen.residual, 0.0), *squares)
         why = _failure(inputs, posterior.factor)
         return select(ok, new, state), not_taken(ok, info, why)
 

@@ -14,10 +14,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.errors import require
+
+_LARGEST = float(np.sqrt(np.finfo(float).max))  # of a standard deviation
 
 
 def as_noise(value: Any, n: int, whose: str) -> Array:
@@ -39,6 +42,12 @@ def _settle_noise(own: Any, covariance: Any, whose: str) -> None:
         )
     if covariance is not None:
         object.__setattr__(own, "noise", linalg.factor(covariance, f"noise covariance of {whose}"))
+    leaves = [] if callable(own.noise) else jax.tree_util.tree_leaves(own.noise)
+    if any(np.any(np.abs(x) > _LARGEST) for x in leaves if not isinstance(x, Tracer)):
+        raise ValueError(
+            f"noise of {whose} holds a number above {_LARGEST:.3g}, whose square is none: give a "
+            "smaller standard deviation, or NaN in the place of readings that tell nothing"
+        )
 
 
 def _kinds(tree: Any) -> Any:

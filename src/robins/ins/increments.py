@@ -38,7 +38,7 @@ from jaxtyping import Array
 
 from robins import _float64  # noqa: F401
 from robins.dataset import ImuTable
-from robins.errors import require
+from robins.errors import require, require_kind
 from robins.ins.frames import to_ned_frd
 from robins.rotation import from_rotvec, multiply, normalise, rotate, to_rotvec
 
@@ -71,8 +71,10 @@ def from_imu(imu: ImuTable, usual_s: float | None = None) -> tuple[Increments, n
         usual_s: s, sampling interval of the sensor, for a table too short to show it; None: shown.
 
     Raises:
+        TypeError: it is no table of an IMU.
         ValueError: fewer than two samples, time that does not increase, a value that is not finite.
     """
+    require_kind(imu, ImuTable, "from_imu")
     imu = to_ned_frd(imu)
     time = np.asarray(imu.time_ns)
     gyro, accel = np.asarray(imu.gyro, float), np.asarray(imu.accel, float)

@@ -36,7 +36,9 @@ _ENDS = (0.2, 99.8)  # per cent between which the samples' extent is taken, agai
 _SIDE, _SHARE = 0.15, 20  # cubes of that part of the extent count for so many samples at most
 _HUBER = 1.345  # of the noise; the estimates of normal noise keep 95 % of their efficiency
 _VAGUE = 0.1  # of the field, one sigma: what is known no better is not known
-_STRETCHED = 2.0  # axes of the ellipsoid; more is no soft iron but a field that changed
+_STRETCHED = 2.0  # axes of the ellipsoid; more is soft iron only if the samples lie on it
+_NEEDLE = 20.0  # axes; more is no ellipsoid that a fit could settle on
+_OFF = 0.1  # of the field, RMS: a surface that samples are further from than that is not theirs
 _SPHERE = np.vstack([np.eye(4, 9)[:3], [[0, 0, 0, 1, 1, 1, 0, 0, 0]]]).T  # (9, 4) free directions
 _FLAT = 0.08  # of the extent along the widest axis; less along the narrowest is a plane
 _REACH = np.deg2rad(30.0)  # of a sample, for the share of directions that are covered
@@ -96,7 +98,8 @@ def calibrate(
 
     Raises:
         CalibrationError: too few samples; they lie in a plane or a part of the ellipsoid so small
-            that it does not tell what is looked for; a strength that is not positive.
+            that it does not tell what is looked for; neither an ellipsoid nor, where soft iron is
+            None, a sphere fits; a strength that is not positive.
     """
     z = np.asarray(field_t, float)
     if z.ndim != 2 or z.shape[1] != 3:
@@ -115,15 +118,39 @@ def calibrate(
         raise CalibrationError("all samples of the field are equal: turn the sensor about")
     unit = _evened(((z - centre) / size)[:: -(-len(z) // MOST)])
     _refuse_flat(unit)
+    why = CalibrationError(_NO_ELLIPSOID)
     if soft_iron is not False:
         try:
             fitted = _refined(unit, *_direct_ellipsoid(unit), free=np.eye(9))
-            return _told(unit, *fitted, np.eye(9), centre, size, strength_t)
-        except CalibrationError:
+            found = _told(unit, *fitted, np.eye(9), centre, size, strength_t)
+            _refuse_stretched(found)
+            return found
+        except CalibrationError as error:
             if soft_iron:
                 raise
+            why = error
     fitted = _refined(unit, *_direct_sphere(unit), free=_SPHERE)
-    return _told(unit, *fitted, _SPHERE, centre, size, strength_t)
+    found = _told(unit, *fitted, _SPHERE, centre, size, strength_t)
+    if soft_iron is None and found.after_t > _OFF * found.field_t:
+        share = found.after_t / found.field_t
+        raise CalibrationError(
+            f"a sphere, the hard iron alone, is {share:.0%} of the field off, and there is no "
+            f"ellipsoid: {why.what}",
+            fix=why.fix,
+        )
+    return found
+
+
+def _refuse_stretched(found: Calibration) -> None:
+    """Refuse axes that differ by much where the samples do not lie on the ellipsoid."""
+    axes = np.linalg.eigvalsh(found.matrix)
+    share = found.after_t / found.field_t
+    if axes[2] > _STRETCHED * axes[0] and share > 0.5 * _OFF:
+        raise CalibrationError(
+            f"the axes of the ellipsoid differ by a factor of {axes[2] / axes[0]:.2g}, and the "
+            f"samples are {share:.0%} of the field off it",
+            fix="if the field was not the same while the sensor was turned, turn it away from iron",
+        )
 
 
 def _evened(z: np.ndarray) -> np.ndarray:
@@ -197,7 +224,7 @@ def _refined(
         step = -free @ np.linalg.lstsq(J.T @ J, J.T @ (distance * share), rcond=None)[0]
         offset, W = _unpacked(_packed(offset, W) + step)
         axes = np.linalg.eigvalsh(W)
-        if not (np.all(np.isfinite(step)) and 0.0 < axes[2] < _STRETCHED * axes[0]):
+        if not (np.all(np.isfinite(step)) and 0.0 < axes[2] < _NEEDLE * axes[0]):
             raise CalibrationError(_NO_ELLIPSOID)
         if np.abs(step).max() < _SETTLED:
             return offset, W

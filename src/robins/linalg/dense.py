@@ -298,7 +298,13 @@ def factor(P: ArrayLike, name: str = "covariance") -> Float[Array, "n n"]:
         raise ValueError(f"{name} has shape {P_.shape}; a square matrix is wanted")
     if not np.all(np.isfinite(P_)):
         raise ValueError(f"{name} has entries that are not finite numbers")
-    size = np.sqrt(np.abs(np.diag(P_)))
+    if np.any(negative := np.diag(P_) < 0.0):
+        i = int(np.argmax(negative))
+        raise ValueError(
+            f"{name} is not positive semidefinite: its variance at ({i}, {i}), counted from 0, is "
+            f"{P_[i, i]:.3g}; if this is rounding, zero is meant"
+        )
+    size = np.sqrt(np.diag(P_))
     scale = np.where(size > 0.0, size, 1.0)
     unit = P_ / np.outer(scale, scale)
     if np.max(np.abs(unit - unit.T), initial=0.0) > 1e-9:
@@ -308,7 +314,8 @@ def factor(P: ArrayLike, name: str = "covariance") -> Float[Array, "n n"]:
     greatest = np.max(value, initial=1.0)
     if value.size and value[0] < -1e-10 * greatest:
         raise ValueError(
-            f"{name} is not positive semidefinite: its least scaled eigenvalue is {value[0]:.3g}"
+            f"{name} is not positive semidefinite: scaled to variances of one, its least "
+            f"eigenvalue is {value[0]:.3g}"
         )
     # What rounding leaves of a zero eigenvalue would be a standard deviation of 1e-8: it is zero.
     rounding = len(P_) * np.finfo(float).eps * greatest

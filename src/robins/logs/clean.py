@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
+from robins.errors import require_kind
 from robins.logs.findings import LogError, refused
 from robins.logs.limits import (
     ACCEL_LIMIT,
@@ -54,9 +55,11 @@ def clean(dataset: Dataset) -> Dataset:
     ``imu_gaps`` lists the times between which IMU samples are missing.
 
     Raises:
+        TypeError: it is no dataset, or one of its tables is none of its kind.
         LogError: arrays that are no tables (F04), fewer than two IMU samples left, or a GNSS
             component whose sigma is never positive.
     """
+    require_kind(dataset, Dataset, "clean", "make one of the table: Dataset(name, imu=table)")
     imu, counts, gaps = clean_imu(dataset.imu)
     tables: dict[str, Any] = {"imu": imu}
     for kind, cleaner in _CLEANERS.items():

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
+from robins.errors import require_kind
 from robins.logs.checks_attitude import check_attitude
 from robins.logs.checks_gnss import check_gnss, check_velocity
 from robins.logs.checks_imu import check_columns, check_imu
@@ -24,7 +25,7 @@ from robins.logs.checks_motion import check_motion, check_turning
 from robins.logs.checks_time import check_span, check_time
 from robins.logs.findings import Finding, by_severity
 from robins.logs.limits import check_limits
-from robins.logs.tables import Table, checked, kind_of, tables_of
+from robins.logs.tables import KINDS, Table, checked, kind_of, tables_of
 
 
 class Code(NamedTuple):
@@ -288,9 +289,12 @@ def examine(subject: Subject) -> list[Finding]:
         Errors first, then warnings, then notes; empty for a log without a flaw.
 
     Raises:
+        TypeError: it is no dataset or table.
         LogError: arrays that are no tables: other lengths, types, shapes.
     """
     parts = subject if isinstance(subject, Sequence) else [subject]
+    for part in parts:
+        require_kind(part, (Dataset, *KINDS), "examine")
     datasets = [part for part in parts if isinstance(part, Dataset)]
     findings = [finding for dataset in datasets for finding in dataset.findings]
     unit_known = {file for dataset in datasets for file in dataset.time_unit_known}

@@ -77,7 +77,10 @@ def from_local(path: LocalPath, origin: Origin, source: str = "") -> Trajectory:
     C_el, r0_e = origin._axes()
     with np.errstate(invalid="ignore"):  # what is infinite has no place: NaN, for `clean` to count
         r_e = r0_e + path.r_l @ C_el.T
-    lat, lon, alt = (np.asarray(a) for a in geodetic_from_ecef(r_e))
+    try:
+        lat, lon, alt = (np.asarray(a) for a in geodetic_from_ecef(r_e))
+    except ValueError as error:
+        raise LogError(source or "path", str(error), "look at the unit of the path") from error
     C_nl = np.swapaxes(_axes_at(lat, lon, "ENU"), -1, -2) @ C_el
     with np.errstate(invalid="ignore"):
         v_n = np.einsum("nij,nj->ni", C_nl, path.v_l)

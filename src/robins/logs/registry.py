@@ -13,13 +13,14 @@ from functools import partial
 from typing import NamedTuple
 
 from robins.dataset import Dataset
+from robins.errors import require_kind
 from robins.logs import broad, phone, rosbag, rtklib, ulog
 from robins.logs.findings import Finding, LogError, refused
 from robins.logs.mounting import Origin
 from robins.logs.opening import beginning
 from robins.logs.quantities import words_of
 from robins.logs.read_text import read_text
-from robins.logs.tables import Table, kind_in_text, tables_of
+from robins.logs.tables import KINDS, Table, kind_in_text, tables_of
 from robins.logs.text import Head, peek
 from robins.logs.text_format import TextFormat
 from robins.logs.text_formats import TEXT_FORMATS
@@ -185,9 +186,11 @@ def write_log(
         origin: where places are metres: the point they are from, by default the first.
 
     Raises:
+        TypeError: it is no dataset or table.
         LogError: the format holds something else, or the file cannot be written; no part of it is
             left behind.
     """
+    require_kind(table, (Dataset, *KINDS), "write_log")
     if isinstance(format, TextFormat):
         row = format
     else:

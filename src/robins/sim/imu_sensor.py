@@ -27,6 +27,7 @@ from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.dataset import ImuTable
+from robins.errors import require_kind
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 
 # What follows is part of the file format, as `robins.sim.random.Component` is: a table of normal
@@ -185,8 +186,10 @@ def corrupt_table(imu: ImuTable, model: ImuErrorModel, key: Array) -> tuple[ImuT
     is not in the table; it counts as long as that of the second.
 
     Raises:
+        TypeError: it is no table of an IMU.
         ValueError: fewer than two rows, or time that does not increase.
     """
+    require_kind(imu, ImuTable, "corrupt_table")
     dt = np.diff(imu.time_ns) * 1e-9
     if len(dt) == 0 or np.any(dt <= 0.0):
         raise ValueError(

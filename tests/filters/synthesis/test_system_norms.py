@@ -190,6 +190,22 @@ def test_no_norm_without_stability(radius):
         assert norm(A, one, one) == np.inf
 
 
+@pytest.mark.parametrize("norm", [h2_norm, hinf_norm, peak_gain])
+def test_what_is_no_system_is_refused_by_name(norm):
+    one, A = np.eye(2), 0.5 * np.eye(2)
+    for given, words in (
+        ((np.ones((2, 3)), one, one), r"A is \(2, 3\), must be \(2, 2\)"),
+        ((np.nan * one, one, one), r"A\[0, 0\] is nan"),
+        ((A, np.ones((3, 1)), one), r"B is \(3, 1\), must be \(2, 1\)"),
+        ((A, one, one, np.eye(1)), r"D is \(1, 1\), must be \(2, 2\)"),
+    ):
+        with pytest.raises(ValueError, match=words) as told:
+            norm(*given)
+        assert type(told.value) is ValueError
+    with pytest.raises(ValueError, match="A is"):
+        spectral_radius(np.ones((2, 3)))
+
+
 def test_units_of_the_states_do_not_matter():
     for k, (A, B, C, D) in enumerate(systems(10, 5)):
         unit = 10.0 ** np.random.default_rng(k).uniform(-9, 9, len(A))

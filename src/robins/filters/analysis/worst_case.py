@@ -23,6 +23,7 @@ from jaxtyping import Array, ArrayLike, Float
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
+from robins.filters.checks import matrix
 from robins.filters.kalman import kalman
 from robins.filters.linearise import Linearisation, taylor
 from robins.filters.model import Model
@@ -301,17 +302,26 @@ def steady_h_infinity(
         gamma: bound; inf gives the Kalman filter.
 
     Raises:
-        ValueError: gamma is not positive, or no such filter exists.
+        TypeError: a matrix is not of real numbers.
+        ValueError: gamma is not positive, a matrix is of another shape, not finite, or no
+            covariance where it must be one, or no such filter exists.
     """
-    F, Q, H, R, L = (np.asarray(a, dtype=float) for a in (F, Q, H, R, weight))
+    F = matrix("F", F)
+    n = len(F)
+    F, Q, H = matrix("F", F, n, n), matrix("Q", Q, n, n), matrix("H", H, None, n)
+    R, L = matrix("R", R, len(H), len(H)), matrix("weight", weight, None, n)
     require(gamma > 0.0, f"gamma must be positive, or inf for the Kalman filter; got {gamma}")
+    linalg.factor(Q, "Q")
+    if not np.all(np.diag(linalg.factor(R, "R")) > 0.0):
+        raise ValueError("R is singular: a reading without noise has no steady filter of this form")
     q = len(L)
     missing = f"no steady H-infinity filter with gamma = {gamma:g} exists: "
-    C = np.concatenate([H, L / gamma])
+    with np.errstate(over="ignore"):
+        C = np.concatenate([H, L / gamma])
     weights = scipy.linalg.block_diag(R, -np.eye(q))
     try:
         P_pred = scipy.linalg.solve_discrete_are(F.T, C.T, Q, weights)
-    except np.linalg.LinAlgError as error:
+    except ValueError as error:  # which those of linear algebra are too
         raise ValueError(
             missing + "its Riccati equation has no stabilising solution; give a larger gamma, and "
             "see that H sees what F does not let decay"

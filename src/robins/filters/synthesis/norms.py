@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
+from robins.filters.checks import matrix
+
 Number = float | int  # where types are checked an int is no float
 
 _CIRCLE = 1e-6  # eigenvalues as near to the unit circle are looked at
@@ -20,8 +22,26 @@ _STARTS = 65  # even samples of the half circle that begin a search
 _SQUARINGS = 64  # of A: a radius of 1 - eps needs 58
 
 
+def _system(
+    A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The matrices of a system, D zero by default.
+
+    Raises:
+        TypeError: one is not of real numbers.
+        ValueError: one has another shape than the others ask for, or is not finite.
+    """
+    A = matrix("A", A)
+    n = len(A)
+    A, B, C = matrix("A", A, n, n), matrix("B", B, n), matrix("C", C, None, n)
+    shape = len(C), B.shape[1]
+    return A, B, C, np.zeros(shape) if D is None else matrix("D", D, *shape)
+
+
 def spectral_radius(A: np.ndarray) -> float:
     """Greatest modulus of an eigenvalue of A; below one where the system is stable."""
+    A = matrix("A", A)
+    A = matrix("A", A, None, len(A))
     return float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0))
 
 
@@ -44,9 +64,10 @@ def gramian(A: np.ndarray, B: np.ndarray) -> np.ndarray:
 
 def h2_norm(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = None) -> float:
     """sqrt(trace(C P C' + D D')), P the controllability Gramian; inf unless A is stable."""
+    A, B, C, D = _system(A, B, C, D)
     if spectral_radius(A) >= 1.0:
         return np.inf
-    direct = 0.0 if D is None else float(np.sum(D * D))
+    direct = float(np.sum(D * D))
     power = np.einsum("ij,jk,ik->", C, gramian(A, B), C)
     return float(np.sqrt(max(float(power), 0.0) + direct))
 
@@ -72,6 +93,7 @@ def hinf_norm(
     Returns:
         The norm, from above; inf unless A is stable.
     """
+    A, B, C, D = _system(A, B, C, D)
     if spectral_radius(A) >= 1.0:
         return np.inf
     levels = Levels.of(A, B, C, D)
@@ -167,10 +189,10 @@ def peak_gain(
     Returns:
         The gain; inf unless A is stable.
     """
+    A, B, C, D = _system(A, B, C, D)
     values = np.linalg.eigvals(A)
     if np.max(np.abs(values), initial=0.0) >= 1.0:
         return np.inf
-    D = np.zeros((len(C), B.shape[1])) if D is None else D
     widths = np.maximum(1.0 - np.abs(values), 1e-15)[:, None] * np.logspace(-1.5, 2.0, 15)
     angles = np.angle(values)[:, None]
     about = np.concatenate([angles, angles - widths, angles + widths], axis=1).ravel()

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robins.errors import require
+from robins.filters.checks import matrix
 
 _MARGINAL = 1e-7  # eigenvalues of a defective block at 1 may be computed as far inside the circle
 _UNSEEN = 1e-9  # least singular value of the scaled Popov-Belevitch-Hautus matrix that counts as 0
@@ -62,7 +63,7 @@ def plant(A: Any, Bw: Any, Bn: Any, C: Any, Dw: Any = None, Dn: Any = None, L: A
             not decay by itself is not seen in y. The message names the block or the mode.
     """
     named = ((A, "A"), (Bw, "Bw"), (Bn, "Bn"), (C, "C"))
-    A, Bw, Bn, C = (_matrix(value, name) for value, name in named)
+    A, Bw, Bn, C = (matrix(name, value) for value, name in named)
     n, m = A.shape[0], C.shape[0]
     require(A.shape[1] == n and n != 0, f"A is {A.shape}: the transition of a state must be square")
     require(m != 0, f"C is {C.shape}: nothing is measured")
@@ -72,7 +73,7 @@ def plant(A: Any, Bw: Any, Bn: Any, C: Any, Dw: Any = None, Dn: Any = None, L: A
     _require_shape("Bn", Bn, (n, Bn.shape[1]), why)
     Dw = _feedthrough(Dw, "Dw", m, Bw, "w")
     Dn = _feedthrough(Dn, "Dn", m, Bn, "n")
-    L = np.eye(n) if L is None else _matrix(L, "L")
+    L = np.eye(n) if L is None else matrix("L", L)
     require(
         L.shape[1] == n and L.shape[0] != 0,
         f"L is {L.shape}, must have one row for each number to be estimated and {n} columns: {why}",
@@ -103,7 +104,7 @@ def current_form(A: Any, Bw: Any, Bn: Any, C: Any, Dv: Any, L: Any = None, Dn: A
         ValueError: as `plant`, the blocks named as they are given here.
     """
     given = plant(A, Bw, Bn, C, None, Dn, L)
-    Dv = _matrix(Dv, "Dv")
+    Dv = matrix("Dv", Dv)
     n, m = len(given.A), len(given.C)
     _require_shape("Dv", Dv, (m, Dv.shape[1]), f"C says that y has {m} components")
     return Plant(
@@ -124,7 +125,7 @@ def error_system(plant: Plant, K: Any) -> ErrorSystem:
         TypeError: K is not made of real numbers.
         ValueError: K is not (n, m) or not finite.
     """
-    K = _matrix(K, "K")
+    K = matrix("K", K)
     n, m = len(plant.A), len(plant.C)
     _require_shape("K", K, (n, m), f"x has {n} components and y has {m}")
     return ErrorSystem(
@@ -136,27 +137,11 @@ def _require_shape(name: str, block: np.ndarray, shape: tuple[int, int], why: st
     require(block.shape == shape, f"{name} is {block.shape}, must be {shape}: {why}")
 
 
-def _matrix(value: Any, name: str) -> np.ndarray:
-    try:
-        numbers = np.asarray(value)
-    except ValueError as error:
-        raise ValueError(f"{name} is no matrix: its rows differ in length") from error
-    if numbers.dtype.kind not in "iuf":
-        raise TypeError(f"{name} holds {numbers.dtype}, real numbers are wanted")
-    if numbers.ndim != 2:
-        raise ValueError(f"{name} has shape {numbers.shape}, a matrix (rows of numbers) is wanted")
-    numbers = numbers.astype(float)
-    if not np.isfinite(numbers).all():
-        row, column = np.argwhere(~np.isfinite(numbers))[0]
-        raise ValueError(f"{name}[{row}, {column}] is {numbers[row, column]}, not a finite number")
-    return numbers
-
-
 def _feedthrough(D: Any, name: str, m: int, B: np.ndarray, signal: str) -> np.ndarray:
     wanted = (m, B.shape[1])
     if D is None:
         return np.zeros(wanted)
-    D = _matrix(D, name)
+    D = matrix(name, D)
     if D.shape == wanted:
         return D
     why = f"C says that y has {m} components and B{signal} that {signal} has {wanted[1]}"

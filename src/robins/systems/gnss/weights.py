@@ -28,9 +28,9 @@ from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-from robins.filters.rules._robust import shares
+from robins.filters.rules._robust import MOST, shares, weighed
 
-LEAST = 1e-8  # as good as none, and leaves digits
+LEAST = 1.0 / MOST  # beyond it a component is refused
 
 
 def huber_weight(k: float) -> Callable[[Array], Array]:
@@ -82,10 +82,10 @@ def by_component(
         return jax.lax.fori_loop(0, iterations, better, jnp.ones(len(own)))
 
     def before(memory, prior: Belief, o: Observation):
-        w, there = weights(o), o.present & o.accepted
+        given, w = weighed(o, 1.0 / weights(o))
+        there = o.present & o.accepted
         least = jnp.min(jnp.where(there, w, 1.0))
         mean = jnp.sum(jnp.where(there, w, 0.0)) / jnp.maximum(jnp.sum(there.astype(float)), 1.0)
-        o = o._replace(noise=o.noise / jnp.sqrt(w)[:, None])
-        return memory, prior, o.noted(name, least=least, mean=mean)
+        return memory, prior, given.noted(name, least=least, mean=mean)
 
     return Rule(before=before, name=name)

@@ -92,10 +92,8 @@ def marg_filter(
         weight: share of travel that keeps its weight (`rules.huber`).
         field_t: T, spread of strength and vertical component of a new field.
     """
-    chain = [
-        rules.only(
-            model.TRAVEL, rules.huber(weight, patience=None)
-        ),  # an assumption may stay wrong
+    chain = [  # assumptions, which may be wrong for long: time does not make them right
+        rules.only(model.TRAVEL, rules.huber(weight, patience=None)),
         rules.only(model.REST_RATE, rules.gate(0.9999, 100, "accept")),
     ]
     if gate is not None:
