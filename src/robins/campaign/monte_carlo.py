@@ -108,6 +108,7 @@ def one_record(
         "mean": posterior.mean,
         "updates": info,
         "outputs": dict(case.outputs),
+        "readings": dict(case.y),
         "tally": tally,
     }
 
@@ -209,7 +210,7 @@ def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, An
     Returns:
         NumPy records with a leading axis of ``count`` runs. Of the reported components error and
         sigma (E, r) and block_nees by block; of the state mean, nees (E,) and dim (); by sensor
-        updates, each an `Update`; by name the outputs; the tally of its steps.
+        updates, each an `Update`, and readings; by name the outputs; the tally of its steps.
 
     Raises:
         ValueError: there is no such contender.
@@ -222,19 +223,22 @@ def blocks_of(problem: Problem) -> Blocks:
     return tuple((b.name, b.where.start, b.where.stop) for b in problem.blocks)
 
 
+_NEEDED = ("innovation", "sigma", "nis", "dof")  # of each run's updates, by its statistics
+
+
 def parted(record: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Of a record what statistics need of each run, and what is shown of the first one only."""
     named = {"mean": record["mean"], "updates": record["updates"]}
-    needed = {name: (u.nis, u.dof) for name, u in record["updates"].items()}
+    needed = {
+        name: {field: getattr(u, field) for field in _NEEDED}
+        for name, u in record["updates"].items()
+    }
     return record | {"mean": None, "updates": needed}, named
 
 
 def joined(needed: dict[str, Any], named: dict[str, Any]) -> dict[str, Any]:
     """The record of `parted`; the leading axis of what is shown of one run is one."""
-    updates = {
-        name: u._replace(nis=needed["updates"][name][0], dof=needed["updates"][name][1])
-        for name, u in named["updates"].items()
-    }
+    updates = {name: u._replace(**needed["updates"][name]) for name, u in named["updates"].items()}
     return needed | {"mean": named["mean"], "updates": updates}
 
 

@@ -86,7 +86,8 @@ class Statistics:
             worst = [np.max(np.abs(error[:, span]), axis=1) for span in self.windows]
             self._each("peaks", np.stack(worst, axis=1))
         if "tally" in record:
-            for name, value in _by_name(record["tally"]).items():
+            tally = record["tally"].looking(record["updates"], record.get("readings"))
+            for name, value in _by_name(tally).items():
                 self._each(name, value)
 
     def merge(self, other: Statistics) -> None:

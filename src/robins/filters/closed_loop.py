@@ -164,6 +164,9 @@ def run_closed(
         audit(state, closed.final, again, time_s)
     if not is_traced(closed.tally):
         warn_not_taken(closed.tally)
+        if keep is everything:
+            tally = closed.tally.looking(closed.steps.info, closed.readings.y)
+            closed = closed._replace(tally=tally)
     return closed
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax.tree_util import tree_leaves, tree_map
 
 from robins.filters.audit import audit, reports
@@ -17,6 +18,10 @@ from robins.filters.model import Model
 from robins.filters.observation import as_measurement, as_real
 from robins.filters.run import Step, everything
 from robins.filters.sameness import same, same_model
+from robins.filters.tally import Tally, doubts
+from robins.manifold import State
+
+WINDOW = 400  # last updates of each sensor that are judged
 
 _DONE = int(Code.DONE)
 _NAMES = {int(code): code.name for code in Code}
@@ -63,6 +68,7 @@ class OnlineFilter:
         self._machine = on(machine, self.filter, self.model, state)
         self._reports = any(map(reports, tree_leaves(state, is_leaf=reports)))
         self.counts: Counter[str] = Counter()
+        self._last: dict[str, deque[tuple[StepInfo, Any]]] = {}
 
     @property
     def state(self) -> FilterState:
@@ -102,6 +108,9 @@ class OnlineFilter:
         """
         kept, (moved, used) = self._machine.step(u, dict(y), dict(aux or {}), keep)
         self._count(moved, *used.values())
+        if isinstance(kept, Step):
+            for sensor, info in kept.info.items():
+                self._remember(sensor, info, y[sensor])
         return kept
 
     def update(self, y: Any, sensor: str | None = None, aux: Any = None) -> StepInfo:
@@ -126,7 +135,29 @@ class OnlineFilter:
         numbers = (as_real if self._machine.is_numpy else as_measurement)(sensor, y)
         info = self._machine.update(sensor, numbers, aux)
         self._count(_DONE, info.code)
+        self._remember(sensor, info, numbers)
         return info
+
+    def doubts(self, bounds: bool = False, assumed: Collection[str] = ()) -> list[str]:
+        """Sentences on why to doubt the last 400 updates of each sensor, as those on a run.
+
+        Updates by `step` are among them where it keeps the whole `Step`. The probability of a false
+        alarm is that of one call.
+
+        Args:
+            bounds: as in `robins.filters.doubts`.
+            assumed: likewise.
+        """
+        tally = Tally.blank(tuple(self._last))
+        info, readings = {}, {}
+        for sensor, kept in self._last.items():
+            info[sensor], readings[sensor] = tree_map(lambda *x: np.stack(x), *kept)
+            code, dof = info[sensor].code, info[sensor].dof
+            judged = (dof > 0) & (code != int(Code.REFUSED))
+            tally.updates[sensor] = np.bincount(code, minlength=len(Code))
+            tally.nis[sensor] = np.sum(np.where(judged, info[sensor].nis, 0.0))
+            tally.dof[sensor] = np.sum(np.where(judged, dof, 0))
+        return doubts(tally.looking(info, readings), bounds, assumed)
 
     def look(self, question: Callable[..., Any], *args: Any) -> Any:
         """What ``question(filter, model, state, *args)`` gives, compiled; the state stays.
@@ -137,6 +168,13 @@ class OnlineFilter:
             args: pytrees of numbers.
         """
         return self._machine.look(question, *args)
+
+    def _remember(self, sensor: str, info: StepInfo, y: State) -> None:
+        """Keep an update for `doubts`; what C computes next must not change it."""
+        kept = (info._replace(gain=(), notes={}), y)
+        if self._machine.is_numpy:
+            kept = tree_map(np.array, kept)
+        self._last.setdefault(sensor, deque(maxlen=WINDOW)).append(kept)
 
     def _count(self, moved: Any, *used: Any) -> None:
         """Count a prediction that was not taken, and updates; let the memories report."""

@@ -186,4 +186,7 @@ def run(
         audit(state, solution.final, again, time_s)
     if not is_traced(solution.tally):
         warn_not_taken(solution.tally)
+        if keep is everything:
+            tally = solution.tally.looking(solution.steps.info, measurements)
+            solution = solution._replace(tally=tally)
     return solution

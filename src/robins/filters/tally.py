@@ -12,6 +12,8 @@ from jaxtyping import Array
 
 from robins.filters.belief import FAILURES, SENTENCES, Code, StepInfo
 from robins.filters.chi_square import chi2_band
+from robins.filters.whiteness import looked, suspicions
+from robins.manifold import State
 
 # A gate against outliers refuses a few measurements in a hundred. One that refuses more than this
 # share takes the model for right and the sensor for wrong.
@@ -36,6 +38,7 @@ class Tally(NamedTuple):
     updates: dict[str, Any]  # (codes,) number of updates by `Code`, by sensor
     nis: dict[str, Any]  # () sum of the normalised innovations squared, by sensor
     dof: dict[str, Any]  # () sum of their degrees of freedom, by sensor
+    looks: Mapping[str, Any] = {}  # sums of `whiteness.looked` by sensor, where steps were kept
 
     @classmethod
     def blank(cls, sensors: Mapping[str, Any] | tuple[str, ...]) -> Tally:
@@ -62,6 +65,20 @@ class Tally(NamedTuple):
             },
             self.dof | {k: self.dof[k] + jnp.where(judged[k], i.dof, 0) for k, i in info.items()},
         )
+
+    def looking(
+        self, info: Mapping[str, tuple], readings: Mapping[str, State] | None = None
+    ) -> Tally:
+        """Add sums of innovations and readings over the steps, for `doubts`; not in `jit`.
+
+        Args:
+            info: by sensor a `StepInfo` of all steps, or what has its innovation, sigma, nis, dof.
+            readings: by sensor, as the run took them.
+        """
+        given = readings or {}
+        fields = ("innovation", "sigma", "nis", "dof")
+        seen = {k: [getattr(i, field) for field in fields] for k, i in info.items()}
+        return self._replace(looks={k: looked(*seen[k], given.get(k)) for k in seen})
 
     def counts(self, sensor: str | None = None) -> dict[Code, int]:
         """How often each code occurred: in predictions, or in the updates of a sensor."""
@@ -103,13 +120,15 @@ def doubts(tally: Tally, bounds: bool = False, assumed: Collection[str] = ()) ->
     measurements the filter refused; and sensors whose mean NIS per degree of freedom is above 4
     (standard deviations half of what they should be) or below 1/16 (four times) and outside the
     99.9 % band of chi-square with a tenth of the degrees of freedom: innovations of a wrong model
-    are correlated.
+    are correlated. Of runs whose steps were looked at (`Tally.looking`, which `run` does where it
+    keeps whole steps) also what `whiteness.suspicions` finds in the sequence.
 
     Args:
         tally: of a run (`Solution.tally`), or of several with leading axes.
-        bounds: the filter states bounds, not standard deviations (an H-infinity filter), so its
-            NIS is not tested.
-        assumed: sensors whose noise is a guess on the cautious side: a small NIS says nothing.
+        bounds: the filter states bounds, not standard deviations (an H-infinity filter), so the
+            mean NIS of the run is not tested.
+        assumed: sensors whose noise is a guess on the cautious side: a small NIS says nothing, nor
+            does the side and order of innovations.
     """
     said = not_taken(tally)
     for sensor in tally.updates:
@@ -124,7 +143,7 @@ def doubts(tally: Tally, bounds: bool = False, assumed: Collection[str] = ()) ->
         nis, dof = float(np.sum(tally.nis[sensor])), int(np.sum(tally.dof[sensor]))
         if not bounds and dof >= FEWEST:
             said += _off(sensor, nis / dof, dof, sensor in assumed)
-    return said
+    return said + suspicions(tally.looks, assumed)
 
 
 def _off(sensor: str, ratio: float, dof: int, cautious: bool) -> list[str]:

@@ -22,6 +22,7 @@ from robins import rotation
 from robins.filters import Belief, Code, StepWarning, Tally, doubts, rts_smoother, run
 from robins.filters.analysis.consistency import grand_mean_nis
 from robins.filters.run import Step
+from robins.filters.whiteness import joined
 from robins.ins.blocks import Blocks
 from robins.ins.increments import after_gap
 from robins.results import Outcome, Progress, silent, variable
@@ -205,7 +206,8 @@ def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answe
             of_steps = found.steps
     mean, sigma, seen = of_steps
     likelihood, bounds = float(found.log_likelihood), contender.bounds
-    answer = Answer("", mean, sigma, seen, case.start, likelihood, found.tally, bounds)
+    tally = found.tally.looking(seen, case.y)
+    answer = Answer("", mean, sigma, seen, case.start, likelihood, tally, bounds)
     if not smoothed:
         return answer, answer
     belief = rts_smoother(found)
@@ -221,8 +223,16 @@ def _joined(parts: Sequence[Answer]) -> Answer:
         sigma=sigma,
         updates=seen,
         log_likelihood=sum(a.log_likelihood for a in parts),
-        tally=jax.tree_util.tree_map(lambda *x: np.stack(x), *[a.tally for a in parts]),
+        tally=_tally_of(parts),
     )
+
+
+def _tally_of(parts: Sequence[Answer]) -> Tally:
+    looks = [a.tally.looks for a in parts]
+    tally = jax.tree_util.tree_map(
+        lambda *x: np.stack(x), *[a.tally._replace(looks={}) for a in parts]
+    )
+    return tally._replace(looks={k: joined([look[k] for look in looks]) for k in looks[0]})
 
 
 def epochs_of(pieces: Sequence[Piece]) -> np.ndarray:

@@ -1,0 +1,263 @@
+"""Sequences of innovations and readings: what a sound filter does not show, and how sure that is.
+
+The innovations of a filter that is right are independent of all before them, lie on either side of
+zero alike, and are as large late as they were early; a sensor that is alive does not repeat itself.
+Each test compares one of these with a quantile of a stated probability, and with a size below
+which a deviation is of no consequence: in a long log every model is wrong by many of its sigmas.
+
+The innovations are those before a robust rule weighs them: a weight changes the sigma, not the
+side. All is NumPy on arrays that a run has kept, with any leading axes of runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+
+import numpy as np
+from jax.tree_util import tree_leaves
+from jaxtyping import ArrayLike
+from scipy.special import bdtrik, ndtri
+
+from robins.filters.chi_square import chi_square
+from robins.manifold import State
+
+FALSE_ALARM = 1e-5  # probability that a sound run is doubted, over all its sensors and tests
+BY_CHANCE = 1e-3  # probability that chance alone doubts as many runs as a sentence counts
+TESTS = 4  # of a component: following, the side in all, the side late, the size late
+FEWEST = 20  # innovations below which nothing is judged
+BEFORE = 10  # innovations whose sum is compared with the next
+CLIPPED = 3.0  # sigmas: an outlier counts as one of these
+FOLLOWING = 0.2  # correlation with those before that is worth a word
+ONE_SIDE = 0.6  # share on one side that is worth a word: a bias of a quarter of a sigma
+LATE_NIS = 2.0  # mean NIS per degree of freedom in the last quarter that is worth a word
+REPEATS = 10  # equal readings in a row of a stuck sensor
+COARSE = 0.1  # resolution over sigma of the innovation from which a reading may repeat itself
+
+# Sums of a component, last axis of `looked`: those of pieces of one log may be added.
+_COUNT, _PRODUCT, _SQUARE, _SEEN, _ABOVE, _LATE, _LATE_ABOVE, _NIS, _DOF, _REPEATS = range(10)
+
+
+def looked(
+    innovation: ArrayLike,
+    sigma: ArrayLike,
+    nis: ArrayLike,
+    dof: ArrayLike,
+    readings: State = None,
+) -> np.ndarray:
+    """Sums that `suspicions` judges: (..., m, 10), of a sensor's updates over the steps of a run.
+
+    Args:
+        innovation: (..., T, m), NaN where missing.
+        sigma: (..., T, m), NaN where not used.
+        nis: (..., T).
+        dof: (..., T).
+        readings: (..., T) pytree of what the sensor gave, as a run takes it; not given, repeated
+            readings are not looked for.
+    """
+    e, sigma = np.asarray(innovation, float), np.asarray(sigma, float)
+    m = e.shape[-1]
+    out = np.zeros((*e.shape[:-2], m, 10))
+    there = np.any(np.isfinite(e), axis=(*range(e.ndim - 2), -1))
+    e, sigma = e[..., there, :], sigma[..., there, :]
+    nis, dof = (np.asarray(x, float)[..., there] for x in (nis, dof))
+    if not e.shape[-2]:
+        return out
+    w = _standard(e, sigma)
+    total = np.cumsum(w, axis=-2)
+    before = total[..., :-1, :].copy()
+    before[..., BEFORE:, :] -= total[..., : -BEFORE - 1, :]
+    product = w[..., 1:, :] * before
+    late = slice(3 * w.shape[-2] // 4, None)
+    used = np.isfinite(nis) & (dof > 0)
+    for column, value in (
+        (_COUNT, np.sum(product != 0.0, axis=-2)),
+        (_PRODUCT, np.sum(product, axis=-2)),
+        (_SQUARE, np.sum(product**2, axis=-2)),
+        (_SEEN, np.sum(w != 0.0, axis=-2)),
+        (_ABOVE, np.sum(w > 0.0, axis=-2)),
+        (_LATE, np.sum(w[..., late, :] != 0.0, axis=-2)),
+        (_LATE_ABOVE, np.sum(w[..., late, :] > 0.0, axis=-2)),
+        (_NIS, np.sum(np.where(used, nis, 0.0)[..., late], axis=-1)[..., None]),
+        (_DOF, np.sum(np.where(used, dof, 0.0)[..., late], axis=-1)[..., None]),
+    ):
+        out[..., column] = value
+    if readings is not None:
+        out[..., _REPEATS] = _repeats(readings, there, e, sigma)
+    return out
+
+
+def _standard(e: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Innovations over their sigmas, clipped; zero where missing.
+
+    One that was refused has no sigma, and takes that of the run: it counts all the same.
+    """
+    blank = np.isnan(sigma)
+    if np.any(blank):
+        known = np.where(blank, 0.0, sigma)
+        mean = np.sum(known, axis=-2, keepdims=True) / np.maximum(
+            np.sum(~blank, axis=-2, keepdims=True), 1
+        )
+        sigma = np.where(blank, np.where(mean > 0.0, mean, 1.0), sigma)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return np.clip(np.nan_to_num(e / sigma, nan=0.0), -CLIPPED, CLIPPED)
+
+
+def _repeats(readings: State, there: np.ndarray, e: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Most equal readings in a row of each component; zero where the rule exempts it.
+
+    A reading that is one number throughout is a pseudo-measurement such as zero velocity, and a
+    resolution above a tenth of the innovation's sigma lets a sensor at rest repeat itself.
+    """
+    lead, m = e.shape[:-2], e.shape[-1]
+    flat = [np.asarray(leaf, float) for leaf in tree_leaves(readings)]
+    y = np.concatenate([a.reshape(*a.shape[: len(lead) + 1], -1) for a in flat], axis=-1)
+    if y.shape[-1] != m:  # an element of a manifold has more numbers than components
+        return np.zeros((*lead, m))
+    y = np.where(np.isfinite(e), y[..., there, :], np.nan)
+    with np.errstate(invalid="ignore"):
+        scale = np.sqrt(np.nanmean(np.where(np.isfinite(sigma), sigma, 0.0) ** 2, axis=-2))
+    columns = np.moveaxis(y, -1, -2).reshape(-1, y.shape[-2])
+    most = [_longest(row, s) for row, s in zip(columns, scale.reshape(-1), strict=True)]
+    return np.reshape(most, (*lead, m))
+
+
+def _longest(y: np.ndarray, sigma: float) -> int:
+    y = y[np.isfinite(y)]
+    same = np.diff(y) == 0.0
+    if len(y) < REPEATS or np.all(same):
+        return 0
+    ends = np.flatnonzero(np.concatenate([[True], ~same, [True]]))
+    most = int(np.max(np.diff(ends)))
+    if most < REPEATS:
+        return 0
+    steps = np.diff(np.unique(y))
+    steps = steps[steps > 1e-12 * np.max(np.abs(y))]  # the others are rounding
+    return most if len(steps) and np.min(steps) <= COARSE * sigma else 0
+
+
+def joined(looks: Sequence[np.ndarray]) -> np.ndarray:
+    """Sums over several pieces of one log."""
+    table = np.sum(looks, axis=0)
+    table[..., _REPEATS] = np.max([look[..., _REPEATS] for look in looks], axis=0)
+    return table
+
+
+# ------------------------------------------------------------------------------- sums to sentences
+
+
+def suspicions(looks: Mapping[str, ArrayLike], assumed: Collection[str] = ()) -> list[str]:
+    """Sentences on sequences that a sound filter would not show; none if there is no reason.
+
+    Args:
+        looks: by sensor what `looked` gives; with leading axes each run is judged by itself, and a
+            sentence counts those of which it holds.
+        assumed: sensors whose errors last by design, so that only the size of the innovations and
+            repeated readings count: their noise is a guess on the cautious side, or the gain is
+            held or leaves states out, as those of `constant_gain` and `consider`.
+    """
+    tables = {name: np.asarray(table, float) for name, table in looks.items()}
+    components = sum(table.shape[-2] for table in tables.values())
+    level = FALSE_ALARM / max(TESTS * components, 1)
+    found = []
+    for sensor, table in tables.items():
+        rows = table.reshape(-1, *table.shape[-2:])
+        tests = [_repeating, _late]
+        if sensor not in assumed:  # a filter that states bounds only overreacts: it passes these
+            tests += [_following, _one_sided]
+        for test in tests:
+            found += _told(sensor, rows, test, level)
+    return found
+
+
+Finding = tuple[float, str]  # how strong, and the words after the sensor's name
+Test = Callable[[np.ndarray, float], list[Finding]]
+
+
+def _told(sensor: str, rows: np.ndarray, test: Test, level: float) -> list[str]:
+    """The sentence of one test of one sensor, by its strongest component and run."""
+    found = []
+    for table in rows:
+        by_component = [
+            (strength, index, words)
+            for index, row in enumerate(table)
+            for strength, words in test(row, level)
+        ]
+        if by_component:
+            found.append(max(by_component))
+    # chance doubts a few of very many
+    if len(found) <= _binomial(len(rows), BY_CHANCE, FALSE_ALARM):
+        return []
+    _, index, words = max(found)
+    where = f" (component {index + 1})" if rows.shape[1] > 1 else ""
+    among = f"in {len(found)} of {len(rows)} runs " if len(rows) > 1 else ""
+    return [f"{among}'{sensor}'{where} {words}"]
+
+
+def _following(row: np.ndarray, level: float) -> list[Finding]:
+    count, z = row[_COUNT], row[_PRODUCT] / np.sqrt(max(row[_SQUARE], 1e-300))
+    if count < FEWEST or z < max(-ndtri(level), FOLLOWING * np.sqrt(count)):
+        return []
+    return [
+        (
+            z,
+            f"has innovations that follow the {BEFORE} before them, by {z:.1f} sigma more than "
+            "chance: the filter may trust its motion too much, or the errors of the sensor may "
+            "last; compare a run with more process noise, or estimate that error",
+        )
+    ]
+
+
+def _one_sided(row: np.ndarray, level: float) -> list[Finding]:
+    found = []
+    for seen, above, when in (
+        (row[_SEEN], row[_ABOVE], "of all"),
+        (row[_LATE], row[_LATE_ABOVE], "of the last quarter"),
+    ):
+        if seen < FEWEST:
+            continue
+        most = max(above, seen - above)
+        z = (2.0 * most - seen) / np.sqrt(seen)
+        if most > max(_binomial(seen, level / 2.0), ONE_SIDE * seen):
+            found.append(
+                (
+                    z,
+                    f"has {most:.0f} {when} its {seen:.0f} innovations on one side, by {z:.1f} "
+                    "sigma more than chance: the sensor or the motion may have an error that the "
+                    "model leaves out; look at its bias, its units and its axes",
+                )
+            )
+    return found
+
+
+def _binomial(count: float | int, level: float, share: float = 0.5) -> float:
+    """Number that so many draws, each a hit by this share, exceed with at most this probability."""
+    return max(float(np.ceil(bdtrik(1.0 - level, count, share))), 0.0)
+
+
+def _late(row: np.ndarray, level: float) -> list[Finding]:
+    nis, dof = row[_NIS], row[_DOF]
+    if dof < FEWEST or nis < max(LATE_NIS * dof, float(chi_square(1.0 - level, dof))):
+        return []
+    z = (nis - dof) / np.sqrt(2.0 * dof)
+    return [
+        (
+            z,
+            f"has innovations in the last quarter of mean NIS per degree of freedom "
+            f"{nis / dof:.3g}, {z:.1f} sigma above one: the filter may have lost its way, or its "
+            "standard deviations are too small; look at the time when the NIS begins to rise",
+        )
+    ]
+
+
+def _repeating(row: np.ndarray, level: float) -> list[Finding]:
+    most = row[_REPEATS]
+    if most < REPEATS:
+        return []
+    return [
+        (
+            most,
+            f"gave the same reading {most:.0f} times in a row, though its resolution is finer than "
+            "its noise: it may be stuck, or its last reading may be repeated by what records it; "
+            "look at its readings there, and use each once",
+        )
+    ]
