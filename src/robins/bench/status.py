@@ -23,9 +23,6 @@ Report = dict[str, Any]
 STARTING = "starting"  # its state until the first step: it may compile for long, and says nothing
 
 
-Report = dict[str, Any]  # what a bench says of itself, by name
-
-
 def _refused(what: str, path: Path, fix: str) -> RobinsError:
     error = RobinsError(f"reports of benches are kept here, and it {what}", path, fix)
     error.bad_input = False

@@ -15,7 +15,7 @@ from robins.campaign.machine import ByJax, InLanes, machine_for
 from robins.campaign.statistics import PERCENTS, Statistics, thinned
 from robins.filters import Code, doubts
 from robins.results import Outcome, Probability, Progress, array, keeping, silent, variable
-from robins.systems.judgement import RUNS
+from robins.systems.judgement import RUNS, Metrics, Verdicts
 from robins.systems.study import Problem, StateBlock
 from robins.systems.tables import block_array, innovation_tables
 
@@ -91,7 +91,10 @@ def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray
         metrics=metrics,
         claims=claims,
         counts=_counts(found),
-        notes=[*problem.notes, *(_undecided(c) for c in claims if c["verdict"] == "undecided")],
+        notes=[
+            *problem.notes,
+            *(_undecided(c["id"], c["more_runs"]) for c in claims if c["verdict"] == "undecided"),
+        ],
         warnings=[
             f"{name}: {sentence}"
             for name, s in found.items()
@@ -114,8 +117,8 @@ def _claims(
     problem: Problem,
     found: dict[str, Statistics],
     bound: np.ndarray | None,
-    metrics: dict[str, dict[str, Any]],
-) -> list[dict[str, Any]]:
+    metrics: Metrics,
+) -> Verdicts:
     """Verdicts, with intervals by draws of the runs, the same runs for all filters."""
     claims, runs = problem.claims(metrics), {s.runs for s in found.values()}
     if not claims or len(runs) > 1 or (count := runs.pop()) < 2:
@@ -129,10 +132,9 @@ def _claims(
     return problem.claims(metrics, drawn)
 
 
-def _undecided(claim: dict[str, Any]) -> str:
-    more = claim["more_runs"]
+def _undecided(key: str, more: int | None) -> str:
     how = f"about {more} more runs decide it" if more else "more runs will hardly decide it"
-    return f"The claim {claim['id']} is undecided: its interval reaches an edge of its band; {how}."
+    return f"The claim {key} is undecided: its interval reaches an edge of its band; {how}."
 
 
 def _chances(s: Statistics) -> dict[str, Probability]:
@@ -162,7 +164,7 @@ def _counts(found: dict[str, Statistics]) -> dict[str, int]:
     return out
 
 
-def _stack(found: dict[str, Statistics], pick: Callable[[Statistics], Any]) -> np.ndarray:
+def _stack(found: dict[str, Statistics], pick: Callable[[Statistics], np.ndarray]) -> np.ndarray:
     return np.stack([np.asarray(pick(s), dtype=float) for s in found.values()])
 
 

@@ -327,7 +327,8 @@ class Statistics:
         """
         squares = (self.run_rms / self.pooled_sigma) ** 2
         each = 1.0 - (1.0 - level) / squares.shape[1]
-        return np.transpose(rms_with_bounds(squares, each)[1:])
+        _, low, high = rms_with_bounds(squares, each)
+        return np.column_stack([np.asarray(low), np.asarray(high)])
 
     def anees(self) -> np.ndarray:
         """(E,) average NEES over n."""
@@ -361,6 +362,7 @@ class Statistics:
         return [name.removeprefix("dof of ") for name in names if np.sum(self._all(name)) > 0]
 
 
+Numbers = float | np.ndarray
 TALLY = " counted of "
 PERCENTS = (5, 50, 95, 99)
 THIN = 128  # epochs at which the scatter is kept: its memory does not grow with the steps
@@ -385,7 +387,7 @@ def _infinite(values: np.ndarray, bad: np.ndarray) -> np.ndarray:
     return np.where(bad.reshape(-1, *[1] * (values.ndim - 1)), np.inf, values)
 
 
-def mean_with_bounds(values: np.ndarray, level: float = 0.95) -> tuple[Any, Any, Any]:
+def mean_with_bounds(values: np.ndarray, level: float = 0.95) -> tuple[Numbers, Numbers, Numbers]:
     """Mean of independent numbers, or of each column, with its Student-t confidence bounds."""
     values = np.asarray(values, dtype=float)
     mean, count = np.mean(values, axis=0), len(values)
@@ -396,7 +398,9 @@ def mean_with_bounds(values: np.ndarray, level: float = 0.95) -> tuple[Any, Any,
     return mean, mean - half, mean + half
 
 
-def rms_with_bounds(square_means: np.ndarray, level: float = 0.95) -> tuple[Any, Any, Any]:
+def rms_with_bounds(
+    square_means: np.ndarray, level: float = 0.95
+) -> tuple[Numbers, Numbers, Numbers]:
     """Root of the mean of per-run mean squares, with bounds from the spread between runs.
 
     Epochs of one run are correlated, runs are not, so the spread between runs is what counts.

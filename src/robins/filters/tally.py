@@ -77,8 +77,8 @@ class Tally(NamedTuple):
         """
         given = readings or {}
         fields = ("innovation", "sigma", "nis", "dof")
-        seen = {k: [getattr(i, field) for field in fields] for k, i in info.items()}
-        return self._replace(looks={k: looked(*seen[k], given.get(k)) for k in seen})
+        seen = {k: {field: getattr(i, field) for field in fields} for k, i in info.items()}
+        return self._replace(looks={k: looked(**x, readings=given.get(k)) for k, x in seen.items()})
 
     def counts(self, sensor: str | None = None) -> dict[Code, int]:
         """How often each code occurred: in predictions, or in the updates of a sensor."""

@@ -117,10 +117,9 @@ def band(value: Any) -> str:
     return show(value)
 
 
-def found(claim: Mapping[str, Any]) -> str:
+def found(value: float | Sequence[float] | None, interval: Sequence[float] | None = None) -> str:
     """The value of a claim, with its 95 % interval where there is one."""
-    interval = claim.get("interval")
-    return show(claim["value"]) + (f" ({band(interval)})" if interval else "")
+    return show(value) + (f" ({band(interval)})" if interval else "")
 
 
 def verdict(claims: Sequence[Mapping[str, Any]]) -> str:

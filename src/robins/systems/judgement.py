@@ -16,7 +16,8 @@ from robins.errors import require, require_known
 
 Metrics = Mapping[str, Mapping[str, Any]]  # by filter
 Band = Sequence[float | int | None]  # from, to
-Judge = Callable[..., list[dict[str, Any]]]  # (metrics, metrics of draws of the runs) -> verdicts
+Verdicts = list[dict[str, Any]]  # of claims, as `summary.json` has them
+Judge = Callable[..., Verdicts]  # (metrics, metrics of draws of the runs) -> verdicts
 MOST_MORE = 1e4  # times as many runs, beyond which nobody waits for a verdict
 RUNS = "runs"  # in the metrics of draws: of how many runs they are
 
@@ -110,7 +111,7 @@ def judging(claims: Mapping[str, Claim], stated: Sequence[str] | None = None) ->
 def about(filters: Sequence[str], judge: Judge) -> Judge:
     """Verdicts on these filters alone, whatever else was run beside them."""
 
-    def judged(metrics: Metrics, drawn: Sequence[Metrics] = ()) -> list[dict[str, Any]]:
+    def judged(metrics: Metrics, drawn: Sequence[Metrics] = ()) -> Verdicts:
         chosen = [{k: m for k, m in one.items() if k in filters} for one in (metrics, *drawn)]
         return judge(chosen[0], chosen[1:])
 
@@ -119,7 +120,7 @@ def about(filters: Sequence[str], judge: Judge) -> Judge:
 
 def _verdicts(
     claims: Mapping[str, Claim], metrics: Metrics, drawn: Sequence[Metrics] = ()
-) -> list[dict[str, Any]]:
+) -> Verdicts:
     out = []
     for key, claim in claims.items():
         exists = (n in metrics and metrics[n].get("feasible", True) for n in claim.needs)

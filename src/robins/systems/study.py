@@ -24,7 +24,7 @@ from robins.manifold import State
 from robins.results import Outcome
 from robins.scenario import Parameters
 from robins.systems.catalogue import listed
-from robins.systems.judgement import Claim, judging, standard_metrics
+from robins.systems.judgement import Claim, Judge, judging, standard_metrics
 from robins.systems.parts import HowMany, Names, RunNumber, Runs
 
 

@@ -191,7 +191,8 @@ class Rms(NamedTuple):
         """In SI; the length of the error over the components of the block."""
         squares = np.sum(found.run_rms[:, block.where] ** 2, axis=1)
         stated = np.sum(found.sigma[found.counted, block.where] ** 2, axis=1)
-        return cls(*rms_with_bounds(squares), float(np.sqrt(np.mean(stated))))
+        rms, low, high = (float(one) for one in rms_with_bounds(squares))
+        return cls(rms, low, high, float(np.sqrt(np.mean(stated))))
 
 
 def _outcome(vary: Sequence[Varied], every: Sequence[Point]) -> Outcome:

@@ -57,7 +57,9 @@ def scale(m: int) -> float:
         return sum(parts) - m
 
     # without a component there is nothing to scale; beyond 16 it is one to 1e-9
-    return float(optimize.brentq(excess, 0.9, 1.01, xtol=1e-12)) if 0 < m <= 16 else 1.0
+    if not 0 < m <= 16:
+        return 1.0
+    return float(optimize.root_scalar(excess, bracket=(0.9, 1.01), xtol=1e-12).root)
 
 
 def log_density(seen: Normalised) -> Float[Array, ""]:

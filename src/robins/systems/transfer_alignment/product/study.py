@@ -222,8 +222,8 @@ def product_metrics(statistics: Any) -> dict[str, Any]:
         out[f"{name}_last_sigma_arcmin"] = last.tolist()
         if name == "attitude":
             rms, sigma = rms_by_component(statistics), statistics.pooled_sigma
-            sizes = (np.linalg.norm(x[block.where]) for x in (rms, sigma))
-            out["attitude_over_sigma"] = float(np.divide(*sizes))
+            error, stated = (np.linalg.norm(x[block.where]) for x in (rms, sigma))
+            out["attitude_over_sigma"] = float(error / stated)
             for key in ("attitude_rms_arcmin", "attitude_last_sigma_arcmin"):
                 north, east, down = out[key]
                 out[key] = [east, north, down]  # sizes, which have no sign
