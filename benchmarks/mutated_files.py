@@ -137,7 +137,8 @@ def _beside(path: Path, name: str) -> Path:
 
 
 def _read_plan(path: Path) -> object:
-    return read(Folder(_beside(path, "campaign.json")))
+    plan = read(Folder(_beside(path, "campaign.json")))
+    return plan if plan is None or plan.runs > 10_000 else plan.shards
 
 
 def _read_sweep(path: Path) -> object:

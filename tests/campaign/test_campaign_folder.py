@@ -270,6 +270,20 @@ def test_what_is_no_campaign_is_told(tmp_path):
     (tmp_path / "campaign.json").write_text("{")
     with pytest.raises(RobinsError, match="is damaged"):
         campaign_status(tmp_path)
+    plan = {
+        "schema": 1,
+        "asked": "a",
+        "scenario": "a",
+        "text": "",
+        "seed": 0,
+        "runs": 4,
+        "width": 4,
+    }
+    plan |= {"filters": ["kf"], "machine": "jax", "code": "0"}
+    for wrong in ({"width": 0}, {"runs": -1}, {"runs": "4"}, {"filters": [1]}, {"text": None}):
+        (tmp_path / "campaign.json").write_text(json.dumps(plan | wrong))
+        with pytest.raises(RobinsError, match=r"campaign.json is damaged"):
+            campaign_status(tmp_path)
     for content in ("{", "[" * 5000, "[]", '{"points": [1]}'):
         (tmp_path / "sweep.json").write_text(content)
         with pytest.raises(InputError, match=r"sweep.json is damaged .*repeat the same"):

@@ -13,7 +13,16 @@ from example_folder import a_solution, a_summary, names, write
 
 import robins
 from robins import results
-from robins.results import ResultError, ResultWriter, array, read, solution, variable
+from robins.results import (
+    ResultError,
+    ResultWriter,
+    array,
+    manifest,
+    read,
+    solution,
+    summary,
+    variable,
+)
 
 # ------------------------------------------------------------------------------- there and back
 
@@ -141,6 +150,27 @@ def without(attr):
     solution = a_solution()
     del solution["error_attitude"].attrs[attr]
     return solution
+
+
+def test_a_result_of_others_whose_checksums_fit(tmp_path):
+    path = tmp_path / "out"
+    write(path, a_summary())
+    made = json.loads((path / "manifest.json").read_text())
+
+    def sealed(**more):
+        rest = {k: v for k, v in (made | more).items() if k != "sha256"}
+        seal = manifest._seal(rest)
+        (path / "manifest.json").write_text(summary.dumps(rest | {"sha256": seal}))
+
+    for files in (None, {"summary.json": 3}, {"summary.json": {"size": 1}}):
+        sealed(files=files)
+        with pytest.raises(ResultError, match=r"manifest.json is damaged: it lists no files"):
+            read(path)
+    for content, why in (("[" * 5000, "RecursionError"), ("[]", "it lists no files")):
+        (path / "summary.json").write_text(content)
+        sealed(files={"summary.json": manifest.digest(path / "summary.json")})
+        with pytest.raises(ResultError, match=f"summary.json is damaged.*{why}"):
+            read(path)
 
 
 @pytest.mark.parametrize(("rows", "chunk"), [(10**12, 1000), (10, 1 << 27)])

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path, PurePosixPath
@@ -135,6 +135,7 @@ def read(store: Store) -> Plan | None:
         data = json.loads(content)
         schema = data.pop("schema")
         plan = Plan(**data | {"filters": tuple(data["filters"])})
+        _check(plan)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise RobinsError(
             f"{NAME} is damaged ({error})",
@@ -148,6 +149,20 @@ def read(store: Store) -> Plan | None:
             "use the version of robins that wrote it.",
         )
     return plan
+
+
+def _check(plan: Plan) -> None:
+    """Refuse a plan that cannot be cut into chunks.
+
+    Raises:
+        TypeError, ValueError: a field is of another type, or counts nothing.
+    """
+    for field in fields(plan):
+        value = getattr(plan, field.name)
+        if type(value) is not {"int": int, "str": str}.get(str(field.type), tuple):
+            raise TypeError(f"{field.name} is {value!r}")
+    if plan.runs < 1 or plan.width < 1 or not all(type(name) is str for name in plan.filters):
+        raise ValueError(f"{plan.runs} runs in chunks of {plan.width} of {plan.filters}")
 
 
 def needed(store: Store) -> Plan:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from robins import __version__
+from robins.foreign import decoding
 from robins.results.errors import ResultError, cannot
 from robins.results.summary import dumps, loads, plain
 
@@ -95,10 +96,8 @@ def load(folder: Path, shown: str | os.PathLike[str]) -> dict[str, Any]:
         ) from None
     except OSError as error:
         raise cannot(shown, f"read {NAME}", error) from error
-    try:
+    with decoding(lambda why: ResultError(shown, f"{NAME} is damaged ({why})", _REMAKE)):
         manifest = loads(text)
-    except ValueError as error:
-        raise ResultError(shown, f"{NAME} is damaged ({error})", _REMAKE) from None
     if not isinstance(manifest, dict) or not isinstance(manifest.get("schema"), int):
         raise ResultError(shown, f"{NAME} is not one of robins", "name a folder robins wrote")
     if manifest["schema"] != SCHEMA_VERSION:
@@ -112,6 +111,10 @@ def load(folder: Path, shown: str | os.PathLike[str]) -> dict[str, Any]:
         raise ResultError(shown, f"{NAME} is damaged: its checksum does not fit", _REMAKE)
     if manifest.get("complete") is not True:
         raise ResultError(shown, "is not complete", _REMAKE)
+    files = manifest.get("files")
+    listed = files.values() if isinstance(files, dict) else [None]
+    if not all(isinstance(one, dict) and {"size", "sha256"} <= set(one) for one in listed):
+        raise ResultError(shown, f"{NAME} is damaged: it lists no files", _REMAKE)
     return manifest
 
 

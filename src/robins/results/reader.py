@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 import xarray as xr
 
+from robins.foreign import decoding
 from robins.results import dataframe, folder, manifest, solution, summary
 from robins.results.errors import ResultError, cannot
 
@@ -67,4 +68,9 @@ def read(path: str | os.PathLike[str]) -> Result:
     except OSError as error:
         raise cannot(path, "read the result", error) from error
     shown = Path(path) if where == folder.resolve(path) else where
-    return Result(shown, made, summary.loads(text), dataset)
+    damaged = "summary.json is damaged"
+    with decoding(lambda why: ResultError(path, f"{damaged} ({why})", "make the result again")):
+        told = summary.loads(text)
+    if not isinstance(told, dict) or not isinstance(told.get("files"), dict):
+        raise ResultError(path, f"{damaged}: it lists no files", "make the result again")
+    return Result(shown, made, told, dataset)
