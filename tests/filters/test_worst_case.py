@@ -18,6 +18,7 @@ from robins.filters.analysis.worst_case import (
     gamma_min,
     spectral_norm,
     steady_h_infinity,
+    steady_kalman,
     worst_case_gain,
 )
 from robins.filters.rules.adaptive_h_infinity import adaptive_h_infinity
@@ -241,6 +242,20 @@ def test_the_steady_filter_is_where_the_recursion_goes():
         HR = SYSTEM.H.T @ np.linalg.inv(SYSTEM.R)
         np.testing.assert_allclose(steady.K, done.P[-1] @ HR, rtol=1e-8, atol=1e-9)
         np.testing.assert_allclose(steady.K_a_priori, done.P_wide[-1] @ HR, rtol=1e-8, atol=1e-9)
+    plain = steady_kalman(SYSTEM.F, SYSTEM.Q, SYSTEM.H, SYSTEM.R)  # done is the Kalman filter's
+    for got, want in zip(plain, (done.P_pred[-1], done.P[-1], done.P[-1] @ HR), strict=False):
+        np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-11)
+
+
+def test_units_do_not_drown_the_steady_kalman_filter():
+    """A drift of 1e-15 beside an attitude of 1e-8, in closed form for a walk that is measured."""
+    q, r = np.array([1e-16, 1e2]), np.array([1e-8, 1e-3])
+    found = steady_kalman(np.eye(2), np.diag(q), np.eye(2), np.diag(r))
+    P_pred = q / 2 + np.sqrt(q**2 / 4 + q * r)
+    np.testing.assert_allclose(np.diag(found.P_pred), P_pred, rtol=1e-9)
+    np.testing.assert_allclose(np.diag(found.K), P_pred / (P_pred + r), rtol=1e-9)
+    with pytest.raises(ValueError, match="not detectable"):
+        steady_kalman(np.eye(2), np.diag(q), np.eye(1, 2), np.eye(1))
 
 
 def test_the_scalar_of_the_textbook_in_closed_form():

@@ -10,6 +10,7 @@ from robins.filters.analysis import (
     observability,
     observability_along,
     steady_h_infinity,
+    steady_kalman,
     used_sensors,
     worst_case_gain,
 )
@@ -57,6 +58,9 @@ from robins.filters.rule import Rule
 from robins.filters.run import Solution, Step, filter_step, run
 from robins.filters.smooth import rts_smoother
 from robins.filters.tally import StepWarning, Tally, doubts
+from robins.moved import moved
+
+__getattr__ = moved(__name__)
 
 __all__ = [
     "SENTENCES",
@@ -123,6 +127,7 @@ __all__ = [
     "sigma_points",
     "sigma_weights",
     "steady_h_infinity",
+    "steady_kalman",
     "taylor",
     "unscented",
     "unscented_transform",

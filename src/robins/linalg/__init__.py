@@ -25,6 +25,9 @@ from robins.linalg.dense import (
     tria,
     van_loan,
 )
+from robins.moved import moved
+
+__getattr__ = moved(__name__)
 
 __all__ = [
     "as_factor",

@@ -29,6 +29,7 @@ from robins.filters.analysis.worst_case import (
     existence_margin,
     gamma_min,
     steady_h_infinity,
+    steady_kalman,
     worst_case_gain,
 )
 
@@ -50,6 +51,7 @@ __all__ = [
     "observability_along",
     "spectrum",
     "steady_h_infinity",
+    "steady_kalman",
     "unobservable",
     "used_sensors",
     "whitened_innovations",

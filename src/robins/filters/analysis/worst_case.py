@@ -277,12 +277,52 @@ def _linearised(model: Model, start: Belief, steps: Any, weight: Any, u: Any, au
 
 
 class SteadyHInfinity(NamedTuple):
-    """A time-invariant H-infinity filter."""
+    """A time-invariant Kalman or H-infinity filter."""
 
     P_pred: np.ndarray  # (n, n) before the measurement
     P: np.ndarray  # (n, n) after it
     K: np.ndarray  # (n, m) P H' R^-1, of the estimate after the measurement
     K_a_priori: np.ndarray  # (n, m) P~ H' R^-1, of the estimate before it; P~ is P inflated
+
+
+def _matrices(
+    F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The matrices of a system that does not change, of shapes that fit."""
+    F = matrix("F", F)
+    n = len(F)
+    F, Q, H = matrix("F", F, n, n), matrix("Q", Q, n, n), matrix("H", H, None, n)
+    return F, Q, H, matrix("R", R, len(H), len(H))
+
+
+def steady_kalman(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> SteadyHInfinity:
+    """Steady gain and covariances of the Kalman filter of a system that does not change.
+
+    Of x' = F x + w, y = H x + v, from the discrete algebraic Riccati equation (DARE), polished to
+    the last digits (`robins.filters.synthesis.kalman_gain`, which takes a `Plant`). Variances of
+    very different units do not drown each other.
+
+    Args:
+        F: (n, n) transition.
+        Q: (n, n) process noise covariance.
+        H: (m, n).
+        R: (m, m) measurement noise covariance.
+
+    Raises:
+        TypeError: a matrix is not of real numbers.
+        ValueError: a matrix is of another shape, not finite, or no covariance where it must be one,
+            or there is no steady state, with the reason.
+    """
+    # Imported here: a filter that runs needs no design.
+    from robins.filters.synthesis import current_form, kalman_gain
+    from robins.filters.synthesis.norms import gramian
+
+    F, Q, H, R = _matrices(F, Q, H, R)
+    G, W = np.asarray(linalg.factor(Q, "Q")), np.asarray(linalg.factor(R, "R"))
+    K = kalman_gain(current_form(F, G, np.zeros((len(F), 0)), H, W))
+    left = np.eye(len(F)) - K @ H
+    P = gramian(left @ F, np.hstack([left @ G, -K @ W]))
+    return SteadyHInfinity(F @ P @ F.T + Q, P, K, K)
 
 
 def steady_h_infinity(
@@ -306,10 +346,8 @@ def steady_h_infinity(
         ValueError: gamma is not positive, a matrix is of another shape, not finite, or no
             covariance where it must be one, or no such filter exists.
     """
-    F = matrix("F", F)
-    n = len(F)
-    F, Q, H = matrix("F", F, n, n), matrix("Q", Q, n, n), matrix("H", H, None, n)
-    R, L = matrix("R", R, len(H), len(H)), matrix("weight", weight, None, n)
+    F, Q, H, R = _matrices(F, Q, H, R)
+    L = matrix("weight", weight, None, len(F))
     require(gamma > 0.0, f"gamma must be positive, or inf for the Kalman filter; got {gamma}")
     linalg.factor(Q, "Q")
     if not np.all(np.diag(linalg.factor(R, "R")) > 0.0):

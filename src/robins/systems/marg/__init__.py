@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from robins.moved import moved
 from robins.systems.marg.aboard import aboard
 from robins.systems.marg.live import LiveMarg
 from robins.systems.marg.log import first_belief, first_look, prepare
@@ -23,6 +24,8 @@ SYSTEM = System(
     orientation=lambda parameters: parameters.orientation,
     aboard=aboard,
 )
+
+__getattr__ = moved(__name__)
 
 __all__ = [
     "SYSTEM",
