@@ -18,7 +18,7 @@ import pytest
 from ratchets import imported_modules
 
 import robins
-from robins.moved import MOVED
+from robins.errors import MOVED
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "robins"

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import importlib
+import warnings
+from collections.abc import Callable, Iterable
+from types import FunctionType
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -75,3 +78,39 @@ def require_known(kind: str, name: str, among: Iterable[str], where: str = "this
         name in known,
         f"no {kind} '{name}' in {where}{hint(name, known)} It has {', '.join(known)}",
     )
+
+
+# ----------------------------------------------------------------------------- names that moved
+
+# By package, what it had: the package that has it now, and its name there.
+MOVED: dict[str, dict[str, tuple[str, str]]] = {
+    "robins.linalg": {"steady_state": ("robins.filters", "steady_kalman")},
+    "robins.filters": {
+        "constrain": ("robins.filters.limits", "constrain"),
+        "information_sum": ("robins.filters", "fuse"),
+    },
+    "robins.systems.marg": {
+        "marg_filter": ("robins.systems.marg.replay", "marg_filter"),
+        "causal_attitudes": ("robins.systems.marg.model", "causal_attitudes"),
+        "smoothed_attitudes": ("robins.systems.marg.model", "smoothed_attitudes"),
+    },
+}
+
+
+def moved(package: str) -> Callable[[str], FunctionType]:
+    """The `__getattr__` of a package (PEP 562), for its names in `MOVED`.
+
+    Code that uses such a name goes on, with a `DeprecationWarning` that states the new place.
+
+    Args:
+        package: its ``__name__``.
+    """
+
+    def attribute(name: str) -> FunctionType:
+        if name not in MOVED[package]:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        place, now = MOVED[package][name]
+        warnings.warn(f"{package}.{name} is now {place}.{now}", DeprecationWarning, stacklevel=2)
+        return getattr(importlib.import_module(place), now)
+
+    return attribute

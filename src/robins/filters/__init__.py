@@ -1,5 +1,6 @@
 """Filters: a way to linearise and a chain of rules; without navigation, sensors or files."""
 
+from robins.errors import moved
 from robins.filters.analysis import (
     Bound,
     bound_along,
@@ -58,7 +59,6 @@ from robins.filters.rule import Rule
 from robins.filters.run import Solution, Step, filter_step, run
 from robins.filters.smooth import rts_smoother
 from robins.filters.tally import StepWarning, Tally, doubts
-from robins.moved import moved
 
 __getattr__ = moved(__name__)
 

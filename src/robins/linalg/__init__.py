@@ -5,6 +5,7 @@ matrices from this room and never call ``jnp.linalg`` themselves, so that what i
 (singular factors, gradients, signs) is solved in one place.
 """
 
+from robins.errors import moved
 from robins.linalg.dense import (
     as_factor,
     block_diagonal,
@@ -25,7 +26,6 @@ from robins.linalg.dense import (
     tria,
     van_loan,
 )
-from robins.moved import moved
 
 __getattr__ = moved(__name__)
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from robins.moved import moved
+from robins.errors import moved
 from robins.systems.marg.aboard import aboard
 from robins.systems.marg.live import LiveMarg
 from robins.systems.marg.log import first_belief, first_look, prepare
