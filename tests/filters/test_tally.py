@@ -1,6 +1,7 @@
 """What a run says of steps that were not taken, and why a reader should doubt a filter."""
 
 import json
+import re
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +27,7 @@ from robins.filters import (
     kalman,
     particle,
     run,
+    whiteness,
 )
 from robins.filters.composite.delayed import Late
 
@@ -167,3 +169,105 @@ def test_doubts(given, said):
 def test_a_bound_is_not_tested_as_a_covariance():
     assert not doubts(tally(nis=1000, DONE=100), bounds=True)
     assert doubts(tally(nis=1000, DONE=100))
+
+
+# ------------------------------------------------------------------------- sentences from sequences
+
+DT_S, LONG = 0.1, 400
+F = np.array([[1.0, DT_S], [0.0, 1.0]])
+L = np.linalg.cholesky(0.2 * np.array([[DT_S**3 / 3, DT_S**2 / 2], [DT_S**2 / 2, DT_S]]))
+
+
+def tracked(runs, seed, too_small=1.0, change=lambda k, y: y):
+    """Kalman filters of a position with its rate by NumPy: what `looked` takes, and error/sigma."""
+    rng = np.random.default_rng(seed)
+    x, m, P = np.zeros((runs, 2)), np.zeros((runs, 2)), np.eye(2)
+    e, sigma, given, far = [], [], [], []
+    for k in range(LONG):
+        x = x @ F.T + rng.standard_normal((runs, 2)) @ L.T
+        y = change(k, x[:, 0] + rng.standard_normal(runs))
+        m, P = m @ F.T, F @ P @ F.T + L @ L.T / too_small**2
+        S = P[0, 0] + 1.0
+        e.append(y - m[:, 0])
+        sigma.append(np.full(runs, np.sqrt(S)))
+        m, P = m + np.outer(e[-1], P[:, 0] / S), P - np.outer(P[:, 0], P[0]) / S
+        given.append(y)
+        far.append(np.max(np.abs(m - x) / np.sqrt(np.diag(P)), axis=1))
+    e, sigma, given = (np.array(a).T[..., None] for a in (e, sigma, given))
+    nis = (e / sigma)[..., 0] ** 2
+    return (e, sigma, nis, np.ones_like(nis, int), given), np.max(far[LONG // 4 :], axis=0)
+
+
+def doubted(numbers):
+    """The sentences on each run alone."""
+    table = whiteness.looked(*numbers)
+    return [whiteness.suspicions({"y": row}) for row in table], table
+
+
+def test_no_sound_run_of_a_thousand_is_doubted_but_nearly_all_that_trust_their_motion_too_much():
+    numbers, _ = tracked(1000, 1)
+    sound, table = doubted(numbers)
+    assert not any(sound)
+    assert not whiteness.suspicions({"y": table})
+    numbers, far = tracked(20, 2, too_small=10.0)
+    assert np.sum(far > 5.0) >= 19
+    sure, table = doubted(numbers)
+    assert sum(map(bool, sure)) >= 19
+    (said,) = [one for one in whiteness.suspicions({"y": table}) if "follow" in one]
+    assert re.match(r"in (19|20) of 20 runs 'y' has innovations that follow the 10 before", said)
+
+
+def test_the_order_of_innovations_is_not_hidden_by_gaps_weights_or_outliers():
+    (e, sigma, nis, dof, _), _ = tracked(20, 4, too_small=10.0)
+    gone = np.arange(LONG) % 3 > 0
+    e, sigma = np.where(gone[:, None], np.nan, e), np.where(gone[:, None], np.nan, sigma)
+    alone = whiteness.looked(e[:, ~gone], sigma[:, ~gone], nis[:, ~gone], dof[:, ~gone])
+    np.testing.assert_allclose(whiteness.looked(e, sigma, nis, dof), alone, rtol=1e-12)
+    (e, sigma, nis, dof, _), _ = tracked(20, 5, too_small=10.0)
+    e[:, 7] = 1e30
+    sigma[:, 9] = np.nan  # refused
+    found, _ = doubted((e, sigma, nis, dof))
+    assert sum(any("follow" in one for one in row) for row in found) >= 19
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda k, y: y if k < 300 else y + 300.0 + 0.5 * (k - 300) ** 2, "on one side"),
+        (lambda k, y: y + (k > 300) * 30.0 * (-1) ** k, "last quarter of mean NIS"),
+        (lambda k, y: y if k % 40 > 12 else 0.125 + 0.0 * y, "same reading 13 times in a row"),
+        (lambda k, y: 4.0 * np.round(y / 4.0), ""),  # coarse
+        (lambda k, y: 0.0 * y, "-"),  # a pseudo-measurement repeats itself
+    ],
+)
+def test_what_a_sequence_shows(change, said):
+    found, _ = doubted(tracked(1, 6, change=change)[0])
+    repeated = [one for one in found[0] if "same reading" in one]
+    assert any(said in one for one in found[0]) if len(said) > 1 else not repeated
+    if not said:
+        assert not found[0]
+
+
+def test_pieces_of_a_log_are_judged_as_one():
+    numbers, _ = tracked(2, 7, change=lambda k, y: y if k % 40 > 12 else 0.125 + 0.0 * y)
+    table = whiteness.looked(*numbers)
+    whole = whiteness.joined(list(table))
+    assert whole[0, 0] == table[:, 0, 0].sum()
+    (said,) = [one for one in whiteness.suspicions({"y": whole}, ("y",)) if "same" in one]
+    assert "'y' gave the same reading 13 times in a row" in said
+
+
+def test_a_run_and_a_stream_are_doubted_alike():
+    y = np.where(np.arange(60)[:, None] < 30, RNG.normal(size=(60, 1)), 0.25)
+    data = {"a": y, "b": y + 100.0}
+    found = run(FILTERS["kalman"], MODEL, START, data, np.zeros(60))
+    live = OnlineFilter(FILTERS["kalman"], MODEL, START)
+    for k in range(60):
+        live.predict(0.0)
+        for name, rows in data.items():
+            live.update(rows[k], name)
+    said = doubts(found.tally)
+    assert any("'a' gave the same reading 30 times in a row" in one for one in said)
+    assert any("'b' has 60 of all its 60 innovations on one side" in one for one in said)
+    assert live.doubts() == said
+    assert not any("one side" in one for one in live.doubts(assumed=["a", "b"]))
