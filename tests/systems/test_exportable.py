@@ -26,6 +26,7 @@ SOME = [
     ("ins-gnss/drive", "ekf"),
     ("rocket/a1", "federated-scalar-ukf"),
     ("rocket/a1", "federated-vector-stukf"),
+    ("rocket/b1", "gate-scale-factor"),
     ("satellite/s1", "mekf"),
     ("transfer-alignment/aircraft", "product"),
 ]
@@ -51,9 +52,10 @@ class Given:
             case = c.case(self.problem.simulate(run))
             if case.loop is not None:
                 case = solved(c.filter, c.model, case, lambda step: ())[1]
-            return case.start, case.u, dict(case.y), dict(case.aux)
+            return case.start, case.rows, case.u, dict(case.y), dict(case.aux)
 
-        start, *rows = jax.eval_shape(given, jnp.asarray(0))
+        start, turning, *rows = jax.eval_shape(given, jnp.asarray(0))
+        self.reported = c.reported if turning is None else np.zeros(turning.shape)
         # Halves are a quaternion of length one, and a latitude.
         start = jax.tree.map(lambda x: jnp.full(x.shape, 0.5, x.dtype), start)
         self.state = c.filter.init(start, c.model.dims) if isinstance(start, Belief) else start
@@ -101,7 +103,7 @@ def of_another_kind(point, places, notes, struct, units):
 def undeclared(given):
     """Fields of another unit than is declared, of the mean and of the readings."""
     problem, mean = given.problem, given.state.belief.mean
-    axes = tangent_axes(problem, given.contender.reported, manifold.dim(mean))
+    axes = tangent_axes(problem, given.reported, manifold.dim(mean))
     readings = jax.tree.map(lambda x: np.full(x.shape, 0.5, x.dtype), given.rows)
     notes = field_notes(problem, axes, given.state, readings)
     units = [axis and axis[1].partition("]")[0][1:] for axis in axes]

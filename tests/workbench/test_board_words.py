@@ -93,6 +93,8 @@ def test_what_is_reported_as_a_mixture_is_not_told():
     axes = tangent_axes(PROBLEM, mixed, 8)
     assert axes[4:] == [None] * 4
     assert ("state", "mean_place") not in field_notes(PROBLEM, axes, state_of(MEAN), {})
+    turning = np.stack([REPORTED, mixed])  # at two epochs
+    assert tangent_axes(PROBLEM, turning, 8) == axes
     none = tangent_axes(PROBLEM, 0.5 * REPORTED, 8)
     assert components(none) == [
         "factor is lower triangular, covariance P = factor factor' of the error"

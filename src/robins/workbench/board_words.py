@@ -21,8 +21,13 @@ Axis = tuple[str, str, str]  # block, "[unit], frame", axis
 
 
 def tangent_axes(problem: Problem, reported: Any, n: int) -> list[Axis | None]:
-    """What each of n components of the error is, where it is reported by itself."""
+    """What each of n components of the error is, where it is reported by itself.
+
+    Where what is reported turns with the time, that is all epochs.
+    """
     rows = np.eye(n) if reported is None else np.asarray(reported)
+    if rows.ndim == 3:
+        rows = np.where(np.all(rows == rows[0], axis=(0, 2))[:, None], rows[0], 0.0)
     found: list[Axis | None] = [None] * n
     for block in problem.blocks:
         for row, axis in zip(rows[block.where], block.axes, strict=True):

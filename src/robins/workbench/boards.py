@@ -19,6 +19,7 @@ from robins.bench.rig import Rig
 from robins.bench.rigs import RIGS, rig_of
 from robins.bench.run.setup import changed, read
 from robins.bench.wire.c_header import firmware
+from robins.campaign.monte_carlo import reported_rows
 from robins.filters import SENTENCES, Code
 from robins.program import DOUBLE, SINGLE, Precision, Program, trace_steps
 from robins.program.harness import Key, Recorded, check_c, makefile, recorded_h
@@ -209,7 +210,8 @@ def _library(
     steps = [(functions[e], first[e]) for e in functions]
     programs = trace_steps([*steps, (anew, (belief,))], _any_start(runs), unroll=unroll)
     entries = [_entry(n, p) for n, p in zip([*functions, RESET], programs, strict=True)]
-    axes = tangent_axes(problem, contender.reported, len(belief.factor))
+    reported = reported_rows(contender.reported, run.case)[0]
+    axes = tangent_axes(problem, reported, len(belief.factor))
     notes = field_notes(problem, axes, run.start, first)
     library = Library(asked.library, entries, run.start, (), notes, precision)
     c = library.source()
