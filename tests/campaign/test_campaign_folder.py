@@ -286,7 +286,7 @@ def test_what_is_no_campaign_is_told(tmp_path):
             campaign_status(tmp_path)
     for content in ("{", "[" * 5000, "[]", '{"points": [1]}'):
         (tmp_path / "sweep.json").write_text(content)
-        with pytest.raises(InputError, match=r"sweep.json is damaged .*repeat the same"):
+        with pytest.raises(InputError, match=r"sweep.json is damaged .*the same `robins sweep`"):
             campaign_status(tmp_path)
 
 
@@ -297,7 +297,7 @@ def test_a_file_in_place_of_a_campaign_is_bad_input(tmp_path, capsys, command):
     word, *options = command.split()
     assert main(["campaign", word, str(path), *options]) == 2
     told = capsys.readouterr().err
-    assert "Not a directory; name the folder of a campaign" in told
+    assert "name the folder of a campaign" in told
     assert told.count(str(path)) == 1
 
 
