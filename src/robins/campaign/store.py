@@ -122,8 +122,6 @@ class Folder:
                     path.unlink()
 
     def _cannot(self, what: str, error: OSError) -> RobinsError:
-        if error.errno in (errno.ENOTDIR, errno.ENAMETOOLONG):
-            return RobinsError("is no folder", self.where, "name the folder of a campaign.")
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         fix = "make room" if full else "make the folder readable and writable"
         fix = f"{fix}; what is there is whole, and {GOES_ON}"
