@@ -32,6 +32,7 @@ class Records:
         )
         self.meter: meter.Meter = config.pluginmanager.get_plugin("meter")
         self.write = os.environ.get("COSTS")
+        self.failed: set[str] = set()
 
     def passed(self) -> list[str]:
         """Ceilings that the run passed; seconds are compared where they are recorded."""
@@ -42,17 +43,24 @@ class Records:
         }
         return budget.passed(budget.by_room(files), most, budget.COUNTS) if self.whole else []
 
+    def pytest_runtest_logreport(self, report):
+        """Note the files with a failure, whose cost is not that of their tests."""
+        if report.failed:
+            self.failed.add(report.nodeid.removeprefix("tests/").partition("::")[0])
+
     @pytest.hookimpl(trylast=True)
     def pytest_sessionfinish(self, session, exitstatus):
-        """Fail a run that passed a ceiling; write the record of one that passed its tests."""
-        if exitstatus != pytest.ExitCode.OK:
+        """Fail a run that passed a ceiling; write the record of the files whose tests passed."""
+        if exitstatus not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
             return
         if self.write:
-            written = lines(record(self.meter, whole=self.write == "all"))
+            for file in self.failed:
+                self.meter.rows.pop(file, None)
+            written = lines(record(self.meter, whole=self.write == "all" and not self.failed))
             new = budget.COSTS.with_suffix(".new")
             new.write_text(written, "utf-8")
             new.replace(budget.COSTS)
-        elif self.passed():
+        elif exitstatus == pytest.ExitCode.OK and self.passed():
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
     def pytest_terminal_summary(self, terminalreporter):
