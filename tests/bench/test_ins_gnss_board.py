@@ -20,6 +20,7 @@ from robins.bench.rigs.ins_gnss.navigating import epochs_of
 from robins.bench.run.setup import changed, read
 from robins.bench.wire import Receiver
 from robins.cli import main
+from robins.systems import trust
 from robins.systems.ins_gnss import SYSTEM
 from robins.systems.streaming import Flag
 from robins.workbench import bench_replay, bench_up
@@ -233,6 +234,7 @@ def test_it_flies_on_the_bench_and_its_record_is_heard_again(
         f'bench = "ins-gnss"\nflies = "{scenario}"\nfilter = "ekf"\n'
         f'[ports]\nnavigation = "{program}"\n'
     )
+    trust.confirm(program)
     outcome = bench_up(str(bench), record=record)
     assert outcome.failure == ""
     assert np.isfinite(outcome.solution["lat_rad"].values[0][-1])

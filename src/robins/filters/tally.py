@@ -76,8 +76,10 @@ class Tally(NamedTuple):
             readings: by sensor, as the run took them.
         """
         given = readings or {}
-        fields = ("innovation", "sigma", "nis", "dof")
+        fields = ("innovation", "nis", "dof")
         seen = {k: {field: getattr(i, field) for field in fields} for k, i in info.items()}
+        for k, i in info.items():
+            seen[k]["sigma"] = _sigma(i)
         return self._replace(looks={k: looked(**x, readings=given.get(k)) for k, x in seen.items()})
 
     def counts(self, sensor: str | None = None) -> dict[Code, int]:
@@ -85,6 +87,14 @@ class Tally(NamedTuple):
         numbers = np.asarray(self.predictions if sensor is None else self.updates[sensor])
         total = numbers.reshape(-1, len(Code)).sum(axis=0)
         return {Code(i): int(number) for i, number in enumerate(total) if number}
+
+
+def _sigma(info: tuple) -> np.ndarray:
+    """Sigma of the innovations of all steps; that of a `StepInfo` in NumPy, without a program."""
+    if not isinstance(info, StepInfo):
+        return np.asarray(getattr(info, "sigma"))  # noqa: B009
+    square = np.sum(np.asarray(info.factor) ** 2, axis=-1)
+    return np.where(np.asarray(info.used), np.sqrt(square), np.nan)
 
 
 def _one(code: Array) -> Array:

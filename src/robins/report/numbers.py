@@ -117,7 +117,9 @@ def band(value: Any) -> str:
     return show(value)
 
 
-def found(value: float | Sequence[float] | None, interval: Sequence[float] | None = None) -> str:
+def found(
+    value: float | int | Sequence[float] | None, interval: Sequence[float] | None = None
+) -> str:
     """The value of a claim, with its 95 % interval where there is one."""
     return show(value) + (f" ({band(interval)})" if interval else "")
 

@@ -25,6 +25,7 @@ from robins.bench.run.watching import Looking, page_for, starting
 from robins.bench.status import Status
 from robins.results import Outcome, Progress, silent
 from robins.results.summary import plain
+from robins.systems import trust
 from robins.workbench.errors import InputError
 from robins.workbench.publication import part
 
@@ -65,6 +66,9 @@ def bench_up(
     """
     if paused and not live:
         raise InputError("--paused waits for the page's Start", fix="give --live too.")
+    for port in (options.get("ports") or {}).values():
+        if (path := program(port)) is not None:
+            trust.confirm(path)  # the user names it
     flight = flight_of(scenario, settings, options)
     file = None if record is None else Path(record)
     status = Status()
