@@ -10,7 +10,7 @@ from attitude_matching import in_unit, run_with
 from dense_h_infinity import greatest, h_infinity_filter, least_gamma
 from dense_kalman import SPLIT_W, random_system, simulate, split
 
-from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
+from robins.filters import Belief, Model, Motion, Sensor, checks, kalman, run, unscented
 from robins.filters.analysis.worst_case import (
     Channel,
     error_operator,
@@ -284,7 +284,6 @@ def test_the_scalar_of_the_textbook_in_closed_form():
         ({"R": np.eye(2)}, r"R is \(2, 2\), must be \(1, 1\)", ValueError),
         ({"R": 1.0}, r"R has shape \(\), a matrix", ValueError),
         ({"F": np.ones((2, 3))}, r"F is \(2, 3\), must be \(2, 2\)", ValueError),
-        ({"F": [[1.0, 2.0], [3.0]]}, "F is no matrix: its rows differ", ValueError),
         ({"F": np.diag([1.0, np.inf])}, r"F\[1, 1\] is inf", ValueError),
         ({"H": np.ones((1, 3))}, r"H is \(1, 3\), must be \(1, 2\)", ValueError),
         ({"Q": np.ones((2, 2)) * 1j}, "Q holds complex128", TypeError),
@@ -297,6 +296,11 @@ def test_matrices_of_which_there_is_no_steady_filter(wrong, words, error):
     with pytest.raises(error, match=words) as told:
         inspect.unwrap(steady_h_infinity)(**given | {"weight": np.eye(2), "gamma": 9.0} | wrong)
     assert type(told.value) is error  # none of NumPy's own
+
+
+def test_rows_that_differ_are_no_matrix():
+    with pytest.raises(ValueError, match="F is no matrix: its rows differ"):
+        inspect.unwrap(checks.matrix)("F", [[1.0, 2.0], [3.0]])
 
 
 def test_an_unseen_drift_has_no_steady_filter():

@@ -240,7 +240,7 @@ def test_gamma_min_and_feasibility_are_facts():
 
 def test_a_filter_that_does_not_exist_has_no_figures():
     class Any:
-        count_from, counted, rms, diverged = 0, slice(0, None), np.ones((4, 9)), 0
+        count_from, pooled_rms, diverged = 0, np.ones(9), 0
         blocks = found("s0").problem.blocks
 
         def settled(self, limit):
