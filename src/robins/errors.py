@@ -6,7 +6,6 @@ import difflib
 import importlib
 import warnings
 from collections.abc import Callable, Iterable
-from types import FunctionType
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -97,7 +96,7 @@ MOVED: dict[str, dict[str, tuple[str, str]]] = {
 }
 
 
-def moved(package: str) -> Callable[[str], FunctionType]:
+def moved(package: str) -> Callable[[str], Callable]:
     """The `__getattr__` of a package (PEP 562), for its names in `MOVED`.
 
     Code that uses such a name goes on, with a `DeprecationWarning` that states the new place.
@@ -106,7 +105,7 @@ def moved(package: str) -> Callable[[str], FunctionType]:
         package: its ``__name__``.
     """
 
-    def attribute(name: str) -> FunctionType:
+    def attribute(name: str) -> Callable:
         if name not in MOVED[package]:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         place, now = MOVED[package][name]

@@ -116,7 +116,7 @@ def test_statistics_are_taken_where_a_chunk_was_computed(problem):
 def test_lanes_give_all_that_statistics_need_and_show_the_first_run(problem):
     by_lanes, by_jax = (machine(problem).chunks(8) for machine in (InLanes, ByJax))
     got, want = (of("right") for _, _, of in (next(by_lanes), next(by_jax)))
-    assert len(got["mean"]) == len(got["updates"]["y"].innovation) == 1
+    assert len(got["mean"]) == len(got["updates"]["y"].code) == 1
     np.testing.assert_allclose(got["mean"][0], want["mean"][0], atol=1e-12)
     for name in ("nis", "dof", "innovation"):
         mine, all_ = (getattr(r["updates"]["y"], name) for r in (got, want))

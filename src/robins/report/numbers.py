@@ -118,7 +118,7 @@ def band(value: Any) -> str:
 
 
 def found(
-    value: float | int | Sequence[float] | None, interval: Sequence[float] | None = None
+    value: float | int | str | Sequence[float] | None, interval: Sequence[float] | None = None
 ) -> str:
     """The value of a claim, with its 95 % interval where there is one."""
     return show(value) + (f" ({band(interval)})" if interval else "")
