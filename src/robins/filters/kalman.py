@@ -145,7 +145,7 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
         S_y, cross, S_post = linalg.block_factor(spread, (excess, noise), S, deficit)
         sound = finite(S_y * S_y)  # of a number without a finite square the rest is nonsense
         S_y, cross = _aside(sound, S_y), jnp.where(sound, cross, 0.0)
-        S_post = jnp.where(sound, S_post, jnp.nan)
+        S_post = jnp.tril(jnp.where(sound, S_post, jnp.nan))  # zeros above, as code in C knows
         # After an exact measurement nothing is left in its direction, not even rounding: that
         # would be a covariance of its own to measurements yet to come.
         exact = jnp.any(used & ~jnp.any(noise != 0.0, axis=1) & ~jnp.any(excess != 0.0, axis=1))
