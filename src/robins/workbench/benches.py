@@ -66,8 +66,8 @@ def bench_up(
     """
     if paused and not live:
         raise InputError("--paused waits for the page's Start", fix="give --live too.")
-    for port in (options.get("ports") or {}).values():
-        if (path := program(port)) is not None:
+    for text in (options.get("ports") or {}).values():
+        if (path := program(text)) is not None:
             trust.confirm(path)  # the user names it
     flight = flight_of(scenario, settings, options)
     file = None if record is None else Path(record)
