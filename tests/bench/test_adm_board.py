@@ -172,7 +172,9 @@ def test_from_a_design_to_a_board_in_three_commands(tmp_path, capsys):
     assert heard["same"]
     # who hears it is the program: another one in its place answers otherwise
     Path(built).write_text("#!/bin/sh\nexit 3\n")
-    assert main(again) != 0
+    assert main(again) == 2  # the record names a program that has changed
+    assert f"--trust {built}" in capsys.readouterr().err
+    assert main([*again, "--trust", built]) != 0
     assert "died" in capsys.readouterr().err
 
 
