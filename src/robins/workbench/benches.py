@@ -66,9 +66,6 @@ def bench_up(
     """
     if paused and not live:
         raise InputError("--paused waits for the page's Start", fix="give --live too.")
-    for text in (options.get("ports") or {}).values():
-        if (path := program(text)) is not None:
-            trust.confirm(path)  # the user names it
     flight = flight_of(scenario, settings, options)
     file = None if record is None else Path(record)
     status = Status()
@@ -99,6 +96,9 @@ def flight_of(scenario: str, settings: Sequence[str], options: Mapping[str, Any]
     Raises:
         robins.scenario.ScenarioError: there is no such scenario, or an option does not fit.
     """
+    for text in (options.get("ports") or {}).values():
+        if (path := program(text)) is not None:
+            trust.confirm(path)  # the user names it
     # a 0 is one that was given, though it equals False
     given = {k: v for k, v in options.items() if v is not None and v is not False and v != {}}
     return changed(read(scenario, tuple(settings)), given)
