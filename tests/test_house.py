@@ -18,7 +18,6 @@ import pytest
 from ratchets import imported_modules
 
 import robins
-from robins.errors import MOVED
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "robins"
@@ -374,15 +373,3 @@ def test_one_worker_thread_unless_the_user_asks_for_more(given, workers):
         "print(sum(name.startswith('tf_XLAEigen') for name in names))"
     )
     assert int(python(code, PJRT_NPROC=given).stdout) == workers
-
-
-def test_public_names_that_moved_are_found_with_a_warning():
-    for package, names in MOVED.items():
-        here = importlib.import_module(package)
-        assert not set(names) & set(here.__all__ if hasattr(here, "__all__") else ()), package
-        for name, (place, now) in names.items():
-            with pytest.warns(DeprecationWarning, match=f"{package}.{name} is now {place}.{now}"):
-                got = getattr(here, name)
-            assert got is getattr(importlib.import_module(place), now)
-        with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
-            _ = here.nothing
