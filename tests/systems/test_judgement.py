@@ -190,6 +190,19 @@ def test_a_verdict_of_its_own_is_decided_by_most_draws():
     assert [judged(limit) for limit in (0.1, of(metrics), 2.0)] == ["not", "undecided", "partly"]
 
 
+def test_a_claim_that_states_a_confidence_has_no_interval():
+    """An interval of what is proven at 99 % would ask for the same confidence twice."""
+    metrics, every = drawn(np.random.default_rng(6).chisquare(2, (50, 2)) * (1.0, 4.0))
+    of = ratio("a", "b", "rms")
+    near = of(metrics) * 1.001
+    for tested, verdict in ((False, "undecided"), (True, "reproduced")):
+        one = Claim("x", ("a", "b"), of, (0.0, near), tested=tested)
+        (found,) = judging({"c": one})(metrics, every)
+        assert (found["verdict"], found["interval"] is None) == (verdict, tested)
+    claims = consistency_claims(dict.fromkeys(("sigma", "anees", "nis"), "x"))
+    assert [claims[key].tested for key in ("sigma", "nis")] == [True, True]
+
+
 def test_a_claim_names_what_its_nees_is_of():
     nees_claim("NEES of the position stays below 1.3", "a", "position", (0.0, 1.3))
     with pytest.raises(ValueError, match="decided by nees_all_states; say in its words"):

@@ -116,7 +116,7 @@ class Statistics:
     def resampled(self, draws: np.ndarray) -> Iterator[Statistics]:
         """The statistics of other choices of the runs, for a bootstrap.
 
-        Sums over the runs at each epoch cannot be made anew, and are NaN there: figures pooled over
+        Sums over the runs at each epoch cannot be formed again, and are NaN there: figures pooled over
         the epochs are those of the runs drawn.
 
         Args:

@@ -31,6 +31,7 @@ class Claim(NamedTuple):
     band: Band | None  # in which it is reproduced
     partly: Band | None = None
     verdict: Callable[[Metrics], str] | None = None  # decides where no band of the value does
+    tested: bool = False  # the value or its band states a confidence, so it has no interval
 
 
 def graded(good: object, fair: object = False) -> str:
@@ -127,7 +128,7 @@ def _verdicts(
         value = claim.value(metrics) if all(exists) else None
         if value is None:
             continue
-        interval = interval_of(claim.value, value, drawn)
+        interval = None if claim.tested else interval_of(claim.value, value, drawn)
         verdict = _verdict(claim, metrics, value, interval, drawn)
         out.append(
             {
@@ -284,6 +285,7 @@ def consistency_claims(texts: Mapping[str, str], judged: str | None = None) -> d
             needs,
             lambda metrics: float(np.max([_proven(m) for m in of(metrics)])),
             (0.0, 0.05),
+            tested=True,
         ),
         "anees": Claim(
             texts["anees"],
@@ -297,6 +299,7 @@ def consistency_claims(texts: Mapping[str, str], judged: str | None = None) -> d
             farthest,
             None,
             verdict=lambda metrics: graded(all(_nis_inside(m) for m in of(metrics))),
+            tested=True,
         ),
     }
 
