@@ -116,8 +116,8 @@ class Statistics:
     def resampled(self, draws: np.ndarray) -> Iterator[Statistics]:
         """The statistics of other choices of the runs, for a bootstrap.
 
-        Sums over the runs at each epoch cannot be formed again, and are NaN there: figures pooled over
-        the epochs are those of the runs drawn.
+        Sums over the runs at each epoch cannot be formed again, and are NaN there: figures pooled
+        over the epochs are those of the runs drawn.
 
         Args:
             draws: (B, runs) numbers of runs.
