@@ -68,9 +68,8 @@ class Statistics:
         nees = {"nees": record["nees"]}
         nees |= {f"nees of {name}": value for name, value in record["block_nees"].items()}
         for name, value in nees.items():
-            value = _infinite(value, bad)
-            self._sum(name, value)
-            self._each(name, np.mean(value[:, self.counted], axis=1))
+            self._each(name, np.mean(_infinite(value, bad)[:, self.counted], axis=1))
+        self._sum("nees", _infinite(record["nees"], bad))
         for name, update in record["updates"].items():
             for what, value in (("nis", update.nis), ("dof", update.dof)):
                 self._sum(f"{what} of {name}", value)
@@ -333,11 +332,6 @@ class Statistics:
     def anees(self) -> np.ndarray:
         """(E,) average NEES over n."""
         return self.sums["nees"] / (self.runs * self.n)
-
-    def block_anees(self) -> dict[str, np.ndarray]:
-        """(E,) average NEES of each block over its size."""
-        there = (b for b in self.blocks if f"nees of {b.name}" in self.sums)
-        return {b.name: self.sums[f"nees of {b.name}"] / (self.runs * len(b.axes)) for b in there}
 
     def anees_band(self, level: float = 0.95) -> np.ndarray:
         """(2,) band of `anees`."""
