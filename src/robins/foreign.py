@@ -51,11 +51,9 @@ def decoding(refuse: Refuse) -> Iterator[None]:
     except Exception as error:
         first = (str(error).strip().splitlines() or [""])[0]
         kind = type(error).__name__
-        ours = isinstance(error, ValueError) and type(error).__module__ in (
-            "tomllib",
-            "json.decoder",
-        )
-        raise refuse(first if first and ours else f"{kind}: {first}" if first else kind) from error
+        if first and type(error).__module__ in ("tomllib", "json.decoder"):
+            raise refuse(first) from error  # a fault of syntax, in words for people
+        raise refuse(f"{kind}: {first}" if first else kind) from error
 
 
 def within(declared: int, present: int, what: str, refuse: Refuse) -> None:

@@ -197,7 +197,7 @@ class ArduPilotPhysics:
         self._socket.close()
 
     def admits(self, sender: Address) -> bool:
-        """Whether datagrams of this address are looked at.
+        """True if datagrams of this address are read.
 
         The bound address always is. Another is if no address is bound yet, or if it is of the same
         machine, that machine is this one (loopback) or the declared peer, and the bound address has

@@ -1,4 +1,4 @@
-"""Whether a process computes or waits, by the processor time that it uses.
+"""Idle time of a process, by the processor time that it uses.
 
 A part that compiles is alive however long that takes; one that waits for what never comes is not.
 """

@@ -179,7 +179,7 @@ def opening(rule: Rule, patience: int | None) -> Rule:
 
 
 def is_hopeless(seen: Normalised, limit: ArrayLike) -> Array:
-    """Whether a weight by that limit of the NIS would be hardly any."""
+    """True if the weight by that limit of the NIS is below `_HARDLY`."""
     return seen.nis * _HARDLY > limit
 
 
