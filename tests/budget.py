@@ -21,7 +21,7 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 COSTS, CEILINGS = HERE / "costs.json", HERE / "budget.toml"
-COUNTS = ("programs", "processes", "compilers", "runs")
+COUNTS = ("programs", "processes", "builds", "runs")
 LEAST_S = 0.2  # of a test that is worth a line of its own
 # Which of two rooms compiles a shared function first depends on the order of files.
 ROOM = 1.08
@@ -110,7 +110,7 @@ def table() -> str:
 
 def commands() -> str:
     """Promised commands and their ceilings, in Markdown."""
-    kinds = ("programs", "processes", "compilers", "runs", "modules")
+    kinds = ("programs", "processes", "builds", "runs", "modules")
     lines = ["| command | " + " | ".join(kinds) + " |", "|---" * (len(kinds) + 1) + "|"]
     for name, most in ceilings()["commands"].items():
         lines.append(f"| `{name}` | {' | '.join(str(most[k]) for k in kinds)} |")

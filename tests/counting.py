@@ -13,7 +13,7 @@ from collections import Counter
 from functools import cache
 from pathlib import Path
 
-KINDS = ("programs", "processes", "compilers", "runs")
+KINDS = ("programs", "processes", "builds", "runs")
 COMPILER = re.compile(r"(.*-)?(cc|c\+\+|gcc|g\+\+|clang|clang\+\+|zig|ccache)(-[\d.]+)?(\.exe)?")
 
 
@@ -28,6 +28,7 @@ class Counts(Counter[str]):
     def __init__(self, every: bool) -> None:
         super().__init__()
         self.every, self.joined = every, False
+        self.libraries: set[str] = set()
 
     def begin(self) -> None:
         """Begin to count, programs as soon as JAX is imported."""
@@ -53,7 +54,13 @@ class Counts(Counter[str]):
             words = [given[1]] if isinstance(given[1], (str, bytes)) else list(given[1])
             name = Path(os.fsdecode(given[0] or words[0])).name
             built = COMPILER.fullmatch(name) or "ziglang" in words
-            self["compilers" if built else "processes"] += 1
+            if not built:
+                self["processes"] += 1
+            elif not any(Path(os.fsdecode(word)).name in self.libraries for word in words):
+                self["builds"] += 1
+        elif event == "robins.build":
+            self["builds"] += given[0] not in self.libraries
+            self.libraries.add(given[0])
         elif event == "robins.simulate":
             self["runs"] += given[0]
 

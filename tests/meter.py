@@ -1,7 +1,8 @@
 """Meter of a test run: processor seconds of each test, and its counts.
 
 Counted are the programs that JAX is asked to compile, whether or not its cache has them; processes
-started; calls of a C compiler; and runs that campaigns simulate (`counting.py`).
+started; texts given to a C compiler, whether or not the cache of compiled C has them; and runs that
+campaigns simulate (`counting.py`).
 """
 
 import hashlib

@@ -118,8 +118,11 @@ def test_what_a_process_asks_for_is_counted():
     jax.jit(lambda x: 3.0 * x + 0.125)(1.0)
     for words in (["git", "log"], ["gcc-12", "-c"], [sys.executable, "-m", "ziglang", "cc"]):
         counts._audit("subprocess.Popen", (words[0], words))
+    for name in ("a.so", "a.so", "b.so"):  # the compiler is called where the cache lacks a text
+        counts._audit("robins.build", (name,))
+    counts._audit("subprocess.Popen", ("gcc", ["gcc", "-o", "/tmp/x/a.so"]))
     counts._audit("robins.simulate", (7,))
-    assert dict(counts) == {"programs": 1, "processes": 1, "compilers": 2, "runs": 7}
+    assert dict(counts) == {"programs": 1, "processes": 1, "builds": 4, "runs": 7}
 
 
 # ------------------------------------------------------------------------------------- the source

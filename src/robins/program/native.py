@@ -127,6 +127,7 @@ def build(text: str, flags: tuple[str, ...] = FLAGS, language: Language = C) -> 
     told = "\0".join([text, *command, _version(command), *flags, made_for])
     folder, name = cache_folder(), hashlib.sha256(told.encode()).hexdigest()[:24]
     library = folder / f"{name}.so"
+    sys.audit("robins.build", library.name)
     if library.exists():
         return library
     with tempfile.TemporaryDirectory(dir=folder) as own:
