@@ -4,12 +4,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import System
-from two_sensors import CHANNELS, ROWS, SYSTEMS, Y, added, centralised, corrected, one_run
+from two_sensors import CHANNELS, ROWS, SYSTEMS, Y, added, centralised, corrected, one_run, split
 
-from robins.filters import Belief
+from robins.filters import Belief, Code
+from robins.filters.composite.channels import are_apart
 from robins.filters.composite.distributed import distributed, intersecting
 from robins.filters.composite.fusion import common_information_sum, covariance_intersection
 from robins.manifold import Angle
+
+# Mean and standard deviation of a component of local filters; another one is known exactly.
+DIFFERENT = ((0.0, 0.6), (4.9, 0.8), (-5.1, 0.8), (8.0, 0.8))
 
 # -------------------------------------------------------------------------- distributed, intersect
 
@@ -41,6 +45,23 @@ def test_distributed_fusion_is_a_sum_of_the_locals_information(feedback):
     central = np.linalg.det(centralised(SYSTEMS[0], Y[0, :steps])[1][-1])
     claimed = np.linalg.det(np.asarray(got[1][-1]))
     assert claimed < (0.3 if feedback == "full" else 1.0) * central
+
+
+def test_local_filters_that_differ_are_reported():
+    filter_, (a, b) = distributed(CHANNELS), split(SYSTEMS[0]).sensors
+    dims = {sensor.name: sensor.dim for sensor in (a, b)}
+    state, _ = filter_.update(filter_.init(SYSTEMS[0].start(), dims), a, jnp.zeros(2))
+    reading, codes = b.read(state.belief.mean, None), []
+    for off in (0.0, 1.0, 1e3, np.nan):
+        codes.append(int(filter_.update(state, b, reading + off)[1].code))
+    assert codes == [Code.DONE, Code.DONE, Code.APART, Code.MISSING]
+
+
+def test_which_components_of_local_filters_are_compared():
+    beliefs = [Belief(jnp.array([0.0, x]), jnp.diag(jnp.array([0.0, s]))) for x, s in DIFFERENT]
+    apart = [bool(are_apart([beliefs[0], other], 1, None)) for other in beliefs[1:]]
+    assert apart == [False, True, True]  # of 4.9, 5.1 and 8 with a standard deviation of 0.6, 0.8
+    assert not are_apart(beliefs, 0, 1)
 
 
 # ------------------------------------------------------------------------- states of one local

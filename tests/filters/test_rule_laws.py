@@ -284,13 +284,16 @@ def test_a_jump_of_the_state_is_followed_and_a_burst_is_not():
             data = jnp.asarray(y + np.vstack([jumped, burst]))[..., None]
 
             def keep(step):
-                return step.posterior.mean[0], step.posterior.sigma[0]
+                return step.posterior.mean[0], step.posterior.sigma[0], step.info["y"].expected[0]
 
             return jax.vmap(lambda one: run(filter_, model, start, one, keep=keep).steps)(data)
 
         return {name: one(*row) for name, row in RETURNING.items()}
 
-    for name, (mean, sigma) in found().items():
+    for name, (mean, sigma, expected) in found().items():
+        # what the innovation is compared with is not what a rule makes of it
+        first = np.asarray(expected[:2, AT])
+        np.testing.assert_allclose(first, expected[:2, AT - 1], rtol=0.05, err_msg=name)
         error = np.abs(np.asarray(mean) - truth - np.vstack([jumped, 0.0 * step]))
         off = error > 5.0 * np.asarray(sigma)
         assert not np.any(off[:, :AT]), name

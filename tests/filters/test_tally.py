@@ -149,6 +149,8 @@ def tally(nis=100.0, dof=100, **codes) -> Tally:
         (tally(nis=6, DONE=100), "smaller than the filter expects"),
         (tally(nis=120, dof=20, DONE=20), ""),  # two that count: chi-square may reach 6.9 of each
         (tally(nis=160, dof=20, DONE=20), "mean NIS per degree of freedom 8"),
+        (tally(DONE=90, APART=10), ""),
+        (tally(DONE=80, APART=20), "differed by more than 5 standard deviations at 20 of 100"),
         (tally(DONE=99, NOT_FINITE=1), "1 of 100 updates with 'gnss' are NOT_FINITE"),
         (tally(nis=np.inf, DONE=99, CONTRADICTED=1), "contradict what is known exactly"),
     ],
@@ -228,6 +230,19 @@ def test_the_order_of_innovations_is_not_hidden_by_gaps_weights_or_outliers():
     sigma[:, 150:] = np.nan  # refused
     found, _ = doubted((e, sigma, nis, dof))
     assert sum(any("follow" in one for one in row) for row in found) >= 19
+    (e, sigma, nis, dof, _), _ = tracked(1, 6, change=lambda k, y: y + (k > 300) * 30.0 * (-1) ** k)
+    found, _ = doubted((e, sigma, np.minimum(nis, 1.0), dof))  # as a rule that weighs leaves it
+    assert any("of the last 100 innovations beyond 3 sigma" in one for one in found[0])
+
+
+def test_one_lasting_error_counts_as_one_innovation():
+    e = 1.7 * np.ones((LONG, 1))
+    e[1::2] *= -1.0
+    table = whiteness.looked(e, np.ones_like(e), e[:, 0] ** 2, np.ones(LONG, int))
+    assert any("mean NIS" in one for one in whiteness.suspicions({"y": table}))
+    assert not whiteness.suspicions({"y": table}, ("y",))
+    table = whiteness.looked(10.0 * e, np.ones_like(e), 100.0 * e[:, 0] ** 2, np.ones(LONG, int))
+    assert any("mean NIS" in one for one in whiteness.suspicions({"y": table}, ("y",)))
 
 
 @pytest.mark.parametrize(

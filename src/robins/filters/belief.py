@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from robins import linalg, manifold
@@ -68,6 +69,7 @@ class Code(IntEnum):
     TOO_OLD = 7
     NOT_PREDICTED = 8
     CONTRADICTED = 9
+    APART = 10
 
 
 # A prediction or an update was not taken, or a rule could not do what it is for.
@@ -114,6 +116,10 @@ SENTENCES: dict[Code, str] = {
         "each other, and were left out: give the sensor, the constraint or the initial state the "
         "noise that it has, or look at the bounds"
     ),
+    Code.APART: (
+        "the measurement was used, but its local filter and another one differ by more than 5 "
+        "standard deviations"
+    ),
 }
 
 
@@ -126,6 +132,7 @@ class StepInfo(NamedTuple):
     """Innovation, gain and outcome of an update. m is the measurement's tangent dimension."""
 
     innovation: Array  # (m,) y minus its prediction; NaN where missing
+    expected: Array  # (m,) standard deviation of it, before a robust rule weighs it
     factor: Array  # (m, m) lower factor of the innovation covariance; identity rows where not used
     gain: Array  # (n, m); zero columns where not used
     used: Array  # (m,) bool: there, not refused, and independent of the components above
@@ -154,5 +161,6 @@ class StepInfo(NamedTuple):
 
     @property
     def sigma(self) -> Array:
-        """(..., m) standard deviation of each innovation component; NaN where it was not used."""
-        return jnp.where(self.used, jnp.sqrt(jnp.sum(self.factor**2, axis=-1)), jnp.nan)
+        """(..., m) ``expected``; NaN where a component was not used."""
+        where: Any = np.where if isinstance(self.used, np.ndarray) else jnp.where
+        return where(self.used, self.expected, jnp.nan)

@@ -27,6 +27,8 @@ from robins.filters.rule import Rule, keep_belief
 from robins.filters.trees import finite, select
 
 Form = Literal["sqrt", "joseph"]
+# What rules change of an observation; the rest follows from the belief that it is seen from.
+_OF_RULES = ("noise", "unweighed", "accepted", "notes")
 
 
 class FilterState(NamedTuple):
@@ -178,6 +180,7 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
     posterior = select(jnp.any(used), Belief(mean, S_post), prior)
     info = StepInfo(
         innovation=jnp.where(o.present, o.residual, jnp.nan),
+        expected=o.expected,
         factor=S_y,
         gain=jnp.where(used[None, :], gain, 0.0),
         used=used,
@@ -307,7 +310,8 @@ def kalman(
             if faded is not prior:  # the rule built another prior; seen while tracing
                 prior = faded
                 again = way.observation(prior, sensor, y, aux)
-                seen = again._replace(noise=seen.noise, accepted=seen.accepted, notes=seen.notes)
+                kept = {name: getattr(seen, name) for name in _OF_RULES}
+                seen = again._replace(**kept)
         seen = seen._replace(accepted=seen.accepted & seen.present)
         posterior, info = updated(prior, seen, form)
         # A contradiction alone has an infinite NIS that is no overflow.

@@ -32,6 +32,20 @@ class Observation(NamedTuple):
     size: Array  # (m,) of what the spread was summed from: 1e-14 of it is rounding
     deficit: Array | None = None  # (m,) vector to take away again, for indefinite weights
     notes: Mapping[str, Any] = {}  # what rules say of it before the update, by their names
+    unweighed: Array | None = None  # (m, q) noise before a robust rule raised it; None: none did
+
+    @property
+    def expected(self) -> Array:
+        """(m,) standard deviation of the innovation, before a robust rule weighs it."""
+        noise = self.noise if self.unweighed is None else self.unweighed
+        square = sum(jnp.sum(root**2, axis=-1) for root in (self.spread, self.excess, noise))
+        taken = 0.0 if self.deficit is None else self.deficit**2
+        return jnp.sqrt(jnp.maximum(square - taken, 0.0))
+
+    def raised(self, noise: Array, accepted: Array) -> Observation:
+        """With the noise factor that a robust rule gives it, and what the rule still uses."""
+        before = self.noise if self.unweighed is None else self.unweighed
+        return self._replace(noise=noise, accepted=accepted, unweighed=before)
 
     def noted(self, rule: str, **notes: Any) -> Observation:
         """With notes of a rule, which the update hands on to its `StepInfo` (`with_notes`)."""

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -18,6 +19,7 @@ from robins.manifold import State
 # A gate against outliers refuses a few measurements in a hundred. One that refuses more than this
 # share takes the model for right and the sensor for wrong.
 REFUSED_SHARE = 1.0 / 3.0
+APART_SHARE = 0.1  # of measurements whose local filter differs from another, worth a word
 FEWEST = 20  # measurements, or degrees of freedom, below which no share and no mean is judged
 
 # Mean NIS per degree of freedom that is worth a word: standard deviations half of what they should
@@ -76,10 +78,10 @@ class Tally(NamedTuple):
             readings: by sensor, as the run took them.
         """
         given = readings or {}
-        fields = ("innovation", "nis", "dof")
-        seen = {k: {field: getattr(i, field) for field in fields} for k, i in info.items()}
-        for k, i in info.items():
-            seen[k]["sigma"] = _sigma(i)
+        fields = ("innovation", "sigma", "nis", "dof")
+        # in NumPy, where no operation is a program
+        steps = {k: jax.tree_util.tree_map(np.asarray, i) for k, i in info.items()}
+        seen = {k: {field: getattr(i, field) for field in fields} for k, i in steps.items()}
         return self._replace(looks={k: looked(**x, readings=given.get(k)) for k, x in seen.items()})
 
     def counts(self, sensor: str | None = None) -> dict[Code, int]:
@@ -87,14 +89,6 @@ class Tally(NamedTuple):
         numbers = np.asarray(self.predictions if sensor is None else self.updates[sensor])
         total = numbers.reshape(-1, len(Code)).sum(axis=0)
         return {Code(i): int(number) for i, number in enumerate(total) if number}
-
-
-def _sigma(info: tuple) -> np.ndarray:
-    """Sigma of the innovations of all steps; that of a `StepInfo` in NumPy, without a program."""
-    if not isinstance(info, StepInfo):
-        return np.asarray(getattr(info, "sigma"))  # noqa: B009
-    square = np.sum(np.asarray(info.factor) ** 2, axis=-1)
-    return np.where(np.asarray(info.used), np.sqrt(square), np.nan)
 
 
 def _one(code: Array) -> Array:
@@ -127,11 +121,13 @@ def doubts(tally: Tally, bounds: bool = False, assumed: Collection[str] = ()) ->
     """Sentences on why a reader should doubt the results of a filter; none if there is no reason.
 
     They name steps that were not taken, and contradictions; sensors more than a third of whose
-    measurements the filter refused; and sensors whose mean NIS per degree of freedom is above 4
-    (standard deviations half of what they should be) or below 1/16 (four times) and outside the
-    99.9 % band of chi-square with a tenth of the degrees of freedom: innovations of a wrong model
-    are correlated. Of runs whose steps were looked at (`Tally.looking`, which `run` does where it
-    keeps whole steps) also what `whiteness.suspicions` finds in the sequence.
+    measurements the filter refused; sensors at more than a tenth of whose measurements the local
+    filters of a joined one were more than 5 standard deviations apart; and sensors whose mean NIS
+    per degree of freedom is above 4 (standard deviations half of what they should be) or below 1/16
+    (four times) and outside the 99.9 % band of chi-square with a tenth of the degrees of freedom:
+    innovations of a wrong model are correlated. Of runs whose steps were looked at
+    (`Tally.looking`, which `run` does where it keeps whole steps) also what
+    `whiteness.suspicions` finds in the sequence.
 
     Args:
         tally: of a run (`Solution.tally`), or of several with leading axes.
@@ -149,6 +145,13 @@ def doubts(tally: Tally, bounds: bool = False, assumed: Collection[str] = ()) ->
             said.append(
                 f"{refused} of {measured} measurements of '{sensor}' were refused: look at the "
                 "noise of the sensor and of the motion, and at the initial state"
+            )
+        apart = counts.get(Code.APART, 0)
+        if measured >= FEWEST and apart > APART_SHARE * measured:
+            said.append(
+                f"the local filter of '{sensor}' and another one differed by more than 5 standard "
+                f"deviations at {apart} of {measured} measurements: a sensor of one of them may "
+                "have an error that the model leaves out"
             )
         nis, dof = float(np.sum(tally.nis[sensor])), int(np.sum(tally.dof[sensor]))
         if not bounds and dof >= FEWEST:

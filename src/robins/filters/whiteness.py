@@ -12,29 +12,31 @@ side. All is NumPy on arrays that a run has kept, with any leading axes of runs.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from jax.tree_util import tree_leaves
 from jaxtyping import ArrayLike
-from scipy.special import bdtrik, ndtri
+from scipy.special import bdtrik, ndtr, ndtri
 
 from robins.filters.chi_square import chi_square
 from robins.manifold import State
 
 FALSE_ALARM = 1e-5  # probability that a sound run is doubted, over all its sensors and tests
 BY_CHANCE = 1e-3  # probability that chance alone doubts as many runs as a sentence counts
-TESTS = 4  # of a component: following, the side in all, the side late, the size late
+TESTS = 5  # of a component: following, the side in all, the side late, size and share far late
 FEWEST = 20  # innovations below which nothing is judged
 BEFORE = 10  # innovations whose sum is compared with the next
 CLIPPED = 3.0  # sigmas: an outlier counts as one of these
 FOLLOWING = 0.2  # correlation with those before that is worth a word
 ONE_SIDE = 0.6  # share on one side that is worth a word: a bias of a quarter of a sigma
+FAR_SHARE = 1.0 / 3.0  # innovations of the last quarter beyond `CLIPPED` that are worth a word
 LATE_NIS = 2.0  # mean NIS per degree of freedom in the last quarter that is worth a word
 REPEATS = 10  # equal readings in a row of a stuck sensor
 COARSE = 0.1  # resolution over sigma of the innovation from which a reading may repeat itself
 
 # Sums of a component, last axis of `looked`: those of pieces of one log may be added.
-_COUNT, _PRODUCT, _SQUARE, _SEEN, _ABOVE, _LATE, _LATE_ABOVE, _NIS, _DOF, _REPEATS = range(10)
+_COUNT, _PRODUCT, _SQUARE, _SEEN, _ABOVE, _LATE, _LATE_ABOVE, _FAR, _NIS, _DOF, _REPEATS = range(11)
 
 
 def looked(
@@ -44,7 +46,7 @@ def looked(
     dof: ArrayLike,
     readings: State = None,
 ) -> np.ndarray:
-    """Sums that `suspicions` judges: (..., m, 10), of a sensor's updates over the steps of a run.
+    """Sums that `suspicions` judges: (..., m, 11), of a sensor's updates over the steps of a run.
 
     Args:
         innovation: (..., T, m), NaN where missing.
@@ -56,7 +58,7 @@ def looked(
     """
     e, sigma = np.asarray(innovation, float), np.asarray(sigma, float)
     m = e.shape[-1]
-    out = np.zeros((*e.shape[:-2], m, 10))
+    out = np.zeros((*e.shape[:-2], m, 11))
     there = np.any(np.isfinite(e), axis=(*range(e.ndim - 2), -1))
     e, sigma = e[..., there, :], sigma[..., there, :]
     nis, dof = (np.asarray(x, float)[..., there] for x in (nis, dof))
@@ -77,6 +79,7 @@ def looked(
         (_ABOVE, np.sum(w > 0.0, axis=-2)),
         (_LATE, np.sum(w[..., late, :] != 0.0, axis=-2)),
         (_LATE_ABOVE, np.sum(w[..., late, :] > 0.0, axis=-2)),
+        (_FAR, np.sum(np.abs(w[..., late, :]) >= CLIPPED, axis=-2)),
         (_NIS, np.sum(np.where(used, nis, 0.0)[..., late], axis=-1)[..., None]),
         (_DOF, np.sum(np.where(used, dof, 0.0)[..., late], axis=-1)[..., None]),
     ):
@@ -161,9 +164,10 @@ def suspicions(looks: Mapping[str, ArrayLike], assumed: Collection[str] = ()) ->
     found = []
     for sensor, table in tables.items():
         rows = table.reshape(-1, *table.shape[-2:])
-        tests = [_repeating, _late]
-        if sensor not in assumed:  # a filter that states bounds only overreacts: it passes these
-            tests += [_following, _one_sided]
+        lasting = sensor in assumed
+        tests = [_repeating, partial(_late, lasting=lasting)]
+        if not lasting:  # a filter that states bounds only overreacts: it passes these
+            tests += [_far, _following, _one_sided]
         for test in tests:
             found += _told(sensor, rows, test, level)
     return found
@@ -234,9 +238,11 @@ def _binomial(count: float | int, level: float, share: float = 0.5) -> float:
     return max(float(np.ceil(bdtrik(1.0 - level, count, share))), 0.0)
 
 
-def _late(row: np.ndarray, level: float) -> list[Finding]:
+def _late(row: np.ndarray, level: float, lasting: bool) -> list[Finding]:
     nis, dof = row[_NIS], row[_DOF]
-    if dof < FEWEST or nis < max(LATE_NIS * dof, float(chi_square(1.0 - level, dof))):
+    # errors that last make all innovations of a run large or small together: they count as one
+    free = 1.0 if lasting else dof
+    if dof < FEWEST or nis < dof * max(LATE_NIS, float(chi_square(1.0 - level, free)) / free):
         return []
     z = (nis - dof) / np.sqrt(2.0 * dof)
     return [
@@ -245,6 +251,21 @@ def _late(row: np.ndarray, level: float) -> list[Finding]:
             f"has innovations in the last quarter of mean NIS per degree of freedom "
             f"{nis / dof:.3g}, {z:.1f} sigma above one: the filter may have lost its way, or its "
             "standard deviations are too small; look at the time when the NIS begins to rise",
+        )
+    ]
+
+
+def _far(row: np.ndarray, level: float) -> list[Finding]:
+    count, far = row[_LATE], row[_FAR]
+    chance = _binomial(count, level, 2.0 * float(ndtr(-CLIPPED)))
+    if count < FEWEST or far <= max(FAR_SHARE * count, chance):
+        return []
+    return [
+        (
+            far / count,
+            f"has {far:.0f} of the last {count:.0f} innovations beyond {CLIPPED:.0f} sigma, before "
+            "a rule gives them a weight: the filter may have lost its way, or the sensor may be "
+            "wrong; look at the time when that begins",
         )
     ]
 

@@ -14,6 +14,7 @@ import numpy as np
 from jax.tree_util import register_static
 from jaxtyping import Array
 
+from robins import manifold
 from robins.errors import require
 from robins.filters.audit import Again, audit
 from robins.filters.belief import Belief, Code, StepInfo
@@ -133,8 +134,30 @@ def members_of(filters: Sequence[Filter]):
 # ----------------------------------------------------------------------------- steps of the whole
 
 
-def updating(channels: Sequence[Channel], fuse: Fuse, name: str):
-    """The `update` of a joined filter: the sensor's local filter updates, then all are fused."""
+FAR = 5.0  # standard deviations of a difference of local filters that chance does not make
+
+
+def are_apart(beliefs: Sequence[Belief], index: int, common: int | None) -> Array:
+    """() bool: a local filter differs from another by more than `FAR` standard deviations.
+
+    The errors of local filters with the same process noise are not negatively correlated, so that
+    the sum of the variances is an upper bound of that of the difference.
+    """
+    own, others = beliefs[index], (*beliefs[:index], *beliefs[index + 1 :])
+    found = jnp.zeros((), bool)
+    for other in others:
+        square = manifold.local(own.mean, other.mean)[:common] ** 2
+        variance = own.sigma[:common] ** 2 + other.sigma[:common] ** 2
+        found |= jnp.any((square > FAR**2 * variance) & (variance > 0.0))
+    return found
+
+
+def updating(channels: Sequence[Channel], fuse: Fuse, name: str, common: int | None = None):
+    """The `update` of a joined filter: the sensor's local filter updates, then all are fused.
+
+    Its code is `Code.APART` where the local filters differ in the first ``common`` components (by
+    default in any).
+    """
     owner = owners(channels)
 
     def update(
@@ -151,6 +174,9 @@ def updating(channels: Sequence[Channel], fuse: Fuse, name: str):
         # What a measurement did not touch stands bit for bit.
         same = equal(before.belief, after.belief)
         belief = select(same, state.belief, fuse([m.belief for m in members]))
+        apart = are_apart([m.belief for m in members[: len(channels)]], i, common)
+        apart = apart & (info.code == int(Code.DONE))
+        info = info._replace(code=jnp.where(apart, int(Code.APART), info.code))
         singular = jnp.stack([is_singular(m.belief) for m in members])
         ok = same | (finite(belief) & ~jnp.any(singular))
         new = FilterState(belief, joined._replace(members=members, silent=silent))

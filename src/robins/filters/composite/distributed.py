@@ -127,7 +127,11 @@ def intersecting(
 
 
 def _side_by_side(
-    channels: Sequence[Channel], fuse: Fuse, feedback: Feedback, name: str, common: int = 1
+    channels: Sequence[Channel],
+    fuse: Fuse,
+    feedback: Feedback,
+    name: str,
+    common: int | None = None,
 ) -> Filter:
     channels = tuple(channels)
     owners(channels)
@@ -135,7 +139,7 @@ def _side_by_side(
 
     def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
         each = local_dims(channels, dims)
-        if belief.factor.shape[0] < common:
+        if belief.factor.shape[0] < (common or 1):
             raise ValueError(
                 f"distributed: {common} components are common, the state has "
                 f"{belief.factor.shape[0]}"
@@ -166,4 +170,4 @@ def _side_by_side(
         return members(state)[1]([belief] * count, belief)
 
     members = members_of([c.filter for c in channels])
-    return in_step(Filter(init, predict, updating(channels, fuse, name), reset, members))
+    return in_step(Filter(init, predict, updating(channels, fuse, name, common), reset, members))

@@ -323,6 +323,7 @@ def _seen(seen: StepInfo, log_prior: Array, log_post: Array, used: Array) -> Ste
     code = seen.code[jnp.argmax(log_post)]
     return StepInfo(
         innovation=expected.mean,
+        expected=expected.expected,
         factor=expected.factor,
         gain=jnp.einsum("r,rnm->nm", jnp.exp(log_post), seen.gain),
         used=used,

@@ -86,6 +86,7 @@ class Innovation(NamedTuple):
     """What a mixture of filters expected of a measurement, and what it got."""
 
     mean: Array  # (m,) y minus its prediction; NaN where missing
+    expected: Array  # (m,) standard deviation of it, before robust rules weigh it
     factor: Array  # (m, m) of its covariance; identity rows where not used
     nis: Array
     dof: Array
@@ -100,7 +101,9 @@ def innovation(seen: StepInfo, weight: Array, used: Array) -> Innovation:
     residual = jnp.where(used[None], residual, mean[None])
     factor = linalg.tria(wide(deviations(residual, seen.factor, weight, mean)))
     white = linalg.solve_lower(factor, jnp.where(used, mean, 0.0)[:, None])[:, 0]
-    return Innovation(jnp.where(missing, jnp.nan, mean), factor, jnp.sum(white**2), jnp.sum(used))
+    spread = jnp.where(counts, seen.expected, 0.0) ** 2 + (residual - mean[None]) ** 2
+    expected, mean = jnp.sqrt(weight @ spread), jnp.where(missing, jnp.nan, mean)
+    return Innovation(mean, expected, factor, jnp.sum(white**2), jnp.sum(used))
 
 
 def _sound(states: State, weight: Array, instead: State) -> State:

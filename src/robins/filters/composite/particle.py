@@ -205,6 +205,7 @@ def particle(
         code = jnp.where(lost & ~wrong, int(Code.NOT_FINITE), infos.code[best])
         info = StepInfo(
             innovation=expected.mean,
+            expected=expected.expected,
             factor=expected.factor,
             gain=jnp.where(used[None], gain, 0.0),
             used=used,

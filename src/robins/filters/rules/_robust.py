@@ -130,8 +130,7 @@ def weighed(o: Observation, scale: Array) -> tuple[Observation, Array]:
     refused = lost & jnp.any(o.noise != 0.0, axis=1)
     root = jnp.sqrt(jnp.where(lost, 1.0, scale))
     noise = jnp.broadcast_to(root, refused.shape)[:, None] * o.noise
-    o = o._replace(noise=noise, accepted=o.accepted & ~refused)
-    return o, jnp.where(lost, 0.0, 1.0 / scale)
+    return o.raised(noise, o.accepted & ~refused), jnp.where(lost, 0.0, 1.0 / scale)
 
 
 def opening(rule: Rule, patience: int | None) -> Rule:

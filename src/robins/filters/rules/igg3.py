@@ -77,7 +77,7 @@ def igg3(
         count = jnp.where(hopeless & ~recovered, earlier + 1, 0)
         count = jnp.where(measured, count, earlier)
         heavier = o.noise / jnp.sqrt(jnp.where(weight > 0.0, weight, 1.0))[:, None]
-        o = o._replace(noise=heavier, accepted=o.accepted & (weight > 0.0))
+        o = o.raised(heavier, o.accepted & (weight > 0.0))
         o = o.noted("igg3", weight=jnp.min(weight), recovered=recovered)
         return {**memory, o.sensor: count}, prior, o
 
