@@ -55,6 +55,13 @@ def test_a_test_is_meant_by_its_name_and_parameters():
         assert tiers.meant(some, node) == of_some
 
 
+def test_parameters_that_no_test_has_are_found():
+    entries = [{"test": "a.py::test_b", "only": only} for only in ("x", "x|z", "z")]
+    nodes = ["a.py::test_b[x]", "a.py::test_b[y]"]
+    assert tiers.meaningless(entries, nodes) == ["a.py::test_b"]
+    assert tiers.meaningless(entries, nodes[1:]) == []  # one of them, by its name
+
+
 class Item(NamedTuple):
     nodeid: str
 

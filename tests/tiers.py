@@ -50,9 +50,24 @@ def meant(entry: dict[str, str], node: str) -> bool:
     return name == entry["test"] and bool(wanted.fullmatch(parameters.removesuffix("]")))
 
 
+def meaningless(entries: list[dict[str, str]], nodes: list[str]) -> list[str]:
+    """Tests with several parameters here, of which ``only`` of an entry fits none."""
+    by_name: dict[str, list[str]] = {}
+    for node in nodes:
+        by_name.setdefault(plain(node), []).append(node)
+    return [
+        entry["test"]
+        for entry in entries
+        if len(here := by_name.get(entry["test"], [])) > 1
+        and not any(meant(entry, n) for n in here)
+    ]
+
+
 def mark(items: list[pytest.Item]) -> None:
     """Give each test its tier."""
     costly, moved = costs(), dict[str, list[dict[str, str]]]()
+    if idle := meaningless(certified(), [item.nodeid.removeprefix("tests/") for item in items]):
+        raise pytest.UsageError(f"certify.toml: 'only' fits no parameters of {', '.join(idle)}")
     for entry in certified():
         moved.setdefault(entry["test"], []).append(entry)
     for item in items:
