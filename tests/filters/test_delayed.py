@@ -1,5 +1,7 @@
 """However late and in whatever order measurements come: the belief is that of the in-order run."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -296,6 +298,18 @@ def test_older_than_the_start_is_too_old():
     live = streamed(BACK, None, None)
     assert int(live.update(Late(Y["a"][0], 3), "a").code) == Code.TOO_OLD
     assert int(live.update(Late(Y["a"][0], 2), "a").code) == Code.DONE
+
+
+def test_an_earlier_reading_that_makes_a_later_one_impossible_is_told():
+    still = Motion(LINEAR.motion.step, jnp.zeros(2))
+    exact = (replace(sensor, noise=0.0 * sensor.noise) for sensor in LINEAR.sensors)
+    live = OnlineFilter(BACK, Model(still, tuple(exact)), BEGIN)
+    live.predict()
+    assert int(live.update(in_time(np.zeros(2)), "b").code) == Code.DONE
+    # From 1 the way to 0 would take a rate, and the rate was found to be 0.
+    info = live.update(Late(np.ones(1), 1), "a")
+    assert int(info.code) == Code.CONTRADICTED
+    assert float(info.log_likelihood) == -np.inf
 
 
 def test_after_a_reset_there_is_no_way_back():
