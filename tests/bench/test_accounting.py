@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 from clockwork import CLOCKWORK
 
+from robins.bench.broker.link import BenchError
 from robins.bench.recording import Event
 from robins.bench.rigs import RIGS
 from robins.bench.run.accounting import EDGES_US, RECENT, Histogram, Latencies
 from robins.bench.run.outcome import outcome
 from robins.bench.run.session import Ran
-from robins.bench.run.setup import Flight, built_in, changed, read, steps_of
+from robins.bench.run.setup import Flight, built_in, changed, kit_of, read, steps_of
 from robins.bench.run.telemetry import Telemetry
 from robins.bench.run.untested import doubts
 
@@ -187,7 +188,7 @@ def ran_of(of: Flight, steps: int, **more: Any) -> Ran:
 def test_a_run_without_a_step_has_its_reason_and_no_figures(name, tmp_path):
     of, record = read(name), tmp_path / "record.mcap"
     for failure, reason in (("'adm' died", "'adm' died"), ("", "it was stopped before its first")):
-        found = outcome(of, ran_of(of, 0, failure=failure), None, record)
+        found = outcome(of, ran_of(of, 0, failure=failure), record)
         told = json.loads(found.files["bench.json"])
         assert found.failure == told["failure"]
         assert found.failure.startswith(reason)
@@ -195,17 +196,23 @@ def test_a_run_without_a_step_has_its_reason_and_no_figures(name, tmp_path):
         assert found.notes[0] == f"The run failed: {found.failure}."
 
 
-def test_what_a_judge_cannot_judge_is_a_result_all_the_same():
+@pytest.mark.parametrize("wrong", ["judge", "inside"])
+def test_what_a_judge_cannot_judge_is_a_result_all_the_same(wrong):
     of = read(CLOCKWORK)
-    of = of._replace(rig=replace(of.rig, judge=lambda flight, ran: [][ran.steps]))
+    of = of._replace(rig=replace(of.rig, **{wrong: lambda given, ran, *said: [][-1]}))
     for failure in ("", "'adder' died"):
-        found = outcome(of, ran_of(of, 3, failure=failure), None, None)
-        reason = (
-            r"test_accounting.py, line \d+: the judge of the rig 'clockwork' fails \(IndexError: "
-        )
+        found = outcome(of, ran_of(of, 3, failure=failure), None)
+        reason = rf"test_accounting.py, line \d+: the {wrong} of the rig 'clockwork' fails \(IndexError: "
         assert re.match((failure and f"{failure}; {reason}") or reason, found.failure)
         assert found.solution is not None
         assert "value_count_n" in found.solution
+
+
+def test_what_a_rig_cannot_prepare_is_named():
+    of = read(CLOCKWORK)
+    of = of._replace(rig=replace(of.rig, prepare=lambda setup, given: given["length"]))
+    with pytest.raises(BenchError, match=r"line \d+: the prepare of the rig 'clockwork' fails"):
+        kit_of(of)
 
 
 def test_what_a_run_does_not_test_is_said():

@@ -77,16 +77,8 @@ def bench_up(
             if file is not None:
                 interrupt.add_note(f"what was flown is in {file}")
             raise
-    inside, rig = None, flight.rig
-    if (
-        rig.inside is not None
-        and flight.setup.clock == "lockstep"
-        and ran.steps
-        and all(map(program, flight.setup.ports.values()))
-    ):
-        progress(0.97, "the same inside one program")
-        inside = rig.inside(ran.kit, ran.steps, *([ran.said] if rig.console else []))
-    found = outcome(flight, ran, inside, file)
+    progress(0.97, "comparing")
+    found = outcome(flight, ran, file)
     return replace(found, warnings=[*found.warnings, *filter(None, [status.refused])])
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,11 @@ import xarray as xr
 
 from robins.bench.broker.link import BenchError
 from robins.bench.live.feed import latest
+from robins.bench.ports.port import program
 from robins.bench.rig import Judged
 from robins.bench.run.numbers import arrays_of
 from robins.bench.run.session import Ran
-from robins.bench.run.setup import Flight
+from robins.bench.run.setup import Flight, calling
 from robins.bench.run.telemetry import Flown, difference
 from robins.bench.run.untested import doubts
 from robins.results import Outcome, array, variable
@@ -36,16 +36,22 @@ def judged(flight: Flight, ran: Ran) -> Judged:
         return Judged()
     if flight.rig.judge is None:
         return Judged(arrays=arrays_of(flight.rig, ran.flown))
-    try:
+    with calling(flight.rig, "judge", "or leave it out: then all numbers are drawn"):
         return flight.rig.judge(flight, ran)
-    except Exception as error:  # of the user's code, and of what was flown there is more to show
-        at = traceback.extract_tb(error.__traceback__)[-1]
-        where = f"{Path(at.filename).name}, line {at.lineno}"
-        raise BenchError(
-            f"the judge of the rig '{flight.rig.name}' fails ({type(error).__name__}: {error})",
-            where,
-            "correct it, or leave it out: then all numbers are drawn",
-        ) from error
+
+
+def in_one_program(flight: Flight, ran: Ran) -> Mapping[str, np.ndarray] | None:
+    """The same run inside one program; None where a run of this kind has none to compare with.
+
+    Raises:
+        BenchError: the rig cannot compute it; names the line that failed.
+    """
+    rig, setup = flight.rig, flight.setup
+    on_lines = all(map(program, setup.ports.values()))
+    if rig.inside is None or setup.clock != "lockstep" or not (ran.steps and on_lines):
+        return None
+    with calling(rig, "inside", "or leave it out: then no run is compared with it"):
+        return rig.inside(ran.kit, ran.steps, *([ran.said] if rig.console else []))
 
 
 def figures(
@@ -102,24 +108,28 @@ def figures(
     }
 
 
-def outcome(
-    flight: Flight, ran: Ran, inside: Mapping[str, np.ndarray] | None, record: Path | None
-) -> Outcome:
+def outcome(flight: Flight, ran: Ran, record: Path | None) -> Outcome:
     """All that a result folder says of the run.
 
     Args:
         flight: what was asked for.
         ran: what came of it.
-        inside: the same run inside one program; None where there is none to compare with.
         record: what went over the lines, to be moved into the folder.
     """
+    failures = [ran.failure]
     if not (ran.steps or ran.failure):
-        ran = ran._replace(failure="it was stopped before its first step")
+        failures = ["it was stopped before its first step"]
+    said, inside = Judged(arrays=arrays_of(flight.rig, ran.flown)), None
+    # of the user's own code, and of what was flown there is more to show
+    try:
+        inside = in_one_program(flight, ran)
+    except BenchError as error:
+        failures.append(str(error))
     try:
         said = judged(flight, ran)
     except BenchError as error:
-        said = Judged(arrays=arrays_of(flight.rig, ran.flown))
-        ran = ran._replace(failure="; ".join(filter(None, (ran.failure, str(error)))))
+        failures.append(str(error))
+    ran = ran._replace(failure="; ".join(filter(None, failures)))
     told = figures(flight, ran, said, inside)
     files: dict[str, bytes | Path] = {ACCOUNT: dumps(plain(told)).encode()}
     last_lines = []

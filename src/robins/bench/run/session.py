@@ -124,7 +124,7 @@ class Session:
         Raises:
             ScenarioError: the length of the run does not fit the scenario.
             PortError, ResultError: a port cannot be opened; there is no room for what passes.
-            ValueError: what the rig cannot prepare.
+            BenchError: the rig cannot prepare the run.
         """
         self.flight, self.rig, self._watch = flight, flight.rig, watch
         self._tell = progress or (lambda share, what: None)

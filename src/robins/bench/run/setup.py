@@ -13,8 +13,10 @@ end = "601 s"
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Mapping
+import traceback
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -22,11 +24,12 @@ import pydantic
 
 from robins import scenario
 from robins.bench.broker.faults import LinkFault
+from robins.bench.broker.link import BenchError
 from robins.bench.broker.says import Saying
 from robins.bench.ports.port import program
 from robins.bench.rig import Kit, Rig, Timing
 from robins.bench.rigs import RIGS, rig_of
-from robins.errors import hint
+from robins.errors import RobinsError, hint
 from robins.scenario import Parameters, Quantity, ScenarioError
 from robins.systems import trust
 from robins.systems.catalogue import is_file
@@ -125,9 +128,39 @@ class Flight(NamedTuple):
         return self.rig.timing(self.given)
 
 
+@contextlib.contextmanager
+def calling(rig: Rig, name: str, otherwise: str = "") -> Iterator[None]:
+    """Call a function of a rig, which may be the user's own.
+
+    Args:
+        rig: whose it is.
+        name: field of the rig.
+        otherwise: what to do beside correcting it.
+
+    Raises:
+        BenchError: it failed; names the line.
+    """
+    try:
+        yield
+    except RobinsError:
+        raise
+    except Exception as error:
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        raise BenchError(
+            f"the {name} of the rig '{rig.name}' fails ({type(error).__name__}: {error})",
+            f"{Path(at.filename).name}, line {at.lineno}",
+            ", ".join(filter(None, ("correct it", otherwise))),
+        ) from error
+
+
 def kit_of(flight: Flight) -> Kit:
-    """What the parts of a run are made from."""
-    return flight.rig.prepare(flight.setup, flight.given)
+    """What the parts of a run are made from.
+
+    Raises:
+        BenchError: the rig cannot prepare it; names the line that failed.
+    """
+    with calling(flight.rig, "prepare"):
+        return flight.rig.prepare(flight.setup, flight.given)
 
 
 def built_in() -> dict[str, Path]:
