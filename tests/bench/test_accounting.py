@@ -202,7 +202,8 @@ def test_what_a_judge_cannot_judge_is_a_result_all_the_same(wrong):
     of = of._replace(rig=replace(of.rig, **{wrong: lambda given, ran, *said: [][-1]}))
     for failure in ("", "'adder' died"):
         found = outcome(of, ran_of(of, 3, failure=failure), None)
-        reason = rf"test_accounting.py, line \d+: the {wrong} of the rig 'clockwork' fails \(IndexError: "
+        said = rf"the {wrong} of the rig 'clockwork' fails \(IndexError: "
+        reason = rf"test_accounting.py, line \d+: {said}"
         assert re.match((failure and f"{failure}; {reason}") or reason, found.failure)
         assert found.solution is not None
         assert "value_count_n" in found.solution
@@ -231,7 +232,7 @@ def test_what_a_run_does_not_test_is_said():
         f"The fault 'loss' at all links begins at 600 s, {after}",
         f"The fault 'silent' at adder, from 0.5 s on, met nothing: {nothing}",
     ]
-    assert outcome(short, ran, None, None).warnings == doubts(short, ran)
+    assert outcome(short, ran, None).warnings == doubts(short, ran)
     late = [Event(k, "behind", f"the run is {k}.0 s behind", {"time_s": 4.0}) for k in (33, 66)]
     behind = ["At 4 s the run is 66.0 s behind"]
     assert doubts(of, ran._replace(events=late)) == behind

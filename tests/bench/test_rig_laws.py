@@ -14,14 +14,14 @@ from stations import on_threads
 
 from robins.bench.recording import read_record
 from robins.bench.rig import Rig
-from robins.bench.run.outcome import outcome
+from robins.bench.run import outcome
 from robins.bench.run.session import Ran
 from robins.bench.run.setup import Flight
 from robins.bench.run.telemetry import difference
 from robins.logs import load_dataset
 from robins.results import Outcome
 from robins.results import read as read_result
-from robins.workbench import bench_replay, bench_up, benches, publish
+from robins.workbench import bench_replay, bench_up, publish
 
 SPANS = [f"{of}.{edge}" for of in ("counted", "wind.span") for edge in ("begin=20 s", "end=60 s")]
 PLACE = 'velocity_sigma = "0.05 m/s"\n'
@@ -86,18 +86,19 @@ def fly(tmp_path_factory):
     @cache
     def now(name: str) -> Done:
         folder, seen = tmp_path_factory.mktemp(name), list[tuple[Flight, Ran, Any]]()
+        compare = outcome.in_one_program
         drive = DRIVE.replace(PLACE, PLACE + ARM)
         (folder / "drive.toml").write_text(f'system = "ins-gnss"\n{drive}{OUTAGE}')
         scenario = folder / "bench.toml"
         scenario.write_text(TABLE[name].scenario.replace("{folder}", str(folder)))
 
-        def see(flight, ran, inside, record):
-            seen.append((flight, ran, inside))
-            return outcome(flight, ran, inside, record)
+        def see(flight, ran):
+            seen.append((flight, ran, compare(flight, ran)))
+            return seen[0][-1]
 
         with pytest.MonkeyPatch.context() as patch:
             on_threads(patch)
-            patch.setattr(benches, "outcome", see)
+            patch.setattr(outcome, "in_one_program", see)
             done = bench_up(str(scenario), record=folder / "record.mcap")
         flight, ran, inside = seen[0]
         return Done(flight.rig, ran, inside, done, publish(done, folder / "out").path)

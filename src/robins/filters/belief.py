@@ -160,7 +160,7 @@ class StepInfo(NamedTuple):
         )
 
     @property
-    def sigma(self) -> Array:
+    def sigma(self) -> Array | np.ndarray:
         """(..., m) ``expected``; NaN where a component was not used."""
         where: Any = np.where if isinstance(self.used, np.ndarray) else jnp.where
         return where(self.used, self.expected, jnp.nan)
