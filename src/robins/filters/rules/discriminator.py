@@ -70,11 +70,11 @@ def discriminator(
                            lambda = (tr V - m) / tr H P H'
 
     with r, H whitened by R^-1/2 as in `strong_tracking`. "Significantly" is by a factor that chance
-    alone exceeds in a whole run with the probability ``false_alarm`` at most: each of the run's
+    alone exceeds in a whole run with about the probability ``false_alarm``: each of the run's
     ``looks`` may fail with false_alarm / looks (Bonferroni), and the factor is the quantile of such
     an average of squares (`chance_levels` in `robins.filters.rules._fading`). Neighbouring averages
     are nearly the same number, so with rho = 0.98 false alarms are three to four times rarer than
-    stated; with rho = 0.9 they are as stated. With a ``threshold`` the factor is
+    stated; with rho = 0.9 they are 1.3 times as many. With a ``threshold`` the factor is
     1 + threshold sqrt(2 (1 - rho) / ((1 + rho) m)), as in `strong_tracking`.
 
     "projected" fades only what the channel sees, P + (lambda-1) P H' (H P H')^+ H P; "multiple"
