@@ -36,6 +36,15 @@ def test_no_compiler_has_anything_to_say(tmp_path, unroll, level):
     assert not re.search(r"malloc|static|goto|\bif \((?!!ANY)", text)
 
 
+def test_an_infinite_number_is_a_real_and_no_float(tmp_path):
+    program = trace(lambda x: x + jnp.array([-jnp.inf, jnp.nan]), jnp.zeros(2))
+    source = tmp_path / "step.c"
+    source.write_text(to_c(program))
+    line_ = [*compiler(), *STRICT, "-Wdouble-promotion", "-fsyntax-only", str(source)]
+    done = subprocess.run(line_, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def libm(x, name):
     """The function in extended precision, rounded once."""
     return getattr(np, name)(x.astype(np.longdouble))

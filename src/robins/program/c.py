@@ -347,7 +347,9 @@ def literal(value: object, kind: str, bare: bool = False, precision: Precision =
     """A number in C; bare beside an operator, else in the macro of its kind."""
     if kind == "real":
         text = precision.number(value)
-        return (f"({text})" if text.startswith("-") else text) if bare else f"REAL({text})"
+        if not bare or text.lstrip("-") in ("INFINITY", "NAN"):  # which C has as floats
+            return f"REAL({text})"
+        return f"({text})" if text.startswith("-") else text
     number = int(value)  # type: ignore[call-overload]
     if kind == "whole" and number == -(2**63):
         return "WHOLE(INT64_MIN)"

@@ -10,7 +10,7 @@ typedef int64_t whole;
 typedef uint32_t word;
 typedef uint64_t word64;
 
-#define REAL(x) (x)
+#define REAL(x) ((real)(x))
 #define WHOLE(x) ((whole)(x))
 #define FLAG(x) (x)
 #define WORD(x) ((word)(x))
