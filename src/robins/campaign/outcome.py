@@ -13,10 +13,10 @@ from robins.campaign.bound import bound_sigma
 from robins.campaign.histogram import WORST
 from robins.campaign.machine import ByJax, InLanes, machine_for
 from robins.campaign.statistics import PERCENTS, Statistics, thinned
-from robins.filters import Code, doubts
+from robins.filters import Code, Tally, doubts
 from robins.results import Outcome, Probability, Progress, array, keeping, silent, variable
 from robins.systems.judgement import RUNS, Metrics, Verdicts
-from robins.systems.study import Problem, StateBlock
+from robins.systems.study import Contender, Problem, StateBlock
 from robins.systems.tables import block_array, innovation_tables
 
 
@@ -98,9 +98,13 @@ def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray
         warnings=[
             f"{name}: {sentence}"
             for name, s in found.items()
-            for sentence in doubts(s.tally, problem.contenders[name].bounds)
+            for sentence in _doubts(problem.contenders[name], s.tally)
         ],
     )
+
+
+def _doubts(contender: Contender, tally: Tally) -> list[str]:
+    return doubts(tally, contender.bounds, tuple(tally.updates) if contender.lasting else ())
 
 
 DRAWS, SEED = 200, 1993  # of the bootstrap

@@ -166,7 +166,7 @@ def suspicions(looks: Mapping[str, ArrayLike], assumed: Collection[str] = ()) ->
         rows = table.reshape(-1, *table.shape[-2:])
         lasting = sensor in assumed
         tests = [_repeating, partial(_late, lasting=lasting)]
-        if not lasting:  # a filter that states bounds only overreacts: it passes these
+        if not lasting:
             tests += [_far, _following, _one_sided]
         for test in tests:
             found += _told(sensor, rows, test, level)

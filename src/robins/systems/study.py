@@ -83,6 +83,7 @@ class Contender(NamedTuple):
     case: Callable[[Any], Case] = as_simulated  # from what the problem simulates
     reported: np.ndarray | None = None  # (r, n) reported = this @ tangent error; None: all of it
     bounds: bool = False  # it states bounds of an H-infinity filter, not standard deviations
+    lasting: bool = False  # its gain is not that of least variance, so innovations are correlated
     facts: Mapping[str, Any] = {}  # figures known without a run, put among its metrics
     # why its steps call Python, "it solves ... in Python": such a filter runs by JAX alone
     on_host: str = ""

@@ -161,6 +161,7 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
         filter=make_filter(spec.build),
         model=model.model(noise, given.star.noise, additive, given.star.camera is not None),
         case=recipe(as_case, additive, spec.build, numbers=around),
+        lasting=spec.build.startswith("fixed") or frozen is not None,
         facts=facts,
         on_host=spec.on_host,
     )
