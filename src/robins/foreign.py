@@ -168,5 +168,7 @@ def _array(raw: bytes, name: str, refuse: Refuse) -> np.ndarray:
             f"{name!r} holds {len(raw) - file.tell()} bytes where its header declares {size}: "
             f"{dtype} of shape {shape}"
         )
-    flat = np.frombuffer(raw, dtype, offset=file.tell())
-    return flat.reshape(shape, order="F" if fortran else "C").copy(order="K")
+    # of a shape that NumPy itself does not take
+    with decoding(lambda why: refuse(f"{name!r} is no array of NumPy: {why}")):
+        flat = np.frombuffer(raw, dtype, offset=file.tell())
+        return flat.reshape(shape, order="F" if fortran else "C").copy(order="K")

@@ -23,6 +23,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.errors import require
 from robins.linalg import scalars
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ else:
 _SMALL = 1e-3  # rad^2; below it the series, of which no dropped term exceeds 1e-18
 _SMALL_TURN = 1e-2  # rad^2; below it those of `turn_coefficients`: 1e-16 of the first term
 
-_SKEWED = 0.05  # of a direction cosine matrix: one that is written with two digits is one still
+_SKEWED = 0.05  # of a matrix or a quaternion: one that is written with two digits is one still
 _LOCK = 1e-14  # rad from the vertical, about; a unit quaternion is rounded to 3e-16
 
 
@@ -41,6 +42,25 @@ def _same_rank(*arrays):
     """Leading axes of length one where an array has fewer, for then the rest broadcasts itself."""
     most = max(a.ndim for a in arrays)
     return [a.reshape((1,) * (most - a.ndim) + a.shape) for a in arrays]
+
+
+def _refuse_no_quaternion(q):
+    """Refuse what has not four components or not the length one; in compiled code only the first.
+
+    Raises:
+        ValueError: it is none. What holds NaN is missing, and passes.
+    """
+    shape = np.shape(q)
+    require(shape[-1:] == (4,), f"a quaternion has 4 components along its last axis, got {shape}")
+    if not isinstance(q, Tracer):
+        with np.errstate(all="ignore"):
+            size = np.linalg.norm(np.asarray(q), axis=-1)
+            worst = np.max(np.abs(size - 1.0), initial=0.0, where=~np.isnan(size))
+        require(
+            worst <= _SKEWED,
+            f"no rotation: the length of a quaternion differs from 1 by {worst:.3g}; "
+            "rotation.normalise makes it 1",
+        )
 
 
 def _library(*arrays):
@@ -86,12 +106,28 @@ def conjugate(q: Float[Real, "*b 4"]) -> Float[Real, "*b 4"]:
 
 
 def normalise(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
-    """Scale to unit length."""
+    """Scale to unit length.
+
+    Raises:
+        ValueError: a length is zero or not finite; not in compiled code.
+    """
+    if not isinstance(q, Tracer):
+        with np.errstate(all="ignore"):
+            size = np.linalg.norm(np.asarray(q), axis=-1)
+        require(
+            not np.any((size == 0.0) | np.isinf(size)),
+            "no rotation: a quaternion of length zero, or of none that is a finite number",
+        )
     return q / jnp.linalg.norm(q, axis=-1, keepdims=True)
 
 
 def rotate(q: Float[Real, "*#b 4"], v: Float[Real, "*#b 3"]) -> Float[Real, "*b 3"]:
-    """Turn vectors; with q_nb, body components become navigation components."""
+    """Turn vectors; with q_nb, body components become navigation components.
+
+    Raises:
+        ValueError: q is no unit quaternion (to 0.05; of a length that compiled code does not see).
+    """
+    _refuse_no_quaternion(q)
     xp = _library(q, v)
     q, v = _same_rank(q, v)
     w, u = q[..., :1], q[..., 1:]
@@ -106,7 +142,7 @@ def from_rotvec(phi: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
 
 
 def to_rotvec(q: Float[Real, "*b 4"]) -> Float[Real, "*b 3"]:
-    """Rotation vector [rad] of length at most pi; q and -q give the same."""
+    """Rotation vector [rad] of length at most pi; q and -q give the same, and so does 2 q."""
     xp = _library(q)
     q = xp.where(q[..., :1] < 0.0, -q, q)
     w, u = q[..., :1], q[..., 1:]
@@ -157,7 +193,12 @@ def left_jacobian(
 
 
 def to_dcm(q: Float[Real, "*b 4"]) -> Float[Real, "*b 3 3"]:
-    """Direction cosine matrix: ``v_n = C_nb @ v_b``."""
+    """Direction cosine matrix: ``v_n = C_nb @ v_b``.
+
+    Raises:
+        ValueError: as `rotate`.
+    """
+    _refuse_no_quaternion(q)
     xp = _library(q)
     return xp.stack([xp.stack(row, -1) for row in scalars.dcm(_components(q))], -2)
 
@@ -171,6 +212,8 @@ def from_dcm(C: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
         ValueError: C is no rotation: a reflection, or not orthogonal to 0.05. In compiled code,
             which cannot raise, a reflection gives NaN.
     """
+    shape = np.shape(C)
+    require(shape[-2:] == (3, 3), f"a direction cosine matrix is 3 x 3, got {shape}")
     reflected = _refuse_no_rotation(C)
     c = [[C[..., i, j] for j in range(3)] for i in range(3)]
     trace = c[0][0] + c[1][1] + c[2][2]
@@ -234,7 +277,11 @@ def to_euler(q: Float[Array, "*b 4"]) -> tuple[Array, Array, Array]:
     takes the whole turn. The angles are found by way of the half sum and the half difference of
     roll and heading (Bernardes & Viollet 2022), of which only one is lost near the vertical: so
     they describe the rotation to rounding at every pitch.
+
+    Raises:
+        ValueError: as `rotate`.
     """
+    _refuse_no_quaternion(q)
     w, x, y, z = _components(q)
     # Cosine and sine of (roll - heading)/2 and of (roll + heading)/2, each pair times sqrt(2) and
     # times the sine of half the angle between the pitch and -90 or +90 deg.

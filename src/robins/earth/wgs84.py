@@ -62,10 +62,19 @@ def _alternating(x, coefficients):
 
 _Q0 = _q(_EP2)
 _DEEPEST = 5.3e6  # m from the centre, some 1060 km deep at the poles
+_FARTHEST = 1e100  # m, whose square is finite
+_LOWEST = -1e6  # m, height; nearer to the centre the ellipsoids of gravity have no sense
+_POLAR = 1e-9  # cosine of a latitude 6 mm from a pole
 
 
 def _floats(*values: ArrayLike) -> list[Array]:
     return [jnp.asarray(v, float) for v in values]
+
+
+def _refuse_deep(alt_m: ArrayLike) -> None:
+    if not isinstance(alt_m, Tracer):
+        lowest = np.min(np.asarray(alt_m, float), initial=np.inf)
+        require(not lowest < _LOWEST, f"a height must be {_LOWEST:g} m or more, got {lowest:.6g}")
 
 
 def curvature_radii(lat_rad: ArrayLike) -> tuple[Array, Array]:
@@ -103,11 +112,16 @@ def geodetic_from_ecef(r_e: ArrayLike) -> tuple[Array, Array, Array]:
 
     Raises:
         ValueError: a position is deeper than that, as the centre of the Earth is, or one in
-            kilometres; not in compiled code, where the centre gives NaN.
+            kilometres, or it is infinite; not in compiled code, where the centre gives NaN.
     """
     (r,) = _floats(r_e)
     if not isinstance(r, Tracer):
-        nearest = np.min(np.linalg.norm(np.asarray(r), axis=-1), initial=np.inf)
+        with np.errstate(over="ignore"):
+            distance = np.linalg.norm(np.asarray(r), axis=-1)
+        farthest = np.max(distance, initial=0.0)
+        far = "a position must be of finite numbers of metres, got one at a distance of"
+        require(not farthest > _FARTHEST, f"{far} {farthest:.6g} m")
+        nearest = np.min(distance, initial=np.inf)
         require(
             not nearest < _DEEPEST,
             f"a position {nearest:.6g} m from the centre of the Earth has no geodetic coordinates: "
@@ -148,7 +162,11 @@ def gravity_n(lat_rad: ArrayLike, alt_m: ArrayLike) -> Float[Real, "*b 3"]:
     Above the ellipsoid the plumb line is curved: the north component is -8.1e-9 sin(2 lat) per
     metre of height, 8e-5 m/s^2 at 10 km and 45 deg. Given NumPy arrays it returns one, and
     nothing is compiled.
+
+    Raises:
+        ValueError: a height is below -1000 km; not in compiled code.
     """
+    _refuse_deep(alt_m)
     given = (lat_rad, alt_m)
     xp = np if all(isinstance(x, np.ndarray) for x in given) else jnp
     lat, alt = xp.broadcast_arrays(*(xp.asarray(x, float) for x in given))
@@ -204,9 +222,20 @@ def earth_rate_n(lat_rad: ArrayLike) -> Float[Array, "*b 3"]:
 def transport_rate_n(lat_rad: ArrayLike, alt_m: ArrayLike, v_n: ArrayLike) -> Float[Array, "*b 3"]:
     """Rotation of the local frame over the Earth omega_en_n [rad/s] at velocity v_n [m/s].
 
-    North-east-down; Groves (2013), eq. 5.44. Not finite at the poles, where north is not defined.
+    North-east-down; Groves (2013), eq. 5.44.
+
+    Raises:
+        ValueError: a latitude is that of a pole, where north is not defined, a height below
+            -1000 km, or v_n has not three components; in compiled code only the last.
     """
     lat, alt, v = _floats(lat_rad, alt_m, v_n)
+    require(v.shape[-1:] == (3,), "v_n has 3 components along its last axis", v.shape)
+    _refuse_deep(alt)
+    if not isinstance(lat, Tracer):
+        require(
+            not np.any(np.abs(np.cos(np.asarray(lat))) < _POLAR),
+            "the local frame has no rate at a pole, where north is not defined; use ECEF",
+        )
     meridian, transverse = curvature_radii(lat)
     north = v[..., 1] / (transverse + alt)
     east = -v[..., 0] / (meridian + alt)

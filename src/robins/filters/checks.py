@@ -59,6 +59,19 @@ def matrix(
     return numbers
 
 
+def positive(what: str, given: Any, of_infinity: str) -> None:
+    """Refuse what is no positive number; infinity is one.
+
+    Raises:
+        TypeError: it is not one real number.
+        ValueError: it is not positive; the message says what infinity would mean.
+    """
+    number = np.asarray(given)
+    if number.ndim or number.dtype.kind not in "iuf":
+        raise TypeError(f"{what} must be one real number, got {given!r}")
+    require(number > 0.0, f"{what} must be positive, or inf for {of_infinity}; got {given}")
+
+
 def finite_numbers(what: str, given: Any) -> np.ndarray:
     """An array of floats from real and finite numbers.
 

@@ -43,7 +43,13 @@ def _settle_noise(own: Any, covariance: Any, whose: str) -> None:
     if covariance is not None:
         object.__setattr__(own, "noise", linalg.factor(covariance, f"noise covariance of {whose}"))
     leaves = [] if callable(own.noise) else jax.tree_util.tree_leaves(own.noise)
-    if any(np.any(np.abs(x) > _LARGEST) for x in leaves if not isinstance(x, Tracer)):
+    # as NumPy's, for JAX's own comparisons are stand-ins inside a trace
+    leaves = [np.asarray(x) for x in leaves if not isinstance(x, Tracer)]
+    if any(x.dtype.kind not in "biuf" for x in leaves):
+        raise TypeError(f"noise of {whose} is not of real numbers")
+    if any(x.ndim == 1 and np.any(x < 0.0) for x in leaves):
+        raise ValueError(f"noise of {whose} holds a negative number, and is standard deviations")
+    if any(np.any(np.abs(x) > _LARGEST) for x in leaves):
         raise ValueError(
             f"noise of {whose} holds a number above {_LARGEST:.3g}, whose square is none: give a "
             "smaller standard deviation, or NaN in the place of readings that tell nothing"

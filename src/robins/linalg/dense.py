@@ -7,10 +7,12 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.scipy.linalg import expm, solve_triangular
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from robins import _float64  # noqa: F401
+from robins.errors import require
 
 # What is below this share of a row's length is rounding: such a row depends on those above it.
 # Orthogonalising errs by a few 1e-16 of the length; 1e-14 leaves room for sizes up to about 50.
@@ -26,6 +28,13 @@ def block_diagonal(a: Float[Array, "m k"], b: Float[Array, "n l"]) -> Float[Arra
     return jnp.concatenate(
         [jnp.concatenate([a, right], axis=1), jnp.concatenate([left, b], axis=1)]
     )
+
+
+def _require_square(name: str, given: ArrayLike, rows: int | None = None) -> None:
+    shape = np.shape(given)
+    wanted = "a square matrix" if rows is None else f"({rows}, {rows})"
+    fits = len(shape) == 2 and shape[0] == shape[1] and rows in (None, shape[0])
+    require(fits, f"{name} has shape {shape}; {wanted} is wanted")
 
 
 def tria(*blocks: Float[Array, "n _"]) -> Float[Array, "n n"]:
@@ -161,7 +170,12 @@ def block_factor(
 
 @jax.custom_jvp
 def cholesky(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Lower Cholesky factor; all NaN, its derivatives zero, where P is not positive definite."""
+    """Lower Cholesky factor; all NaN, its derivatives zero, where P is not positive definite.
+
+    Raises:
+        ValueError: P is not square.
+    """
+    _require_square("P", P)
     n = P.shape[0]
     if n > UNROLLED:
         return jnp.linalg.cholesky(P)
@@ -194,7 +208,12 @@ def _cholesky_jvp(primals, tangents):
 
 
 def symmetric_root(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The symmetric positive semidefinite root of P; negative rounding becomes zero."""
+    """The symmetric positive semidefinite root of P; negative rounding becomes zero.
+
+    Raises:
+        ValueError: P is not square.
+    """
+    _require_square("P", P)
     value, vector = jnp.linalg.eigh(P)
     return (vector * jnp.sqrt(jnp.maximum(value, 0.0))[None, :]) @ vector.T
 
@@ -269,7 +288,13 @@ def log_diagonal(L: Float[Array, "n n"], include: Array) -> Float[Array, ""]:
 
 
 def eigenvalue_bounds(P: Float[Array, "n n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Least and greatest eigenvalue of a symmetric matrix."""
+    """Least and greatest eigenvalue of a symmetric matrix.
+
+    Raises:
+        ValueError: P is not square, or has no rows.
+    """
+    _require_square("P", P)
+    require(P.shape[0], "P has no rows, so no eigenvalue")
     value = jnp.linalg.eigvalsh(P)
     return value[0], value[-1]
 
@@ -291,11 +316,17 @@ def factor(P: ArrayLike, name: str = "covariance") -> Float[Array, "n n"]:
         name: what to call it in an error.
 
     Raises:
+        TypeError: P is not of real numbers.
         ValueError: P is not square, finite and symmetric, or has a negative eigenvalue.
     """
-    P_ = np.asarray(P, dtype=float)
-    if P_.ndim != 2 or P_.shape[0] != P_.shape[1]:
-        raise ValueError(f"{name} has shape {P_.shape}; a square matrix is wanted")
+    try:
+        given = np.asarray(P)
+    except ValueError as error:
+        raise ValueError(f"{name} is no matrix: its rows differ in length") from error
+    if given.dtype.kind not in "biuf":
+        raise TypeError(f"{name} holds {given.dtype}, real numbers are wanted")
+    P_ = given.astype(float)
+    _require_square(name, P_)
     if not np.all(np.isfinite(P_)):
         raise ValueError(f"{name} has entries that are not finite numbers")
     if np.any(negative := np.diag(P_) < 0.0):
@@ -340,8 +371,22 @@ def van_loan(
 
     Returns:
         Phi = exp(A dt), and Qd, the covariance the noise adds over dt [s].
+
+    Raises:
+        ValueError: a shape does not fit, dt is negative, or a number is not finite; in compiled
+            code only the first.
     """
+    A, Qc = jnp.asarray(A, float), jnp.asarray(Qc, float)
+    _require_square("A", A)
     n = A.shape[0]
+    require(n, "A has no rows: there is nothing to discretise")
+    _require_square("Qc", Qc, n)
+    for name, value in (("A", A), ("Qc", Qc), ("dt", dt)):
+        sound = isinstance(value, Tracer) or np.all(np.isfinite(value))
+        require(sound, f"{name} has entries that are not finite numbers")
+    require(
+        isinstance(dt, Tracer) or np.all(np.asarray(dt) >= 0.0), "dt must be zero or positive", dt
+    )
     size = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(A), axis=0)) * jnp.abs(dt))
     halvings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(size, 1.0))), 0, _DOUBLINGS)
     top = jnp.concatenate([-A, Qc], axis=1)

@@ -18,7 +18,7 @@ Formats = Mapping[str, str | TextFormat]
 
 
 def load_dataset(
-    paths: Iterable[str | os.PathLike[str]],
+    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     *,
     name: str | None = None,
     mounting: Mounting | None = None,
@@ -27,8 +27,8 @@ def load_dataset(
     """Read IMU, and whatever else there is, as it is in the files; see `clean`.
 
     Args:
-        paths: in any order; one IMU table in all, and at most one of each other kind. A path in a
-            file of its own is the truth.
+        paths: one, or several in any order; one IMU table in all, and at most one of each other
+            kind. A path in a file of its own is the truth.
         name: of the dataset; by default the name of the file with the IMU.
         mounting: turns the sensor's axes to forward-right-down and says where the antenna is.
         formats: path -> its format, for files that are not recognised by content.
@@ -39,7 +39,8 @@ def load_dataset(
     Raises:
         LogError: as `open_log`; no IMU log, two tables of one kind, or a lever arm without GNSS.
     """
-    paths = [os.fspath(p) for p in paths]
+    several = [paths] if isinstance(paths, (str, os.PathLike)) else paths
+    paths = [os.fspath(p) for p in several]
     if unknown := set(formats or {}) - set(paths):
         given = ", ".join(sorted(unknown))
         raise LogError(given, "a format is given, but not the file", "check its path")

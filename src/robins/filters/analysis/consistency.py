@@ -51,6 +51,10 @@ class Verdict(NamedTuple):
         return bool(self.low <= self.value <= self.high)
 
 
+def _require_level(level: float) -> None:
+    require(0.0 < level < 1.0, "level must be a share between 0 and 1", level)
+
+
 def grand_mean_nis(nis: np.ndarray, dof: np.ndarray, level: float = 0.95) -> Verdict:
     """Mean of all innovations squared per degree of freedom, over runs and time.
 
@@ -65,8 +69,14 @@ def grand_mean_nis(nis: np.ndarray, dof: np.ndarray, level: float = 0.95) -> Ver
 
     Returns:
         A verdict about a value that should be near one.
+
+    Raises:
+        ValueError: the shapes differ, or the level is not between 0 and 1.
     """
     nis, dof = np.asarray(nis, dtype=float), np.asarray(dof)
+    _require_level(level)
+    require(np.all(dof >= 0), "degrees of freedom must be zero or more", np.min(dof, initial=0))
+    require(nis.shape == dof.shape, f"nis is of shape {nis.shape}, dof of {dof.shape}: they differ")
     total = float(np.sum(dof))
     if total == 0.0:
         return Verdict(float("nan"), float("nan"), float("nan"))
@@ -85,8 +95,19 @@ def anees(values: np.ndarray, n: int, level: float = 0.95) -> tuple[np.ndarray, 
 
     Returns:
         (T,) average NEES over n, its band (2,), and the share of epochs inside the band.
+
+    Raises:
+        ValueError: the values are not those of runs and epochs, there is none, n is below one, or
+            the level is not between 0 and 1.
     """
     values = np.asarray(values, dtype=float)
+    require(
+        values.ndim == 2 and values.size,
+        "anees takes values of one run or more a row, one epoch or more a column",
+        values.shape,
+    )
+    require(n >= 1, "n, the number of states, must be 1 or more", n)
+    _require_level(level)
     mean = np.mean(values, axis=0) / n
     band = chi2_band(n, values.shape[0], level) / n
     inside = (mean >= band[0]) & (mean <= band[1])
@@ -119,15 +140,20 @@ def whiteness(series: np.ndarray, lags: int = 20, level: float = 0.95) -> Verdic
         level: of the one-sided bound.
 
     Raises:
-        ValueError: fewer than three times as many samples as lags, or all of them the same.
+        ValueError: it is not one row of numbers, has fewer than three times as many samples as
+            lags or all of them the same, there is no lag, or the level is not between 0 and 1.
     """
     x = np.asarray(series, dtype=float)
+    require(x.ndim == 1, "whiteness takes one series, (T,)", x.shape)
+    require(lags >= 1, "lags must be 1 or more", lags)
+    _require_level(level)
     here = np.isfinite(x)
     count = int(np.sum(here))
     require(not count < 3 * lags, f"whiteness over {lags} lags wants {3 * lags} samples", count)
+    require(np.ptp(x[here]) != 0.0, "whiteness of a series that never changes")
+    x = x / np.max(np.abs(x[here]))  # so that no square is beyond the largest number
     x = np.where(here, x - np.mean(x[here]), 0.0)
     power = np.sum(x**2) / count
-    require(power != 0.0, "whiteness of a series that never changes")
     total = 0.0
     for lag in range(1, lags + 1):
         pairs = int(np.sum(here[lag:] & here[:-lag]))

@@ -34,6 +34,7 @@ from robins import linalg
 from robins.errors import require
 from robins.filters.analysis.bound import Linearised, linearised
 from robins.filters.belief import Belief
+from robins.filters.checks import matrix
 from robins.filters.model import Model
 from robins.filters.observation import left_out
 from robins.manifold import State
@@ -125,8 +126,12 @@ def spectrum(L: Any) -> tuple[np.ndarray, np.ndarray]:
 
     Values below `NOTHING` belong to directions that are not seen at all; as their vectors are any
     mixture of these, `unobservable` sorts them out.
+
+    Raises:
+        TypeError: L is not of real numbers.
+        ValueError: L is not square, or not finite, as after an overflow: give windows then.
     """
-    vectors, left, _ = np.linalg.svd(np.asarray(L, float))
+    vectors, left, _ = np.linalg.svd(matrix("L", L, None, len(np.atleast_1d(L))))
     with np.errstate(divide="ignore"):
         values = np.maximum((1.0 - left) * (1.0 + left) / left**2, 0.0)
     return values, vectors
@@ -155,7 +160,16 @@ def worded(vector: np.ndarray, names: Sequence[str], most: int = 4) -> str:
 
     The shares are squares of the components, in units of the prior; "with" joins states of one
     sign, "against" of opposite ones. States that have less than 1 % are left out.
+
+    Raises:
+        ValueError: it has not a number for each name, or is no direction: zero, or not finite.
     """
+    require(
+        np.shape(vector) == (len(names),),
+        f"a vector of shape {np.shape(vector)} has not a number for each of {len(names)} names",
+    )
+    length = float(np.linalg.norm(vector))
+    require(0.0 < length < np.inf, "no direction: the length of the vector is", length)
     order = np.argsort(-np.round(np.abs(vector), 9), kind="stable")[:most]  # ties keep their order
     text = ""
     for i in order:

@@ -18,12 +18,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
-from robins.filters.checks import matrix
+from robins.filters.checks import matrix, positive
 from robins.filters.kalman import kalman
 from robins.filters.linearise import Linearisation, taylor
 from robins.filters.model import Model
@@ -48,9 +49,21 @@ def existence_margin(belief: Belief, weight: Any, gamma: Any) -> Float[Array, ""
 
     Returns:
         In units of P^-1; NaN where P is singular.
+
+    Raises:
+        TypeError: gamma is not one real number.
+        ValueError: it is not positive (not seen in compiled code), or L has not as many columns as
+            the state has components.
     """
+    if not isinstance(gamma, Tracer):
+        positive("gamma", gamma, "the Kalman filter")
     L = as_weight(weight, "existence_margin")(belief.mean) / jnp.asarray(gamma, float)
-    root = linalg.solve_lower(belief.factor, jnp.eye(belief.factor.shape[0]))
+    n = belief.factor.shape[0]
+    require(
+        L.shape[1] == n,
+        f"existence_margin: weight has {L.shape[1]} columns, the state has {n} components",
+    )
+    root = linalg.solve_lower(belief.factor, jnp.eye(n))
     return linalg.eigenvalue_bounds(root.T @ root - L.T @ L)[0]
 
 
@@ -85,8 +98,9 @@ def gamma_min(
         count_missing: as `h_infinity` takes it.
 
     Raises:
-        ValueError: the Kalman filter itself cannot take every step.
+        ValueError: the Kalman filter itself cannot take every step, or rtol is below 1e-12.
     """
+    require(rtol >= 1e-12, "rtol must be 1e-12 or more, for numbers have no more digits", rtol)
     rule = h_infinity(np.inf, weight, estimate=estimate, count_missing=count_missing)
     filter_ = kalman(linearise, [rule])
 
@@ -348,8 +362,9 @@ def steady_h_infinity(
     """
     F, Q, H, R = _matrices(F, Q, H, R)
     L = matrix("weight", weight, None, len(F))
-    require(gamma > 0.0, f"gamma must be positive, or inf for the Kalman filter; got {gamma}")
+    positive("gamma", gamma, "the Kalman filter")
     linalg.factor(Q, "Q")
+    require(len(H), "H has no rows: nothing is measured")
     if not np.all(np.diag(linalg.factor(R, "R")) > 0.0):
         raise ValueError("R is singular: a reading without noise has no steady filter of this form")
     q = len(L)

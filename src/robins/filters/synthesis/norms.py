@@ -13,12 +13,14 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
+from robins.errors import require
 from robins.filters.checks import matrix
 
 Number = float | int  # where types are checked an int is no float
 
 _CIRCLE = 1e-6  # eigenvalues as near to the unit circle are looked at
 _STARTS = 65  # even samples of the half circle that begin a search
+_LARGEST = 1e70  # whose fourth power is a number
 _SQUARINGS = 64  # of A: a radius of 1 - eps needs 58
 
 
@@ -29,13 +31,17 @@ def _system(
 
     Raises:
         TypeError: one is not of real numbers.
-        ValueError: one has another shape than the others ask for, or is not finite.
+        ValueError: one has another shape than the others ask for, is not finite or beyond 1e70.
     """
     A = matrix("A", A)
     n = len(A)
     A, B, C = matrix("A", A, n, n), matrix("B", B, n), matrix("C", C, None, n)
     shape = len(C), B.shape[1]
-    return A, B, C, np.zeros(shape) if D is None else matrix("D", D, *shape)
+    D = np.zeros(shape) if D is None else matrix("D", D, *shape)
+    for name, block in (("A", A), ("B", B), ("C", C), ("D", D)):
+        most = np.max(np.abs(block), initial=0.0)
+        require(most <= _LARGEST, f"{name} holds {most:.3g}: give units of at most {_LARGEST:g}")
+    return A, B, C, D
 
 
 def spectral_radius(A: np.ndarray) -> float:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import scipy.linalg
 import scipy.optimize
 
 from robins.errors import require
+from robins.filters.checks import positive
 from robins.filters.synthesis import norms
 from robins.filters.synthesis.design import Design, Unreachable, certify
 from robins.filters.synthesis.plant import Plant, error_system
@@ -90,9 +92,9 @@ def least_riccati_gamma(plant: Plant) -> float:
     return _least(plant)[-1]
 
 
-def check_gamma(gamma: norms.Number) -> None:
-    """Raise a ValueError unless gamma is a positive number or inf."""
-    require(gamma > 0.0, f"gamma must be positive, or inf for no bound; got {gamma}")
+def check_gamma(gamma: Any) -> None:
+    """Raise a TypeError unless gamma is a number, a ValueError unless it is positive or inf."""
+    positive("gamma", gamma, "no bound")
 
 
 def _search(plant: Plant, gamma: float) -> tuple[np.ndarray, float]:
