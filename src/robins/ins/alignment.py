@@ -138,10 +138,11 @@ def level(
         heading_sigma_rad: (...) its sigma.
 
     Raises:
-        ValueError: a vector that is not finite; free fall; the nose straight up or down, where it
-            has no heading.
+        ValueError: a vector or a sigma that is not finite, a sigma below zero; free fall; the nose
+            straight up or down, where it has no heading.
     """
     f = _specific_force(f_b)
+    _refuse_bad_sigmas(sigma_f=sigma_f, heading_sigma_rad=heading_sigma_rad)
     heading, heading_sigma = np.asarray(heading_rad, float), np.asarray(heading_sigma_rad, float)
     across = np.hypot(f[..., 1], f[..., 2])
     pitch = np.arctan2(f[..., 0], across)
@@ -188,12 +189,13 @@ def gyrocompass(
         alt_m: (...) height above the ellipsoid.
 
     Raises:
-        ValueError: a vector that is not finite; free fall; specific force that is not gravity's;
-            rates that are not the Earth's; a heading sigma above 0.3 rad, by too high a latitude
-            or too poor gyros.
+        ValueError: a vector or a sigma that is not finite, a sigma below zero; free fall; specific
+            force that is not gravity's; rates that are not the Earth's; a heading sigma above 0.3
+            rad, by too high a latitude or too poor gyros.
     """
     f, omega, lat = _specific_force(f_b), np.asarray(omega_ib_b, float), np.asarray(lat_rad, float)
     _refuse_bad_vectors("omega_ib_b", omega)
+    _refuse_bad_sigmas(sigma_f=sigma_f, sigma_omega=sigma_omega)
     g = np.asarray(gravity(lat, np.asarray(alt_m, float)))
     size = np.linalg.norm(f, axis=-1)
     sigma_of_f, sigma_of_omega = (np.max(np.asarray(x, float)) for x in (sigma_f, sigma_omega))
@@ -290,7 +292,7 @@ def heading_from_velocity(
     # east differ, and the bias would not average out.
     first = np.arctan2(*v[:, 1::-1].sum(0))
     across = np.hypot(sigma[:, 0] * np.sin(first), sigma[:, 1] * np.cos(first))
-    require(np.all(across > 0.0), "sigma_v must be positive", sigma_v)
+    require(np.all(sigma >= 0.0) and np.all(across > 0.0), "sigma_v must be positive", sigma_v)
     weight = across**-2
     north, east = weight @ v[:, :2]
     heading = float(np.arctan2(east, north))
@@ -331,6 +333,8 @@ def align(
         ValueError: the vehicle moved, or what `level` and `gyrocompass` refuse.
     """
     omega, f = np.asarray(omega_ib_b, float), np.asarray(f_b, float)
+    for name, rows in (("omega_ib_b", omega), ("f_b", f)):
+        require(rows.ndim == 2, f"{name} must have shape (n, 3), got {rows.shape}")
     sigma_omega, sigma_f = static_sigmas(model, dt_s * len(f), f.mean(0), omega.mean(0))
     limits = {
         "g": float(gravity(lat_rad, alt_m)),
@@ -387,6 +391,13 @@ def _hint_of_g(size: ArrayLike) -> str:
 def _refuse_bad_vectors(name: str, x: np.ndarray) -> None:
     require(x.shape[-1:] == (3,), f"{name} must have three components, got shape {x.shape}")
     require(np.all(np.isfinite(x)), f"{name} must be finite", x)
+
+
+def _refuse_bad_sigmas(**sigmas: ArrayLike | float) -> None:
+    for name, given in sigmas.items():
+        sigma = np.asarray(given, float)
+        sound = np.all((sigma >= 0.0) & np.isfinite(sigma))
+        require(sound, f"{name} must be finite, and zero or more", given)
 
 
 def _tilt_of_force(f: np.ndarray, C_nb: np.ndarray) -> np.ndarray:

@@ -36,6 +36,7 @@ from robins.units import from_si
 
 _FEWEST_CLUSTERS = 9  # in the longest averages; gives them about ten degrees of freedom
 _PER_DECADE = 10
+_HUGE = 1e100  # of a sample, or one over a change
 # Probabilities of a residual so large: below the first a whole curve is doubted, above the second a
 # part of it is explained, above the third it is so for want of a better.
 _DOUBTED, _EXPLAINED, _BARELY = 1e-3, 1e-2, 1e-5
@@ -439,6 +440,13 @@ def _refuse_bad_values(x: np.ndarray) -> None:
         raise ValueError(
             f"axis {still[0]} is constant at {x[0, still[0]]:g}: there is no noise to analyse; is "
             "the sensor stuck or the noise below its resolution?"
+        )
+    largest, spread = np.max(np.abs(x), axis=0), np.ptp(x, axis=0)
+    if np.any(away := (largest > _HUGE) | (spread < 1.0 / _HUGE)):
+        k = int(np.argmax(away))
+        raise ValueError(
+            f"axis {k} is up to {largest[k]:g} and changes by {spread[k]:g}: outside of 1e-100 to "
+            "1e100 squares are no numbers; is the unit right?"
         )
 
 
