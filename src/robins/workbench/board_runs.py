@@ -31,7 +31,7 @@ class Used(NamedTuple):
     nis: Array
     dof: Array
     innovation: Array
-    sigma: Array
+    sigma: Array | np.ndarray
     used: Array
 
 
