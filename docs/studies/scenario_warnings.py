@@ -54,6 +54,7 @@ REASONS = {
     (OPEN, "kf-told-[rb]*", "attitude_matching", "*"): NOT_THERE,
     (OPEN, "*", "velocity_matching", "*"): "open loop, its errors outgrow its linear model",
     (PAIR, "kf", "master_*", "*"): "has no states for the flexure",
+    ("airship/*", "*", "*", "*"): "nine states, without the biases of gyros and accelerometers",
     ("rocket/a8", "magnetic-raw", "*", "*"): "its model stands still, and 10 rad a step cover that",
     ("rocket/a8", "federated-vector-ukf", "*", "*"): "its shares are no bound: errors of 8 sigma",
 }
