@@ -34,7 +34,7 @@ def as_noise(value: Any, n: int, whose: str) -> Array:
     return linalg.as_factor(noise)
 
 
-def _settle_noise(own: Any, covariance: Any, whose: str) -> None:
+def _settle_noise(own: Motion | Sensor, covariance: Any, whose: str) -> None:
     if (own.noise is None) == (covariance is None):
         raise TypeError(
             f"{whose} needs noise=, standard deviations or a factor L of the covariance L L', or "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from functools import partial
 
 import numpy as np
 import scipy.linalg
@@ -23,6 +23,8 @@ _FARTHER, _FARTHEST = 10.0**0.25, 1e12  # steps beyond that grid and their end, 
 _FALLS = 1e-4  # relative, in a step
 _RTOL = 1e-10  # of lambda
 _STEPS = 60  # of Newton's iteration at most; it converges quadratically once it is near
+
+check_gamma = partial(positive, "gamma", of_infinity="no bound")
 
 
 def kalman_gain(plant: Plant) -> np.ndarray:
@@ -90,11 +92,6 @@ def least_riccati_gamma(plant: Plant) -> float:
         ValueError: as `kalman_gain`.
     """
     return _least(plant)[-1]
-
-
-def check_gamma(gamma: Any) -> None:
-    """Raise a TypeError unless gamma is a number, a ValueError unless it is positive or inf."""
-    positive("gamma", gamma, "no bound")
 
 
 def _search(plant: Plant, gamma: float) -> tuple[np.ndarray, float]:
