@@ -41,6 +41,7 @@ def room_of(module: str) -> str:
 
 def imports(source: Path) -> Iterator[Import]:
     """Every import of a room of robins by another."""
+    rooms = rooms_in(source)
     for path in sorted(source.rglob("*.py")):
         parts = ("robins", *path.relative_to(source).with_suffix("").parts)
         module = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
@@ -49,7 +50,7 @@ def imports(source: Path) -> Iterator[Import]:
             inside = name == "robins" or name.startswith("robins.")
             room = room_of(name)
             # `from robins import __version__` names no room: the package imports nothing itself.
-            if inside and room in rooms_in(source) and room != room_of(module):
+            if inside and room in rooms and room != room_of(module):
                 yield Import(room_of(module), room, f"{path.relative_to(source)}:{line}")
 
 
