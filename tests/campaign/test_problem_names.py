@@ -93,3 +93,14 @@ def test_what_fails_before_anything_is_computed_fails_as_it_is(tmp_path):
     with pytest.raises(KeyError), results.rescued(tmp_path / "out"):
         raise KeyError("early")
     assert not list(tmp_path.iterdir())
+
+
+def test_only_a_gain_that_is_not_held_is_doubted_for_the_order_of_innovations():
+    y, held = {"y": 5.0 * jnp.arange(60.0)[:, None]}, contender()._replace(lasting=True)
+    case = Case(Belief(jnp.zeros(2), jnp.eye(2)), None, y, {}, jnp.zeros((60, 2)))
+    given = {"contenders": {"kf": contender(), "held": held}, "epoch_s": np.arange(60.0)}
+    problem = a_problem(simulate=lambda index: case, **given)
+    said = simulate(problem, 1).warnings
+    assert any(one.startswith("kf: ") and "on one side" in one for one in said)
+    assert any(one.startswith("held: ") and "mean NIS" in one for one in said)
+    assert not any(one.startswith("held: ") and "on one side" in one for one in said)

@@ -43,7 +43,7 @@ class Observation(NamedTuple):
         return jnp.sqrt(jnp.maximum(square - taken, 0.0))
 
     def raised(self, noise: Array, accepted: Array) -> Observation:
-        """With the noise factor that a robust rule gives it, and what the rule still uses."""
+        """A copy with the noise factor and the accepted components that a robust rule chooses."""
         before = self.noise if self.unweighed is None else self.unweighed
         return self._replace(noise=noise, accepted=accepted, unweighed=before)
 

@@ -77,7 +77,7 @@ def bench_up(
             if file is not None:
                 interrupt.add_note(f"what was flown is in {file}")
             raise
-    progress(0.97, "comparing")
+    progress(0.97, "judging the run")
     found = outcome(flight, ran, file)
     return replace(found, warnings=[*found.warnings, *filter(None, [status.refused])])
 

@@ -55,7 +55,7 @@ class Servos(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class BodyState:
-    """What ArduPilot is told of the motion; None: no such sensor.
+    """Motion of the vehicle as sent to ArduPilot; None: no such sensor.
 
     Attributes:
         time_s: of the physics, since its start.
@@ -137,7 +137,7 @@ def encode(state: BodyState) -> bytes:
 
 @dataclass
 class ArduPilotCounts:
-    """What came since we listen."""
+    """Counts of datagrams since the socket was opened."""
 
     packets: int = 0  # of servo outputs, those that are repeated included
     lost: int = 0  # by the jumps of the count

@@ -109,7 +109,7 @@ def figures(
 
 
 def outcome(flight: Flight, ran: Ran, record: Path | None) -> Outcome:
-    """All that a result folder says of the run.
+    """Contents of the result folder of a run.
 
     Args:
         flight: what was asked for.
@@ -120,7 +120,7 @@ def outcome(flight: Flight, ran: Ran, record: Path | None) -> Outcome:
     if not (ran.steps or ran.failure):
         failures = ["it was stopped before its first step"]
     said, inside = Judged(arrays=arrays_of(flight.rig, ran.flown)), None
-    # of the user's own code, and of what was flown there is more to show
+    # Both are the user's own code; where it fails, what was flown is still shown.
     try:
         inside = in_one_program(flight, ran)
     except BenchError as error:
@@ -198,7 +198,7 @@ def lateness(ran: Ran) -> dict[str, Any]:
 
 
 def notes(flight: Flight, told: dict[str, Any]) -> list[str]:
-    """What the figures say, in sentences."""
+    """Sentences that sum up the figures."""
     out = []
     off = told["max_abs_difference_in_process"]
     if told["failure"]:

@@ -43,7 +43,7 @@ _GLANCE_NS = 50_000_000  # how often processes are looked at
 
 @runtime_checkable
 class Watch(Protocol):
-    """Who looks on while it runs, such as the live page; its calls must return at once."""
+    """Observer of a run, such as the live page; its calls must return at once."""
 
     def event(self, kind: str, time_s: float, text: str) -> None:
         """Something happened."""
@@ -55,12 +55,12 @@ class Watch(Protocol):
         """The run is over."""
 
     def commands(self, session: Session) -> list[dict[str, Any]]:
-        """What whoever looks on wants done; see `robins.bench.live.Live.commands`."""
+        """Commands of the observer; see `robins.bench.live.Live.commands`."""
         ...
 
 
 class Ran(NamedTuple):
-    """What came of a run."""
+    """Result of a run."""
 
     flown: Flown
     kit: Any  # of the rig
@@ -282,7 +282,7 @@ class Session:
         self._orders.say(message, values)
 
     def _say(self, step: int) -> None:
-        """What the operator says before a step."""
+        """Send the operator's messages that are due before a step."""
         for one in self._orders.due(step):
             self.broker.say(one.message, one.payload)
             values = self.rig.wire.decode(one.message, one.payload)
@@ -493,6 +493,6 @@ class Session:
 
 
 def wiring(rig: Rig, kit: Kit) -> Wiring:
-    """Who says what to whom."""
+    """Links of a rig: which part sends which message to which."""
     takes = {part: dict(build(kit).takes) for part, build in rig.build.items()}
     return Wiring(rig.wire, rig.sends, takes, rig.console)

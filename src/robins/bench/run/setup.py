@@ -154,7 +154,7 @@ def calling(rig: Rig, name: str, otherwise: str = "") -> Iterator[None]:
 
 
 def kit_of(flight: Flight) -> Kit:
-    """What the parts of a run are made from.
+    """Kit from which the parts of a run are made.
 
     Raises:
         BenchError: the rig cannot prepare it; names the line that failed.

@@ -83,7 +83,7 @@ def wide(blocks: Array) -> Array:
 
 
 class Innovation(NamedTuple):
-    """What a mixture of filters expected of a measurement, and what it got."""
+    """Innovation of a mixture of filters, with its covariance."""
 
     mean: Array  # (m,) y minus its prediction; NaN where missing
     expected: Array  # (m,) standard deviation of it, before robust rules weigh it
