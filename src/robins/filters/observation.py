@@ -48,7 +48,7 @@ class Observation(NamedTuple):
         return self._replace(noise=noise, accepted=accepted, unweighed=before)
 
     def noted(self, rule: str, **notes: Any) -> Observation:
-        """With notes of a rule, which the update hands on to its `StepInfo` (`with_notes`)."""
+        """A copy with notes of a rule, which the update copies to its `StepInfo` (`with_notes`)."""
         return self._replace(notes=with_notes(self.notes, rule, notes))
 
 

@@ -126,7 +126,7 @@ def _onlooker(
 
 
 class Compared(NamedTuple):
-    """What a part said twice, compared."""
+    """Comparison of what a part sent in the record and in its replay."""
 
     node: str
     frames: int  # that it said the second time
@@ -233,7 +233,7 @@ def bench_replay(
 
 @contextlib.contextmanager
 def _starter(flight: Flight, part: str, other: Path | None) -> Iterator[Start]:
-    """What starts a part of a recorded run on a path, or the program that was in its place."""
+    """Function that starts a part of a recorded run, or the program that stood in for it."""
     with held_folder() as folder:
         path = folder / "kit"
         put(kit_of(flight), path)

@@ -293,7 +293,7 @@ class Session:
         return self._orders.active(self.broker.time_ns)
 
     def state_of(self, part: str) -> str:
-        """What a part is: "up", "board", or "dead"."""
+        """State of a part: "up", "board" or "dead"."""
         if part in self.ports:
             return "board"
         off = self.crew.process(part) is None or part in self.broker.off
@@ -376,12 +376,12 @@ class Session:
 
     @property
     def time_s(self) -> float:
-        """Of the run."""
+        """Time of the run [s]."""
         return 0.0 if self._broker is None else self._broker.time_ns * 1e-9
 
     @property
     def paused(self) -> bool:
-        """Whether it waits for a start."""
+        """True while the run waits for a start."""
         return self._paused
 
     def event(self, kind: str, text: str, shown: bool = True) -> None:
