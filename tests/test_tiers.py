@@ -66,6 +66,29 @@ class Item(NamedTuple):
     nodeid: str
 
 
+class Marked:
+    def __init__(self, nodeid):
+        self.nodeid, self.marks = f"tests/{nodeid}", []
+
+    def add_marker(self, mark):
+        self.marks.append(mark.name)
+
+
+def test_a_fast_test_is_cheap_in_a_cheap_file():
+    large = tiers.heavy()
+    rows = tiers.budget.costs()["files"].items()
+    costly = {f: next(iter(row["tests"])) for f, row in rows if row["tests"] and f not in large}
+    for file, test in list(costly.items())[:3]:
+        dear, cheap = Marked(f"{file}::{test}[x]"), Marked(f"{file}::test_of_nothing")
+        tiers.mark([dear, cheap])
+        assert "fast" not in dear.marks
+        assert cheap.marks == ["fast"]
+    others = [Marked(f"{file}::test_of_nothing") for file in large]
+    tiers.mark(others)
+    assert others
+    assert not any(item.marks for item in others)
+
+
 def by_file(items):
     costs, load = tiers.costs(), {}
     for item in items:

@@ -1,12 +1,14 @@
 """Which tests run when: by what they cost, and by what they prove.
 
-    make check      `fast`: not among the costly of `costs.json`
+    make check      `fast`: neither the test nor its file is among the costly of `costs.json`
     make test       all but `certify`
     make certify    those of `certify.toml`, and every property with a thousand examples
 
 `costs.json` holds, by file, the seconds of processor of each test that takes 0.2 s or more, from an
-empty cache; `make costs` writes it (`budget.py`). `certify.toml` names what is too long to wait for
-at every push, which promise it guards, and which tests of `make test` stand for it meanwhile.
+empty cache; `make costs` writes it (`budget.py`). In a costly file a cheap test is cheap only after
+the others, which made the worlds and the programs that it uses. `certify.toml` names what is too
+long to wait for at every push, which promise it guards, and which tests of `make test` stand for it
+meanwhile.
 
 PART=2/4 runs the second of four parts that cost alike.
 """
@@ -25,6 +27,7 @@ import pytest
 
 HERE = Path(__file__).parent
 CERTIFY = HERE / "certify.toml"
+HEAVY_S = 20.0  # of a file none of whose tests is fast
 
 
 def plain(node: str) -> str:
@@ -41,6 +44,11 @@ def costs() -> dict[str, float]:
     """Seconds of processor of costly tests, without their parameters."""
     files = budget.costs()["files"]
     return {f"{f}::{test}": s for f, row in files.items() for test, s in row["tests"].items()}
+
+
+def heavy() -> set[str]:
+    """Files that take `HEAVY_S` or more."""
+    return {f for f, row in budget.costs()["files"].items() if row["seconds"] >= HEAVY_S}
 
 
 def meant(entry: dict[str, str], node: str) -> bool:
@@ -65,7 +73,7 @@ def meaningless(entries: list[dict[str, str]], nodes: list[str]) -> list[str]:
 
 def mark(items: list[pytest.Item]) -> None:
     """Give each test its tier."""
-    costly, moved = costs(), dict[str, list[dict[str, str]]]()
+    costly, large, moved = costs(), heavy(), dict[str, list[dict[str, str]]]()
     if idle := meaningless(certified(), [item.nodeid.removeprefix("tests/") for item in items]):
         raise pytest.UsageError(f"certify.toml: 'only' fits no parameters of {', '.join(idle)}")
     for entry in certified():
@@ -74,7 +82,7 @@ def mark(items: list[pytest.Item]) -> None:
         node = item.nodeid.removeprefix("tests/")
         if any(meant(entry, node) for entry in moved.get(plain(node), ())):
             item.add_marker(pytest.mark.certify)
-        elif plain(node) not in costly:
+        elif plain(node) not in costly and node.partition("::")[0] not in large:
             item.add_marker(pytest.mark.fast)
 
 
