@@ -8,9 +8,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 from scipy.special import gammaincinv
+
+from robins.errors import require
+
+MOST = 64  # components of a measurement that a table of limits reaches to
 
 
 def chi_square(probability: Any, dof: Any) -> np.ndarray:
@@ -18,10 +23,30 @@ def chi_square(probability: Any, dof: Any) -> np.ndarray:
     return np.asarray(2.0 * gammaincinv(0.5 * np.asarray(dof, float), probability))
 
 
-def quantiles(probability: Any, most: int, each: int = 1) -> np.ndarray:
-    """(most + 1,) of 0, 1, ..., most times ``each`` degrees; without a component infinity."""
-    dof = np.arange(each, each * most + 1, each)
-    return np.concatenate([[np.inf], chi_square(probability, dof)])
+def limits(probability: Any, each: int = 1) -> np.ndarray:
+    """Quantiles by the number of components, for a rule to keep.
+
+    Args:
+        probability: one, or a batch of them.
+        each: degrees of freedom of a component.
+
+    Returns:
+        (..., MOST + 1) of 0, 1, ..., `MOST` times ``each`` degrees; without a component infinity.
+    """
+    dof = np.arange(each, each * MOST + 1, each)
+    p = np.asarray(probability, float)[..., None]
+    return np.concatenate([np.full((*p.shape[:-1], 1), np.inf), chi_square(p, dof)], -1)
+
+
+def within(table: Any, residual: Any) -> Any:
+    """The part of a table of `limits` that a measurement can reach; uncut it costs code in C.
+
+    Raises:
+        ValueError: the measurement has more components than the table.
+    """
+    count = len(residual)
+    require(count < len(table), f"a measurement of more than {MOST} components", count)
+    return jnp.asarray(table)[: count + 1]
 
 
 def chi2_band(dof: ArrayLike, count: int = 1, level: float = 0.95) -> np.ndarray:

@@ -16,13 +16,13 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
 from robins.errors import require
-from robins.filters.audit import audit
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState
 from robins.filters.model import Model, Sensor
 from robins.filters.run import Step, check_names, everything, is_traced, nothing
-from robins.filters.sameness import same, same_model
+from robins.filters.sameness import same_model
 from robins.filters.tally import Tally, warn_not_taken
+from robins.filters.values import as_data
 
 
 class Reading(NamedTuple):
@@ -66,7 +66,7 @@ def _without(filter_: Filter, sensor: Sensor, state: FilterState, y: Any, aux: A
     )
 
 
-@partial(jax.jit, static_argnames=("filter_", "keep"))
+@partial(jax.jit, static_argnames=("keep",))
 def _scan(filter_, model, state, loop: Loop, keep):
     def body(carry, given):
         state, world, tally = carry
@@ -153,22 +153,18 @@ def run_closed(
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
     as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
     state, world, rows, due = (as_arrays(x) for x in (state, loop.world, loop.rows, loop.due))
-    loop = Loop(same(_as_partial(loop.react)), world, rows, due)
-    filter_, model = same(filter_), same_model(model)
+    loop = Loop(as_data(loop.react), world, rows, due)
+    model = same_model(model)
     closed = Closed(*_scan(filter_, model, state, loop, keep))
     if not is_traced(closed.final):
 
-        def again(first: FilterState) -> FilterState:
-            return _scan(filter_, model, first, loop, nothing)[2]
+        def again(other: Filter) -> FilterState:
+            return _scan(other, model, state, loop, nothing)[2]
 
-        audit(state, closed.final, again, time_s)
+        filter_.report(state, closed.final, again, time_s)
     if not is_traced(closed.tally):
         warn_not_taken(closed.tally)
         if keep is everything:
             tally = closed.tally.looking(closed.steps.info, closed.readings.y)
             closed = closed._replace(tally=tally)
     return closed
-
-
-def _as_partial(react: Any) -> jax.tree_util.Partial:
-    return react if isinstance(react, jax.tree_util.Partial) else jax.tree_util.Partial(react)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief
-from robins.filters.linearise import Linearisation, taylor
+from robins.filters.linearise import Linearisation, taylor, ways
 from robins.filters.model import Sensor
 from robins.filters.observation import Observation, left_out, whiten
 
@@ -79,7 +79,7 @@ def iterated(linearise: Linearisation | None = None, iterations: int = 4) -> Lin
         )
         return look(t, M)
 
-    return Linearisation(way.transition, observation)
+    return ways(way.transition, observation)
 
 
 def _carried(prior: Belief, t):

@@ -8,6 +8,7 @@ condition numbers of about 1e12.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
@@ -23,9 +24,12 @@ from robins.filters.checks import one_of
 from robins.filters.linearise import Linearisation, Transition, taylor
 from robins.filters.model import Motion, Sensor
 from robins.filters.observation import Observation, contradicted, left_out, whiten
-from robins.filters.rule import Rule, keep_belief
+from robins.filters.rule import Rule
+from robins.filters.sameness import same
 from robins.filters.trees import finite, select
+from robins.filters.values import kind, value
 
+Again = Callable[[Any], Any]  # a filter -> the final state of the same run with it
 Form = Literal["sqrt", "joseph"]
 # What rules change of an observation; the rest follows from the belief that it is seen from.
 _OF_RULES = ("noise", "unweighed", "accepted", "notes")
@@ -57,7 +61,7 @@ def no_members(state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
     return (), lambda beliefs, belief: state
 
 
-class Filter(NamedTuple):
+class Filter:
     """Pure functions; a run, a campaign, a bench or a loop of yours calls them.
 
     Attributes:
@@ -72,32 +76,79 @@ class Filter(NamedTuple):
             another one; by default there are none.
     """
 
-    init: Callable[[Belief, Mapping[str, int]], FilterState]
-    predict: Callable[[FilterState, Motion, Any], tuple[FilterState, Prediction]]
-    update: Callable[[FilterState, Sensor, Any, Any], tuple[FilterState, StepInfo]]
-    reset: Callable[[FilterState, Belief], FilterState]
-    members: Callable[[FilterState], tuple[tuple[Belief, ...], Follow]] = no_members
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        raise NotImplementedError
+
+    def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        raise NotImplementedError
+
+    def members(self, state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
+        return no_members(state)
+
+    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
+        """Raise what its rules have to report; ``again(filter)`` is the final state of a run anew."""
+
+    def _predict(self, state: FilterState, motion: Motion, u: Any):
+        raise NotImplementedError
+
+    def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
+        raise NotImplementedError
+
+    @jax.jit
+    def predict(self, state: FilterState, motion: Motion, u: Any = None):
+        """`_predict`; the state remembers whether it was taken."""
+        state, prediction = self._predict(state, motion, u)
+        # of a type of its own: with a weak one a stream would compile again after the first step
+        current = (prediction.code == int(Code.DONE)).astype(bool)
+        return state._replace(current=current), prediction
+
+    @jax.jit
+    def update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
+        """`_update`; not after a prediction that was not taken.
+
+        The belief is then of an earlier time than the measurement: to fuse it would be to leave out
+        the motion and its noise. It goes on with the next prediction that is taken, or a `reset`.
+        """
+        new, info = self._update(state, sensor, y, aux)
+        ok = state.current | (info.code == int(Code.MISSING))
+        new = select(state.current, new, state)
+        return new, not_taken(ok, info, jnp.asarray(int(Code.NOT_PREDICTED)))
+
+    def _replace(self, **new: Any) -> Filter:
+        names = ("init", "predict", "update", "reset", "members")
+        return Functions(**{k: same(new.get(k, getattr(self, k))) for k in names})
+
+
+@value
+class Functions(Filter):
+    """A filter of functions; what is not converted yet."""
+
+    init: Any = kind()
+    predict: Any = kind()
+    update: Any = kind()
+    reset: Any = kind()
+    members: Any = kind(default=no_members)
+
+    def report(self, start: Any, final: Any, again: Any, time: Any) -> None:
+        from robins.filters.audit import audit
+
+        if again is None:
+            audit(start, final, None, time)
+
+
+def functions(*args: Any, **kw: Any) -> Filter:
+    return Functions(*map(same, args), **{k: same(v) for k, v in kw.items()})
 
 
 def compiled(filter_: Filter) -> Filter:
-    """The same filter with `predict` and `update` compiled.
-
-    In a run it makes no difference. Called by themselves they are one program each, where every
-    operation, and a branch at every call, would be one of its own.
-    """
     return filter_._replace(predict=jax.jit(filter_.predict), update=jax.jit(filter_.update))
 
 
 def in_step(filter_: Filter) -> Filter:
-    """The same filter, compiled, which uses no measurement after a prediction that was not taken.
-
-    The belief is then of an earlier time than the measurement: to fuse it would be to leave out
-    the motion and its noise. It goes on with the next prediction that is taken, or a `reset`.
-    """
+    """Of a filter of functions what `Filter` does of the others."""
 
     def predict(state: FilterState, motion: Motion, u: Any = None):
         state, prediction = filter_.predict(state, motion, u)
-        # of a type of its own: with a weak one a stream would compile again after the first step
         current = (prediction.code == int(Code.DONE)).astype(bool)
         return state._replace(current=current), prediction
 
@@ -239,6 +290,97 @@ def _as_rules(given: Any) -> tuple[Rule, ...]:
     return tuple(given)
 
 
+@value
+class Kalman(Filter):
+    """The filter of `kalman`."""
+
+    way: Linearisation
+    rules: tuple[Rule, ...]
+    form: Form = kind()
+
+    @property
+    def settling(self) -> bool:
+        return any(rule.settles for rule in self.rules)
+
+    def drawn(self, belief: Belief):
+        return () if self.way.reuse is None else self.way.reuse.draw(belief)
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        memory = tuple(rule.init(belief, dims) for rule in self.rules)
+        return FilterState(belief, memory, self.drawn(belief))
+
+    def settle(self, state: FilterState):
+        """The belief of a step whose measurements are all in, as the rules leave it."""
+        belief, memory, code = state.belief, list(state.memory), jnp.asarray(int(Code.DONE))
+        for i, rule in enumerate(self.rules):
+            memory[i], belief, found = rule.settle(memory[i], belief)
+            code = jnp.where(code == int(Code.DONE), found, code)
+        return belief, tuple(memory), code
+
+    def _predict(self, state: FilterState, motion: Motion, u: Any):
+        origin, held, settled = (
+            self.settle(state) if self.settling else (state.belief, state.memory, None)
+        )
+        transition = self.way.transition(origin, motion, u)
+        memory = []
+        for rule, one in zip(self.rules, held, strict=True):
+            one, transition = rule.process(one, transition)
+            memory.append(one)
+        belief = Belief(transition.mean, predicted_factor(transition, self.form))
+        points = () if transition.points is None else transition.points
+        new = FilterState(belief, tuple(memory), points)
+        ok = finite(new) & finite(belief.factor * belief.factor)
+        why = _failure(transition, belief.factor)
+        if settled is not None:
+            why = jnp.where(settled == int(Code.DONE), why, settled)
+            ok = ok & (settled == int(Code.DONE))
+            kept = select(finite(held), held, state.memory)
+            state = state._replace(memory=kept)
+        code = jnp.where(ok, int(Code.DONE), why)
+        new = select(ok, new, state)
+        transition = transition._replace(points=None)
+        return new, Prediction(transition, new.belief, code, origin if self.settling else None)
+
+    def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
+        prior, memory = state.belief, list(state.memory)
+        if self.way.reuse is None:
+            seen = self.way.observation(prior, sensor, y, aux)
+        else:
+            seen = self.way.reuse.observation(state.points, prior, sensor, y, aux)
+        for i, rule in enumerate(self.rules):
+            memory[i], faded, seen = rule.before(memory[i], prior, seen)
+            if faded is not prior:  # the rule built another prior; seen while tracing
+                prior = faded
+                again = self.way.observation(prior, sensor, y, aux)
+                kept = {name: getattr(seen, name) for name in _OF_RULES}
+                seen = again._replace(**kept)
+        seen = seen._replace(accepted=seen.accepted & seen.present)
+        posterior, info = updated(prior, seen, self.form)
+        # A contradiction alone has an infinite NIS that is no overflow.
+        ok = finite(info.nis) | (info.code == int(Code.CONTRADICTED))
+        for i, rule in enumerate(self.rules):
+            memory[i], posterior, info = rule.after(memory[i], posterior, info, seen)
+        new = FilterState(posterior, tuple(memory), self.drawn(posterior))
+        ok = finite(new) & ok
+        squares = (block * block for block in left_out(seen)[:3])
+        inputs = (prior, jnp.where(info.used, seen.residual, 0.0), *squares)
+        why = _failure(inputs, posterior.factor)
+        return select(ok, new, state), not_taken(ok, info, why)
+
+    def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        return FilterState(belief, state.memory, self.drawn(belief))
+
+    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
+        for i, rule in enumerate(self.rules):
+
+            def anew(rule: Rule, i: int = i) -> Any:
+                assert again is not None
+                rules = (*self.rules[:i], rule, *self.rules[i + 1 :])
+                return again(dataclasses.replace(self, rules=rules)).memory[i]
+
+            rule.report(start.memory[i], final.memory[i], None if again is None else anew, time)
+
+
 def kalman(
     linearise: Linearisation | None = None, rules: Sequence[Rule] = (), form: Form = "sqrt"
 ) -> Filter:
@@ -258,74 +400,4 @@ def kalman(
         ValueError: the form is neither.
     """
     one_of("form", form, Form)
-    way, rules = _as_way(linearise), _as_rules(rules)
-
-    settling = any(rule.settle is not keep_belief for rule in rules)
-
-    def drawn(belief: Belief):
-        return () if way.reuse is None else way.reuse.draw(belief)
-
-    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        memory = tuple(rule.init(belief, dims) for rule in rules)
-        return FilterState(belief, memory, drawn(belief))
-
-    def settle(state: FilterState):
-        """The belief of a step whose measurements are all in, as the rules leave it."""
-        belief, memory, code = state.belief, list(state.memory), jnp.asarray(int(Code.DONE))
-        for i, rule in enumerate(rules):
-            memory[i], belief, found = rule.settle(memory[i], belief)
-            code = jnp.where(code == int(Code.DONE), found, code)
-        return belief, tuple(memory), code
-
-    def predict(state: FilterState, motion: Motion, u: Any = None):
-        origin, held, settled = settle(state) if settling else (state.belief, state.memory, None)
-        transition = way.transition(origin, motion, u)
-        memory = []
-        for rule, one in zip(rules, held, strict=True):
-            one, transition = rule.process(one, transition)
-            memory.append(one)
-        belief = Belief(transition.mean, predicted_factor(transition, form))
-        points = () if transition.points is None else transition.points
-        new = FilterState(belief, tuple(memory), points)
-        ok = finite(new) & finite(belief.factor * belief.factor)
-        why = _failure(transition, belief.factor)
-        if settled is not None:
-            why = jnp.where(settled == int(Code.DONE), why, settled)
-            ok = ok & (settled == int(Code.DONE))
-            kept = select(finite(held), held, state.memory)
-            state = state._replace(memory=kept)
-        code = jnp.where(ok, int(Code.DONE), why)
-        new = select(ok, new, state)
-        transition = transition._replace(points=None)
-        return new, Prediction(transition, new.belief, code, origin if settling else None)
-
-    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
-        prior, memory = state.belief, list(state.memory)
-        if way.reuse is None:
-            seen = way.observation(prior, sensor, y, aux)
-        else:
-            seen = way.reuse.observation(state.points, prior, sensor, y, aux)
-        for i, rule in enumerate(rules):
-            memory[i], faded, seen = rule.before(memory[i], prior, seen)
-            if faded is not prior:  # the rule built another prior; seen while tracing
-                prior = faded
-                again = way.observation(prior, sensor, y, aux)
-                kept = {name: getattr(seen, name) for name in _OF_RULES}
-                seen = again._replace(**kept)
-        seen = seen._replace(accepted=seen.accepted & seen.present)
-        posterior, info = updated(prior, seen, form)
-        # A contradiction alone has an infinite NIS that is no overflow.
-        ok = finite(info.nis) | (info.code == int(Code.CONTRADICTED))
-        for i, rule in enumerate(rules):
-            memory[i], posterior, info = rule.after(memory[i], posterior, info, seen)
-        new = FilterState(posterior, tuple(memory), drawn(posterior))
-        ok = finite(new) & ok
-        squares = (block * block for block in left_out(seen)[:3])
-        inputs = (prior, jnp.where(info.used, seen.residual, 0.0), *squares)
-        why = _failure(inputs, posterior.factor)
-        return select(ok, new, state), not_taken(ok, info, why)
-
-    def reset(state: FilterState, belief: Belief) -> FilterState:
-        return FilterState(belief, state.memory, drawn(belief))
-
-    return in_step(Filter(init, predict, update, reset))
+    return Kalman(_as_way(linearise), _as_rules(rules), form)

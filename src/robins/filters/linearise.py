@@ -33,6 +33,8 @@ from robins import linalg, manifold
 from robins.filters.belief import Belief, Number
 from robins.filters.model import Motion, Sensor, as_noise
 from robins.filters.observation import Observation, innovation
+from robins.filters.sameness import same
+from robins.filters.values import kind, value
 from robins.manifold import State
 
 NARROWEST = 1e3 * float(jnp.finfo(float).eps)  # (n + lambda) / n of sigma points
@@ -63,12 +65,29 @@ class Reuse(NamedTuple):
     observation: Callable[[Points, Belief, Sensor, Any, Any], Observation]
 
 
-class Linearisation(NamedTuple):
-    """A way to linearise, as two functions; and a third where points are not drawn anew."""
+class Linearisation:
+    """A way to linearise."""
 
-    transition: Callable[[Belief, Motion, Any], Transition]
-    observation: Callable[[Belief, Sensor, Any, Any], Observation]
-    reuse: Reuse | None = None
+    reuse: Any = None  # a `Reuse` where points are not drawn anew
+
+    def transition(self, belief: Belief, motion: Motion, u: Any) -> Transition:
+        raise NotImplementedError
+
+    def observation(self, prior: Belief, sensor: Sensor, y: Any, aux: Any) -> Observation:
+        raise NotImplementedError
+
+
+@value
+class Ways(Linearisation):
+    """A way of functions; what is not converted yet."""
+
+    transition: Any = kind()
+    observation: Any = kind()
+    reuse: Any = kind(default=None)
+
+
+def ways(*functions: Any) -> Linearisation:
+    return Ways(*map(same, functions))
 
 
 def _form(x: Any) -> tuple[Any, tuple]:
@@ -127,14 +146,11 @@ def _jacobian(g, x):
     return value, slope
 
 
-def taylor() -> Linearisation:
-    """First-order Taylor expansion at the mean: the extended Kalman filter.
+@value
+class Taylor(Linearisation):
+    """The way of `taylor`."""
 
-    Uses a model's ``linear`` where it has one, else forward-mode automatic differentiation on the
-    manifold.
-    """
-
-    def transition(belief: Belief, motion: Motion, u) -> Transition:
+    def transition(self, belief: Belief, motion: Motion, u) -> Transition:
         if motion.linear is not None:
             mean, F, given = motion.linear(belief.mean, u)
             noise = as_noise(given, F.shape[0], "the motion")
@@ -143,7 +159,7 @@ def taylor() -> Linearisation:
             noise = motion.noise_factor(belief.mean, u)
         return Transition(mean, F @ belief.factor, jnp.zeros((F.shape[0], 0)), noise)
 
-    def observation(prior: Belief, sensor: Sensor, y, aux) -> Observation:
+    def observation(self, prior: Belief, sensor: Sensor, y, aux) -> Observation:
         if sensor.linear is not None:
             z, H = sensor.linear(prior.mean, aux)
         else:
@@ -152,7 +168,14 @@ def taylor() -> Linearisation:
         nothing = jnp.zeros((sensor.dim, 0))
         return _observe(sensor, prior, z, y, aux, H @ prior.factor, nothing, size)
 
-    return Linearisation(transition, observation)
+
+def taylor() -> Linearisation:
+    """First-order Taylor expansion at the mean: the extended Kalman filter.
+
+    Uses a model's ``linear`` where it has one, else forward-mode automatic differentiation on the
+    manifold.
+    """
+    return Taylor()
 
 
 class Weights(NamedTuple):
@@ -234,6 +257,63 @@ def _regress(values: Any, n: int, alpha: Number, beta: Number, kappa: Number):
     return mean, spread.T, root * even.T, math.sqrt(-lack) * b
 
 
+@value
+class Unscented(Linearisation):
+    """The way of `unscented`. Its numbers choose columns and signs, so they are kinds."""
+
+    numbers: tuple[float, float, float] = kind()
+    redraw: bool = kind()
+
+    @property
+    def reuse(self):
+        return None if self.redraw else Reuse(self.draw, self.observe_again)
+
+    def transition(self, belief: Belief, motion: Motion, u) -> Transition:
+        n = belief.factor.shape[0]
+        points = sigma_points(belief, sigma_weights(n, *self.numbers).reach)
+        values = jax.vmap(lambda x: motion.moved(x, u))(points)
+        mean, spread, excess, deficit = _regress(values, n, *self.numbers)
+        noise = motion.noise_factor(belief.mean, u)
+        moved = None if self.redraw else Points(values, _square(noise))
+        return Transition(mean, spread, excess, noise, deficit, moved)
+
+    def observation(self, prior: Belief, sensor: Sensor, y, aux) -> Observation:
+        n = prior.factor.shape[0]
+        weights = sigma_weights(n, *self.numbers)
+        values = jax.vmap(lambda x: sensor.reading(x, aux))(sigma_points(prior, weights.reach))
+        z, spread, excess, deficit = _regress(values, n, *self.numbers)
+        size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / weights.reach
+        return _observe(sensor, prior, z, y, aux, spread, excess, size, deficit)
+
+    def draw(self, belief: Belief) -> Points:
+        n = belief.factor.shape[0]
+        reach = sigma_weights(n, *self.numbers).reach
+        return Points(sigma_points(belief, reach), jnp.zeros((n, n)))
+
+    def observe_again(self, points: Points, prior: Belief, sensor: Sensor, y, aux) -> Observation:
+        n = prior.factor.shape[0]
+        values = jax.vmap(lambda x: sensor.reading(x, aux))(points.states)
+        _, *state, lack = _regress(points.states, n, *self.numbers)
+        z, *reading, deficit = _regress(values, n, *self.numbers)
+        if lack is not None or deficit is not None:
+            raise ValueError(
+                "sigma points can be used again only where kappa alpha^2 + n beta >= 0, got "
+                f"alpha, beta, kappa = {self.numbers}, n = {n}"
+            )
+        # State and reading are the same combinations of the same unit deviations, the noise of the
+        # motion aside: state = S T with T T' = I, so what of the reading lies along T is its
+        # spread and what lies across is left over.
+        wide = jnp.concatenate([*state, points.noise], axis=1)
+        deviation = jnp.concatenate([*reading, jnp.zeros((sensor.dim, n))], axis=1)
+        solid, independent = linalg.guard(prior.factor)
+        T = jnp.where(independent[:, None], linalg.solve_lower(solid, wide), 0.0)
+        spread = deviation @ T.T
+        size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / (
+            sigma_weights(n, *self.numbers).reach
+        )
+        return _observe(sensor, prior, z, y, aux, spread, deviation - spread @ T, size)
+
+
 def unscented(
     alpha: Number = 1.0, beta: Number = 2.0, kappa: Number = 0.0, redraw: bool = True
 ) -> Linearisation:
@@ -252,56 +332,7 @@ def unscented(
             from a measurement than could be, unless the noise is small. Only the first update after
             a prediction that no rule has faded has such points; the others draw.
     """
-
-    def transition(belief: Belief, motion: Motion, u) -> Transition:
-        n = belief.factor.shape[0]
-        points = sigma_points(belief, sigma_weights(n, alpha, beta, kappa).reach)
-        values = jax.vmap(lambda x: motion.moved(x, u))(points)
-        mean, spread, excess, deficit = _regress(values, n, alpha, beta, kappa)
-        noise = motion.noise_factor(belief.mean, u)
-        moved = None if redraw else Points(values, _square(noise))
-        return Transition(mean, spread, excess, noise, deficit, moved)
-
-    def observation(prior: Belief, sensor: Sensor, y, aux) -> Observation:
-        n = prior.factor.shape[0]
-        weights = sigma_weights(n, alpha, beta, kappa)
-        values = jax.vmap(lambda x: sensor.reading(x, aux))(sigma_points(prior, weights.reach))
-        z, spread, excess, deficit = _regress(values, n, alpha, beta, kappa)
-        size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / weights.reach
-        return _observe(sensor, prior, z, y, aux, spread, excess, size, deficit)
-
-    if redraw:
-        return Linearisation(transition, observation)
-
-    def draw(belief: Belief) -> Points:
-        n = belief.factor.shape[0]
-        reach = sigma_weights(n, alpha, beta, kappa).reach
-        return Points(sigma_points(belief, reach), jnp.zeros((n, n)))
-
-    def observe_again(points: Points, prior: Belief, sensor: Sensor, y, aux) -> Observation:
-        n = prior.factor.shape[0]
-        values = jax.vmap(lambda x: sensor.reading(x, aux))(points.states)
-        _, *state, lack = _regress(points.states, n, alpha, beta, kappa)
-        z, *reading, deficit = _regress(values, n, alpha, beta, kappa)
-        if lack is not None or deficit is not None:
-            raise ValueError(
-                "sigma points can be used again only where kappa alpha^2 + n beta >= 0, got "
-                f"alpha = {alpha}, beta = {beta}, kappa = {kappa}, n = {n}"
-            )
-        # State and reading are the same combinations of the same unit deviations, the noise of the
-        # motion aside: state = S T with T T' = I, so what of the reading lies along T is its
-        # spread and what lies across is left over.
-        wide = jnp.concatenate([*state, points.noise], axis=1)
-        deviation = jnp.concatenate([*reading, jnp.zeros((sensor.dim, n))], axis=1)
-        solid, independent = linalg.guard(prior.factor)
-        T = jnp.where(independent[:, None], linalg.solve_lower(solid, wide), 0.0)
-        spread = deviation @ T.T
-        size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / (
-            sigma_weights(n, alpha, beta, kappa).reach
-        )
-        return _observe(sensor, prior, z, y, aux, spread, deviation - spread @ T, size)
-
-    return Linearisation(transition, observation, Reuse(draw, observe_again))
+    return Unscented((alpha, beta, kappa), redraw)
 
 
 def _square(noise: Array) -> Array:

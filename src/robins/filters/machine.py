@@ -19,7 +19,7 @@ from robins.filters.checks import one_of
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Model
 from robins.filters.run import Step, filter_step
-from robins.filters.sameness import content
+from robins.filters.values import content
 
 Name = Literal["jax", "c"]
 Codes = tuple[Any, dict[str, Any]]  # of a step: of its prediction, and by sensor
@@ -42,22 +42,22 @@ class Memory(Protocol):
 Machine = Callable[[Any, Hashable], Memory]  # of a state, and of what the functions hold
 
 
-@partial(jax.jit, static_argnames=("filter_",))
+@jax.jit
 def _predict(filter_, motion, state, u):
     return filter_.predict(state, motion, u)
 
 
-@partial(jax.jit, static_argnames=("filter_",))
+@jax.jit
 def _update(filter_, sensor, state, y, aux):
     return filter_.update(state, sensor, y, aux)
 
 
-@partial(jax.jit, static_argnames=("filter_", "keep"))
+@partial(jax.jit, static_argnames=("keep",))
 def _step(filter_, model, state, u, y, aux, keep):
     return _stepped(filter_, model, state, u, y, aux, keep)
 
 
-@partial(jax.jit, static_argnames=("filter_", "question"))
+@partial(jax.jit, static_argnames=("question",))
 def _look(filter_, model, state, args, question):
     return question(filter_, model, state, *args)
 
@@ -114,7 +114,7 @@ class ByProgram:
     def __init__(self, filter_: Filter, model: Model, state: FilterState, machine: Machine):
         """Of a filter, a model and a state, in the memory that a machine gives."""
         self._filter, self._model = filter_, model
-        self._memory = machine(state, content((filter_, model)))
+        self._memory = machine(state, content(filter_, model))
         self._sensors = {
             s.name: (("update", s.name), partial(_used, filter_, s)) for s in model.sensors
         }

@@ -8,7 +8,7 @@ factors, parameters bound with ``jax.tree_util.Partial``) is data: it may change
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import InitVar, dataclass, fields
+from dataclasses import InitVar
 from typing import Any
 
 import jax
@@ -19,6 +19,7 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.errors import require
+from robins.filters.values import kind, value
 
 _LARGEST = float(np.sqrt(np.finfo(float).max))  # of a standard deviation
 
@@ -72,35 +73,7 @@ def _check_width(whose: str, found: Any) -> None:
             )
 
 
-def _is_static(value: Any) -> bool:
-    # `Partial` is callable but carries arrays; JAX looks inside it.
-    plain = callable(value) and not isinstance(value, jax.tree_util.Partial)
-    return plain or isinstance(value, (str, int, np.integer, type(None)))
-
-
-def _shape_and_data(cls):
-    """Register a dataclass with JAX: callables, names, sizes are static, the rest is data."""
-    names = [f.name for f in fields(cls)]
-
-    def flatten(x):
-        static = tuple((n, getattr(x, n)) for n in names if _is_static(getattr(x, n)))
-        kept = {n for n, _ in static}
-        dynamic = tuple(n for n in names if n not in kept)
-        return tuple(getattr(x, n) for n in dynamic), (static, dynamic)
-
-    def unflatten(aux, children):
-        static, dynamic = aux
-        x = object.__new__(cls)
-        for name, value in (*static, *zip(dynamic, children, strict=True)):
-            object.__setattr__(x, name, value)
-        return x
-
-    jax.tree_util.register_pytree_node(cls, flatten, unflatten)
-    return cls
-
-
-@_shape_and_data
-@dataclass(frozen=True)
+@value
 class Motion:
     """How the state moves from one step to the next.
 
@@ -145,8 +118,7 @@ class Motion:
         return as_noise(value, manifold.dim(x), "the motion")
 
 
-@_shape_and_data
-@dataclass(frozen=True)
+@value
 class Sensor:
     """One measurement: what it would read at a state, and how noisy it is.
 
@@ -167,8 +139,8 @@ class Sensor:
 
     read: Callable[[Any, Any], Any]
     noise: Any = None
-    dim: int = -1
-    name: str = "y"
+    dim: int = kind(default=-1)
+    name: str = kind(default="y")
     linear: Callable[[Any, Any], Any] | None = None
     noise_covariance: InitVar[Any] = None
 
@@ -200,8 +172,7 @@ class Sensor:
         return as_noise(value, self.dim, f"sensor '{self.name}'")
 
 
-@_shape_and_data
-@dataclass(frozen=True)
+@value
 class Model:
     """A motion and its sensors, updated in the order given.
 

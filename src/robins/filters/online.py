@@ -8,16 +8,15 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import tree_leaves, tree_map
+from jax.tree_util import tree_map
 
-from robins.filters.audit import audit, reports
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.machine import Machine, on, settled
 from robins.filters.model import Model
 from robins.filters.observation import as_measurement, as_real
 from robins.filters.run import Step, everything
-from robins.filters.sameness import same, same_model
+from robins.filters.sameness import same_model
 from robins.filters.tally import Tally, doubts
 from robins.manifold import State
 
@@ -63,10 +62,9 @@ class OnlineFilter:
                 function does that has no place there is told by the call that needs it, with the
                 line of the model or the rule.
         """
-        self.filter, self.model = same(filter_), same_model(model)
+        self.filter, self.model = filter_, same_model(model)
         state = settled(filter_.init(start, model.dims) if isinstance(start, Belief) else start)
         self._machine = on(machine, self.filter, self.model, state)
-        self._reports = any(map(reports, tree_leaves(state, is_leaf=reports)))
         self.counts: Counter[str] = Counter()
         self._last: dict[str, deque[tuple[StepInfo, Any]]] = {}
 
@@ -183,7 +181,5 @@ class OnlineFilter:
             self.counts[_NAMES[code]] += 1
         for one in used:
             self.counts[_NAMES[int(one)]] += 1
-        if self._reports:
-            # memories compute by JAX
-            state = tree_map(jnp.asarray, self.state) if self._machine.is_numpy else self.state
-            audit(state, state, None, None)
+        state = tree_map(jnp.asarray, self.state) if self._machine.is_numpy else self.state
+        self.filter.report(state, state, None, None)

@@ -6,14 +6,77 @@ state, so that a run stays one scan, a batch one `vmap`, and streaming use the s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
 
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
+from robins.filters.sameness import same
+from robins.filters.values import kind, value
 
 Memory = Any  # a pytree of arrays; its shapes may not change from step to step
+
+
+class Rule:
+    """One adaptation; every hook in compiled code is pure, and by default the identity.
+
+    Attributes:
+        init: ``(belief, dims) -> memory``; dims maps each sensor's name to its dimension, in the
+            order in which the model updates them.
+        process: ``(memory, transition) -> (memory, transition)``, after the model was linearised
+            and before the covariance is formed: adapt ``noise``, remember ``spread``.
+        before: ``(memory, prior, observation) -> (memory, prior, observation)``: fade the prior,
+            refuse components (``accepted``), scale ``noise``, say so (`Observation.noted`). A rule
+            that hands back *another* prior has the measurement linearised about it again, keeping
+            noise, refusals and notes; one that does not touch the prior must hand back the same
+            object.
+        after: ``(memory, posterior, info, observation) -> (memory, posterior, info)``: inflate,
+            project, learn from the innovation; may add to ``info.notes``. The observation is the
+            one the update used.
+        name: prefix of its notes.
+        settle: ``(memory, belief) -> (memory, belief, code)``, once a step, when all its
+            measurements are in and the state is about to be predicted: inflate what the whole step
+            left. A code other than ``DONE`` says that the step cannot be taken: the belief then
+            stays, the memory of this hook is kept.
+
+    Rules are values (`robins.filters.values`): a class with `value` before it, whose numbers are
+    fields and whose hooks are methods.
+    """
+
+    name = "rule"
+
+    def __new__(cls, *args: Any, **kw: Any) -> Any:
+        """``Rule(before=f)`` is a rule of functions."""
+        return object.__new__(Hooks if cls is Rule else cls)
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
+        return ()
+
+    def process(self, memory: Memory, transition: Transition) -> tuple[Memory, Transition]:
+        return memory, transition
+
+    def before(
+        self, memory: Memory, prior: Belief, observation: Observation
+    ) -> tuple[Memory, Belief, Observation]:
+        return memory, prior, observation
+
+    def after(
+        self, memory: Memory, posterior: Belief, info: StepInfo, observation: Observation
+    ) -> tuple[Memory, Belief, StepInfo]:
+        return memory, posterior, info
+
+    def settle(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief, Any]:
+        return memory, belief, int(Code.DONE)
+
+    @property
+    def settles(self) -> bool:
+        """Whether it does anything once a step."""
+        return type(self).settle is not Rule.settle
+
+    def report(self, start: Memory, final: Memory, again: Any, time: Any) -> None:
+        """Raise what it has to report of a run; `again` runs with this rule exchanged."""
 
 
 def _no_memory(belief: Belief, dims: Mapping[str, int]) -> Memory:
@@ -41,38 +104,26 @@ def keep_belief(memory: Memory, belief: Belief) -> tuple[Memory, Belief, int]:
     return memory, belief, int(Code.DONE)
 
 
-class Rule(NamedTuple):
-    """One adaptation; every hook in compiled code is pure, and by default the identity.
+@value
+class Hooks(Rule):
+    """A rule of functions; what is not converted yet."""
 
-    Attributes:
-        init: ``(belief, dims) -> memory``; dims maps each sensor's name to its dimension, in the
-            order in which the model updates them.
-        process: ``(memory, transition) -> (memory, transition)``, after the model was linearised
-            and before the covariance is formed: adapt ``noise``, remember ``spread``.
-        before: ``(memory, prior, observation) -> (memory, prior, observation)``: fade the prior,
-            refuse components (``accepted``), scale ``noise``, say so (`Observation.noted`). A rule
-            that hands back *another* prior has the measurement linearised about it again, keeping
-            noise, refusals and notes; one that does not touch the prior must hand back the same
-            object.
-        after: ``(memory, posterior, info, observation) -> (memory, posterior, info)``: inflate,
-            project, learn from the innovation; may add to ``info.notes``. The observation is the
-            one the update used.
-        name: prefix of its notes.
-        settle: ``(memory, belief) -> (memory, belief, code)``, once a step, when all its
-            measurements are in and the state is about to be predicted: inflate what the whole step
-            left. A code other than ``DONE`` says that the step cannot be taken: the belief then
-            stays, the memory of this hook is kept.
+    init: Any = kind(default=_no_memory)
+    process: Any = kind(default=_keep_transition)
+    before: Any = kind(default=_keep_prior)
+    after: Any = kind(default=_keep_posterior)
+    name: str = kind(default="rule")
+    settle: Any = kind(default=keep_belief)
 
-    A memory that has something to report of a run has a method `audit`: see `robins.filters.audit`.
-    """
+    @property
+    def settles(self) -> bool:
+        return self.settle is not keep_belief
 
-    init: Callable[[Belief, Mapping[str, int]], Memory] = _no_memory
-    process: Callable[[Memory, Transition], tuple[Memory, Transition]] = _keep_transition
-    before: Callable[[Memory, Belief, Observation], tuple[Memory, Belief, Observation]] = (
-        _keep_prior
-    )
-    after: Callable[[Memory, Belief, StepInfo, Observation], tuple[Memory, Belief, StepInfo]] = (
-        _keep_posterior
-    )
-    name: str = "rule"
-    settle: Callable[[Memory, Belief], tuple[Memory, Belief, Any]] = keep_belief
+    def _replace(self, **new: Any) -> Rule:
+        return dataclasses.replace(
+            self, **{k: same(v) if callable(v) else v for k, v in new.items()}
+        )
+
+
+def hooks(*args: Any, **kw: Any) -> Rule:
+    return Hooks(*map(same, args), **{k: same(v) if callable(v) else v for k, v in kw.items()})

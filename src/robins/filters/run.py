@@ -12,12 +12,11 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from robins.errors import require
-from robins.filters.audit import audit
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Model
 from robins.filters.observation import as_measurement
-from robins.filters.sameness import same, same_model
+from robins.filters.sameness import same_model
 from robins.filters.tally import Tally, warn_not_taken
 
 
@@ -116,7 +115,7 @@ def filter_step(
     return state, Step(prediction, state.belief, info)
 
 
-@partial(jax.jit, static_argnames=("filter_", "keep"))
+@partial(jax.jit, static_argnames=("keep",))
 def _scan(filter_, model, state, u, y, aux, keep):
     def body(carry, row):
         state, total, tally = carry
@@ -176,14 +175,14 @@ def run(
     as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
     state, u, extra = as_arrays(state), as_arrays(u), as_arrays(extra)
-    filter_, model = same(filter_), same_model(model)
+    model = same_model(model)
     solution = _scan(filter_, model, state, u, measurements, extra, keep)
     if not is_traced(solution.final):
 
-        def again(first: FilterState) -> FilterState:
-            return _scan(filter_, model, first, u, measurements, extra, nothing).final
+        def again(other: Filter) -> FilterState:
+            return _scan(other, model, state, u, measurements, extra, nothing).final
 
-        audit(state, solution.final, again, time_s)
+        filter_.report(state, solution.final, again, time_s)
     if not is_traced(solution.tally):
         warn_not_taken(solution.tally)
         if keep is everything:

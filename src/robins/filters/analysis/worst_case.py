@@ -31,7 +31,6 @@ from robins.filters.model import Model
 from robins.filters.rules._inflation import as_weight
 from robins.filters.rules.h_infinity import (
     Estimate,
-    first_infeasible,
     h_infinity,
     least_gamma,
     with_gamma,
@@ -110,15 +109,15 @@ def gamma_min(
         return jnp.where(counts, jnp.max(jnp.array(last), initial=0.0), 0.0)
 
     @jax.jit  # so that nothing is raised where the filter does not exist
-    def attempt(gamma):
-        state = with_gamma(filter_.init(start, model.dims), gamma)
-        done = run(filter_, model, state, y, u, aux, bounds)
+    def attempt(filter_):
+        done = run(filter_, model, start, y, u, aux, bounds)
         return done.final.memory[0], done.log_likelihood, done.steps
 
     def exists(gamma: float) -> bool:
-        return first_infeasible(attempt(gamma)[0]) is None
+        one = with_gamma(filter_, gamma)
+        return one.rules[0].first_infeasible(attempt(one)[0]) is None
 
-    _, log_likelihood, noted = attempt(np.inf)
+    _, log_likelihood, noted = attempt(filter_)
     if not np.isfinite(log_likelihood):
         raise ValueError("gamma_min: a step of the Kalman filter cannot be taken: see its codes")
     lower = float(np.max(noted, initial=0.0))

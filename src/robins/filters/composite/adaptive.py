@@ -46,7 +46,7 @@ from robins.filters.composite.offsets import (
 )
 from robins.filters.kalman import Filter, Form, kalman
 from robins.filters.linearise import Linearisation, Transition, taylor
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 from robins.filters.rules import huber
 from robins.filters.rules._robust import PATIENCE
 
@@ -71,7 +71,7 @@ def excited(parts: Sequence[Part], scales: ArrayLike) -> Rule:
     def process(memory: Any, t: Transition):
         return memory, t._replace(noise=louder(t.noise, parts, scales))
 
-    return Rule(process=process, name="excited")
+    return hooks(process=process, name="excited")
 
 
 def louder(noise: Array, parts: Sequence[Part], scales: ArrayLike) -> Array:

@@ -20,17 +20,27 @@ from robins.filters.audit import Again, audit
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.checks import sensor_names
 from robins.filters.composite.fusion import is_singular
-from robins.filters.kalman import Filter, FilterState, Prediction, in_step, kalman, not_taken
+from robins.filters.kalman import (
+    Filter,
+    FilterState,
+    Prediction,
+    functions,
+    in_step,
+    kalman,
+    not_taken,
+)
 from robins.filters.linearise import Transition
 from robins.filters.model import Motion, Sensor, as_noise
 from robins.filters.trees import equal, finite, select
+from robins.filters.values import kind, value
 from robins.manifold import State
 
 
-class Channel(NamedTuple):
+@value
+class Channel:
     """A local filter and the sensors it uses; made by `channel`."""
 
-    sensors: tuple[str, ...]
+    sensors: tuple[str, ...] = kind()
     filter: Filter
 
     @property
@@ -57,6 +67,10 @@ class Joined(NamedTuple):
         """Ask the members, then raise for steps not taken (`robins.filters.audit`)."""
         rerun = None if again is None else lambda m: again(start._replace(members=m)).members
         audit(start.members, self.members, rerun, time)
+        self.refuse_singular()
+
+    def refuse_singular(self) -> None:
+        """Raise for steps not taken because information was infinite."""
         for i, count in enumerate(np.asarray(self.singular).tolist()):
             name = f"channel '{self.names[i]}'" if i < len(self.names) else "the master"
             require(
@@ -342,4 +356,4 @@ def at_master(filter: Filter, sensors: str | Sequence[str], master: Filter | Non
 
         return beliefs, followed
 
-    return in_step(Filter(init, predict, update, reset, members))
+    return in_step(functions(init, predict, update, reset, members))

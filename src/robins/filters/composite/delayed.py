@@ -21,7 +21,7 @@ from jaxtyping import Array
 from robins.errors import require
 from robins.filters.audit import Again, audit
 from robins.filters.belief import Belief, Code, StepInfo, is_failure
-from robins.filters.kalman import Filter, FilterState, compiled
+from robins.filters.kalman import Filter, FilterState, compiled, functions
 from robins.filters.model import Model, Motion, Sensor
 from robins.filters.trees import select
 
@@ -241,7 +241,7 @@ def delayed(
         # What was measured before the new belief is part of it, or meant to be forgotten.
         return begin(filter_.reset(_inner(state), belief), state.memory.model)
 
-    return compiled(Filter(init, predict, update, reset))
+    return compiled(functions(init, predict, update, reset))
 
 
 def _inner(state: FilterState) -> FilterState:

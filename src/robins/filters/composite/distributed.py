@@ -51,7 +51,7 @@ from robins.filters.composite.fusion import (
     information_sum,
     intersection_weights,
 )
-from robins.filters.kalman import Filter, FilterState, in_step
+from robins.filters.kalman import Filter, FilterState, functions, in_step
 from robins.filters.model import Motion
 
 Feedback = Literal["own", "mean", "full"]
@@ -170,4 +170,4 @@ def _side_by_side(
         return members(state)[1]([belief] * count, belief)
 
     members = members_of([c.filter for c in channels])
-    return in_step(Filter(init, predict, updating(channels, fuse, name, common), reset, members))
+    return in_step(functions(init, predict, updating(channels, fuse, name, common), reset, members))

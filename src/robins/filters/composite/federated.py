@@ -37,6 +37,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import jax
@@ -51,9 +52,11 @@ from robins.filters.checks import one_of
 from robins.filters.composite import channels as _channels
 from robins.filters.composite.channels import Channel, Moved, followed_by
 from robins.filters.composite.fusion import Sharing, check_sharing, information_sum, part
-from robins.filters.kalman import Filter, FilterState, in_step, kalman
+from robins.filters.kalman import Filter, FilterState, kalman
 from robins.filters.linearise import Linearisation, taylor
-from robins.filters.model import Model, Motion
+from robins.filters.model import Model, Motion, Sensor
+from robins.filters.values import Numbers, number, value
+from robins.filters.values import kind as kind_of
 
 # Without a floor a share of zero is an infinite covariance.
 FLOOR = 0.05
@@ -150,6 +153,148 @@ HALF = (
 _TRACE = 1e-8
 
 
+@value
+class Federated(Filter):
+    """The filter of `federated`."""
+
+    channels: tuple[Channel, ...]
+    centre: Filter  # how the fused belief and the master's are predicted
+    fixed: Numbers | None  # shares of the channels, where they are given
+    master: Numbers  # () its share
+    keep: Numbers  # () c of mode "rescale"
+    timeout: Numbers | None
+    mode: Mode = kind_of()
+    sharing: Sharing = kind_of()
+    kind: str = kind_of()
+    has_master: bool = kind_of()
+    late: bool = kind_of()
+
+    @property
+    def count(self) -> int:
+        return len(self.channels)
+
+    @property
+    def filters(self) -> list[Filter]:
+        """By member."""
+        return [*(c.filter for c in self.channels), *([self.centre] if self.has_master else [])]
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        given = [*_channels.local_dims(self.channels, dims), *([{}] if self.has_master else [])]
+        a = self.initial_shares(belief)
+        parts = self.parted(belief, a)
+        states = [f.init(p, d) for f, p, d in zip(self.filters, parts, given, strict=True)]
+        return _channels.starting(states, belief, a, self.channels)
+
+    def initial_shares(self, belief: Belief) -> Array:
+        n = belief.factor.shape[0]
+        if self.mode == "zero-reset":
+            return jnp.array([[_TRACE]] * self.count + [[1.0 - self.count * _TRACE]])
+        if self.fixed is None:
+            a = equal_shares(self.count)
+            return self.with_master(a if self.kind != "diagonal" else jnp.tile(a, (1, n)))
+        if self.fixed.ndim == 2 and self.fixed.shape[1] != n:
+            raise ValueError(f"shares are for {self.fixed.shape[1]} states, the belief has {n}")
+        return self.with_master(floored(jnp.asarray(self.fixed.reshape(self.count, -1))))
+
+    def with_master(self, a: Array) -> Array:
+        if not self.has_master:
+            return a
+        own = jnp.full((1, a.shape[1]), self.master)
+        return jnp.concatenate([(1.0 - self.master) * a, own])
+
+    def next_shares(self, state: FilterState) -> Array:
+        a = self.chosen_shares(state)
+        if self.timeout is None:
+            return a
+        # The self.master's share is its own; where all are silent there is nobody to hand over to.
+        heard = (state.memory.silent < self.timeout)[:, None]
+        left = floored(jnp.where(heard, a[: self.count], 0.0)) * jnp.sum(
+            a[: self.count], axis=0, keepdims=True
+        )
+        return jnp.where(jnp.any(heard), a.at[: self.count].set(left), a)
+
+    def chosen_shares(self, state: FilterState) -> Array:
+        locals_ = [m.belief for m in state.memory.members[: self.count]]
+        if self.kind == "trace":
+            return self.with_master(trace_shares(locals_, state.belief.sigma))
+        if self.kind == "diagonal":
+            return self.with_master(diagonal_shares(locals_))
+        return self.initial_shares(state.belief)
+
+    def parted(self, belief: Belief, a: Array) -> list[Belief]:
+        return [Belief(belief.mean, factor) for factor in part(belief.factor, a, self.sharing)]
+
+    def begun(self, state: FilterState, a: Array) -> list[FilterState]:
+        """Members as the self.mode leaves them at the start of a step."""
+        members = state.memory.members
+        if self.mode == "no-reset":
+            return list(members)
+        beliefs = (
+            self.parted(state.belief, a)
+            if self.mode == "fusion-reset"
+            else _rescaled(members, self.keep)
+        )
+        return [f.reset(m, b) for f, m, b in zip(self.filters, members, beliefs, strict=True)]
+
+    def predict_apart(self, state: FilterState, motion: Motion, u: Any) -> Moved:
+        a = self.next_shares(state)
+        members, codes = [], []
+        for i, (f, member) in enumerate(zip(self.filters, self.begun(state, a), strict=True)):
+            own = followed_by(motion, lambda noise, i=i: part(noise, a, self.sharing)[i])
+            member, prediction = f.predict(member, own, u)
+            members.append(member)
+            codes.append(prediction.code)
+        return Moved(tuple(members), tuple(codes), information_sum([m.belief for m in members]), a)
+
+    def predict_together(self, state: FilterState, motion: Motion, u: Any) -> Moved:
+        a = self.next_shares(state)
+        _, common = self.centre.predict(self.centre.init(state.belief, {}), motion, u)
+        members, codes, own = [], [], False
+        beliefs = self.parted(common.belief, a)
+        for f, member, belief in zip(self.filters, state.memory.members, beliefs, strict=True):
+            code = int(Code.DONE)
+            if member.memory == ():  # a Kalman filter without rules
+                member = f.reset(member, belief)
+            else:
+                own = True
+                seen = _through(motion, common.belief, belief)
+                member, prediction = f.predict(f.reset(member, state.belief), seen, u)
+                code = prediction.code
+            members.append(member)
+            codes.append(code)
+        # Half self.sharing does not add up to what was shared, and rules may have changed a share.
+        lossless = not own and (self.sharing != "half" or a.shape[1] == 1)
+        fused = common.belief if lossless else information_sum([m.belief for m in members])
+        return Moved(tuple(members), tuple(codes), fused, a, common.transition, common.code)
+
+    def _predict(self, state: FilterState, motion: Motion, u: Any):
+        moved = (self.predict_together if self.late else self.predict_apart)(state, motion, u)
+        return _channels.concluded(state, moved)
+
+    def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        return self.members(state)[1](self.parted(belief, state.memory.shares), belief)
+
+    def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
+        return _channels.updating(self.channels, information_sum, "federated")(
+            state, sensor, y, aux
+        )
+
+    def members(self, state: FilterState):
+        return _channels.members_of(self.filters)(state)
+
+    def report(self, start: FilterState, final: FilterState, again: Any, time: Any) -> None:
+        for i, one in enumerate(self.channels):
+
+            def other(filter_: Filter, i: int = i) -> FilterState:
+                own = replace(self.channels[i], filter=filter_)
+                channels = (*self.channels[:i], own, *self.channels[i + 1 :])
+                return again(replace(self, channels=channels)).memory.members[i]
+
+            first, last = start.memory.members[i], final.memory.members[i]
+            one.filter.report(first, last, None if again is None else other, time)
+        final.memory.refuse_singular()
+
+
 def federated(
     channels: Sequence[Channel],
     mode: Mode = "fusion-reset",
@@ -215,109 +360,23 @@ def federated(
         require(timeout >= 1, "federated timeout must be at least one step", timeout)
     if sharing == "half":
         warnings.warn(HALF, UserWarning, stacklevel=2)
-
-    count = len(channels)
-    has_master = master > 0.0 or mode == "zero-reset"
-    late = mode == "zero-reset" or (
-        mode == "fusion-reset"
-        and (sharing == "root" if after_prediction is None else after_prediction)
+    return Federated(
+        channels=channels,
+        centre=kalman(linearise),
+        fixed=fixed,
+        master=number("master", master),
+        keep=number("keep", keep),
+        timeout=None if timeout is None else np.asarray(timeout),
+        mode=mode,
+        sharing=sharing,
+        kind=kind,
+        has_master=master > 0.0 or mode == "zero-reset",
+        late=mode == "zero-reset"
+        or (
+            mode == "fusion-reset"
+            and (sharing == "root" if after_prediction is None else after_prediction)
+        ),
     )
-    centre = kalman(linearise)
-    filters = [*(c.filter for c in channels), *([centre] if has_master else [])]
-
-    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        given = [*_channels.local_dims(channels, dims), *([{}] if has_master else [])]
-        a = initial_shares(belief)
-        parts = parted(belief, a)
-        states = [f.init(p, d) for f, p, d in zip(filters, parts, given, strict=True)]
-        return _channels.starting(states, belief, a, channels)
-
-    def initial_shares(belief: Belief) -> Array:
-        n = belief.factor.shape[0]
-        if mode == "zero-reset":
-            return jnp.array([[_TRACE]] * count + [[1.0 - count * _TRACE]])
-        if fixed is None:
-            a = equal_shares(count)
-            return with_master(a if kind != "diagonal" else jnp.tile(a, (1, n)))
-        if fixed.ndim == 2 and fixed.shape[1] != n:
-            raise ValueError(f"shares are for {fixed.shape[1]} states, the belief has {n}")
-        return with_master(floored(jnp.asarray(fixed.reshape(count, -1))))
-
-    def with_master(a: Array) -> Array:
-        if not has_master:
-            return a
-        own = jnp.full((1, a.shape[1]), master)
-        return jnp.concatenate([(1.0 - master) * a, own])
-
-    def next_shares(state: FilterState) -> Array:
-        a = chosen_shares(state)
-        if timeout is None:
-            return a
-        # The master's share is its own; where all are silent there is nobody to hand over to.
-        heard = (state.memory.silent < timeout)[:, None]
-        left = floored(jnp.where(heard, a[:count], 0.0)) * jnp.sum(a[:count], axis=0, keepdims=True)
-        return jnp.where(jnp.any(heard), a.at[:count].set(left), a)
-
-    def chosen_shares(state: FilterState) -> Array:
-        locals_ = [m.belief for m in state.memory.members[:count]]
-        if kind == "trace":
-            return with_master(trace_shares(locals_, state.belief.sigma))
-        if kind == "diagonal":
-            return with_master(diagonal_shares(locals_))
-        return initial_shares(state.belief)
-
-    def parted(belief: Belief, a: Array) -> list[Belief]:
-        return [Belief(belief.mean, factor) for factor in part(belief.factor, a, sharing)]
-
-    def begun(state: FilterState, a: Array) -> list[FilterState]:
-        """Members as the mode leaves them at the start of a step."""
-        members = state.memory.members
-        if mode == "no-reset":
-            return list(members)
-        beliefs = parted(state.belief, a) if mode == "fusion-reset" else _rescaled(members, keep)
-        return [f.reset(m, b) for f, m, b in zip(filters, members, beliefs, strict=True)]
-
-    def predict_apart(state: FilterState, motion: Motion, u: Any) -> Moved:
-        a = next_shares(state)
-        members, codes = [], []
-        for i, (f, member) in enumerate(zip(filters, begun(state, a), strict=True)):
-            own = followed_by(motion, lambda noise, i=i: part(noise, a, sharing)[i])
-            member, prediction = f.predict(member, own, u)
-            members.append(member)
-            codes.append(prediction.code)
-        return Moved(tuple(members), tuple(codes), information_sum([m.belief for m in members]), a)
-
-    def predict_together(state: FilterState, motion: Motion, u: Any) -> Moved:
-        a = next_shares(state)
-        _, common = centre.predict(centre.init(state.belief, {}), motion, u)
-        members, codes, own = [], [], False
-        beliefs = parted(common.belief, a)
-        for f, member, belief in zip(filters, state.memory.members, beliefs, strict=True):
-            code = int(Code.DONE)
-            if member.memory == ():  # a Kalman filter without rules
-                member = f.reset(member, belief)
-            else:
-                own = True
-                seen = _through(motion, common.belief, belief)
-                member, prediction = f.predict(f.reset(member, state.belief), seen, u)
-                code = prediction.code
-            members.append(member)
-            codes.append(code)
-        # Half sharing does not add up to what was shared, and rules may have changed a share.
-        lossless = not own and (sharing != "half" or a.shape[1] == 1)
-        fused = common.belief if lossless else information_sum([m.belief for m in members])
-        return Moved(tuple(members), tuple(codes), fused, a, common.transition, common.code)
-
-    def predict(state: FilterState, motion: Motion, u: Any = None):
-        moved = (predict_together if late else predict_apart)(state, motion, u)
-        return _channels.concluded(state, moved)
-
-    def reset(state: FilterState, belief: Belief) -> FilterState:
-        return members(state)[1](parted(belief, state.memory.shares), belief)
-
-    update = _channels.updating(channels, information_sum, "federated")
-    members = _channels.members_of(filters)
-    return in_step(Filter(init, predict, update, reset, members))
 
 
 def _rescaled(members: Sequence[FilterState], keep: Number) -> list[Belief]:

@@ -44,7 +44,7 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo, is_failure
 from robins.filters.checks import sensor_names
-from robins.filters.kalman import Filter, FilterState, Prediction, in_step
+from robins.filters.kalman import Filter, FilterState, Prediction, functions, in_step
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import select
 
@@ -246,7 +246,7 @@ def guarded(
             )
         )
 
-    return in_step(Filter(init, predict, update, reset))
+    return in_step(functions(init, predict, update, reset))
 
 
 def _given_out(watch: Watch) -> FilterState:

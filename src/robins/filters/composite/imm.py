@@ -15,6 +15,7 @@ moments are taken on the state's manifold and on factors, so that nothing is sub
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -23,15 +24,16 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
-from robins.filters.audit import Again, audit
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.composite.mixture import innovation, log_normalised, matched
-from robins.filters.kalman import Filter, FilterState, Prediction, in_step
+from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import equal, select
+from robins.filters.values import Numbers, kind, value
 
 
-class Mode(NamedTuple):
+@value
+class Mode:
     """A filter and what of the model is its own."""
 
     filter_: Filter
@@ -51,7 +53,8 @@ class Mode(NamedTuple):
         return state, info._replace(notes={}), info.notes
 
 
-class Family(NamedTuple):
+@value
+class Family:
     """Modes that differ in numbers only.
 
     Filters of different kinds are each a part of the program. Those of a family are one part,
@@ -63,7 +66,7 @@ class Family(NamedTuple):
         numbers: pytree of arrays, one row a mode.
     """
 
-    make: Callable[[Any], Filter | Mode]
+    make: Callable[[Any], Filter | Mode] = kind()
     numbers: Any
 
     def of(self, row: Any) -> Mode:
@@ -115,7 +118,7 @@ def _each(modes: tuple[Mode, ...]) -> Bank:
 def _batched(family: Family) -> Bank:
     """States with a leading axis of modes; one mode is traced, for all."""
     numbers = jax.tree_util.tree_map(jnp.asarray, family.numbers)
-    lengths = {np.shape(x)[:1] for x in jax.tree_util.tree_leaves(numbers)}
+    lengths = {jnp.shape(x)[:1] for x in jax.tree_util.tree_leaves(numbers)}
     if len(lengths) != 1 or lengths == {()}:
         raise ValueError(
             "the numbers of a family must be arrays with one row a mode; "
@@ -146,26 +149,6 @@ class Interaction(NamedTuple):
     states: Any  # of the modes: a tuple, or those of a family with a leading axis
     log_probability: Array  # (modes,)
 
-    def audit(self, start: Interaction, again: Again | None, time: Any) -> None:
-        """Ask the memories of each mode; of a family each has a row (`robins.filters.audit`)."""
-        if not isinstance(self.states, FilterState):
-            every = None if again is None else lambda s: again(start._replace(states=s)).states
-            audit(start.states, self.states, every, time)
-            return
-        for i in range(len(self.log_probability)):
-
-            def row(states: Any, i: int = i) -> Any:
-                return jax.tree_util.tree_map(lambda x: x[i], states)
-
-            def one(first: Any, i: int = i, row: Any = row) -> Any:
-                put = jax.tree_util.tree_map(
-                    lambda x, new: jnp.asarray(x).at[i].set(new), start.states, first
-                )
-                assert again is not None
-                return row(again(start._replace(states=put)).states)
-
-            audit(row(start.states), row(self.states), None if again is None else one, time)
-
 
 def mode(filter_: Filter, motion: Motion | None = None, sensors: Sequence[Sensor] = ()) -> Mode:
     """One mode of `imm`.
@@ -176,6 +159,109 @@ def mode(filter_: Filter, motion: Motion | None = None, sensors: Sequence[Sensor
         sensors: of this mode, each in the place of the run's sensor of its name.
     """
     return Mode(filter_, motion, tuple(sensors))
+
+
+@value
+class Imm(Filter):
+    """The filter of `imm`."""
+
+    modes: tuple[Mode, ...] | Family
+    log_change: Numbers  # (modes, modes)
+    log_first: Numbers  # (modes,)
+    likeliest: bool = kind()
+
+    @property
+    def bank(self) -> Bank:
+        return bank(self.modes)
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        own = set()
+
+        def begin(mode: Mode, _):
+            own.update(s.name for s in mode.sensors)
+            return mode.filter_.init(belief, dims), None, {}
+
+        states, *_ = self.bank.every(begin, (None,) * self.bank.size)
+        if unknown := own - set(dims):
+            raise ValueError(f"modes of imm bring {sorted(unknown)}; the model has {list(dims)}")
+        return FilterState(belief, Interaction(states, jnp.asarray(self.log_first)))
+
+    def mixed(self, states: Any, log_now: Array) -> tuple[Any, Array]:
+        """Where each filter begins, and the predicted log-probabilities."""
+        joint = log_now[:, None] + jnp.asarray(self.log_change)
+        log_weight, log_next = jax.vmap(log_normalised, in_axes=1)(joint)
+        weight = jnp.exp(log_weight)  # (to, from)
+        beliefs = self.bank.beliefs(states)
+        begun = jax.vmap(matched, in_axes=(None, 0, 0))(beliefs, weight, beliefs.mean)
+        # A mode that receives nothing goes on alone, as does one that mixes with none, bit for bit.
+        alone = ~jnp.isfinite(log_next) | (jnp.diagonal(weight) == 1.0)
+
+        def restart(mode: Mode, state: FilterState, belief: Belief, alone: Array):
+            return select(alone, state, mode.filter_.reset(state, belief)), None, {}
+
+        return self.bank.every(restart, states, begun, alone)[0], log_next
+
+    def _predict(self, state: FilterState, motion: Motion, u: Any):
+        states, log_now = state.memory
+        begun, log_next = (states, log_now) if self.bank.size == 1 else self.mixed(states, log_now)
+        after, code, _ = self.bank.every(lambda m, s: m.predict(s, motion, u), begun)
+        taken = code == int(Code.DONE)
+        log_next = _among(taken, log_next)
+        failed = code[jnp.argmax(log_now)]
+        belief = _mixture(self.bank.beliefs(after), log_next)
+        outcome = jnp.where(jnp.any(taken), int(Code.DONE), failed)
+        return FilterState(belief, Interaction(after, log_next)), Prediction(None, belief, outcome)
+
+    def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
+        states, log_prior = state.memory
+        after, seen, each = self.bank.every(lambda m, s: m.update(s, sensor, y, aux), states)
+        sound = ~jnp.isneginf(seen.log_likelihood)
+        of_all = jnp.any(seen.used & sound[:, None], axis=0)
+        alike = jnp.all((seen.used == of_all[None]) | ~sound[:, None])
+        gained = jnp.where(sound & ~alike, 0.0, seen.log_likelihood)
+        log_post, _ = log_normalised(log_prior + gained)
+        log_post = jnp.where(jnp.any(sound), log_post, log_prior)
+        if self.bank.size == 1:
+            info = jax.tree_util.tree_map(lambda a: a[0], seen)
+        else:
+            info = _seen(seen, jnp.where(sound, log_prior, -jnp.inf), log_post, of_all)
+        if self.likeliest:
+            one = jax.tree_util.tree_map(lambda a: a[jnp.argmax(log_post)], seen)
+            info = one._replace(gain=info.gain, log_likelihood=info.log_likelihood)
+        notes = {f"imm.{i}.{k}": v for i, own in enumerate(each) for k, v in own.items()}
+        notes["imm.probability"] = jnp.exp(log_post)
+        # Where no mode has moved the mixture stands bit for bit.
+        was, now = self.bank.beliefs(states), self.bank.beliefs(after)
+        belief = select(equal(now, was), state.belief, _mixture(now, log_post))
+        return FilterState(belief, Interaction(after, log_post)), info._replace(notes=notes)
+
+    def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        inner = state.memory
+        states, *_ = self.bank.every(
+            lambda m, s: (m.filter_.reset(s, belief), None, {}), inner.states
+        )
+        return FilterState(belief, inner._replace(states=states))
+
+    def report(self, start: FilterState, final: FilterState, again: Any, time: Any) -> None:
+        for i in range(self.bank.size):
+            if isinstance(self.modes, Family):
+                mode = self.modes.of(
+                    jax.tree_util.tree_map(lambda x: np.asarray(x)[i], self.modes.numbers)
+                )
+                first, last = (
+                    jax.tree_util.tree_map(lambda x: x[i], s.memory.states) for s in (start, final)
+                )
+                mode.filter_.report(first, last, None, time)
+                continue
+
+            def other(filter_: Filter, i: int = i) -> FilterState:
+                own = replace(self.modes[i], filter_=filter_)
+                return again(
+                    replace(self, modes=(*self.modes[:i], own, *self.modes[i + 1 :]))
+                ).memory.states[i]
+
+            first, last = start.memory.states[i], final.memory.states[i]
+            self.modes[i].filter_.report(first, last, None if again is None else other, time)
 
 
 def imm(
@@ -209,82 +295,14 @@ def imm(
         ValueError: no modes, or probabilities that are negative, of a wrong shape or do not sum to
             one. When a run begins: a mode brings a sensor that the model does not have.
     """
-    all_ = bank(modes)
-    require(all_.size, "imm needs at least one mode")
-    count = all_.size
+    modes = modes if isinstance(modes, Family) else tuple(map(_as_mode, modes))
+    count = bank(modes).size
+    require(count, "imm needs at least one mode")
     even = np.full(count, 1.0 / count)
     first = _probabilities("start", even if start is None else start, (count,))
     with np.errstate(divide="ignore"):
         log_change = np.log(_probabilities("transition", transition, (count, count)))
-        log_first = np.log(first)
-
-    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        own = set()
-
-        def begin(mode: Mode, _):
-            own.update(s.name for s in mode.sensors)
-            return mode.filter_.init(belief, dims), None, {}
-
-        states, *_ = all_.every(begin, (None,) * count)
-        if unknown := own - set(dims):
-            raise ValueError(f"modes of imm bring {sorted(unknown)}; the model has {list(dims)}")
-        return FilterState(belief, Interaction(states, jnp.asarray(log_first)))
-
-    def mixed(states: Any, log_now: Array) -> tuple[Any, Array]:
-        """Where each filter begins, and the predicted log-probabilities."""
-        joint = log_now[:, None] + jnp.asarray(log_change)
-        log_weight, log_next = jax.vmap(log_normalised, in_axes=1)(joint)
-        weight = jnp.exp(log_weight)  # (to, from)
-        beliefs = all_.beliefs(states)
-        begun = jax.vmap(matched, in_axes=(None, 0, 0))(beliefs, weight, beliefs.mean)
-        # A mode that receives nothing goes on alone, as does one that mixes with none, bit for bit.
-        alone = ~jnp.isfinite(log_next) | (jnp.diagonal(weight) == 1.0)
-
-        def restart(mode: Mode, state: FilterState, belief: Belief, alone: Array):
-            return select(alone, state, mode.filter_.reset(state, belief)), None, {}
-
-        return all_.every(restart, states, begun, alone)[0], log_next
-
-    def predict(state: FilterState, motion: Motion, u: Any = None):
-        states, log_now = state.memory
-        begun, log_next = (states, log_now) if count == 1 else mixed(states, log_now)
-        after, code, _ = all_.every(lambda m, s: m.predict(s, motion, u), begun)
-        taken = code == int(Code.DONE)
-        log_next = _among(taken, log_next)
-        failed = code[jnp.argmax(log_now)]
-        belief = _mixture(all_.beliefs(after), log_next)
-        outcome = jnp.where(jnp.any(taken), int(Code.DONE), failed)
-        return FilterState(belief, Interaction(after, log_next)), Prediction(None, belief, outcome)
-
-    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
-        states, log_prior = state.memory
-        after, seen, each = all_.every(lambda m, s: m.update(s, sensor, y, aux), states)
-        sound = ~jnp.isneginf(seen.log_likelihood)
-        of_all = jnp.any(seen.used & sound[:, None], axis=0)
-        alike = jnp.all((seen.used == of_all[None]) | ~sound[:, None])
-        gained = jnp.where(sound & ~alike, 0.0, seen.log_likelihood)
-        log_post, _ = log_normalised(log_prior + gained)
-        log_post = jnp.where(jnp.any(sound), log_post, log_prior)
-        if count == 1:
-            info = jax.tree_util.tree_map(lambda a: a[0], seen)
-        else:
-            info = _seen(seen, jnp.where(sound, log_prior, -jnp.inf), log_post, of_all)
-        if likeliest:
-            one = jax.tree_util.tree_map(lambda a: a[jnp.argmax(log_post)], seen)
-            info = one._replace(gain=info.gain, log_likelihood=info.log_likelihood)
-        notes = {f"imm.{i}.{k}": v for i, own in enumerate(each) for k, v in own.items()}
-        notes["imm.probability"] = jnp.exp(log_post)
-        # Where no mode has moved the mixture stands bit for bit.
-        was, now = all_.beliefs(states), all_.beliefs(after)
-        belief = select(equal(now, was), state.belief, _mixture(now, log_post))
-        return FilterState(belief, Interaction(after, log_post)), info._replace(notes=notes)
-
-    def reset(state: FilterState, belief: Belief) -> FilterState:
-        inner = state.memory
-        states, *_ = all_.every(lambda m, s: (m.filter_.reset(s, belief), None, {}), inner.states)
-        return FilterState(belief, inner._replace(states=states))
-
-    return in_step(Filter(init, predict, update, reset))
+        return Imm(modes, log_change, np.log(first), likeliest)
 
 
 def _probabilities(name: str, given: Rows, shape: tuple[int, ...]) -> np.ndarray:

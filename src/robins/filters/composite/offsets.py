@@ -33,7 +33,7 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief
-from robins.filters.kalman import Filter, FilterState, Prediction
+from robins.filters.kalman import Filter, FilterState, Prediction, functions
 from robins.filters.model import Motion, Sensor
 
 BEGINS = 10.0  # sigma of an offset that begins, in standard deviations of the records
@@ -209,4 +209,4 @@ def narrowed(filter_: Filter, names: Sequence[str]) -> Filter:
         factor = linalg.tria(wide.factor[len(belief.factor) :])
         return narrow(filter_.reset(state.memory, widened(belief, wide.mean.offset, factor)))
 
-    return Filter(init, predict, update, reset)
+    return functions(init, predict, update, reset)

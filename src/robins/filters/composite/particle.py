@@ -35,6 +35,7 @@ from robins.filters.kalman import (
     Filter,
     FilterState,
     Prediction,
+    functions,
     in_step,
     predicted_factor,
     updated,
@@ -217,7 +218,7 @@ def particle(
         )
         return FilterState(belief, cloud), info
 
-    return in_step(Filter(init, predict, update, reset))
+    return in_step(functions(init, predict, update, reset))
 
 
 def reseed(state: FilterState, key: Any) -> FilterState:

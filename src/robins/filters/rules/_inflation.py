@@ -38,6 +38,23 @@ def as_weight(weight: Any, whose: str) -> Weight:
     return lambda mean: L
 
 
+def as_numbers(weight: Any, whose: str) -> Any:
+    """L as a leaf, checked; a function as it is."""
+    if callable(weight):
+        return weight
+    numbers = finite_numbers(f"{whose}: weight", weight)
+    require(np.any(numbers), f"{whose}: weight is zero, so no error would count")
+    if numbers.ndim == 1:
+        numbers = np.diag(numbers)
+    if numbers.ndim == 2:
+        numbers = numbers[np.any(numbers != 0.0, axis=1)]
+    return np.asarray(_rows(jnp.asarray(numbers), whose))
+
+
+def rows_of(weight: Any, mean: State, whose: str) -> Array:
+    return _rows(jnp.asarray(weight(mean), float), whose) if callable(weight) else weight
+
+
 def _rows(L: Array, whose: str) -> Array:
     if jnp.ndim(L) not in (1, 2):
         raise ValueError(

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from robins import linalg
-from robins.errors import require
-from robins.filters.belief import Belief
+from robins.filters.belief import Belief, Number
 from robins.filters.observation import Normalised, Observation, left_out, normalised, whiten
 from robins.filters.rule import Memory, Rule
 from robins.filters.rules._variances import ratio, variance
 from robins.filters.trees import select
+from robins.filters.values import Numbers, number, value
 
 
 class Shares(NamedTuple):
@@ -133,7 +133,49 @@ def weighed(o: Observation, scale: Array) -> tuple[Observation, Array]:
     return o.raised(noise, o.accepted & ~refused), jnp.where(lost, 0.0, 1.0 / scale)
 
 
-def opening(rule: Rule, patience: int | None) -> Rule:
+@value
+class Opening(Rule):
+    """The rule of `opening`."""
+
+    inner: Rule
+    patience: Numbers  # () measurements in a row
+
+    @property
+    def name(self) -> str:
+        """That of the rule inside."""
+        return self.inner.name
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
+        """Memory of the rule inside, and hopeless measurements in a row by sensor."""
+        return self.inner.init(belief, dims), {name: jnp.zeros((), int) for name in dims}
+
+    def before(self, memory: Memory, prior: Belief, o: Observation):
+        """What the rule inside makes of a measurement, or the measurement as it was."""
+        inner, counts = memory
+        inner, faded, given = self.inner.before(inner, prior, o)
+        counting, hopeless = _judged(o, given)
+        due = hopeless & (counts[o.sensor].astype(float) >= self.patience)
+        wide = widened_to_dof(due, prior, o, normalised(o))
+        count = jnp.where(hopeless & ~due, counts[o.sensor] + 1, 0)
+        count = jnp.where(counting, count, counts[o.sensor])
+        given = given._replace(
+            noise=jnp.where(due, o.noise, given.noise),
+            accepted=jnp.where(due, o.accepted, given.accepted),
+        )
+        given = given.noted(self.name, recovered=due)
+        memory = inner, {**counts, o.sensor: count}
+        return memory, select(due, wide, Belief(*faded)), given
+
+
+def _judged(o: Observation, given: Observation) -> tuple[Array, Array]:
+    """Whether a rule could weigh a measurement, and whether it left it hardly any weight."""
+    R, raised = variance(o.noise), variance(given.noise)
+    counting = o.accepted & o.present & (R > 0.0)
+    hopeless = jnp.all(~counting | ~given.accepted | (ratio(R, raised) < _HARDLY))
+    return jnp.any(counting), jnp.any(counting) & hopeless
+
+
+def opening(rule: Rule, patience: Number | None) -> Rule:
     r"""A robust rule that does not refuse for ever.
 
     A filter that has gone wrong would give weight to no measurement any more. So when ``patience``
@@ -149,32 +191,8 @@ def opening(rule: Rule, patience: int | None) -> Rule:
     """
     if patience is None:
         return rule
-    require(patience >= 0, f"{rule.name} patience must not be negative", patience)
-
-    def init(belief: Belief, dims: Mapping[str, int]):
-        return rule.init(belief, dims), {name: jnp.zeros((), int) for name in dims}
-
-    def before(memory: Memory, prior: Belief, o: Observation):
-        inner, counts = memory
-        inner, faded, given = rule.before(inner, prior, o)
-        R, raised = variance(o.noise), variance(given.noise)
-        counting = o.accepted & o.present & (R > 0.0)
-        weight = ratio(R, raised)
-        hopeless = jnp.any(counting)
-        hopeless &= jnp.all(~counting | ~given.accepted | (weight < _HARDLY))
-        due = hopeless & (counts[o.sensor] >= patience)
-        wide = widened_to_dof(due, prior, o, normalised(o))
-        count = jnp.where(hopeless & ~due, counts[o.sensor] + 1, 0)
-        count = jnp.where(jnp.any(counting), count, counts[o.sensor])
-        given = given._replace(
-            noise=jnp.where(due, o.noise, given.noise),
-            accepted=jnp.where(due, o.accepted, given.accepted),
-        )
-        given = given.noted(rule.name, recovered=due)
-        memory = inner, {**counts, o.sensor: count}
-        return memory, select(due, wide, Belief(*faded)), given
-
-    return rule._replace(init=init, before=before)
+    negative = f"{rule.name} patience must not be negative"
+    return Opening(rule, number(negative, patience, lambda p: p >= 0))
 
 
 def is_hopeless(seen: Normalised, limit: ArrayLike) -> Array:

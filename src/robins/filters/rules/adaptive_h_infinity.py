@@ -10,7 +10,7 @@ from jaxtyping import Array
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 from robins.filters.rules import _inflation
 
 NAME = "adaptive_h_infinity"
@@ -133,4 +133,4 @@ def adaptive_h_infinity(
         code = jnp.where(counts & ~exists, int(Code.INFEASIBLE), int(Code.DONE))
         return memory, belief._replace(factor=jnp.where(acts, wide, belief.factor)), code
 
-    return Rule(init=init, after=after, name=NAME, settle=settle)
+    return hooks(init=init, after=after, name=NAME, settle=settle)

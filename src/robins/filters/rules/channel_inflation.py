@@ -13,7 +13,7 @@ from robins.filters.belief import Belief, Number
 from robins.filters.checks import finite_numbers
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 from robins.manifold import State
 
 
@@ -67,4 +67,4 @@ def channel_inflation(lambda_: Number, B: Any) -> Rule:
     def before(memory, prior: Belief, o: Observation):
         return memory, prior, o.noted("channel_inflation", lambda_=jnp.asarray(float(lambda_)))
 
-    return Rule(init=init, process=process, before=before, name="channel_inflation")
+    return hooks(init=init, process=process, before=before, name="channel_inflation")

@@ -13,7 +13,7 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 
 
 def consider(states: Sequence[Any] | ArrayLike) -> Rule:
@@ -66,7 +66,7 @@ def consider(states: Sequence[Any] | ArrayLike) -> Rule:
         info = info._replace(gain=jnp.where(column, 0.0, info.gain))
         return memory, Belief(mean, factor), info.noted("consider", withheld=withheld)
 
-    return Rule(init=init, after=after, name="consider")
+    return hooks(init=init, after=after, name="consider")
 
 
 def _chosen(states: Sequence[Any] | ArrayLike) -> np.ndarray:

@@ -14,7 +14,7 @@ from robins.filters.belief import Belief, StepInfo
 from robins.filters.checks import finite_numbers
 from robins.filters.kalman import FilterState
 from robins.filters.observation import Observation, left_out
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 from robins.filters.trees import select
 
 
@@ -77,7 +77,7 @@ def constant_gain(gains: Mapping[str, Any]) -> Rule:
         info = info._replace(gain=K).noted("constant_gain", moved=jnp.max(jnp.abs(moved)))
         return memory, belief, info
 
-    return Rule(init=init, after=after, name="constant_gain")
+    return hooks(init=init, after=after, name="constant_gain")
 
 
 def with_gains(state: FilterState, gains: Mapping[str, Any]) -> FilterState:

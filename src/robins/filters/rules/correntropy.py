@@ -10,7 +10,7 @@ from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief, Number
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 from robins.filters.rules._robust import MOST, PATIENCE, opening, shares, weighed
 
 
@@ -76,4 +76,4 @@ def correntropy(kernel: Number = 3.0, iterations: int = 3, patience: int | None 
         o, w = weighed(o, 1.0 / weights(o))
         return memory, prior, o.noted("correntropy", weight=jnp.min(w))
 
-    return opening(Rule(before=before, name="correntropy"), patience)
+    return opening(hooks(before=before, name="correntropy"), patience)

@@ -12,9 +12,9 @@ from jaxtyping import Array
 from robins.errors import require
 from robins.filters.belief import Belief, Number
 from robins.filters.checks import one_of
-from robins.filters.chi_square import quantiles
+from robins.filters.chi_square import limits, within
 from robins.filters.observation import Observation, normalised
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 from robins.filters.rules import _fading
 from robins.filters.rules._robust import (
     is_hopeless,
@@ -135,7 +135,7 @@ def discriminator(
     def before(memory: _Memory, prior: Belief, o: Observation):
         seen = normalised(o)
         # quantile by number of components used; none used is never too much
-        quantile = jnp.asarray(quantiles(probability, len(o.residual)))[seen.dof]
+        quantile = within(limits(probability), o.residual)[seen.dof]
         count, power = memory.counter[o.sensor], memory.power[o.sensor]
         longer = jnp.where(seen.nis > quantile, count + 1, 0)
         count = jnp.where(seen.dof == 0, count, longer)
@@ -164,4 +164,4 @@ def discriminator(
         o = o.noted("discriminator", weight=weight, lambda_=factor, counter=count, state=state)
         return memory, Belief(prior.mean, S), o
 
-    return Rule(init=init, before=before, name="discriminator")
+    return hooks(init=init, before=before, name="discriminator")

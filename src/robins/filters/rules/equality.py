@@ -12,7 +12,7 @@ from robins.errors import require
 from robins.filters import trees
 from robins.filters.belief import Belief, Code, Number, StepInfo
 from robins.filters.checks import finite_numbers
-from robins.filters.chi_square import quantiles
+from robins.filters.chi_square import limits, within
 from robins.filters.limits.constrain import (
     ITERATIONS,
     Function,
@@ -25,7 +25,7 @@ from robins.filters.limits.constrain import (
 )
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 
 
 def equality(
@@ -95,7 +95,7 @@ def equality(
         held = constrain(posterior, g, d, weight, noise, hard, iterations)
         refused = jnp.zeros((), bool)
         if gate is not None:
-            refused = held.nis > jnp.asarray(quantiles(gate, len(held.residual)))[held.dof]
+            refused = held.nis > within(limits(gate), held.residual)[held.dof]
         skip = refused | used
         belief = trees.select(skip, posterior, held.belief)
         worst = jnp.max(jnp.abs(held.residual))
@@ -105,7 +105,7 @@ def equality(
         code = jnp.where(partly, int(Code.PARTLY_MISSING), info.code)
         return used | once, belief, info._replace(code=code)
 
-    return Rule(init=init, process=process, after=after, name="equality")
+    return hooks(init=init, process=process, after=after, name="equality")
 
 
 def _check_rows(g: Numbers, d: Any, noise: Numbers | None) -> None:

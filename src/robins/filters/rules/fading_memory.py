@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 
 
 def fading_memory(factor: Number = 1.01) -> Rule:
@@ -45,7 +45,7 @@ def fading_memory(factor: Number = 1.01) -> Rule:
     def before(memory, prior: Belief, o: Observation):
         return memory, prior, o.noted("fading_memory", factor=memory)
 
-    return Rule(init=init, before=before, settle=settle, name="fading_memory")
+    return hooks(init=init, before=before, settle=settle, name="fading_memory")
 
 
 def per_step(memory_s: Number, step_s: Number) -> float:

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.checks import one_of
-from robins.filters.chi_square import quantiles
+from robins.filters.chi_square import limits, within
 from robins.filters.observation import Observation, normalised
-from robins.filters.rule import Rule
+from robins.filters.rule import Memory, Rule
 from robins.filters.rules._robust import widened
+from robins.filters.values import Numbers, kind, number, value
 
 Recovery = Literal["accept", "inflate", "reinitialise"]
 Scope = Literal["joint", "component"]
@@ -32,6 +34,84 @@ class _Channel(NamedTuple):
     ratio: Array  # () greatest test ratio of the last measurement
     residual: Array  # (k, m) the last innovations that were too large, newest last
     known: Array  # (k, m) bool, components they had
+
+
+@value
+class Gate(Rule):
+    """The rule of `gate`."""
+
+    limit: Numbers  # (most + 1,) q by the number of components present
+    scatter: Numbers | None  # the same for the scatter of refusals; where they must agree
+    patience: Numbers  # () refusals in a row before recovery
+    kept: int = kind()  # refusals remembered; 0 where they need not agree
+    recovery: Recovery = kind()
+    joint: bool = kind()
+
+    name = "gate"
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
+        """A `_Channel` by sensor."""
+        return {name: self.channel(m) for name, m in dims.items()}
+
+    def channel(self, m: int) -> _Channel:
+        """Nothing refused yet, of a sensor of m components."""
+        shape = () if self.joint else (m,)
+        residual = jnp.zeros((self.kept, m))
+        return _Channel(jnp.zeros(shape, int), jnp.zeros(()), residual, residual > 0.0)
+
+    def before(self, memory: Memory, prior: Belief, o: Observation):
+        """Refuse what is too large, or recover."""
+        was: _Channel = memory[o.sensor]
+        q, ratio, judged, used = self.judge(o)
+        over = judged & ~(ratio <= 1.0)
+        due, residual, known = self.due(was, over, used, o)
+        passed = ~over | due
+        refused = jnp.where(judged, jnp.where(passed, 0, was.refused + 1), was.refused)
+        worst = jnp.max(jnp.where(over, 1.0, ratio), initial=0.0)
+        worst = jnp.where(jnp.any(judged), worst, was.ratio)
+        if self.recovery != "accept":
+            prior = self.recovered(due, due & used, ratio, q, prior, o)
+        most = jnp.max(refused, initial=0)
+        o = o.noted("gate", ratio=worst, refused=most, recovered=jnp.any(due))
+        memory = {**memory, o.sensor: _Channel(refused, worst, residual, known)}
+        return memory, prior, o._replace(accepted=o.accepted & passed)
+
+    def judge(self, o: Observation):
+        """Limit, ratio to it, whether there is something to judge, and the components used."""
+        seen = normalised(o)
+        if self.joint:
+            q = within(self.limit, o.residual)[seen.dof]
+            return q, seen.nis / q, seen.dof > 0, seen.used
+        variance = jnp.sum(seen.factor**2, axis=1)
+        square = jnp.where(seen.used, o.residual, 0.0) ** 2
+        return self.limit[1], square / variance / self.limit[1], seen.used, seen.used
+
+    def due(self, was: _Channel, over: Array, used: Array, o: Observation):
+        """Whether patience has ended, and the refusals remembered."""
+        due = over & (was.refused.astype(float) >= self.patience)
+        if not self.kept:
+            return due, was.residual, was.known
+        fresh = jnp.broadcast_to(over, used.shape)[None, :]
+        residual = jnp.where(fresh, _push(was.residual, o.residual), was.residual)
+        known = jnp.where(fresh, _push(was.known, used), was.known)
+        agree = _agree_as_one if self.joint else _agree_each
+        due = jax.lax.cond(
+            jnp.any(due),
+            lambda: due & agree(self.scatter, residual, known, o.noise),
+            lambda: due,
+        )
+        return due, residual, known
+
+    def recovered(self, due, chosen, ratio, q, prior: Belief, o: Observation) -> Belief:
+        """The prior, widened where recovery is due."""
+        jump = jnp.where(chosen, o.residual, 0.0)
+        if not self.kept:
+            excess = jnp.where(due, 1.0 - 1.0 / jnp.where(due, ratio, 2.0), 0.0)
+            jump = jump * jnp.sqrt(excess / q)
+        root = jump[:, None] if self.joint else jnp.diag(jump)
+        if self.kept:
+            root = jnp.concatenate([root, _OPEN**0.5 * o.noise], axis=1)
+        return widened(jnp.any(due), prior, o, chosen, root)
 
 
 def gate(
@@ -71,71 +151,21 @@ def gate(
         ValueError: the probability is not between 0 and 1, patience is negative or too short to
             agree in, or recovery or scope is none of those above.
     """
-    require(0.0 < probability < 1.0, "gate probability must lie between 0 and 1", probability)
+    between = "gate probability must lie between 0 and 1"
+    chance = number(between, probability, lambda p: (p > 0.0) & (p < 1.0))
     one_of("gate recovery", recovery, Recovery)
     one_of("gate scope", scope, Scope)
     agreeing = recovery == "reinitialise"
     least = int(agreeing)
     require(patience >= least, f"gate patience must be at least {least} to {recovery}", patience)
-    joint = scope == "joint"
-    kept = patience + 1 if agreeing else 0
-
-    def init(belief, dims):
-        def channel(m):
-            shape = () if joint else (m,)
-            residual = jnp.zeros((kept, m))
-            return _Channel(jnp.zeros(shape, int), jnp.zeros(()), residual, residual > 0.0)
-
-        return {name: channel(m) for name, m in dims.items()}
-
-    def before(memory, prior: Belief, o: Observation):
-        was: _Channel = memory[o.sensor]
-        q, ratio, judged, used = _judge(o, probability, joint)
-        over = judged & ~(ratio <= 1.0)
-        due = over & (was.refused >= patience)
-        residual, known = was.residual, was.known
-        if agreeing:
-            fresh = jnp.broadcast_to(over, used.shape)[None, :]
-            residual = jnp.where(fresh, _push(residual, o.residual), residual)
-            known = jnp.where(fresh, _push(known, used), known)
-            agree = partial(_agree_as_one if joint else _agree_each, probability)
-            due = jax.lax.cond(
-                jnp.any(due), lambda: due & agree(residual, known, o.noise), lambda: due
-            )
-        passed = ~over | due
-        refused = jnp.where(judged, jnp.where(passed, 0, was.refused + 1), was.refused)
-        worst = jnp.max(jnp.where(over, 1.0, ratio), initial=0.0)
-        worst = jnp.where(jnp.any(judged), worst, was.ratio)
-        now = _Channel(refused, worst, residual, known)
-
-        if recovery != "accept":
-            chosen = due & used
-            jump = jnp.where(chosen, o.residual, 0.0)
-            if not agreeing:
-                excess = jnp.where(due, 1.0 - 1.0 / jnp.where(due, ratio, 2.0), 0.0)
-                jump = jump * jnp.sqrt(excess / q)
-            root = jump[:, None] if joint else jnp.diag(jump)
-            if agreeing:
-                root = jnp.concatenate([root, _OPEN**0.5 * o.noise], axis=1)
-            prior = widened(jnp.any(due), prior, o, chosen, root)
-        most = jnp.max(refused, initial=0)
-        o = o.noted("gate", ratio=worst, refused=most, recovered=jnp.any(due))
-        return {**memory, o.sensor: now}, prior, o._replace(accepted=o.accepted & passed)
-
-    return Rule(init=init, before=before, name="gate")
-
-
-def _judge(o: Observation, probability: float, joint: bool):
-    """Limit, ratio to it, whether there is something to judge, and the components used."""
-    seen = normalised(o)
-    if joint:
-        table = jnp.asarray(quantiles(probability, len(o.residual)))
-        q = table[seen.dof]
-        return q, seen.nis / q, seen.dof > 0, seen.used
-    q = quantiles(probability, 1)[1]
-    variance = jnp.sum(seen.factor**2, axis=1)
-    square = jnp.where(seen.used, o.residual, 0.0) ** 2
-    return q, square / variance / q, seen.used, seen.used
+    return Gate(
+        limit=limits(chance),
+        scatter=limits(chance, patience) if agreeing else None,
+        patience=np.asarray(float(patience)),
+        kept=patience + 1 if agreeing else 0,
+        recovery=recovery,
+        joint=scope == "joint",
+    )
 
 
 def _push(rows: Array, newest: Array) -> Array:
@@ -148,19 +178,17 @@ def _scatter(residual: Array, known: Array) -> Array:
     return jnp.where(shared, residual - jnp.mean(residual, axis=0, keepdims=True), 0.0)
 
 
-def _agree_as_one(probability: float, residual: Array, known: Array, noise: Array) -> Array:
+def _agree_as_one(table: Array, residual: Array, known: Array, noise: Array) -> Array:
     shared = jnp.all(known, axis=0)
     N = jnp.where(shared[:, None], noise, 0.0)
     L = linalg.tria(N, jnp.diag(jnp.where(shared, 0.0, 1.0)))
     # A component without noise agrees only if it repeats: the least pivot makes all else huge.
     L = L + jnp.diag(jnp.where(jnp.diagonal(L) == 0.0, jnp.finfo(float).tiny, 0.0))
     white = linalg.solve_lower(L, _scatter(residual, known).T)
-    table = quantiles(probability, len(shared), len(residual) - 1)
     count = jnp.sum(shared)
-    return (count > 0) & (jnp.sum(white**2) <= jnp.asarray(table)[count])
+    return (count > 0) & (jnp.sum(white**2) <= table[: len(shared) + 1][count])
 
 
-def _agree_each(probability: float, residual: Array, known: Array, noise: Array) -> Array:
-    limit = quantiles(probability, 1, len(residual) - 1)[1]
+def _agree_each(table: Array, residual: Array, known: Array, noise: Array) -> Array:
     scatter = jnp.sum(_scatter(residual, known) ** 2, axis=0)
-    return jnp.all(known, axis=0) & (scatter <= limit * jnp.sum(noise**2, axis=1))
+    return jnp.all(known, axis=0) & (scatter <= table[1] * jnp.sum(noise**2, axis=1))

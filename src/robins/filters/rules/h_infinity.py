@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -12,14 +14,13 @@ from jaxtyping import Array
 from robins import manifold
 from robins.errors import RobinsError, require
 from robins.filters import trees
-from robins.filters.audit import Again
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.checks import one_of
-from robins.filters.kalman import FilterState
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 from robins.filters.rules import _inflation
 from robins.filters.rules._inflation import inflated, local_bound
+from robins.filters.values import Numbers, is_known, kind, number, value
 
 
 class Infeasible(RobinsError, ValueError):
@@ -57,7 +58,6 @@ class Infeasible(RobinsError, ValueError):
 class HInfinityMemory(NamedTuple):
     """What `h_infinity` remembers from step to step."""
 
-    inverse: Array  # () 1 / gamma: 0 is the Kalman filter, and finite
     steps: Array  # () predictions so far
     fresh: Array  # () bool, no sensor has been asked since the prediction
     measured: Array  # () bool, something was used since the prediction
@@ -66,57 +66,6 @@ class HInfinityMemory(NamedTuple):
     events: Array  # () steps in which the policy acted
     first: Array  # () the first of them
     weighted_first: Array  # (q, n) L S there
-
-
-def first_infeasible(final: HInfinityMemory, whole: bool = True) -> tuple[int, Array] | None:
-    """Step, and L S there, where a run of policy "raise" first had no filter; None if it had.
-
-    Args:
-        final: memory that the run ended with.
-        whole: judge the last step too, from which nothing has been predicted.
-    """
-    if int(final.events) > 0:
-        return int(final.first), final.weighted_first
-    n = final.weighted.shape[1]
-    exists = inflated(jnp.eye(n), final.inverse * final.weighted)[1]
-    if whole and bool(final.measured) and not bool(exists):
-        return int(final.steps) - 1, final.weighted
-    return None
-
-
-def anew(memory: HInfinityMemory, gamma: Any) -> HInfinityMemory:
-    """The same memory with another gamma and no events."""
-    inverse = 1.0 / jnp.asarray(gamma, float)
-    return memory._replace(inverse=inverse, events=jnp.zeros((), int), first=jnp.array(-1))
-
-
-class Demanding(HInfinityMemory):
-    """The same under policy "raise"."""
-
-    def audit(self, start: HInfinityMemory, again: Again | None, time: Any) -> None:
-        """What it has to report (`robins.filters.audit`).
-
-        One sample at a time, a step is judged when the next prediction closes it: until then more
-        sensors may come.
-
-        Raises:
-            Infeasible: the filter did not exist at some step.
-        """
-        broken = first_infeasible(self, whole=again is not None)
-        if broken is None:
-            return
-        step, weighted = broken
-        gamma, least = 1.0 / float(self.inverse), None
-        if again is not None:
-            step -= int(start.steps)
-
-            def exists(one: float) -> bool:
-                return first_infeasible(again(anew(start, one))) is None
-
-            least = least_gamma(exists, gamma)
-        times = () if time is None else np.asarray(time)
-        time_s = float(times[step]) if 0 <= step < len(times) else None
-        raise Infeasible(step, time_s, gamma, float(local_bound(weighted)), least)
 
 
 def least_gamma(exists: Callable[[float], bool], lower: float, rtol: float = 1e-4) -> float:
@@ -144,6 +93,163 @@ Policy = Literal["raise", "raise_gamma", "compensate"]
 Estimate = Literal["a-posteriori", "a-priori", "predictor"]
 
 NAME = "h_infinity"
+
+
+@value
+class HInfinity(Rule):
+    """The rule of `h_infinity`."""
+
+    inverse: Numbers  # () 1 / gamma: 0 is the Kalman filter, and finite
+    weight: Any  # (q, n) L, or a function of the mean
+    margin: Numbers  # ()
+    policy: Policy = kind()
+    estimate: Estimate = kind()
+    count_missing: bool = kind()
+
+    name = NAME
+
+    @property
+    def judges_prior(self) -> bool:
+        return self.estimate == "a-priori"
+
+    @property
+    def moves_on(self) -> bool:
+        return self.estimate != "a-posteriori"
+
+    def rows(self, mean: Any) -> Array:
+        """L at a mean."""
+        return _inflation.rows_of(self.weight, mean, NAME)
+
+    def in_force(self, bound: Array) -> Array:
+        """1 / gamma of this step, as the policy leaves it."""
+        if self.policy != "raise_gamma":
+            return self.inverse
+        some = jnp.where(bound > 0.0, bound, 1.0)
+        return jnp.where(
+            bound > 0.0, jnp.minimum(self.inverse, (1.0 - self.margin) ** 0.5 / some), self.inverse
+        )
+
+    def init(self, belief: Belief, dims):
+        weighted = _inflation.weighted_factor(self.rows, belief, NAME)
+        return HInfinityMemory(
+            steps=jnp.zeros((), int),
+            fresh=jnp.array(True),
+            measured=jnp.array(False),
+            predicted=belief.mean if self.moves_on else (),
+            weighted=weighted,
+            events=jnp.zeros((), int),
+            first=jnp.array(-1),
+            weighted_first=jnp.zeros_like(weighted),
+        )
+
+    def process(self, memory: HInfinityMemory, transition):
+        if self.moves_on:
+            memory = memory._replace(predicted=transition.mean)
+        return memory, transition
+
+    def before(self, memory: HInfinityMemory, prior: Belief, o: Observation):
+        if self.judges_prior:
+            seen = _inflation.weighted_factor(self.rows, prior, NAME)
+            memory = memory._replace(weighted=jnp.where(memory.fresh, seen, memory.weighted))
+        return memory._replace(fresh=jnp.array(False)), prior, o
+
+    def after(self, memory: HInfinityMemory, posterior: Belief, info: StepInfo, o: Observation):
+        if not self.judges_prior:
+            memory = memory._replace(
+                weighted=_inflation.weighted_factor(self.rows, posterior, NAME)
+            )
+        memory = memory._replace(measured=memory.measured | jnp.any(info.used))
+        # Noted but not remembered, so that a run which does not keep it does not compute it.
+        bound = _inflation.local_bound(memory.weighted)
+        inverse = self.in_force(bound)
+        left = 1.0 - (bound * inverse) ** 2
+        notes = {"bound": bound, "gamma": 1.0 / inverse, "margin": left}
+        counts = memory.measured | self.count_missing
+        if self.policy == "raise_gamma":
+            notes["raised"] = counts & (inverse < self.inverse)
+        if self.policy == "compensate":
+            notes["compensated"] = counts & (left < self.margin)
+        return memory, posterior, info.noted(NAME, **notes)
+
+    def settle(self, memory: HInfinityMemory, belief: Belief):
+        counts = memory.measured | (self.count_missing & (memory.steps > 0))
+        weighted = _inflation.weighted_factor(self.rows, belief, NAME)
+        judged = (
+            jnp.where(memory.fresh, weighted, memory.weighted) if self.judges_prior else weighted
+        )
+        inverse, factor, acted = self.inverse, belief.factor, jnp.array(False)
+        if self.policy == "raise_gamma":
+            inverse = self.in_force(_inflation.local_bound(judged))
+            acted = inverse < self.inverse
+        if self.policy == "compensate":
+            factor, acted = _inflation.deflated(factor, inverse * weighted, 1.0 - self.margin)
+            weighted = _inflation.weighted_factor(self.rows, belief._replace(factor=factor), NAME)
+        wide, exists = _inflation.inflated(factor, inverse * weighted)
+        if self.judges_prior:
+            exists = exists & _inflation.inflated(factor, inverse * judged)[1]
+        new = Belief(belief.mean, wide)
+        if self.moves_on:
+            # P~ L'L d / gamma^2 takes the mean on from P H'R^-1 r to P~ H'R^-1 r.
+            d = manifold.local(memory.predicted, belief.mean)
+            L = inverse * self.rows(belief.mean)
+            new = new._replace(mean=manifold.retract(belief.mean, wide @ ((L @ wide).T @ (L @ d))))
+        active = counts & exists & (self.inverse > 0.0)
+        new = trees.select(active, new, belief)
+
+        missed = counts & ~exists
+        acted = missed | (counts & acted)
+        begins = acted & (memory.events == 0)
+        memory = memory._replace(
+            steps=memory.steps + 1,
+            fresh=jnp.array(True),
+            measured=memory.measured & missed,
+            events=memory.events + acted.astype(int),
+            first=jnp.where(begins, memory.steps - 1, memory.first),
+            weighted_first=jnp.where(begins, judged, memory.weighted_first),
+        )
+        return memory, new, jnp.where(missed, int(Code.INFEASIBLE), int(Code.DONE))
+
+    def first_infeasible(
+        self, final: HInfinityMemory, whole: bool = True
+    ) -> tuple[int, Array] | None:
+        """Step, and L S there, where a run first had no filter; None if it had.
+
+        Args:
+            final: memory that the run ended with.
+            whole: judge the last step too, from which nothing has been predicted.
+        """
+        if int(final.events) > 0:
+            return int(final.first), final.weighted_first
+        n = final.weighted.shape[1]
+        exists = inflated(jnp.eye(n), self.inverse * final.weighted)[1]
+        if whole and bool(final.measured) and not bool(exists):
+            return int(final.steps) - 1, final.weighted
+        return None
+
+    def report(self, start: HInfinityMemory, final: HInfinityMemory, again: Any, time: Any) -> None:
+        """Under policy "raise": that the filter did not exist at some step.
+
+        Raises:
+            Infeasible: it did not.
+        """
+        if self.policy != "raise":
+            return
+        broken = self.first_infeasible(final, whole=again is not None)
+        if broken is None:
+            return
+        step, weighted = broken
+        gamma, least = 1.0 / float(self.inverse), None
+        if again is not None:
+            step -= int(start.steps)
+
+            def exists(one: float) -> bool:
+                other = replace(self, inverse=np.asarray(1.0 / one))
+                return other.first_infeasible(again(other)) is None
+
+            least = least_gamma(exists, gamma)
+        times = () if time is None else np.asarray(time)
+        time_s = float(times[step]) if 0 <= step < len(times) else None
+        raise Infeasible(step, time_s, gamma, float(local_bound(weighted)), least)
 
 
 def h_infinity(
@@ -198,125 +304,41 @@ def h_infinity(
         ValueError: gamma is not positive, the weight is not finite or of the wrong shape, policy or
             estimate is unknown or they do not go together, or the margin is not between 0 and 1.
     """
-    asked = _as_gamma(gamma)
     one_of("h_infinity policy", policy, Policy)
     one_of("h_infinity estimate", estimate, Estimate)
-    require(0.0 < margin < 1.0, "margin must lie between 0 and 1", margin)
-    judges_prior = estimate == "a-priori"
-    if judges_prior and policy == "compensate":
+    if estimate == "a-priori" and policy == "compensate":
         raise ValueError(
             "policy='compensate' mends P after the measurement, estimate='a-priori' needs it "
             "before: use 'raise_gamma'"
         )
-    moves_on = estimate != "a-posteriori"
-    rows = _inflation.as_weight(weight, NAME)
-
-    def in_force(inverse, bound):
-        """1 / gamma of this step, as the policy leaves it."""
-        if policy != "raise_gamma":
-            return inverse
-        some = jnp.where(bound > 0.0, bound, 1.0)
-        return jnp.where(bound > 0.0, jnp.minimum(inverse, (1.0 - margin) ** 0.5 / some), inverse)
-
-    def init(belief: Belief, dims):
-        weighted = _inflation.weighted_factor(rows, belief, NAME)
-        return (Demanding if policy == "raise" else HInfinityMemory)(
-            inverse=jnp.asarray(1.0 / asked),
-            steps=jnp.zeros((), int),
-            fresh=jnp.array(True),
-            measured=jnp.array(False),
-            predicted=belief.mean if moves_on else (),
-            weighted=weighted,
-            events=jnp.zeros((), int),
-            first=jnp.array(-1),
-            weighted_first=jnp.zeros_like(weighted),
-        )
-
-    def process(memory: HInfinityMemory, transition):
-        if moves_on:
-            memory = memory._replace(predicted=transition.mean)
-        return memory, transition
-
-    def before(memory: HInfinityMemory, prior: Belief, o: Observation):
-        if judges_prior:
-            seen = _inflation.weighted_factor(rows, prior, NAME)
-            memory = memory._replace(weighted=jnp.where(memory.fresh, seen, memory.weighted))
-        return memory._replace(fresh=jnp.array(False)), prior, o
-
-    def after(memory: HInfinityMemory, posterior: Belief, info: StepInfo, o: Observation):
-        if not judges_prior:
-            memory = memory._replace(weighted=_inflation.weighted_factor(rows, posterior, NAME))
-        memory = memory._replace(measured=memory.measured | jnp.any(info.used))
-        # Noted but not remembered, so that a run which does not keep it does not compute it.
-        bound = _inflation.local_bound(memory.weighted)
-        inverse = in_force(memory.inverse, bound)
-        left = 1.0 - (bound * inverse) ** 2
-        notes = {"bound": bound, "gamma": 1.0 / inverse, "margin": left}
-        counts = memory.measured | count_missing
-        if policy == "raise_gamma":
-            notes["raised"] = counts & (inverse < memory.inverse)
-        if policy == "compensate":
-            notes["compensated"] = counts & (left < margin)
-        return memory, posterior, info.noted(NAME, **notes)
-
-    def settle(memory: HInfinityMemory, belief: Belief):
-        counts = memory.measured | (count_missing & (memory.steps > 0))
-        weighted = _inflation.weighted_factor(rows, belief, NAME)
-        judged = jnp.where(memory.fresh, weighted, memory.weighted) if judges_prior else weighted
-        inverse, factor, acted = memory.inverse, belief.factor, jnp.array(False)
-        if policy == "raise_gamma":
-            inverse = in_force(memory.inverse, _inflation.local_bound(judged))
-            acted = inverse < memory.inverse
-        if policy == "compensate":
-            factor, acted = _inflation.deflated(factor, inverse * weighted, 1.0 - margin)
-            weighted = _inflation.weighted_factor(rows, belief._replace(factor=factor), NAME)
-        wide, exists = _inflation.inflated(factor, inverse * weighted)
-        if judges_prior:
-            exists = exists & _inflation.inflated(factor, inverse * judged)[1]
-        new = Belief(belief.mean, wide)
-        if moves_on:
-            # P~ L'L d / gamma^2 takes the mean on from P H'R^-1 r to P~ H'R^-1 r.
-            d = manifold.local(memory.predicted, belief.mean)
-            L = inverse * rows(belief.mean)
-            new = new._replace(mean=manifold.retract(belief.mean, wide @ ((L @ wide).T @ (L @ d))))
-        active = counts & exists & (memory.inverse > 0.0)
-        new = trees.select(active, new, belief)
-
-        missed = counts & ~exists
-        acted = missed | (counts & acted)
-        begins = acted & (memory.events == 0)
-        memory = memory._replace(
-            steps=memory.steps + 1,
-            fresh=jnp.array(True),
-            measured=memory.measured & missed,
-            events=memory.events + acted.astype(int),
-            first=jnp.where(begins, memory.steps - 1, memory.first),
-            weighted_first=jnp.where(begins, judged, memory.weighted_first),
-        )
-        return memory, new, jnp.where(missed, int(Code.INFEASIBLE), int(Code.DONE))
-
-    return Rule(init, process, before, after, name=NAME, settle=settle)
-
-
-def _as_gamma(gamma: Any) -> float:
-    value = np.asarray(gamma)
-    if value.dtype.kind not in "iuf" or value.ndim:
-        raise TypeError(f"gamma must be one real number, got {gamma!r}")
-    require(value > 1e-300, f"gamma must be positive, or inf for the Kalman filter; got {gamma}")
-    return float(value)
-
-
-def with_gamma(state: FilterState, gamma: Any) -> FilterState:
-    """A filter state that goes on with another gamma, positive or inf, and no events counted.
-
-    Gamma is data here: it may be traced, and nothing compiles anew.
-
-    Raises:
-        ValueError: the filter has no `h_infinity` rule.
-    """
-    held = [isinstance(one, HInfinityMemory) for one in state.memory]
-    require(any(held), "this filter has no h_infinity rule whose gamma could be exchanged")
-    memory = tuple(
-        anew(one, gamma) if here else one for one, here in zip(state.memory, held, strict=True)
+    return HInfinity(
+        inverse=1.0 / _as_gamma(gamma),
+        weight=_inflation.as_numbers(weight, NAME),
+        margin=number("margin must lie between 0 and 1", margin, lambda m: (m > 0) & (m < 1)),
+        policy=policy,
+        estimate=estimate,
+        count_missing=count_missing,
     )
-    return state._replace(memory=memory)
+
+
+def _as_gamma(gamma: Any) -> Any:
+    if not is_known(gamma):
+        return gamma
+    value = np.asarray(gamma)
+    if value.dtype.kind not in "iuf":
+        raise TypeError(f"gamma must be one real number, got {gamma!r}")
+    require(
+        np.all(value > 1e-300), f"gamma must be positive, or inf for the Kalman filter; got {gamma}"
+    )
+    return np.asarray(value, float)
+
+
+def with_gamma(filter_: Any, gamma: Any) -> Any:
+    """The filter with another gamma in each of its `h_infinity` rules."""
+
+    def put(rule: Any) -> Any:
+        return (
+            replace(rule, inverse=1.0 / _as_gamma(gamma)) if isinstance(rule, HInfinity) else rule
+        )
+
+    return jax.tree_util.tree_map(put, filter_, is_leaf=lambda x: isinstance(x, HInfinity))

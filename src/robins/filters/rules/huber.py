@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+import numpy as np
 
-from robins.errors import require
 from robins.filters.belief import Belief, Number
-from robins.filters.chi_square import quantiles
+from robins.filters.chi_square import MOST, limits, within
 from robins.filters.observation import Observation, normalised
-from robins.filters.rule import Rule
+from robins.filters.rule import Memory, Rule
 from robins.filters.rules._robust import PATIENCE, opening, scale_to_quantile, weighed
+from robins.filters.values import Numbers, number, value
+
+
+@value
+class Huber(Rule):
+    """The rule of `huber`: s of r' (H P H' + s R)^-1 r = k^2 where the NIS exceeds k^2."""
+
+    limit: Numbers  # (MOST + 1,) k^2 by the number of components present
+
+    name = "huber"
+
+    def before(self, memory: Memory, prior: Belief, o: Observation):
+        """Noise of the measurement, scaled by s."""
+        seen = normalised(o)
+        s = scale_to_quantile(o, within(self.limit, o.residual)[seen.dof], seen)
+        o, weight = weighed(o, s)
+        return memory, prior, o.noted("huber", weight=weight)
 
 
 def huber(
@@ -44,17 +60,9 @@ def huber(
         ValueError: the probability is not in (0, 1], the threshold not positive, or patience is
             negative.
     """
-    require(0.0 < probability <= 1.0, "huber probability must lie in (0, 1]", probability)
-    require(threshold is None or threshold > 0.0, "huber threshold must be positive", threshold)
-
-    def before(memory, prior: Belief, o: Observation):
-        seen = normalised(o)
-        if threshold is None:
-            limit = jnp.asarray(quantiles(probability, len(o.residual)))[seen.dof]
-        else:
-            limit = float(threshold) ** 2
-        s = scale_to_quantile(o, limit, seen)
-        o, weight = weighed(o, s)
-        return memory, prior, o.noted("huber", weight=weight)
-
-    return opening(Rule(before=before, name="huber"), patience)
+    share = "huber probability must lie in (0, 1]"
+    limit = limits(number(share, probability, lambda p: (p > 0.0) & (p <= 1.0)))
+    if threshold is not None:
+        k = number("huber threshold must be positive", threshold, lambda k: k > 0.0)
+        limit = k[..., None] ** 2 * np.ones(MOST + 1)
+    return opening(Huber(limit), patience)

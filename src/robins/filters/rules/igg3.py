@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from robins.errors import require
 from robins.filters.belief import Belief, Number
 from robins.filters.observation import Observation, normalised
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 from robins.filters.rules._robust import widened
 
 
@@ -81,4 +81,4 @@ def igg3(
         o = o.noted("igg3", weight=jnp.min(weight), recovered=recovered)
         return {**memory, o.sensor: count}, prior, o
 
-    return Rule(init=init, before=before, name="igg3")
+    return hooks(init=init, before=before, name="igg3")

@@ -15,7 +15,7 @@ from robins.filters.limits.constrain import Function, Numbers, as_sensor
 from robins.filters.limits.interval import clip, truncate
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 
 Method = Literal["active-set", "truncation"]
 
@@ -79,7 +79,7 @@ def inequality(
         notes = {"outside": jnp.sum(kept.outside), "infeasible": kept.infeasible}
         return cut, belief, info.contradicted_where(kept.infeasible).noted("inequality", **notes)
 
-    return Rule(init=init, process=process, after=after, name="inequality")
+    return hooks(init=init, process=process, after=after, name="inequality")
 
 
 def _bounds(lower: Numbers | None, upper: Numbers | None) -> tuple[np.ndarray, np.ndarray]:

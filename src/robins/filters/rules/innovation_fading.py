@@ -11,7 +11,7 @@ from robins.errors import require
 from robins.filters.belief import Belief, Number
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 from robins.filters.rules._variances import ratio, reading_variance, variance
 
 
@@ -99,4 +99,4 @@ def innovation_fading(window: int = 10, limit: Number = 5.0, reach: Number = flo
         prior = prior._replace(factor=jnp.sqrt(factor) * prior.factor)
         return memory, prior, o.noted("innovation_fading", lambda_=factor)
 
-    return Rule(init=init, process=process, before=before, name="innovation_fading")
+    return hooks(init=init, process=process, before=before, name="innovation_fading")

@@ -12,7 +12,7 @@ from robins.filters.belief import Belief, StepInfo
 from robins.filters.checks import sensor_names
 from robins.filters.limits.constrain import Weight, check_weight, metric_of, nearest
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 
 
 def projection(
@@ -72,7 +72,7 @@ def projection(
         info = info.contradicted_where(jnp.any(wrong))
         return memory, belief, info.noted("projection", residual=jnp.max(jnp.abs(o.residual)))
 
-    return Rule(init=init, after=after, name="projection")
+    return hooks(init=init, after=after, name="projection")
 
 
 def projected(

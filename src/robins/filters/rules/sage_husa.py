@@ -12,7 +12,7 @@ from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.checks import one_of
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 from robins.filters.rules import _variances
 
 
@@ -132,6 +132,6 @@ def sage_husa(
             motion = scale, last
         return (sensors, motion), posterior, info._replace(notes=notes)
 
-    rule = Rule(init=init, after=after, name="sage_husa")
+    rule = hooks(init=init, after=after, name="sage_husa")
     rule = rule._replace(before=before) if of_sensor else rule
     return rule._replace(process=process) if of_motion else rule

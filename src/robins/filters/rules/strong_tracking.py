@@ -15,7 +15,7 @@ from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.checks import one_of
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 from robins.filters.rules import _fading
 
 Form = Literal["outside", "lumped", "multiple", "projected"]
@@ -134,7 +134,7 @@ def strong_tracking(
     def after(memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
         return memory._replace(fresh=memory.fresh & ~jnp.any(info.used)), posterior, info
 
-    return Rule(init=init, process=process, before=before, after=after, name="strong_tracking")
+    return hooks(init=init, process=process, before=before, after=after, name="strong_tracking")
 
 
 def _faded_outside(memory: _Memory, S: Array, white: _fading.White, N: Array, limit: Number):

@@ -13,7 +13,7 @@ from robins.errors import require
 from robins.filters.belief import Belief, Number
 from robins.filters.checks import one_of
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 from robins.filters.rules._robust import MOST, PATIENCE, opening, shares, weighed
 
 Whose = Literal["R", "both"]
@@ -94,4 +94,4 @@ def student_t(
             prior = prior._replace(factor=jnp.sqrt(b) * prior.factor)
         return memory, prior, o.noted("student_t", weight=weight, prior=1.0 / b)
 
-    return opening(Rule(before=before, name="student_t"), patience)
+    return opening(hooks(before=before, name="student_t"), patience)

@@ -11,7 +11,7 @@ from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.observation import Observation, left_out
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 from robins.filters.rules import _variances
 
 
@@ -122,4 +122,4 @@ def variational_bayes(
         notes = info.notes | _variances.numbered("variational_bayes.r_scale", known.scale)
         return memory, posterior, info._replace(notes=notes)
 
-    return Rule(init=init, before=before, after=after, name="variational_bayes")
+    return hooks(init=init, before=before, after=after, name="variational_bayes")

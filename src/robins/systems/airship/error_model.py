@@ -38,6 +38,7 @@ from jaxtyping import Array, Float
 from robins import _float64  # noqa: F401
 from robins.earth import Geodetic, curvature_radii, earth_rate_n, gravity_n, transport_rate_n
 from robins.filters import Belief, Code, Motion, Rule
+from robins.filters.rule import hooks
 from robins.ins.frames import swap
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
@@ -264,7 +265,7 @@ def feedback() -> Rule:
         nav = belief.mean.nav
         return memory, Belief(Fed(nav, jnp.zeros(9)), belief.factor), int(Code.DONE)
 
-    return Rule(settle=settle, name="feedback")
+    return hooks(settle=settle, name="feedback")
 
 
 def _start_sigma(given: Airship, course: Course) -> list[np.ndarray]:

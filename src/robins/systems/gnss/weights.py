@@ -27,7 +27,7 @@ from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 from robins.filters.rules._robust import MOST, shares, weighed
 
 LEAST = 1.0 / MOST  # beyond it a component is refused
@@ -88,4 +88,4 @@ def by_component(
         mean = jnp.sum(jnp.where(there, w, 0.0)) / jnp.maximum(jnp.sum(there.astype(float)), 1.0)
         return memory, prior, given.noted(name, least=least, mean=mean)
 
-    return Rule(before=before, name=name)
+    return hooks(before=before, name=name)

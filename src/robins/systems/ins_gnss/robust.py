@@ -34,6 +34,7 @@ from jaxtyping import Array
 from robins.filters import Belief, Family, Filter, Model, Motion, Rule, Sensor, imm, kalman, taylor
 from robins.filters.composite.imm import Mode
 from robins.filters.observation import Observation
+from robins.filters.rule import hooks
 from robins.filters.rules import student_t
 from robins.ins.state import InsState
 from robins.linalg import block_diagonal
@@ -267,7 +268,7 @@ def tails() -> Rule:
             seen = seen._replace(noise=jnp.sqrt(scale) * o.noise)
         return memory, prior, seen
 
-    return Rule(before=before, name="tails")
+    return hooks(before=before, name="tails")
 
 
 def weighed() -> Filter:

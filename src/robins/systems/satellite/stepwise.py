@@ -33,6 +33,7 @@ from robins.filters import Belief, Code, Rule, StepInfo, StepWarning
 from robins.filters.kalman import FilterState
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
+from robins.filters.rule import hooks
 from robins.filters.rules.constant_gain import Fixed, constant_gain
 from robins.filters.synthesis import (
     EveryStep,
@@ -185,7 +186,7 @@ def redesigned() -> Rule:
         memory = memory._replace(gain=gain, failed=memory.failed + (~passed).astype(int))
         return memory, posterior, info.noted(NAME, **{_FAILED: ~passed})
 
-    return Rule(init=init, process=process, after=after, name=NAME, settle=settle)
+    return hooks(init=init, process=process, after=after, name=NAME, settle=settle)
 
 
 def begun(state: FilterState, of: Frozen, gain: Any) -> FilterState:

@@ -124,7 +124,7 @@ def _contender(
     known: dict[str, Any] = dict(facts or {})
     gamma = known.get("gamma", np.inf)
     if facts:
-        start = with_gamma(filter_.init(start, model.dims), gamma)
+        filter_ = with_gamma(filter_, gamma)
         known |= {key: known[key] / unit for key in ("gamma", "gamma_min")}
     case = Partial(_case, start, F, aux[am.ATTITUDE])
     return Contender(filter_, model, case, rows, bounds=bool(np.isfinite(gamma)), facts=known)
@@ -152,11 +152,18 @@ def existence(
     """
     model, (u, aux) = system.model(sigma_rad), system.inputs()
     y = np.where(course.heard[:, None], np.zeros((len(course.heard), 3)), np.nan)
-    first = filter_.init(system.start(), model.dims)
 
     def attempt(gamma: float):
-        state = with_gamma(first, gamma)
-        return run(filter_, model, state, y, u, aux, keep=_existing, time_s=course.epoch_s).steps
+        return run(
+            with_gamma(filter_, gamma),
+            model,
+            system.start(),
+            y,
+            u,
+            aux,
+            keep=_existing,
+            time_s=course.epoch_s,
+        ).steps
 
     # No gamma below the largest local bound of the Kalman filter exists, and the refusal says
     # which one would.

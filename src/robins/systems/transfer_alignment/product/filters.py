@@ -32,7 +32,7 @@ from jaxtyping import ArrayLike
 
 from robins.filters import Family, Filter, imm, kalman, taylor, unscented
 from robins.filters.linearise import Transition
-from robins.filters.rule import Rule
+from robins.filters.rule import Rule, hooks
 from robins.filters.rules import huber
 from robins.sim.flexure import Flexure
 from robins.systems.transfer_alignment.product.parameters import Structure
@@ -70,7 +70,7 @@ def supposing(hypothesis: Hypothesis, stiff: ArrayLike) -> Rule:
         spread, noise = t.spread * kept[:, None], noise * kept[:, None]
         return memory, t._replace(mean=mean, spread=spread, noise=noise)
 
-    return Rule(process=process, name="supposing")
+    return hooks(process=process, name="supposing")
 
 
 # Changes in one step of the filter, tenths of a second: from the row's hypothesis to the column's.
