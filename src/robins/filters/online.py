@@ -65,6 +65,7 @@ class OnlineFilter:
         self.filter, self.model = filter_, same_model(model)
         state = settled(filter_.init(start, model.dims) if isinstance(start, Belief) else start)
         self._machine = on(machine, self.filter, self.model, state)
+        self._start = tree_map(np.array, state)  # C writes over what it is given
         self.counts: Counter[str] = Counter()
         self._last: dict[str, deque[tuple[StepInfo, Any]]] = {}
 
@@ -76,6 +77,7 @@ class OnlineFilter:
     @state.setter
     def state(self, state: FilterState) -> None:
         self._machine.state = state
+        self._start = tree_map(np.array, state)
 
     @property
     def belief(self) -> Belief:
@@ -182,4 +184,4 @@ class OnlineFilter:
         for one in used:
             self.counts[_NAMES[int(one)]] += 1
         state = tree_map(jnp.asarray, self.state) if self._machine.is_numpy else self.state
-        self.filter.report(state, state, None, None)
+        self.filter.report(self._start, state, None, None)
