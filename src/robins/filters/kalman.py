@@ -85,6 +85,11 @@ class Filter:
     def members(self, state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
         return no_members(state)
 
+    @property
+    def reports(self) -> bool:
+        """Whether there can be something to report; a stream asks at each step."""
+        return type(self).report is not Filter.report
+
     def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
         """Raise what its rules have to report; ``again(filter)`` is the final state of a run anew."""
 
@@ -369,6 +374,10 @@ class Kalman(Filter):
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
         return FilterState(belief, state.memory, self.drawn(belief))
+
+    @property
+    def reports(self) -> bool:
+        return any(rule.reports for rule in self.rules)
 
     def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
         for i, rule in enumerate(self.rules):

@@ -242,6 +242,14 @@ class Imm(Filter):
         )
         return FilterState(belief, inner._replace(states=states))
 
+    @property
+    def reports(self) -> bool:
+        modes = self.modes
+        if isinstance(modes, Family):  # all of one kind
+            first = jax.tree_util.tree_map(lambda x: np.asarray(x)[0], modes.numbers)
+            modes = (modes.of(first),)
+        return any(mode.filter_.reports for mode in modes)
+
     def report(self, start: FilterState, final: FilterState, again: Any, time: Any) -> None:
         for i in range(self.bank.size):
             if isinstance(self.modes, Family):

@@ -219,7 +219,7 @@ class HInfinity(Rule):
             whole: judge the last step too, from which nothing has been predicted.
         """
         if int(final.events) > 0:
-            return int(final.first), final.weighted_first
+            return int(final.first), jnp.asarray(final.weighted_first)  # of a stream in C
         n = final.weighted.shape[1]
         exists = inflated(jnp.eye(n), self.inverse * final.weighted)[1]
         if whole and bool(final.measured) and not bool(exists):
