@@ -76,6 +76,16 @@ class Linearisation:
     def observation(self, prior: Belief, sensor: Sensor, y: Any, aux: Any) -> Observation:
         raise NotImplementedError
 
+    def drawn(self, belief: Belief) -> Any:
+        return () if self.reuse is None else self.reuse.draw(belief)
+
+    def first_observation(
+        self, points: Any, prior: Belief, sensor: Sensor, y: Any, aux: Any
+    ) -> Observation:
+        if self.reuse is None:
+            return self.observation(prior, sensor, y, aux)
+        return self.reuse.observation(points, prior, sensor, y, aux)
+
 
 @value
 class Ways(Linearisation):
