@@ -95,6 +95,11 @@ class Filter:
         """
         return (), lambda beliefs, belief: state
 
+    @property
+    def reports(self) -> bool:
+        """Whether there can be something to report; a stream asks once."""
+        return type(self).report is not Filter.report
+
     def report(
         self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
     ) -> None:
@@ -393,6 +398,10 @@ class Kalman(Filter):
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
         return FilterState(belief, state.memory, self.way.drawn(belief))
+
+    @property
+    def reports(self) -> bool:
+        return any(rule.reports for rule in self.rules)
 
     def report(
         self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None

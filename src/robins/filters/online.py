@@ -6,7 +6,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import tree_map
 
@@ -66,6 +65,7 @@ class OnlineFilter:
         state = settled(filter_.init(start, model.dims) if isinstance(start, Belief) else start)
         self._machine = on(machine, self.filter, self.model, state)
         self._start = tree_map(np.array, state)  # C writes over what it is given
+        self._reports = filter_.reports
         self.counts: Counter[str] = Counter()
         self._last: dict[str, deque[tuple[StepInfo, Any]]] = {}
 
@@ -177,11 +177,11 @@ class OnlineFilter:
         self._last.setdefault(sensor, deque(maxlen=WINDOW)).append(kept)
 
     def _count(self, moved: Any, *used: Any) -> None:
-        """Count a prediction that was not taken, and updates; let the memories report."""
+        """Count a prediction that was not taken, and updates; let the filter report."""
         # whole numbers of Python: to compare one of NumPy with a `Code` takes as long as a step
         if (code := int(moved)) != _DONE:
             self.counts[_NAMES[code]] += 1
         for one in used:
             self.counts[_NAMES[int(one)]] += 1
-        state = tree_map(jnp.asarray, self.state) if self._machine.is_numpy else self.state
-        self.filter.report(self._start, state, None, None)
+        if self._reports:
+            self.filter.report(self._start, self.state, None, None)

@@ -75,6 +75,11 @@ class Rule:
         """Whether it does anything once a step."""
         return type(self).settle is not Rule.settle
 
+    @property
+    def reports(self) -> bool:
+        """Whether there can be something to report."""
+        return type(self).report is not Rule.report
+
     def report(self, start: Memory, final: Memory, again: Any, time: Any) -> None:
         """Raise what it has to report of a run; `again` runs with this rule exchanged."""
 

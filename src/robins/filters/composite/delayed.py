@@ -241,6 +241,10 @@ class Delayed(Filter):
                 own = select(i == 0, seen, own)
         return _Redone(inner, before, gained, own, taken, failed)
 
+    @property
+    def reports(self) -> bool:
+        return self.filter_.reports
+
     def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
         """Ask the filter that is delayed, not its past."""
 

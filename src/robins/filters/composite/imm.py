@@ -268,6 +268,10 @@ class Imm(Filter):
         states, *_ = self.modes.every(moved, state.memory.states)
         return FilterState(belief, state.memory._replace(states=states))
 
+    @property
+    def reports(self) -> bool:
+        return any(self.modes.mode(i).filter_.reports for i in range(self.modes.size))
+
     def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
         for i in range(self.modes.size):
             first = self.modes.state(start.memory.states, i)

@@ -248,7 +248,7 @@ class HInfinity(Rule):
         """
         missed = int(final.events) - before
         if missed > 0 and before == 0:
-            return int(final.first), final.weighted_first
+            return int(final.first), jnp.asarray(final.weighted_first)  # of a stream in C
         if missed > 0:  # the first was another filter's; where one step is missed the rest are
             return int(final.steps) - 1 - missed, final.weighted
         n = final.weighted.shape[1]
