@@ -110,7 +110,7 @@ def _case(filter_: Filter, model: Model, case: Partial, world: Any) -> Case:
     return it if it.loop is None else solved(filter_, model, it, nothing)[1]
 
 
-@partial(jax.jit, static_argnames="filter_")
+@jax.jit
 def _variances(filter_, model, case: Partial, reported, world) -> Array:
     it = _case(filter_, model, case, world)
     line = linearised(model, _start(it), it.truth, it.y, it.u, it.aux)
@@ -148,7 +148,7 @@ class _Found(NamedTuple):
     rows: Array | None  # (r, n) what is reported of the start
 
 
-@partial(jax.jit, static_argnames="filter_")
+@jax.jit
 def _bound(filter_, model, case: Partial, reported, subsets, world) -> _Found:
     it = _case(filter_, model, case, world)
     start = _start(it)

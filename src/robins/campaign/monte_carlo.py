@@ -113,7 +113,7 @@ def one_record(
     }
 
 
-@partial(jax.jit, static_argnames=("filter_", "blocks"))
+@partial(jax.jit, static_argnames="blocks")
 def _records(filter_, blocks: Blocks, model, case: Partial, reported, worlds) -> dict[str, Any]:
     contender = Contender(filter_, model, case, reported)
     return _each(partial(one_record, blocks, contender), worlds)

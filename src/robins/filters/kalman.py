@@ -25,7 +25,6 @@ from robins.filters.linearise import Linearisation, Transition, taylor
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.observation import Observation, contradicted, left_out, whiten
 from robins.filters.rule import Memory, Rule
-from robins.filters.sameness import same
 from robins.filters.trees import finite, select
 from robins.filters.values import kind, value
 
@@ -138,55 +137,6 @@ class Filter:
         ok = state.current | (info.code == int(Code.MISSING))
         new = select(state.current, new, state)
         return new, not_taken(ok, info, jnp.asarray(int(Code.NOT_PREDICTED)))
-
-
-def no_members(state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
-    """ADAPTER."""
-    return (), lambda beliefs, belief: state
-
-
-@value
-class Functions(Filter):
-    """A filter of functions; what is not converted yet."""
-
-    init: Any = kind()
-    predict: Any = kind()
-    update: Any = kind()
-    reset: Any = kind()
-    members: Any = kind(default=no_members)
-
-    def report(self, start: Any, final: Any, again: Any, time: Any) -> None:
-        from robins.filters.audit import audit
-
-        if again is None:
-            audit(start, final, None, time)
-
-
-def functions(*args: Any, **kw: Any) -> Filter:
-    return Functions(*map(same, args), **{k: same(v) for k, v in kw.items()})
-
-
-def compiled(filter_: Filter) -> Filter:
-    return dataclasses.replace(
-        filter_, predict=same(jax.jit(filter_.predict)), update=same(jax.jit(filter_.update))
-    )
-
-
-def in_step(filter_: Filter) -> Filter:
-    """Of a filter of functions what `Filter` does of the others."""
-
-    def predict(state: FilterState, motion: Motion, u: Any = None):
-        state, prediction = filter_.predict(state, motion, u)
-        current = (prediction.code == int(Code.DONE)).astype(bool)
-        return state._replace(current=current), prediction
-
-    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
-        new, info = filter_.update(state, sensor, y, aux)
-        ok = state.current | (info.code == int(Code.MISSING))
-        new = select(state.current, new, state)
-        return new, not_taken(ok, info, jnp.asarray(int(Code.NOT_PREDICTED)))
-
-    return compiled(dataclasses.replace(filter_, predict=same(predict), update=same(update)))
 
 
 def predicted_factor(t: Transition, form: Form) -> Array:
