@@ -143,8 +143,8 @@ def test_a_memory_that_reports_is_asked_after_every_call():
         with pytest.raises(Infeasible, match="at step") as caught:
             run_on(live)
         told.append((str(caught.value), live.counts))
-        live.state = with_gamma(live.state, 1e3)
-        assert int(live.predict().code) == Code.DONE
+        other = OnlineFilter(with_gamma(one, 1e3), MODEL, live.state)
+        assert int(other.predict().code) == Code.DONE
     assert told[0] == told[1]
 
 
