@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -12,7 +10,7 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.linearise import Linearisation, Transition, taylor
-from robins.filters.model import Motion, Sensor
+from robins.filters.model import Data, Motion, Sensor
 from robins.filters.observation import Observation, left_out, whiten
 from robins.filters.values import kind, value
 from robins.manifold import State
@@ -28,10 +26,10 @@ class Iterated(Linearisation):
     way: Linearisation
     iterations: int = kind()
 
-    def transition(self, belief: Belief, motion: Motion, u: Any) -> Transition:
+    def transition(self, belief: Belief, motion: Motion, u: Data) -> Transition:
         return self.way.transition(belief, motion, u)
 
-    def observation(self, prior: Belief, sensor: Sensor, y: Any, aux: Any) -> Observation:
+    def observation(self, prior: Belief, sensor: Sensor, y: Data, aux: Data) -> Observation:
         first = self.way.observation(prior, sensor, y, aux)
         if self.iterations == 1:
             return first
@@ -49,7 +47,7 @@ class Iterated(Linearisation):
         return look(t, M)
 
     def look(
-        self, prior: Belief, sensor: Sensor, y: Any, aux: Any, t: Array, M: Array
+        self, prior: Belief, sensor: Sensor, y: Data, aux: Data, t: Array, M: Array
     ) -> Observation:
         """The measurement about retract(m, S t), regressed over S M, as the prior sees it."""
         mean, S = _carried(prior, t)

@@ -337,7 +337,8 @@ def unscented(
             from a measurement than could be, unless the noise is small. Only the first update after
             a prediction that no rule has faded has such points; the others draw.
     """
-    return Unscented((alpha, beta, kappa), redraw)
+    plain = (x if isinstance(x, (int, float)) else float(x) for x in (alpha, beta, kappa))
+    return Unscented(tuple(plain), redraw)
 
 
 def _square(noise: Array) -> Array:

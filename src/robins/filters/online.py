@@ -64,8 +64,8 @@ class OnlineFilter:
         self.filter, self.model = filter_, same_model(model)
         state = settled(filter_.init(start, model.dims) if isinstance(start, Belief) else start)
         self._machine = on(machine, self.filter, self.model, state)
-        self._start = tree_map(np.array, state)  # C writes over what it is given
         self._reports = filter_.reports
+        self._start = self._held()
         self.counts: Counter[str] = Counter()
         self._last: dict[str, deque[tuple[StepInfo, Any]]] = {}
 
@@ -77,7 +77,7 @@ class OnlineFilter:
     @state.setter
     def state(self, state: FilterState) -> None:
         self._machine.state = state
-        self._start = tree_map(np.array, state)
+        self._start = self._held()
 
     @property
     def belief(self) -> Belief:
@@ -175,6 +175,10 @@ class OnlineFilter:
         if self._machine.is_numpy:
             kept = tree_map(np.array, kept)
         self._last.setdefault(sensor, deque(maxlen=WINDOW)).append(kept)
+
+    def _held(self) -> FilterState:
+        """The state of now for later: what C computes next must not change it."""
+        return tree_map(np.array, self.state) if self._machine.is_numpy else self.state
 
     def _count(self, moved: Any, *used: Any) -> None:
         """Count a prediction that was not taken, and updates; let the filter report."""

@@ -11,18 +11,18 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 from scipy import integrate, optimize, special, stats
 
 from robins import linalg
 from robins.filters.belief import Belief
 from robins.filters.kalman import Again, Filter, FilterState
 from robins.filters.linearise import taylor
-from robins.filters.model import Motion, Sensor
+from robins.filters.model import Data, Motion, Sensor
 from robins.filters.observation import Normalised, normalised
 from robins.filters.run import Step
 from robins.filters.values import value
@@ -97,12 +97,12 @@ class Scored(Filter):
 
     # The states are those of the filter inside, which leaves out itself what is not taken.
     @jax.jit
-    def predict(self, state: FilterState, motion: Motion, u: Any = None):
+    def predict(self, state: FilterState, motion: Motion, u: Data = None):
         """That of the filter inside."""
         return self.inner.predict(state, motion, u)
 
     @jax.jit
-    def update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
+    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None):
         """That of the filter inside, with the score noted."""
         seen = normalised(taylor().observation(state.belief, sensor, y, aux))
         there = seen.dof > 0
@@ -116,7 +116,9 @@ class Scored(Filter):
     def members(self, state: FilterState):
         return self.inner.members(state)
 
-    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
+    def report(
+        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
+    ) -> None:
         def anew(filter_: Filter) -> FilterState:
             assert again is not None
             return again(replace(self, inner=filter_))

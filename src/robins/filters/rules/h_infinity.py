@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, TypeGuard, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from robins import manifold
 from robins.errors import RobinsError, require
@@ -258,7 +258,11 @@ class HInfinity(Rule):
         return None
 
     def report(
-        self, start: HInfinityMemory, final: HInfinityMemory, again: Again | None, time: Any
+        self,
+        start: HInfinityMemory,
+        final: HInfinityMemory,
+        again: Again | None,
+        time: ArrayLike | None,
     ) -> None:
         """Say under policy "raise" that the filter did not exist at some step.
 
