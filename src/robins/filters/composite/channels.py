@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -147,25 +147,29 @@ class Moved(NamedTuple):
     code: Any = int(Code.DONE)  # of that prediction
 
 
+@value
 class JoinedFilter(Composite):
     """Local filters whose beliefs are fused after each step; its memory is a `Joined`.
 
     Attributes:
         channels: the local filters, each with its sensors.
         title: prefix of its notes.
-        common: how many of the first components local filters must agree in; None: all.
         fuse: ``beliefs -> Belief`` of all members.
+        apart: ``(beliefs, i) -> bool``, whether local filter i contradicts another.
         first_shares: ``belief -> shares`` at the start.
         parted: ``(belief, shares) -> beliefs`` by member.
         moved: ``(state, motion, u) -> Moved``.
     """
 
     channels: tuple[Channel, ...]
-    title: str
-    common: int | None = None
+
+    title: ClassVar[str]
 
     def fuse(self, beliefs: Sequence[Belief]) -> Belief:
         raise NotImplementedError
+
+    def apart(self, beliefs: Sequence[Belief], i: int) -> Array:
+        return are_apart(beliefs, i, None)
 
     def first_shares(self, belief: Belief) -> Array:
         raise NotImplementedError
@@ -180,7 +184,7 @@ class JoinedFilter(Composite):
     def filters(self) -> tuple[Filter, ...]:
         return tuple(one.filter for one in self.channels)
 
-    def with_filters(self, filters: tuple[Filter, ...]) -> Filter:
+    def with_filters(self, filters: tuple[Filter, ...]) -> Self:
         each = zip(self.channels, filters, strict=False)  # a master's is no channel's
         return replace(self, channels=tuple(replace(c, filter=f) for c, f in each))
 
@@ -246,7 +250,7 @@ class JoinedFilter(Composite):
     def compared(self, members: Sequence[FilterState], i: int, info: StepInfo) -> StepInfo:
         """What local filter i says of an update, or that it is now apart from another."""
         locals_ = [m.belief for m in members[: len(self.channels)]]
-        apart = are_apart(locals_, i, self.common) & (info.code == int(Code.DONE))
+        apart = self.apart(locals_, i) & (info.code == int(Code.DONE))
         return info._replace(code=jnp.where(apart, int(Code.APART), info.code))
 
     def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
@@ -353,7 +357,7 @@ class AtMaster(Composite):
         return self.joined, self.master
 
     def with_filters(self, filters: tuple[Filter, ...]) -> Filter:
-        return AtMaster(*filters, self.sensors)
+        return replace(self, joined=filters[0], master=filters[1])
 
     def parts(self, state: FilterState) -> tuple[FilterState, ...]:
         return state.memory

@@ -32,7 +32,7 @@ from jaxtyping import Array
 from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.checks import one_of
-from robins.filters.composite.channels import Channel, JoinedFilter, Moved, owners
+from robins.filters.composite.channels import Channel, JoinedFilter, Moved, are_apart, owners
 from robins.filters.composite.fusion import (
     Criterion,
     check_criterion,
@@ -53,14 +53,11 @@ FULL = (
 )
 
 
+@value
 class SideBySide(JoinedFilter):
-    """Local filters with the whole prior and process noise.
+    """Local filters with the whole prior and process noise."""
 
-    Attributes:
-        feedback: what they go on from.
-    """
-
-    feedback: Feedback
+    feedback: Feedback = kind()
 
     def first_shares(self, belief: Belief) -> Array:
         return jnp.ones((len(self.channels), 1))
@@ -88,8 +85,6 @@ class SideBySide(JoinedFilter):
 class Distributed(SideBySide):
     """The filter of `distributed`."""
 
-    channels: tuple[Channel, ...]
-    feedback: Feedback = kind()
     common: int | None = kind()
 
     title = "distributed"
@@ -99,6 +94,9 @@ class Distributed(SideBySide):
         if self.common is not None and n < self.common:
             raise ValueError(f"distributed: {self.common} components are common, the state has {n}")
         return super().first_shares(belief)
+
+    def apart(self, beliefs: Sequence[Belief], i: int) -> Array:
+        return are_apart(beliefs, i, self.common)
 
     def fuse(self, beliefs: Sequence[Belief]) -> Belief:
         if self.common is None:
@@ -110,8 +108,6 @@ class Distributed(SideBySide):
 class Intersecting(SideBySide):
     """The filter of `intersecting`."""
 
-    channels: tuple[Channel, ...]
-    feedback: Feedback = kind()
     criterion: Criterion | Numbers  # or (channels,) weights
 
     title = "intersecting"
@@ -176,6 +172,5 @@ def intersecting(
     one_of("feedback", feedback, Feedback)
     check_criterion(criterion, len(channels))
     owners(channels)
-    if not isinstance(criterion, str):
-        criterion = number("weights must be numbers", criterion)
-    return Intersecting(tuple(channels), feedback, criterion)
+    given = criterion if isinstance(criterion, str) else number("weights must be real", criterion)
+    return Intersecting(tuple(channels), feedback, given)

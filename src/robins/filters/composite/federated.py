@@ -38,7 +38,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import jax
 import jax.numpy as jnp
@@ -161,7 +161,6 @@ _TRACE = 1e-8
 class Federated(JoinedFilter):
     """The filter of `federated`."""
 
-    channels: tuple[Channel, ...]
     centre: Filter  # how the fused belief and the master's are predicted
     fixed: Numbers | None  # (channels,) or (channels, n) shares, where they are given
     master: Numbers  # () its share
@@ -184,7 +183,7 @@ class Federated(JoinedFilter):
     def filters(self) -> tuple[Filter, ...]:
         return (*super().filters, self.centre) if self.has_master else super().filters
 
-    def with_filters(self, filters: tuple[Filter, ...]) -> Filter:
+    def with_filters(self, filters: tuple[Filter, ...]) -> Self:
         centre = filters[-1] if self.has_master else self.centre
         return replace(super().with_filters(filters), centre=centre)
 
@@ -328,18 +327,20 @@ def federated(
     one_of("mode", mode, Mode)
     check_sharing(sharing)
     within = "the master's share must lie from 0 to below 1"
-    master = number(within, master, lambda b: (b >= 0.0) & (b < 1.0))
-    keep = number("keep must lie between 0 and 1", keep, lambda c: (c > 0.0) & (c < 1.0))
-    has_master = _has_master(mode, shares, master)
-    fixed = _fixed_shares(shares, len(channels), master)
+    of_master = number(within, master, lambda b: (b >= 0.0) & (b < 1.0))
+    kept = number("keep must lie between 0 and 1", keep, lambda c: (c > 0.0) & (c < 1.0))
+    has_master = _has_master(mode, shares, of_master)
+    fixed = _fixed_shares(shares, len(channels), of_master)
     weighing = shares if isinstance(shares, str) else "given"
     if sharing == "scalar" and (weighing == "diagonal" or (fixed is not None and fixed.ndim == 2)):
         raise ValueError("scalar sharing takes one share a channel: use 'root' for one a state")
     if after_prediction and mode != "fusion-reset":
         raise ValueError(f"sharing after the prediction is of mode 'fusion-reset', not {mode!r}")
+    patience = None
     if timeout is not None:
         require(mode == "fusion-reset", f"mode {mode!r} does not share anew: it has no timeout")
-        timeout = number("federated timeout must be at least one step", timeout, lambda t: t >= 1)
+        short = "federated timeout must be at least one step"
+        patience = number(short, timeout, lambda steps: steps >= 1)
     if sharing == "half":
         warnings.warn(HALF, UserWarning, stacklevel=2)
     usual = sharing == "root" if after_prediction is None else after_prediction
@@ -347,9 +348,9 @@ def federated(
         channels=channels,
         centre=kalman(linearise),
         fixed=fixed,
-        master=master,
-        keep=keep,
-        timeout=timeout,
+        master=of_master,
+        keep=kept,
+        timeout=patience,
         mode=mode,
         sharing=sharing,
         weighing=weighing,

@@ -282,22 +282,22 @@ def guarded(
     require(not both, f"guarded: {both} cannot judge, it belongs to the assumption")
     named = groups is None or (len(groups) > 0 and all(len(one) > 0 for one in groups))
     require(named, "guarded groups must each name a component", groups)
+    times = number("guarded ratio must be at least 1", ratio, lambda x: x >= 1.0)
+    given = {"limit": limit, "patience": patience, "leap": leap}
+    positive = {
+        name: number(f"guarded {name} must be positive", x, lambda x: x > 0.0)
+        for name, x in given.items()
+    }
     return Guarded(
         filter=filter,
         reference=reference,
-        ratio=number("guarded ratio must be at least 1", ratio, lambda x: x >= 1.0),
-        limit=number("guarded limit must be positive", limit, _is_positive),
-        patience=number("guarded patience must be positive", patience, _is_positive),
-        leap=number("guarded leap must be positive", leap, _is_positive),
+        ratio=times,
+        **positive,
         assumed=assumed,
         judging=judging,
         groups=None if groups is None else tuple(map(tuple, groups)),
         trusted=trusted,
     )
-
-
-def _is_positive(x: Numbers) -> Numbers:
-    return x > 0.0
 
 
 def _given_out(watch: Watch) -> FilterState:
