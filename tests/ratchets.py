@@ -49,7 +49,7 @@ def is_value(node: ast.ClassDef) -> bool:
 
 
 def counted(tree: ast.Module) -> Counter[str]:
-    """Clause-first docstrings, classes that are no values, long functions and loose types of a module."""
+    """Clause-first docstrings, classes, long functions and loose types of a module."""
     found = Counter[str]()
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):

@@ -15,11 +15,11 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
-from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.errors import require_known
 from robins.filters import Belief, Filter, Loop, Model
+from robins.filters.values import kind, value
 from robins.manifold import State
 from robins.results import Outcome
 from robins.scenario import Parameters
@@ -89,17 +89,21 @@ class Contender(NamedTuple):
     on_host: str = ""
 
 
-def recipe(function: Callable[..., Any], *kinds: Any, numbers: Any) -> Partial:
+@value
+class Recipe:
     """``function(*kinds, numbers, world)`` as a function of the world alone.
 
-    Kinds (names, flags, None) choose what is compiled; numbers are data. Recipes of one function
-    and equal kinds share what was compiled (`robins.filters.sameness`).
+    Kinds (names, flags, None) choose what is compiled and are compared by `==`; numbers are data.
+    Recipes of one function and equal kinds share what was compiled.
     """
 
-    def of_kind(numbers: Any, world: Any) -> Any:
-        return function(*kinds, numbers, world)
+    function: Callable[..., Case] = kind()
+    kinds: tuple[Any, ...] = kind()
+    numbers: Any
 
-    return Partial(of_kind, numbers)
+    def __call__(self, world: Any) -> Case:
+        """The case of a world."""
+        return self.function(*self.kinds, self.numbers, world)
 
 
 class Limit(NamedTuple):

@@ -19,6 +19,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
 
 from robins import linalg, manifold
@@ -29,7 +30,7 @@ from robins.filters.kalman import updated
 from robins.filters.linearise import taylor
 from robins.filters.model import Sensor, as_noise
 from robins.filters.observation import Observation, contradicted, normalised
-from robins.filters.values import is_known
+from robins.filters.values import as_data, is_known
 from robins.manifold import State
 
 Given = ArrayLike | Sequence[Any]
@@ -139,7 +140,7 @@ def as_sensor(mean: State, g: Function, d: Any, noise: Given | None) -> tuple[Se
     else:
         target = jax.tree_util.tree_map(jnp.zeros_like, value)
     root = jnp.zeros((c, 0)) if noise is None else as_noise(noise, c, "the constraint")
-    return Sensor(lambda x, aux: read(x), root, c, "constraint", linear), target
+    return Sensor(Partial(_of_state, as_data(read)), root, c, "constraint", linear), target
 
 
 def _by_matrix(mean: State, matrix: Given) -> tuple[Any, Any, Array]:
@@ -155,10 +156,20 @@ def _by_matrix(mean: State, matrix: Given) -> tuple[Any, Any, Array]:
             f"D is {D.shape}: one column for each of {manifold.dim(mean)} states is wanted"
         )
 
-    def read(x):
-        return D @ jnp.concatenate([jnp.reshape(leaf, -1) for leaf in manifold.leaves(x)])
+    return Partial(_product, D), Partial(_product_linear, D), jnp.zeros(len(D))
 
-    return read, lambda x, aux: (read(x), D), jnp.zeros(len(D))
+
+def _of_state(read: Callable[[State], Any], x: State, aux: Any) -> Any:
+    """A function of the state alone, as a sensor reads."""
+    return read(x)
+
+
+def _product(D: Array, x: State) -> Array:
+    return D @ jnp.concatenate([jnp.reshape(leaf, -1) for leaf in manifold.leaves(x)])
+
+
+def _product_linear(D: Array, x: State, aux: Any) -> tuple[Array, Array]:
+    return _product(D, x), D
 
 
 def metric_of(belief: Belief, weight: Weight) -> tuple[Belief, Array | None]:

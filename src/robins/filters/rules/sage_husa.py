@@ -147,4 +147,6 @@ def sage_husa(
     """
     known = _variances.bounded("sage_husa", forgetting, floor, ceiling)
     one_of("sage_husa adapt", adapt, ("R", "Q", "QR"))
-    return SageHusa(**known, endless=bool(forgetting == 1.0), of_sensor="R" in adapt, of_motion="Q" in adapt)
+    return SageHusa(
+        **known, endless=bool(forgetting == 1.0), of_sensor="R" in adapt, of_motion="Q" in adapt
+    )
