@@ -64,7 +64,7 @@ class OnlineFilter:
         self.filter, self.model = filter_, same_model(model)
         state = settled(filter_.init(start, model.dims) if isinstance(start, Belief) else start)
         self._machine = on(machine, self.filter, self.model, state)
-        self._reports = self.filter.reports
+        self._start, self._reports = self.state, self.filter.reports
         self.counts: Counter[str] = Counter()
         self._last: dict[str, deque[tuple[StepInfo, Any]]] = {}
 
@@ -76,6 +76,7 @@ class OnlineFilter:
     @state.setter
     def state(self, state: FilterState) -> None:
         self._machine.state = state
+        self._start = self.state
 
     @property
     def belief(self) -> Belief:
@@ -182,4 +183,4 @@ class OnlineFilter:
         for one in used:
             self.counts[_NAMES[int(one)]] += 1
         if self._reports:
-            self.filter.report(self.state, self.state, None, None)
+            self.filter.report(self._start, self.state, None, None)
