@@ -373,7 +373,7 @@ def test_the_filter_that_is_delayed_is_asked_with_a_run_of_its_own():
     run(one, LINEAR, BEGIN, {"a": Y["a"]}, time_s=time_s)
     live = OnlineFilter(one, LINEAR, BEGIN)
     live.predict()
-    assert [(0.0, 8.0, 16.0, time_s), (1.0, 1.0, None, None)] == HEARD
+    assert [(0.0, 8.0, 16.0, time_s), (0.0, 1.0, None, None)] == HEARD
     assert one.reports
     assert not BACK.reports
 

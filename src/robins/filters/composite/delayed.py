@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo, is_failure
-from robins.filters.kalman import Again, Filter, FilterState
-from robins.filters.model import Model, Motion, Sensor
+from robins.filters.kalman import Again, Filter, FilterState, Prediction
+from robins.filters.model import Data, Model, Motion, Sensor
 from robins.filters.sameness import same_model
 from robins.filters.trees import select
 from robins.filters.values import kind, value
@@ -96,8 +96,8 @@ class Delayed(Filter):
 
     filter_: Filter
     model: Model
-    u: Any  # one input
-    aux: dict[str, Any]  # one of each sensor
+    u: Data  # one input
+    aux: dict[str, Data]  # one of each sensor
     depth: int = kind()
 
     @property
@@ -136,7 +136,9 @@ class Delayed(Filter):
     # The filter itself knows whether its prediction was taken: what comes late can change that.
 
     @jax.jit
-    def predict(self, state: FilterState, motion: Motion, u: Any = None):
+    def predict(
+        self, state: FilterState, motion: Motion, u: Data = None
+    ) -> tuple[FilterState, Prediction]:
         """Predict, and begin a row of the buffer."""
         held = state.memory
         _check_same("the motion", motion, held.model.motion)
@@ -149,7 +151,7 @@ class Delayed(Filter):
         new = _outer(inner, Delay(inner.memory, past, now, reach, known))
         return new, prediction._replace(transition=None, origin=None)
 
-    def opened(self, past: _Past, at: Array, inner: FilterState, u: Any) -> _Past:
+    def opened(self, past: _Past, at: Array, inner: FilterState, u: Data) -> _Past:
         """With a row for a step that begins."""
         none = jnp.zeros(len(self.names), bool)
         entry = _Past(
@@ -165,7 +167,9 @@ class Delayed(Filter):
         return jax.tree_util.tree_map(lambda a, x: a.at[at].set(x), past, entry)
 
     @jax.jit
-    def update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
+    def update(
+        self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None
+    ) -> tuple[FilterState, StepInfo]:
         """Enter a measurement in its step, and filter again from there."""
         held = state.memory
         which, known = self.recognised(held.model, sensor, aux)
@@ -180,7 +184,7 @@ class Delayed(Filter):
         past = past._replace(before=redone.before, log_likelihood=redone.log_likelihood)
         return _outer(inner, Delay(inner.memory, past, held.now, held.reach, known)), told
 
-    def recognised(self, model: Model, sensor: Sensor, aux: Any) -> tuple[int, Model]:
+    def recognised(self, model: Model, sensor: Sensor, aux: Data) -> tuple[int, Model]:
         """Which sensor it is, and the model with its numbers."""
         names = self.names
         if sensor.name not in names:
@@ -192,7 +196,7 @@ class Delayed(Filter):
         sensors = tuple(mine if s.name == sensor.name else s for s in model.sensors)
         return which, Model(model.motion, sensors)
 
-    def placed(self, held: Delay, which: int, value: Any, age: Any) -> _Place:
+    def placed(self, held: Delay, which: int, value: Data, age: Any) -> _Place:
         """Where a measurement of this age belongs."""
         age = jnp.asarray(age, float)
         there = jnp.any(jnp.stack([jnp.any(jnp.isfinite(x)) for x in jax.tree.leaves(value)]))
@@ -245,7 +249,9 @@ class Delayed(Filter):
     def reports(self) -> bool:
         return self.filter_.reports
 
-    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
+    def report(
+        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
+    ) -> None:
         """Ask the filter that is delayed, not its past."""
 
         def anew(filter_: Filter) -> FilterState:
@@ -299,7 +305,9 @@ def delayed(
     return Delayed(filter_, same_model(model), _plain(u), extra, depth)
 
 
-def _entered(past: _Past, place: _Place, name: str, value: Any, aux: Any, info: StepInfo) -> _Past:
+def _entered(
+    past: _Past, place: _Place, name: str, value: Data, aux: Data, info: StepInfo
+) -> _Past:
     """With a measurement in its own step; and in this one, where its sensor is asked for too."""
     now, at, which, used = place.now, place.at, place.which, place.used
 
@@ -364,7 +372,7 @@ def _with(rows: dict[str, Any], name: str, enter: Any, value: Any) -> dict[str, 
     return {**rows, name: jax.tree_util.tree_map(enter, rows[name], value)}
 
 
-def _unread(sensor: Sensor, state: FilterState, aux: Any) -> Any:
+def _unread(sensor: Sensor, state: FilterState, aux: Data) -> Any:
     """A measurement of a sensor that tells nothing."""
     like = jax.eval_shape(sensor.read, state.belief.mean, aux)
     return jax.tree_util.tree_map(lambda leaf: jnp.full(leaf.shape, jnp.nan), like)

@@ -33,7 +33,7 @@ from robins.filters.belief import Belief, Code, Number, StepInfo
 from robins.filters.composite.mixture import innovation, log_normalised, matched
 from robins.filters.kalman import Filter, FilterState, Prediction, predicted_factor, updated
 from robins.filters.linearise import Linearisation, taylor
-from robins.filters.model import Motion, Sensor
+from robins.filters.model import Data, Motion, Sensor
 from robins.filters.trees import finite, select
 from robins.filters.values import Numbers, is_known, kind, number, value
 
@@ -131,7 +131,9 @@ class Particle(Filter):
         xi = jax.random.normal(key, (self.count, k))
         return particles._replace(mean=jax.vmap(one)(particles.mean, xi))
 
-    def _predict(self, state: FilterState, motion: Motion, u: Any):
+    def _predict(
+        self, state: FilterState, motion: Motion, u: Data
+    ) -> tuple[FilterState, Prediction]:
         key, choose, jitter, draw = _split(state.memory.key, 3)
         before, log_weight = self.refreshed(state, choose, jitter)
 
@@ -149,7 +151,9 @@ class Particle(Filter):
         code = jnp.where(taken, int(Code.DONE), int(Code.NOT_FINITE))
         return new, Prediction(None, new.belief, code)
 
-    def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
+    def _update(
+        self, state: FilterState, sensor: Sensor, y: Data, aux: Data
+    ) -> tuple[FilterState, StepInfo]:
         before, log_prior, key = state.memory
 
         def one(b: Belief):

@@ -251,11 +251,15 @@ class HInfinity(Rule):
             return int(final.first), jnp.asarray(final.weighted_first)  # of a stream in C
         if missed > 0:  # the first was another filter's; where one step is missed the rest are
             return int(final.steps) - 1 - missed, final.weighted
+        if not whole or not bool(final.measured):
+            return None
         n = final.weighted.shape[1]
         exists = inflated(jnp.eye(n), self.inverse * final.weighted)[1]
-        if whole and bool(final.measured) and not bool(exists):
-            return int(final.steps) - 1, final.weighted
-        return None
+        return None if bool(exists) else (int(final.steps) - 1, final.weighted)
+
+    @property
+    def reports(self) -> bool:
+        return self.policy == "raise"
 
     def report(
         self,
@@ -272,7 +276,7 @@ class HInfinity(Rule):
         Raises:
             Infeasible: it did not.
         """
-        if self.policy != "raise":
+        if not self.reports:
             return
         before = int(start.events)
         broken = self.first_infeasible(final, before, whole=again is not None)
@@ -290,7 +294,8 @@ class HInfinity(Rule):
             least = least_gamma(exists, gamma)
         times = () if time is None else np.asarray(time)
         time_s = float(times[step]) if 0 <= step < len(times) else None
-        raise Infeasible(step, time_s, gamma, float(local_bound(weighted)), least)
+        bound = float(local_bound(jnp.asarray(weighted)))  # in C a stream has arrays of NumPy
+        raise Infeasible(step, time_s, gamma, bound, least)
 
 
 def h_infinity(
