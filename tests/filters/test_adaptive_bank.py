@@ -8,6 +8,7 @@ from scipy.stats import multivariate_normal
 
 from robins.filters import Belief, Model, Motion, Sensor, adaptive, kalman, run
 from robins.filters.composite.adaptive import changes, excited, lasting
+from robins.filters.composite.bank import EVERY, transitions
 from robins.filters.linearise import Transition
 from robins.filters.rules import huber
 
@@ -94,6 +95,14 @@ def test_scales_change_as_stated_and_begin_where_they_last(scales, up, back):
         assert change[4, 1] == back
     far = np.linalg.matrix_power(change, 10**6)
     np.testing.assert_allclose(lasting(change), far[0], rtol=1e-6)
+
+
+def test_edges_are_probabilities_and_what_is_left_goes_where_it_is_told():
+    edges = [(EVERY, 1, 0.2), (slice(2), 2, [0.1, 0.3]), (2, 0, 0.5), (2, 0, 0.4)]
+    stays = transitions(3, edges)
+    np.testing.assert_allclose(stays, [[0.7, 0.2, 0.1], [0.0, 0.7, 0.3], [0.4, 0.2, 0.4]])
+    moves = transitions(3, edges, rest=[0, 0, 1])
+    np.testing.assert_allclose(moves, [[0.7, 0.2, 0.1], [0.5, 0.2, 0.3], [0.4, 0.6, 0.0]])
 
 
 def test_it_follows_what_lasts_and_ignores_what_does_not():

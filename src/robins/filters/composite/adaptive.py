@@ -36,6 +36,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
+from robins.filters.composite.bank import EVERY, transitions
 from robins.filters.composite.imm import Family, imm
 from robins.filters.composite.offsets import (
     Supposed,
@@ -105,12 +106,11 @@ def changes(scales: Sequence[float | int], up: float = UP, back: float = BACK) -
         ValueError: they are no probabilities.
     """
     s = np.asarray(scales, float)
-    change = np.where(s[None] < s[:, None], back, up)
-    np.fill_diagonal(change, 0.0)
-    stay = 1.0 - change.sum(axis=1)
-    good = 0.0 < up < 1.0 and 0.0 < back < 1.0 and bool(np.all(stay > 0.0))
+    chance = np.where(s[None] < s[:, None], back, up)
+    change = transitions(len(s), [(EVERY, EVERY, chance)])
+    good = 0.0 < up < 1.0 and 0.0 < back < 1.0 and bool(np.all(np.diag(change) > 0.0))
     require(good, "up and back of adaptive must leave a mode a chance to stay", (up, back))
-    return change + np.diag(stay)
+    return change
 
 
 def lasting(change: np.ndarray) -> np.ndarray:

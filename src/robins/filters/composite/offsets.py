@@ -35,6 +35,7 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief
+from robins.filters.composite.bank import EVERY, transitions
 from robins.filters.kalman import Again, Filter, FilterState, Prediction
 from robins.filters.model import Motion, Sensor
 from robins.filters.values import Numbers, kind, value
@@ -80,15 +81,10 @@ def with_offsets(change: np.ndarray, sensors: int) -> np.ndarray:
     """
     plain, count = len(change), len(change) + 2 * sensors
     begins = plain + 2 * np.arange(sensors)
-    p = np.zeros((count, count))
-    p[:plain, :plain] = change
-    p[plain:, 0] = END
-    p[:, begins] = BEGIN
     at = np.arange(count)
-    rest = np.where(np.isin(at, begins), at + 1, at)
-    p[at, rest] = 0.0
-    p[at, rest] = 1.0 - p.sum(axis=1)
-    return p
+    told = slice(plain)
+    edges = [(told, told, change), (slice(plain, None), 0, END), (EVERY, begins, BEGIN)]
+    return transitions(count, edges, np.where(np.isin(at, begins), at + 1, at))
 
 
 # ----------------------------------------------------------------------------- the model of a mode

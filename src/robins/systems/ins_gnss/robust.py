@@ -32,6 +32,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.filters import Belief, Family, Filter, Model, Motion, Rule, Sensor, imm, kalman, taylor
+from robins.filters.composite.bank import EVERY, transitions
 from robins.filters.composite.imm import Mode
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory
@@ -96,18 +97,12 @@ def changes(step_s: float, patience_s: float) -> np.ndarray:
     step_s = min(step_s, 0.5 * patience_s)
     begin, over = (-math.expm1(-step_s / length) for length in (SELDOM_S, patience_s))
     scale = np.array(SCALES)
-    p = np.zeros((len(_ROWS), len(_ROWS)))
-    for same in (RIGHT, LASTS):
-        p[same, same] = np.where(scale[None] > scale[:, None], RISE, FALL)
-    p[:, BEGINS] = begin
+    chance = np.where(scale[None] > scale[:, None], RISE, FALL)
+    edges: list[Any] = [(same, same, chance) for same in (RIGHT, LASTS)]
+    edges += [(EVERY, BEGINS, begin)]
     for off in (LASTS, BEGINS):
-        p[off, ENDS] = over
-        p[off, STRAYED] = over / LATER
-    # where the rest goes
-    at, rest = np.arange(len(p)), np.array([*range(2 * COUNT), COUNT, 0, 0])
-    p[at, rest] = 0.0
-    p[at, rest] = 1.0 - p.sum(axis=1)
-    return p
+        edges += [(off, ENDS, over), (off, STRAYED, over / LATER)]
+    return transitions(len(_ROWS), edges, rest=[*range(2 * COUNT), COUNT, 0, 0])
 
 
 # ------------------------------------------------------------------------------------ the model

@@ -24,6 +24,7 @@ from jaxtyping import Array, ArrayLike
 
 from robins import units
 from robins.filters import Family, Filter, Motion, imm, kalman
+from robins.filters.composite.bank import EVERY, transitions
 from robins.filters.composite.imm import Mode
 from robins.filters.rule import Rule
 from robins.filters.rules import huber
@@ -98,6 +99,5 @@ def blind(system: am.LinearSystem, noise_rad: float, period_s: float) -> Filter:
     rows = hypotheses()
     stiff = np.asarray(rows.sigma) == 0.0
     start = np.where(stiff, 0.5 / np.sum(stiff), 0.5 / np.sum(~stiff))
-    count = len(start)
-    change = np.full((count, count), _OTHER) + np.diag(np.full(count, 1.0 - count * _OTHER))
+    change = transitions(len(start), [(EVERY, EVERY, _OTHER)])
     return imm(Family(supposed(system, noise_rad, period_s), rows), change, start)
