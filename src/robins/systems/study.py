@@ -188,7 +188,7 @@ class Problem(View):
     def __post_init__(self) -> None:
         """Check that all names fit each other."""
         named: dict[str, str] = {}  # what has an axis of its own, in the result
-        for kind, names in (
+        for what, names in (
             ("block", [b.name for b in self.blocks]),
             ("output", [o.name for o in self.outputs]),
             ("sensor", list(self.sensors)),
@@ -197,10 +197,10 @@ class Problem(View):
             for name in names:
                 if other := named.get(name):
                     raise ValueError(
-                        f"{name}: names a {kind} and a {other}, whose axes could not be told "
+                        f"{name}: names a {what} and a {other}, whose axes could not be told "
                         "apart in the result; rename one of them"
                     )
-                named[name] = kind
+                named[name] = what
         for limit in self.limits:
             if named.get(limit.block) != "block":
                 raise ValueError(f"limit {limit.name}: there is no block '{limit.block}'")
