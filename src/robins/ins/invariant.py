@@ -112,8 +112,8 @@ def invariant_motion(noise: InsNoise, gravity: Vector = (0.0, 0.0, GRAVITY)) -> 
     white = jnp.concatenate([_each(noise.gyro_arw), _each(noise.accel_vrw)])
     walk = jnp.concatenate([_each(noise.gyro_bias_rw), _each(noise.accel_bias_rw)])
     g = jnp.asarray(gravity, float)
-    noise, linear = Partial(_noise, g, white, walk), Partial(_linear, g, white, walk)
-    return Motion(Partial(_step, g), noise, linear)
+    given = g, white, walk
+    return Motion(Partial(_step, g), Partial(_noise, *given), Partial(_linear, *given))
 
 
 def _step(g: Array, x: InvariantState, u: Increments) -> InvariantState:
