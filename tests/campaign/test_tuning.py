@@ -13,7 +13,7 @@ def spread(count, sigma, seed=0):
     return np.random.default_rng(seed).normal(size=(count, 50)) * sigma
 
 
-def likelihood(kind, numbers, z):
+def likelihood(numbers, z):
     """Minus the log density of normal numbers (parts, N) of a standard deviation, mean by part."""
     (sigma,) = numbers
     return jnp.mean(jnp.log(sigma) + 0.5 * (z / sigma) ** 2, axis=1)[:, None]
@@ -66,15 +66,25 @@ def test_rows_part_what_is_measured_at_once():
     assert len(found.before) == 20
 
 
-def test_what_is_compiled_is_searched():
-    def trial(x):
-        return Trial(round(float(np.exp(x[0])), 6), ())
+def told(size):
+    """Of a size that is data, or the structure of a tree."""
+    return {"data": (jnp.asarray(size),), "structure": {str(size): ()}}
 
-    def measure(kind, numbers, z):
-        return likelihood(kind, (jnp.asarray(kind),), z)
+
+def likelihood_told(numbers, z):
+    (sigma,) = numbers if isinstance(numbers, tuple) else map(float, numbers)
+    return likelihood((jnp.asarray(sigma),), z)
+
+
+@pytest.mark.parametrize("way", ["data", "structure"])
+def test_what_may_leap_or_is_compiled_is_searched(way):
+    def trial(x):
+        size = round(float(np.exp(x[0])), 6)
+        return Trial(size if way == "data" else (), told(size)[way])
 
     z = spread(30, 3.0)
-    found = choose(Objective(trial, measure, first), ["a"], Data(z), Data(spread(30, 3.0, 1)))
+    at = Objective(trial, likelihood_told, first)
+    found = choose(at, ["a"], Data(z), Data(spread(30, 3.0, 1)))
     assert not found.gradient
     assert np.exp(found.x[0]) == pytest.approx(np.sqrt(np.mean(z**2)), rel=0.02)
 
@@ -111,9 +121,9 @@ def test_it_refuses_few_parts_and_a_lost_filter():
 
 @pytest.mark.parametrize(("lost_at", "better"), [(1.0, True), (2.0, False)])
 def test_a_filter_that_is_lost_on_what_was_held_out_is_worse(lost_at, better):
-    def measure(kind, numbers, arrays):
+    def measure(numbers, arrays):
         z, held_out = arrays
-        found = likelihood(kind, numbers, z)
+        found = likelihood(numbers, z)
         return jnp.where(held_out & (jnp.abs(numbers[0] - lost_at) < 0.2), jnp.inf, found)
 
     z, no, yes = spread(20, 2.0), np.zeros((20, 1), bool), np.ones((20, 1), bool)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.campaign.monte_carlo import contender, reported_rows, solved, worlds
@@ -104,14 +102,14 @@ def bound_sigma(problem: Problem, name: str, world: Any) -> np.ndarray:
     return np.sqrt(np.asarray(_variances(c.filter, c.model, c.case, c.reported, world)))
 
 
-def _case(filter_: Filter, model: Model, case: Partial, world: Any) -> Case:
+def _case(filter_: Filter, model: Model, case: Callable[[Any], Case], world: Any) -> Case:
     """The case of a run. In closed loop it takes the filter to know where the vehicle went."""
     it = case(world)
     return it if it.loop is None else solved(filter_, model, it, nothing)[1]
 
 
-@partial(jax.jit, static_argnames="filter_")
-def _variances(filter_, model, case: Partial, reported, world) -> Array:
+@jax.jit
+def _variances(filter_, model, case, reported, world) -> Array:
     it = _case(filter_, model, case, world)
     line = linearised(model, _start(it), it.truth, it.y, it.u, it.aux)
     return _reported(reported_rows(reported, it)[0], bound_along(line, _start(it).factor).factor)
@@ -148,8 +146,8 @@ class _Found(NamedTuple):
     rows: Array | None  # (r, n) what is reported of the start
 
 
-@partial(jax.jit, static_argnames="filter_")
-def _bound(filter_, model, case: Partial, reported, subsets, world) -> _Found:
+@jax.jit
+def _bound(filter_, model, case, reported, subsets, world) -> _Found:
     it = _case(filter_, model, case, world)
     start = _start(it)
     line = linearised(model, start, it.truth, it.y, it.u, it.aux)

@@ -17,13 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.stages import Traced
-from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.campaign.memory import CHUNK, filled
 from robins.filters import Belief, Code, Step, Tally, run, run_closed
 from robins.filters.analysis.consistency import normalised_sq
-from robins.filters.sameness import same, same_model
+from robins.filters.values import as_data
 from robins.manifold import State, local
 from robins.program.liveness import bytes_of_jaxpr
 from robins.systems.study import Case, Contender, Problem
@@ -113,8 +112,8 @@ def one_record(
     }
 
 
-@partial(jax.jit, static_argnames=("filter_", "blocks"))
-def _records(filter_, blocks: Blocks, model, case: Partial, reported, worlds) -> dict[str, Any]:
+@partial(jax.jit, static_argnames="blocks")
+def _records(filter_, blocks: Blocks, model, case, reported, worlds) -> dict[str, Any]:
     contender = Contender(filter_, model, case, reported)
     return _each(partial(one_record, blocks, contender), worlds)
 
@@ -188,20 +187,15 @@ def _given(problem: Problem, name: str) -> tuple:
 
 
 def contender(problem: Problem, name: str) -> Contender:
-    """A contender of a problem, of which what was compiled for an equal one serves again.
+    """A contender of a problem, as data: what was compiled for another of its kind serves again.
 
     Raises:
         ValueError: there is none of this name.
     """
     if name not in problem.contenders:
         raise ValueError(f"no filter '{name}'; this problem has {sorted(problem.contenders)}")
-    return settled(problem.contenders[name])
-
-
-def settled(c: Contender) -> Contender:
-    """A contender of whose functions those stand for it that were made first of their content."""
-    case = c.case if isinstance(c.case, Partial) else Partial(c.case)  # whose numbers are data
-    return c._replace(filter=same(c.filter), model=same_model(c.model), case=same(case))
+    c = problem.contenders[name]
+    return c._replace(case=as_data(c.case))
 
 
 def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, Any]:

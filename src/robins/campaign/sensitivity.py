@@ -16,6 +16,7 @@ what JAX traces in the place of a number.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -28,7 +29,6 @@ from scipy import stats
 from robins.campaign.memory import CHUNK, MEMORY, width_of
 from robins.campaign.monte_carlo import one_record
 from robins.filters import Belief
-from robins.filters.sameness import content
 from robins.program.liveness import bytes_of_jaxpr
 from robins.scenario import Parameters
 from robins.systems.study import Contender, Study, View
@@ -163,17 +163,26 @@ def depends(before: Any, course: Any, after: Any) -> bool:
         course: of the same parameters, laid out again: what differs here tells nothing.
         after: of other parameters.
     """
-    first, again, other = (jax.tree_util.tree_leaves(x) for x in (before, course, after))
+    first, again, other = (list(_parts(x)) for x in (before, course, after))
     if len(first) != len(other):
         return True
-
-    def alike(a: Any, b: Any) -> bool:
-        if isinstance(a, np.ndarray | np.generic | jax.Array | float | int):
-            return bool(np.array_equal(a, b, equal_nan=np.asarray(a).dtype.kind == "f"))
-        return content(a) == content(b)
-
     each = zip(first, again, other, strict=True)
-    return any(alike(a, b) and not alike(a, c) for a, b, c in each)
+    return any(_alike(a, b) and not _alike(a, c) for a, b, c in each)
+
+
+def _parts(x: Any) -> Iterator[Any]:
+    """The leaves of a pytree, and of the dataclasses among them."""
+    for leaf in jax.tree_util.tree_leaves(x):
+        if dataclasses.is_dataclass(leaf) and not isinstance(leaf, type):
+            yield from _parts([getattr(leaf, f.name) for f in dataclasses.fields(leaf)])
+        else:
+            yield leaf
+
+
+def _alike(a: Any, b: Any) -> bool:
+    if isinstance(a, np.ndarray | np.generic | jax.Array | float | int):
+        return bool(np.array_equal(a, b, equal_nan=np.asarray(a).dtype.kind == "f"))
+    return type(a) is type(b) and bool(a == b)
 
 
 def untraceable(budget: Budget) -> list[int]:

@@ -20,22 +20,28 @@ from jaxtyping import Array, Float
 from scipy import optimize, stats
 
 from robins.errors import RobinsError
+from robins.filters.values import as_data
 from robins.results import Progress, silent
 
 FARTHEST = math.log(1000.0)  # of a factor, either way
 TOO_WIDE = math.log(3.0)  # of a 95 % interval, either way: the data say too little
 FEWEST_PARTS = 6
 _STEP = 0.01  # of differences of runs
-_COARSE = 0.1  # where each run compiles anew, and may leap
+_COARSE = 0.1  # where a run may leap, or compiles anew
 _CURVED = 0.05  # of differences of gradients
 _LOST = 1e6  # objective where a filter is lost
 
 
 class Trial(NamedTuple):
-    """A filter at some x: what is compiled for it, and its numbers."""
+    """A filter at some x.
+
+    Attributes:
+        kind: where it differs, what is measured may leap, as by another threshold.
+        numbers: pytree of arrays; another structure is compiled anew.
+    """
 
     kind: Hashable
-    numbers: Any  # pytree of arrays
+    numbers: Any
 
 
 class Data(NamedTuple):
@@ -50,12 +56,12 @@ class Objective(NamedTuple):
 
     Attributes:
         trial: ``x (p,) -> Trial``; raises a ValueError where there is no such filter.
-        measure: ``(kind, numbers, arrays) -> (parts, k)``, pure, to be compiled.
+        measure: ``(numbers, arrays) -> (parts, k)``, pure, to be compiled.
         total: ``(k,) mean of the parts -> objective``; smooth.
     """
 
     trial: Callable[[np.ndarray], Trial]
-    measure: Callable[[Hashable, Any, Any], Array]
+    measure: Callable[[Any, Any], Array]
     total: Callable[[np.ndarray], float]
 
 
@@ -103,8 +109,8 @@ def choose(
 ) -> Tuned:
     """Find x on some data, and judge it on other data.
 
-    By gradient (L-BFGS-B) where the parameters are numbers of the filter, by search (Nelder & Mead
-    1965) where they decide what is compiled.
+    By gradient (L-BFGS-B) where the parameters are numbers of the model, by search (Nelder & Mead
+    1965) where they are of the filter itself, whose decisions leap, or decide what is compiled.
 
     Args:
         objective: what is to be small.
@@ -146,6 +152,11 @@ def choose(
     return Tuned(x, sigma, slopes.gradient, slopes.evaluations, before, after, gain, low)
 
 
+@jax.jit
+def _measured(measure: Callable[[Any, Any], Array], numbers: Any, arrays: Any) -> Array:
+    return measure(numbers, arrays)
+
+
 class Slopes:
     """An objective and its gradient, on the data that x is chosen on.
 
@@ -156,12 +167,12 @@ class Slopes:
 
     def __init__(self, objective: Objective, p: int, data: Data, progress: Progress = silent):
         self._objective, self._p, self._data, self._progress = objective, p, data, progress
-        self._measure = jax.jit(objective.measure, static_argnums=0)
+        self._measure = as_data(objective.measure)
         self.evaluations = 0
 
     @cached_property
     def gradient(self) -> bool:
-        """Whether all x share what is compiled, so that numbers alone depend on the parameters."""
+        """Whether numbers alone depend on the parameters, and what is measured does not leap."""
         try:
             near = [self._objective.trial(x) for x in (np.zeros(self._p), *_STEP * np.eye(self._p))]
         except ValueError:
@@ -178,7 +189,7 @@ class Slopes:
             trial = self._objective.trial(x)
         except ValueError:
             return np.full((1, 1), np.nan)
-        parts = np.asarray(self._measure(trial.kind, trial.numbers, data.arrays))
+        parts = np.asarray(_measured(self._measure, trial.numbers, data.arrays))
         return parts if data.rows is None else parts[data.rows]
 
     def total(self, parts: np.ndarray) -> float:
@@ -208,7 +219,7 @@ class Slopes:
 
 
 def _form(trial: Trial) -> Hashable:
-    """What two trials must share to share what is compiled."""
+    """What two trials must share, for a slope between them to be one."""
     leaves, tree = jax.tree_util.tree_flatten(trial.numbers)
     return trial.kind, tree, tuple((np.shape(x), jnp.result_type(x)) for x in leaves)
 

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
@@ -110,19 +111,23 @@ def invariant_motion(noise: InsNoise, gravity: Vector = (0.0, 0.0, GRAVITY)) -> 
         raise ValueError(f"gravity must be three numbers [m/s^2], got shape {np.shape(gravity)}")
     white = jnp.concatenate([_each(noise.gyro_arw), _each(noise.accel_vrw)])
     walk = jnp.concatenate([_each(noise.gyro_bias_rw), _each(noise.accel_bias_rw)])
+    g = jnp.asarray(gravity, float)
+    given = g, white, walk
+    return Motion(Partial(_step, g), Partial(_noise, *given), Partial(_linear, *given))
 
-    def noise_of(G, dt):
-        drive = jnp.concatenate([jnp.zeros((9, 6)), jnp.diag(walk)])
-        return jnp.sqrt(dt) * jnp.concatenate([G * white[None], drive], 1)
 
-    def linear(x, u):
-        new, F, G = transition(x, u, gravity)
-        return new, F, noise_of(G, u.dt)
+def _step(g: Array, x: InvariantState, u: Increments) -> InvariantState:
+    return propagate(x, u, g)
 
-    def factor(x, u):
-        return noise_of(transition(x, u, gravity)[2], u.dt)
 
-    return Motion(lambda x, u: propagate(x, u, gravity), factor, linear)
+def _linear(g: Array, white: Array, walk: Array, x: InvariantState, u: Increments):
+    new, F, G = transition(x, u, g)
+    drive = jnp.concatenate([jnp.zeros((9, 6)), jnp.diag(walk)])
+    return new, F, jnp.sqrt(u.dt) * jnp.concatenate([G * white[None], drive], 1)
+
+
+def _noise(g: Array, white: Array, walk: Array, x: InvariantState, u: Increments) -> Array:
+    return _linear(g, white, walk, x, u)[2]
 
 
 def position_sensor(sigma: Sigma, lever_b: Vector = (0.0, 0.0, 0.0), name="position") -> Sensor:
@@ -131,17 +136,20 @@ def position_sensor(sigma: Sigma, lever_b: Vector = (0.0, 0.0, 0.0), name="posit
     A left-invariant observation: with a pose of left error its Jacobian is (J, 0, C), and with one
     sigma for all axes the gain seen in the body does not depend on the attitude believed.
     """
-    lever = _each(lever_b)
+    return Sensor(Partial(_read_position, _each(lever_b)), _each(sigma), 3, name)
 
-    def read(x, aux):
-        return x.pose.position + x.pose.rotation.apply(lever)
 
-    return Sensor(read, _each(sigma), 3, name)
+def _read_position(lever_b: Array, x: InvariantState, aux: Any) -> Array:
+    return x.pose.position + x.pose.rotation.apply(lever_b)
 
 
 def velocity_sensor(sigma: Sigma, name: str = "velocity") -> Sensor:
     """Velocity [m/s] in the navigation frame; left-invariant, as `position_sensor`."""
-    return Sensor(lambda x, aux: x.pose.velocity, _each(sigma), 3, name)
+    return Sensor(_read_velocity, _each(sigma), 3, name)
+
+
+def _read_velocity(x: InvariantState, aux: Any) -> Array:
+    return x.pose.velocity
 
 
 def landmark_sensor(sigma: Sigma, landmark: Vector, name: str = "landmark") -> Sensor:
@@ -149,12 +157,11 @@ def landmark_sensor(sigma: Sigma, landmark: Vector, name: str = "landmark") -> S
 
     A right-invariant observation: it goes with a pose of right error (Hartley et al. 2020).
     """
-    point = _each(landmark)
+    return Sensor(Partial(_read_landmark, _each(landmark)), _each(sigma), 3, name)
 
-    def read(x, aux):
-        return x.pose.rotation.inverse().apply(point - x.pose.position)
 
-    return Sensor(read, _each(sigma), 3, name)
+def _read_landmark(point: Array, x: InvariantState, aux: Any) -> Array:
+    return x.pose.rotation.inverse().apply(point - x.pose.position)
 
 
 def direction_sensor(sigma: Sigma, direction: Vector, name: str = "direction") -> Sensor:
@@ -162,8 +169,11 @@ def direction_sensor(sigma: Sigma, direction: Vector, name: str = "direction") -
 
     Right-invariant, as `landmark_sensor`.
     """
-    way = _each(direction)
-    return Sensor(lambda x, aux: x.pose.rotation.inverse().apply(way), _each(sigma), 3, name)
+    return Sensor(Partial(_read_direction, _each(direction)), _each(sigma), 3, name)
+
+
+def _read_direction(way: Array, x: InvariantState, aux: Any) -> Array:
+    return x.pose.rotation.inverse().apply(way)
 
 
 def _less_biases(x: InvariantState, increment: Increments) -> tuple[Array, ExtendedPose]:

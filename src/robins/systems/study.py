@@ -15,11 +15,11 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
-from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.errors import require_known
 from robins.filters import Belief, Filter, Loop, Model
+from robins.filters.values import kind, value
 from robins.manifold import State
 from robins.results import Outcome
 from robins.scenario import Parameters
@@ -89,17 +89,21 @@ class Contender(NamedTuple):
     on_host: str = ""
 
 
-def recipe(function: Callable[..., Any], *kinds: Any, numbers: Any) -> Partial:
+@value
+class Recipe:
     """``function(*kinds, numbers, world)`` as a function of the world alone.
 
-    Kinds (names, flags, None) choose what is compiled; numbers are data. Recipes of one function
-    and equal kinds share what was compiled (`robins.filters.sameness`).
+    Kinds (names, flags, None) choose what is compiled and are compared by `==`; numbers are data.
+    Recipes of one function and equal kinds share what was compiled.
     """
 
-    def of_kind(numbers: Any, world: Any) -> Any:
-        return function(*kinds, numbers, world)
+    function: Callable[..., Case] = kind()
+    kinds: tuple[Any, ...] = kind()
+    numbers: Any
 
-    return Partial(of_kind, numbers)
+    def __call__(self, world: Any) -> Case:
+        """The case of a world."""
+        return self.function(*self.kinds, self.numbers, world)
 
 
 class Limit(NamedTuple):
@@ -184,7 +188,7 @@ class Problem(View):
     def __post_init__(self) -> None:
         """Check that all names fit each other."""
         named: dict[str, str] = {}  # what has an axis of its own, in the result
-        for kind, names in (
+        for what, names in (
             ("block", [b.name for b in self.blocks]),
             ("output", [o.name for o in self.outputs]),
             ("sensor", list(self.sensors)),
@@ -193,10 +197,10 @@ class Problem(View):
             for name in names:
                 if other := named.get(name):
                     raise ValueError(
-                        f"{name}: names a {kind} and a {other}, whose axes could not be told "
+                        f"{name}: names a {what} and a {other}, whose axes could not be told "
                         "apart in the result; rename one of them"
                     )
-                named[name] = kind
+                named[name] = what
         for limit in self.limits:
             if named.get(limit.block) != "block":
                 raise ValueError(f"limit {limit.name}: there is no block '{limit.block}'")

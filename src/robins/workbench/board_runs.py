@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from robins.campaign.monte_carlo import solved, worlds
 from robins.filters import Belief, Code, Filter, Model, StepInfo
+from robins.filters.run import nothing
 from robins.filters.trees import select
 from robins.manifold import State
 from robins.systems.study import Case, Problem
@@ -70,7 +71,7 @@ def board_runs(problem: Problem, name: str, count: int) -> list[BoardRun]:
     model, found = contender.model, []
     for batch, _ in worlds(problem, count, 1):
         world = jax.tree_util.tree_map(lambda a: a[0], batch)
-        _, case, _ = solved(contender.filter, model, contender.case(world), lambda step: ())
+        _, case, _ = solved(contender.filter, model, contender.case(world), nothing)
         start = case.start
         state = contender.filter.init(start, model.dims) if isinstance(start, Belief) else start
         state = jax.tree_util.tree_map(lambda x: jnp.asarray(x, jnp.asarray(x).dtype), state)

@@ -9,22 +9,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins import scenario
-from robins.campaign.monte_carlo import batch_of, blocks_of, one_record, settled
+from robins.campaign.monte_carlo import Blocks, batch_of, blocks_of, one_record
+from robins.campaign.sensitivity import depends
 from robins.campaign.tuning import Data, Objective, TooLittle, Trial
 from robins.filters import run
 from robins.filters.analysis.predictive import predicted, scored
-from robins.filters.sameness import content, same
+from robins.filters.values import as_data, content, kind, value
 from robins.results import Progress
-from robins.systems.study import Contender, Problem, StateBlock
+from robins.systems.study import Contender, StateBlock
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.recorded import Findings, OpenLog
 from robins.workbench.scenarios import check_filters, read_scenario
@@ -129,6 +130,7 @@ def on_runs(
     if by not in (ERROR, INNOVATIONS, *names):
         known = ", ".join([ERROR, INNOVATIONS, *names])
         raise InputError(f"is none of {known}", f"--by {by}", "choose one of these.")
+    measured = OfRuns(blocks_of(problem), problem.count_from, problem.count_to)
     progress(0.0, "simulating")
     batch = batch_of(problem)
     worlds = batch(jnp.arange(runs)), batch(jnp.arange(runs, 2 * runs))
@@ -139,18 +141,18 @@ def on_runs(
     lay_out = read.study.lay_out
     course = lay_out(parsed(settings_at(tuned, np.zeros(len(tuned)))))
     # what a filter believes of the course, such as its process noise, is what it is told
-    moves = content(course) != content(lay_out(parsed(settings_at(tuned, np.ones(len(tuned))))))
+    moves = depends(course, course, lay_out(parsed(settings_at(tuned, np.ones(len(tuned))))))
 
     def trial(x: np.ndarray) -> Trial:
         given = parsed(settings_at(tuned, x))
         c = read.study.contender(given, lay_out(given) if moves else course, chosen)
-        c = settled(c._replace(filter=scored(c.filter)))
-        return Trial(c.filter, (c.model, c.case, c.reported))
+        filter_ = scored(c.filter)
+        return Trial(content(filter_), (filter_, c.model, as_data(c.case), c.reported))
 
     return Asked(
         filter=chosen,
         vary=tuned,
-        objective=Objective(trial, same(_of_runs(problem)), total_of(by, names)),
+        objective=Objective(trial, measured, total_of(by, names)),
         chosen_on=Data(worlds[0]),
         judged_on=Data(worlds[1]),
         parts="runs",
@@ -176,27 +178,30 @@ def settings_at(tuned: Sequence[Varied], x: np.ndarray) -> list[str]:
     return [v.setting(math.exp(one)) for v, one in zip(tuned, x, strict=True)]
 
 
-def _of_runs(problem: Problem) -> Callable[..., Array]:
+@value
+class OfRuns:
     """What is measured of each run: see above."""
-    blocks, where = blocks_of(problem), [b.where for b in problem.blocks]
-    counted = slice(problem.count_from, problem.count_to)
 
-    def measure(filter_: Any, numbers: Any, worlds: Any) -> Array:
-        def one(world: Any) -> Array:
-            found = one_record(blocks, Contender(filter_, *numbers), world)
-            notes = [update.notes for update in found["updates"].values()]
-            density = sum(jnp.sum(n["predicted.log_density"]) for n in notes)
-            count = sum(jnp.sum(n["predicted.components"]) for n in notes)
-            rows = [jnp.asarray([density, count], float)]
-            for what in ("error", "sigma"):
-                square = found[what][counted] ** 2
-                mean = [jnp.mean(jnp.sum(square[:, one], axis=1)) for one in where]
-                rows.append(jnp.stack(mean))
-            return jnp.concatenate(rows)
+    blocks: Blocks = kind()
+    count_from: int = kind()
+    count_to: int | None = kind()
 
-        return jax.vmap(one)(worlds)
+    def __call__(self, numbers: Any, worlds: Any) -> Array:
+        """(runs, k)."""
+        return jax.vmap(partial(self.one, Contender(*numbers)))(worlds)
 
-    return measure
+    def one(self, contender: Contender, world: Any) -> Array:
+        """(k,) of a run."""
+        found = one_record(self.blocks, contender, world)
+        notes = [update.notes for update in found["updates"].values()]
+        density = sum(jnp.sum(n["predicted.log_density"]) for n in notes)
+        count = sum(jnp.sum(n["predicted.components"]) for n in notes)
+        rows = [jnp.asarray([density, count], float)]
+        for what in ("error", "sigma"):
+            square = found[what][self.count_from : self.count_to] ** 2
+            each = [square[:, first:last] for _, first, last in self.blocks]
+            rows.append(jnp.stack([jnp.mean(jnp.sum(one, axis=1)) for one in each]))
+        return jnp.concatenate(rows)
 
 
 # ------------------------------------------------------------------------------------ recorded log
@@ -233,14 +238,14 @@ def on_log(
     def trial(x: np.ndarray) -> Trial:
         taken = system.recorded(dataset, parsed(settings_at(tuned, x)))
         c = taken.contender(chosen)
-        c = settled(c._replace(filter=scored(c.filter)))
+        filter_ = scored(c.filter)
         cases = [c.case(piece.world) for piece in taken.pieces]
         given = [(case.start, case.y, case.u, case.aux) for case in cases]
-        return Trial(c.filter, (c.model, given))
+        return Trial(content(filter_), (filter_, c.model, given))
 
     with refusing(opened.source):
         first = trial(np.zeros(len(tuned)))
-    of_steps = np.asarray(jax.jit(_steps, static_argnums=0)(first.kind, *first.numbers))
+    of_steps = np.asarray(_compiled_steps(*first.numbers))
     count = int(np.sum(of_steps[:, COMPONENTS]))
     segments = min(SEGMENTS, count // _FEWEST)
     held = np.arange(segments) % 3 == 2
@@ -253,7 +258,7 @@ def on_log(
     return Asked(
         filter=chosen,
         vary=tuned,
-        objective=Objective(trial, Partial(_of_segments, segments), total_of(INNOVATIONS, ())),
+        objective=Objective(trial, OfSegments(segments), total_of(INNOVATIONS, ())),
         chosen_on=Data((), np.flatnonzero(~held)),
         judged_on=Data((), np.flatnonzero(held)),
         parts="segments",
@@ -278,8 +283,17 @@ def _steps(filter_: Any, model: Any, given: Sequence[Any]) -> Array:
     return jnp.concatenate(rows)
 
 
-def _of_segments(segments: int, filter_: Any, numbers: Any, _: Any) -> Array:
-    """(segments, 2) the same of segments of equally many steps."""
-    steps = _steps(filter_, *numbers)
-    place = jnp.arange(len(steps)) * segments // len(steps)
-    return jax.ops.segment_sum(steps, place, segments)
+_compiled_steps = jax.jit(_steps)
+
+
+@value
+class OfSegments:
+    """The same of segments of equally many steps."""
+
+    segments: int = kind()
+
+    def __call__(self, numbers: Any, _: Any) -> Array:
+        """(segments, 2)."""
+        steps = _steps(*numbers)
+        place = jnp.arange(len(steps)) * self.segments // len(steps)
+        return jax.ops.segment_sum(steps, place, self.segments)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +17,8 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import units
-from robins.campaign.monte_carlo import reported_rows
+from robins.campaign.monte_carlo import Blocks, blocks_of, reported_rows
+from robins.filters import Belief
 from robins.filters.analysis.consistency import normalised_sq
 from robins.manifold import local
 from robins.program import FLAGS, Program, build
@@ -276,14 +278,18 @@ def _errors(
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """(E, r) reported error over the steps that count, and of each block its (E,) NEES."""
     rows, along = reported_rows(contender.reported, run.case)
-
-    def one(belief: Any, truth: Any, rows: Any):
-        error, factor = local(belief.mean, truth), belief.factor
-        error, factor = (error, factor) if rows is None else (rows @ error, rows @ factor)
-        at = {b.name: b.where for b in problem.blocks}
-        return error, {name: normalised_sq(error[w], factor[w]) for name, w in at.items()}
-
-    every = jax.jit(jax.vmap(one, (0, 0, along)))
-    error, nees = every(states.belief, run.case.truth, rows)
+    error, nees = _judged(blocks_of(problem), along, states.belief, run.case.truth, rows)
     counted = slice(problem.count_from, problem.count_to)
     return np.asarray(error)[counted], {k: np.asarray(v)[counted] for k, v in nees.items()}
+
+
+@partial(jax.jit, static_argnames=("blocks", "along"))
+def _judged(blocks: Blocks, along: int | None, belief: Belief, truth: Any, rows: Any):
+    """Error and NEES by block, with a leading axis of steps."""
+
+    def one(belief: Belief, truth: Any, rows: Any):
+        error, factor = local(belief.mean, truth), belief.factor
+        error, factor = (error, factor) if rows is None else (rows @ error, rows @ factor)
+        return error, {n: normalised_sq(error[a:b], factor[a:b]) for n, a, b in blocks}
+
+    return jax.vmap(one, (0, 0, along))(belief, truth, rows)

@@ -19,6 +19,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
 
 from robins import linalg, manifold
@@ -29,11 +30,12 @@ from robins.filters.kalman import updated
 from robins.filters.linearise import taylor
 from robins.filters.model import Sensor, as_noise
 from robins.filters.observation import Observation, contradicted, normalised
+from robins.filters.values import as_data, is_known
 from robins.manifold import State
 
-Numbers = ArrayLike | Sequence[Any]
-Function = Numbers | Callable[[State], Any]  # a matrix D, for D x, or a function of the state
-Weight = Literal["covariance", "identity"] | Numbers
+Given = ArrayLike | Sequence[Any]
+Function = Given | Callable[[State], Any]  # a matrix D, for D x, or a function of the state
+Weight = Literal["covariance", "identity"] | Given
 
 ITERATIONS = 4
 
@@ -58,7 +60,7 @@ def constrain(
     g: Function,
     d: Any = None,
     weight: Weight = "covariance",
-    noise: Numbers | None = None,
+    noise: Given | None = None,
     hard: bool = False,
     iterations: int = ITERATIONS,
 ) -> Constrained:
@@ -125,7 +127,7 @@ def nearest(metric: Belief, o: Observation) -> tuple[State, Array, Array, Array]
     return mean, gain, seen.used, contradicted(o, seen)
 
 
-def as_sensor(mean: State, g: Function, d: Any, noise: Numbers | None) -> tuple[Sensor, Any]:
+def as_sensor(mean: State, g: Function, d: Any, noise: Given | None) -> tuple[Sensor, Any]:
     """A constraint as a sensor, and what that sensor reads."""
     read, linear, value = (g, None, g(mean)) if callable(g) else _by_matrix(mean, g)
     c = manifold.dim(value)
@@ -138,10 +140,10 @@ def as_sensor(mean: State, g: Function, d: Any, noise: Numbers | None) -> tuple[
     else:
         target = jax.tree_util.tree_map(jnp.zeros_like, value)
     root = jnp.zeros((c, 0)) if noise is None else as_noise(noise, c, "the constraint")
-    return Sensor(lambda x, aux: read(x), root, c, "constraint", linear), target
+    return Sensor(Partial(_of_state, as_data(read)), root, c, "constraint", linear), target
 
 
-def _by_matrix(mean: State, matrix: Numbers) -> tuple[Any, Any, Array]:
+def _by_matrix(mean: State, matrix: Given) -> tuple[Any, Any, Array]:
     """D x as a function, the same with its slope, and a value of it."""
     if any(manifold.is_element(leaf) for leaf in manifold.leaves(mean)):
         raise ValueError(
@@ -154,10 +156,20 @@ def _by_matrix(mean: State, matrix: Numbers) -> tuple[Any, Any, Array]:
             f"D is {D.shape}: one column for each of {manifold.dim(mean)} states is wanted"
         )
 
-    def read(x):
-        return D @ jnp.concatenate([jnp.reshape(leaf, -1) for leaf in manifold.leaves(x)])
+    return Partial(_product, D), Partial(_product_linear, D), jnp.zeros(len(D))
 
-    return read, lambda x, aux: (read(x), D), jnp.zeros(len(D))
+
+def _of_state(read: Callable[[State], Any], x: State, aux: Any) -> Any:
+    """A function of the state alone, as a sensor reads."""
+    return read(x)
+
+
+def _product(D: Array, x: State) -> Array:
+    return D @ jnp.concatenate([jnp.reshape(leaf, -1) for leaf in manifold.leaves(x)])
+
+
+def _product_linear(D: Array, x: State, aux: Any) -> tuple[Array, Array]:
+    return _product(D, x), D
 
 
 def metric_of(belief: Belief, weight: Weight) -> tuple[Belief, Array | None]:
@@ -216,15 +228,22 @@ def check_rows(D: np.ndarray, d: np.ndarray, exact: np.ndarray) -> None:
     )
 
 
-def check_weight(rule: str, weight: Weight, n: int | None = None) -> None:
-    """The metric W of a rule; with n, whether it fits a state of that dimension."""
+def as_weight(rule: str, weight: Weight) -> Weight:
+    """The metric W of a rule, checked: a name, or a matrix as a leaf."""
     if isinstance(weight, str):
-        if weight not in ("covariance", "identity"):
-            raise ValueError(
-                f"{rule} weight must be 'covariance', 'identity' or a matrix, got {weight!r}"
-            )
-    elif n is not None:
-        if np.shape(weight) != (n, n):
-            raise ValueError(f"{rule} weight is {np.shape(weight)}, the state needs ({n}, {n})")
-    elif not np.all(np.diag(linalg.factor(np.asarray(weight, float), f"{rule} weight")) > 0.0):
+        known = weight in ("covariance", "identity")
+        sentence = f"{rule} weight must be 'covariance', 'identity' or a matrix"
+        require(known, sentence, repr(weight))
+        return weight
+    if not is_known(weight):
+        return weight
+    W = np.asarray(weight, float)
+    if not np.all(np.diag(linalg.factor(W, f"{rule} weight")) > 0.0):
         raise ValueError(f"{rule} weight is not positive definite: each state wants a weight")
+    return W
+
+
+def check_size(rule: str, weight: Weight, n: int) -> None:
+    """Refuse a metric W of another size than the state's."""
+    if not isinstance(weight, str) and np.shape(weight) != (n, n):
+        raise ValueError(f"{rule} weight is {np.shape(weight)}, the state needs ({n}, {n})")

@@ -29,7 +29,7 @@ from robins.systems.airship.parameters import Airship
 from robins.systems.airship.world import Course, World, lay_out, simulate
 from robins.systems.judgement import Claim, ratio_claims
 from robins.systems.parts import ENU
-from robins.systems.study import Case, Contender, Instrument, Norm, StateBlock, Study, View, recipe
+from robins.systems.study import Case, Contender, Instrument, Norm, Recipe, StateBlock, Study, View
 
 # --------------------------------------------------------------------------------- the filters
 
@@ -173,7 +173,7 @@ def contender(given: Airship, course: Course, name: str) -> Contender:
     return Contender(
         filter=make(),
         model=Model(states.motion(given, course), sensors),
-        case=recipe(as_case, states, of, numbers=sigma),
+        case=Recipe(as_case, (states, of), sigma),
         reported=np.pad(states.reported(course), ((0, 0), (0, len(sigma) - COMMON))),
         facts=published(name, given.wind.gusty),
     )

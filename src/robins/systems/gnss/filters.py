@@ -20,7 +20,7 @@ from robins.systems.gnss.model import (
 )
 from robins.systems.gnss.parameters import Believed, Weights
 from robins.systems.gnss.weights import by_component, huber_weight, student_weight, switch_weight
-from robins.systems.study import Case, Contender, recipe
+from robins.systems.study import Case, Contender, Recipe
 
 KINDS = {
     "ls": Kind(memory=False),
@@ -92,6 +92,6 @@ def contender(believed: Believed, place: Place, member: np.ndarray, name: str) -
     return Contender(
         kalman(rules=weighing(name, believed.weights)),
         gnss_model(believed, kind, place, member),
-        recipe(_case, kind, believed, numbers=(place, np.asarray(member, float))),
+        Recipe(_case, (kind, believed), (place, np.asarray(member, float))),
         reported=np.eye(3, n),
     )

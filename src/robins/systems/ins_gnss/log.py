@@ -182,6 +182,9 @@ def bank_step_s(parameters: Replay, fix_step_s: float) -> float:
     return min(fix_step_s, parameters.update.longest_block)
 
 
+_CASES = {asked: partial(case, asked) for asked in (False, True)}
+
+
 def contender(parameters: Replay, fix_step_s: float, name: str) -> Contender:
     """A filter with the model it believes in.
 
@@ -194,9 +197,9 @@ def contender(parameters: Replay, fix_step_s: float, name: str) -> Contender:
     asked = parameters.gnss.velocity_window is None
     if name == ROBUST:
         bank = robust(believed, bank_step_s(parameters, fix_step_s), parameters.update.patience)
-        return Contender(bank, supposed(believed, AS_TOLD), partial(case, asked))
+        return Contender(bank, supposed(believed, AS_TOLD), _CASES[asked])
     if name == WEIGHED:
-        return Contender(weighed(), supposed(believed, AS_TOLD), partial(case, asked))
+        return Contender(weighed(), supposed(believed, AS_TOLD), _CASES[asked])
     told = fresh(believed) if asked else believed
     return Contender(make_filter(name, parameters.update.gate), told)
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from jax.tree_util import Partial
 
 from robins import units
 from robins.errors import require_known
@@ -19,7 +20,7 @@ from robins.systems.ins_gnss.parameters import Drive, Imu
 from robins.systems.ins_gnss.world import Course, as_believed, belief_of, lay_out, simulate
 from robins.systems.judgement import consistency, consistency_claims
 from robins.systems.parts import refuse_unsettled
-from robins.systems.study import Contender, StateBlock, Study, View, recipe
+from robins.systems.study import Contender, StateBlock, Study, View
 from robins.systems.tables import place_arrays, track_arrays
 
 FILTERS = {
@@ -77,7 +78,7 @@ def contender(drive: Drive, course: Course, name: str) -> Contender:
     if name in SMOOTHERS:
         raise ValueError(f"{name}: campaigns compare causal filters; `robins replay` smooths a log")
     model = ins_gnss_model(believed_imu(drive), drive.gnss, drive.aids)
-    case = recipe(as_believed, numbers=belief_of(drive, course))
+    case = Partial(as_believed, belief_of(drive, course))
     return Contender(make_filter(name, drive.update.gate), model, case)
 
 

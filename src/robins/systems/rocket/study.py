@@ -46,7 +46,7 @@ from robins.systems.rocket.world import (
     start_of,
     wrong_by,
 )
-from robins.systems.study import Case, Contender, Norm, StateBlock, Study, View, recipe
+from robins.systems.study import Case, Contender, Norm, Recipe, StateBlock, Study, View
 from robins.systems.tables import block_array
 
 PROBABILITY = 0.999  # of the chi-square tests
@@ -216,7 +216,7 @@ def angle_contender(given: MagneticAttitude, course: Course, name: str) -> Conte
     chosen = ANGLE_FILTERS[name]
     model = angle_model(given, course, chosen)
     _, of = sensors_of(given, course, tuple(model.dims))
-    case = recipe(angle_case, of, numbers=angle_sigma(given))
+    case = Recipe(angle_case, (of,), angle_sigma(given))
     return Contender(angle_filter(given, chosen), model, case)
 
 
@@ -292,7 +292,7 @@ def field_contender(given: FieldVector, course: Course, name: str) -> Contender:
     chosen = FIELD_FILTERS[name]
     _, of = sensors_of(given, course, chosen.sensors)
     numbers = field_sigma(given, chosen), jnp.asarray(course.field_n)
-    case = recipe(field_case, chosen.scaled, of, numbers=numbers)
+    case = Recipe(field_case, (chosen.scaled, of), numbers)
     filter_ = chosen.filter
     if chosen.discriminates is not None:
         filter_ = ukf(projected_discriminator(chosen.discriminates, len(course.time_s)))

@@ -33,12 +33,12 @@ from robins.systems.study import (
     Contender,
     Norm,
     Output,
+    Recipe,
     SensorAxes,
     StateBlock,
     Study,
     System,
     View,
-    recipe,
 )
 
 AXES = ("x", "y", "z (boresight)")
@@ -111,9 +111,12 @@ class Surroundings(NamedTuple):
     frozen: Any  # `stepwise.Frozen`, or None
 
 
+# by whether a filter adds to the components of the quaternion
+_REACTS = {False: partial(react, model.MULTIPLICATIVE), True: partial(react, model.ADDITIVE)}
+
+
 def as_case(additive: bool, build: Build, around: Surroundings, world: World) -> Case:
     """What a filter takes of a run; pure."""
-    reacts = partial(react, model.ADDITIVE if additive else model.MULTIPLICATIVE)
     given = around.given._replace(gyro_matrix=world.gyro_matrix, star_key=world.star_key)
     rows = Row(around.steps, world.gyro_angle, world.gyro_bias, world.star_error)
     start: Any = model.start(world.start_q_ib, around.attitude_rad, around.bias_rad_s, additive)
@@ -122,7 +125,9 @@ def as_case(additive: bool, build: Build, around: Surroundings, world: World) ->
     if around.frozen is not None:
         state = make_filter(build).init(start, {STAR: 3})
         start = stepwise.begun(state, around.frozen, around.gain)
-    loop = Loop(Partial(reacts, given), begin(given, world.craft), rows, {STAR: around.due})
+    loop = Loop(
+        Partial(_REACTS[additive], given), begin(given, world.craft), rows, {STAR: around.due}
+    )
     return Case(start=start, u=None, y={}, aux={}, truth=None, loop=loop)
 
 
@@ -160,7 +165,7 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
     return Contender(
         filter=make_filter(spec.build),
         model=model.model(noise, given.star.noise, additive, given.star.camera is not None),
-        case=recipe(as_case, additive, spec.build, numbers=around),
+        case=Recipe(as_case, (additive, spec.build), around),
         lasting=spec.build.startswith("fixed") or frozen is not None,
         facts=facts,
         on_host=spec.on_host,

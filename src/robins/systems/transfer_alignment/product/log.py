@@ -30,7 +30,7 @@ from robins.results import Outcome, Progress, silent, variable
 from robins.rotation import Rotation
 from robins.systems import replaying
 from robins.systems.replaying import Answer, Piece, Reported
-from robins.systems.study import Alignment, Case, Contender
+from robins.systems.study import Alignment, Case, Contender, Recipe
 from robins.systems.tables import place_arrays
 from robins.systems.transfer_alignment.product.filters import FILTERS
 from robins.systems.transfer_alignment.product.model import Installation, ProductState
@@ -213,12 +213,13 @@ def contender(parameters: Replay, name: str) -> Contender:
         ValueError: no such filter; a noise of the master that is zero.
     """
     made = product_contender(parameters, name, parameters.believed)
+    return made._replace(case=Recipe(_case, (parameters,), made.case))
 
-    def case(run: PairRun) -> Case:
-        given = made.case(run)
-        return given._replace(start=start_belief(given.start, parameters))
 
-    return made._replace(case=case)
+def _case(parameters: Replay, simulated: Recipe, run: PairRun) -> Case:
+    """As of a simulated pair, but for the start."""
+    given = simulated(run)
+    return given._replace(start=start_belief(given.start, parameters))
 
 
 # ---------------------------------------------------------------------------------- what came out

@@ -30,7 +30,7 @@ from robins.systems.judgement import (
     rms_by_component,
 )
 from robins.systems.parts import FRD, NED, Block, refuse_unsettled
-from robins.systems.study import Case, Contender, Limit, StateBlock, Study, View, recipe
+from robins.systems.study import Case, Contender, Limit, Recipe, StateBlock, Study, View
 from robins.systems.tables import place_arrays, track_arrays
 from robins.systems.transfer_alignment.product import model as pm
 from robins.systems.transfer_alignment.product.filters import FILTERS, VARIANTS
@@ -179,7 +179,7 @@ def product_contender(
     return Contender(
         filter=VARIANTS[name].make(),
         model=model,
-        case=recipe(_case, tuple(model.dims), numbers=start),
+        case=Recipe(_case, (tuple(model.dims),), start),
         reported=reported(len(sigma), blocks, frame),
     )
 
