@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from robins import manifold
@@ -15,7 +16,7 @@ from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory, Rule
 from robins.filters.rules import _variances
-from robins.filters.values import Numbers, kind, value
+from robins.filters.values import Numbers, is_known, kind, value
 
 
 class Scale(NamedTuple):
@@ -42,7 +43,7 @@ class SageHusa(Rule):
     forgetting: Numbers  # () b
     floor: Numbers  # () of a ratio
     ceiling: Numbers  # ()
-    endless: bool = kind()  # b is 1
+    endless: bool = kind()  # b is 1, where d_k has another form
     of_sensor: bool = kind()
     of_motion: bool = kind()
 
@@ -148,5 +149,8 @@ def sage_husa(
     known = _variances.bounded("sage_husa", forgetting, floor, ceiling)
     one_of("sage_husa adapt", adapt, ("R", "Q", "QR"))
     return SageHusa(
-        **known, endless=bool(forgetting == 1.0), of_sensor="R" in adapt, of_motion="Q" in adapt
+        **known,
+        endless=is_known(forgetting) and bool(np.all(forgetting == 1.0)),
+        of_sensor="R" in adapt,
+        of_motion="Q" in adapt,
     )
