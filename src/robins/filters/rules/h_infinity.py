@@ -163,13 +163,15 @@ class HInfinity(Rule):
             memory = memory._replace(predicted=transition.mean)
         return memory, transition
 
-    def before(self, memory: HInfinityMemory, prior: Belief, o: Observation):
+    def before(self, memory: HInfinityMemory, prior: Belief, observation: Observation):
         if self.judges_prior:
             seen = self.weighted(prior)
             memory = memory._replace(weighted=jnp.where(memory.fresh, seen, memory.weighted))
-        return memory._replace(fresh=jnp.array(False)), prior, o
+        return memory._replace(fresh=jnp.array(False)), prior, observation
 
-    def after(self, memory: HInfinityMemory, posterior: Belief, info: StepInfo, o: Observation):
+    def after(
+        self, memory: HInfinityMemory, posterior: Belief, info: StepInfo, observation: Observation
+    ):
         if not self.judges_prior:
             memory = memory._replace(weighted=self.weighted(posterior))
         memory = memory._replace(measured=memory.measured | jnp.any(info.used))
@@ -305,7 +307,7 @@ def h_infinity(
     estimate: Estimate = "a-posteriori",
     margin: float = 0.05,
     count_missing: bool = False,
-) -> Rule:
+) -> HInfinity:
     """The central H-infinity filter (Hassibi, Sayed & Kailath 1999, ch. 4).
 
     Keeps the energy of the estimation error L (x - x_hat), summed over a run, below gamma^2 times
