@@ -95,10 +95,10 @@ def worlds(runs):
 def rms_over_time(row: Row, world: World) -> np.ndarray:
     """(E, 3) arcmin, over the runs."""
     model, (u, aux) = row.system.model(row.sigma), row.system.inputs()
-    state = with_gamma(row.filter.init(row.system.start(), model.dims), row.gamma)
+    filter_, start = with_gamma(row.filter, row.gamma), row.system.start()
 
     def one(z):
-        return run(row.filter, model, state, z, u, aux, keep=attitude).steps
+        return run(filter_, model, start, z, u, aux, keep=attitude).steps
 
     estimate = jax.vmap(one)(world.measured * row.per_rad) / row.per_rad
     return np.sqrt(np.mean((np.asarray(world.state[..., PHI] - estimate) / ARCMIN) ** 2, axis=0))
@@ -144,13 +144,13 @@ def local_bounds(unit: str) -> np.ndarray:
     """(E,) what gamma must exceed at each update, in the unit; NaN after the filter has ended."""
     row = of(unit, "physical")
     model, (u, aux) = row.system.model(1.0), row.system.inputs()
-    state = with_gamma(row.filter.init(row.system.start(), model.dims), GAMMA)
+    start, nothing = row.system.start(), jnp.zeros((len(u), 3))
 
     @jax.jit  # so that nothing is raised where the filter does not exist
-    def one(state):
-        return run(row.filter, model, state, jnp.zeros((len(u), 3)), u, aux, keep=bound).steps
+    def one(filter_):
+        return run(filter_, model, start, nothing, u, aux, keep=bound).steps
 
-    found = np.asarray(one(state))
+    found = np.asarray(one(with_gamma(row.filter, GAMMA)))
     ended = np.concatenate([[False], np.maximum.accumulate(found >= GAMMA)[:-1]])
     return np.where(ended, np.nan, found)
 

@@ -37,7 +37,7 @@ def helper(name: str):
 
 matching, dense = helper("attitude_matching"), helper("dense_h_infinity")
 WEIGHT = np.eye(9)
-FILTER = kalman(rules=[h_infinity(np.inf, WEIGHT)])  # gamma is data
+FILTER = kalman(rules=[h_infinity(np.inf, WEIGHT)])
 
 
 def row(what: str, found: str, reference: str) -> None:
@@ -48,8 +48,8 @@ def row(what: str, found: str, reference: str) -> None:
 def filtered(unit: str, gamma: float, steps: int = 400):
     """A run, and what its worst-case gain wants to know of it."""
     model, start, F, aux = matching.run_with(matching.in_unit(unit, steps))
-    state = with_gamma(FILTER.init(start, model.dims), gamma)
-    return model, start, run(FILTER, model, state, np.zeros((steps, 3)), F, aux), F, aux
+    one = with_gamma(FILTER, gamma)
+    return model, start, run(one, model, start, np.zeros((steps, 3)), F, aux), F, aux
 
 
 def least(unit: str, steps: int = 400, P0: str = "physical", rtol: float = 1e-6) -> float:

@@ -1,5 +1,6 @@
 """The bank over the process noise against one written down plainly in NumPy, and what it is for."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ from scipy.stats import multivariate_normal
 
 from robins.filters import Belief, Model, Motion, Sensor, adaptive, kalman, run
 from robins.filters.composite.adaptive import changes, excited, lasting
+from robins.filters.composite.bank import EVERY, transitions
 from robins.filters.linearise import Transition
 from robins.filters.rules import huber
 
@@ -95,6 +97,14 @@ def test_scales_change_as_stated_and_begin_where_they_last(scales, up, back):
     np.testing.assert_allclose(lasting(change), far[0], rtol=1e-6)
 
 
+def test_edges_are_probabilities_and_what_is_left_goes_where_it_is_told():
+    edges = [(EVERY, 1, 0.2), (slice(2), 2, [0.1, 0.3]), (2, 0, 0.5), (2, 0, 0.4)]
+    stays = transitions(3, edges)
+    np.testing.assert_allclose(stays, [[0.7, 0.2, 0.1], [0.0, 0.7, 0.3], [0.4, 0.2, 0.4]])
+    moves = transitions(3, edges, rest=[0, 0, 1])
+    np.testing.assert_allclose(moves, [[0.7, 0.2, 0.1], [0.5, 0.2, 0.3], [0.4, 0.6, 0.0]])
+
+
 def test_it_follows_what_lasts_and_ignores_what_does_not():
     """A wild record among right ones, then a push that no noise of the model explains."""
     rng = np.random.default_rng(5)
@@ -115,6 +125,23 @@ def test_a_part_has_its_own_noise():
     t = Transition(jnp.zeros(4), jnp.eye(4), jnp.asarray(none), jnp.asarray(N))
     _, found = excited([[0], slice(1, 3)], np.array([5.0, 2.0])).process((), t)
     np.testing.assert_allclose(found.noise, np.diag([5.0, 2.0, 2.0, 1.0]) @ N, rtol=1e-15)
+
+
+@pytest.mark.parametrize("off", [(), ("y",)], ids=["right", "off"])
+def test_a_bank_made_again_with_other_numbers_has_the_same_structure(off):
+    def leaves_and_structure(scales, up, robust):
+        parts = [[0], slice(1, 3)]
+        return jax.tree_util.tree_flatten(adaptive(scales, robust, up, 0.1, parts, off=off))
+
+    one, structure = leaves_and_structure((1.0, 8.0), 0.01, 0.99)
+    other, same = leaves_and_structure((2.0, 9.0), 0.02, 0.95)
+    assert structure == same
+    assert hash(structure) == hash(same)
+    assert {x.dtype for x in one} == {np.dtype(float)}
+    found = [x for x in one if np.shape(x) == (3 + 2 * len(off), 2)]  # the scales of the parts
+    np.testing.assert_array_equal(found[0][:3], [[1.0, 1.0], [8.0, 1.0], [1.0, 8.0]])
+    differ = [i for i, (a, b) in enumerate(zip(one, other, strict=True)) if np.any(a != b)]
+    assert len(differ) == 4  # scales, Huber's limits, changes, the start
 
 
 def test_what_cannot_be_is_refused():

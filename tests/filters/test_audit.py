@@ -1,6 +1,6 @@
-"""Whatever filter a rule is in, its memory is asked after a run what it has to report."""
+"""Whatever filter a rule is in, it is asked after a run what it has to report."""
 
-from typing import Any, NamedTuple
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +27,7 @@ from robins.filters import (
     run,
 )
 from robins.filters.rules import gate, only
+from robins.filters.values import Numbers, value
 
 STEPS = 6
 S = SYSTEMS[0]
@@ -39,27 +40,33 @@ DATA = {"a": by_sensor(np.nan_to_num(Y[0, :STEPS]))["a"]}
 HEARD: list[tuple] = []
 
 
-class Asked(NamedTuple):
-    """Counts predictions, and keeps for whom."""
+@value
+class Counting(Rule):
+    """Counts predictions and updates, each as so many, and says for whom."""
 
-    who: Any
-    count: Any
+    who: Numbers
+    each: Numbers
 
-    def audit(self, start, again, time):
-        """What it was asked with; run once more from 100."""
-        more = None if again is None else int(again(start._replace(count=start.count + 100)).count)
-        HEARD.append((int(self.who), int(start.count), int(self.count), more, time))
+    name = "counting"
+
+    def init(self, belief, dims):
+        return jnp.zeros(())
+
+    def process(self, memory, transition):
+        return memory + self.each, transition
+
+    def after(self, memory, posterior, info, observation):
+        return memory + self.each, posterior, info
+
+    def report(self, start, final, again, time):
+        """What it was asked with; run once more with each a hundred."""
+        more = None if again is None else int(again(replace(self, each=100.0 * self.each)))
+        HEARD.append((int(self.who), int(start), int(final), more, time))
 
 
 def counting(who):
-    """A rule whose memory is asked."""
-
-    def process(memory, transition):
-        return memory._replace(count=memory.count + 1), transition
-
-    return Rule(
-        lambda *_: Asked(jnp.asarray(who), jnp.zeros((), int)), process, name=f"counting {who}"
-    )
+    """A rule that reports."""
+    return Counting(jnp.asarray(who, float), np.ones(()))
 
 
 def asked(who):
@@ -69,29 +76,29 @@ def asked(who):
 
 LOCALS = (channel("a", asked(0)), channel("b", asked(1)))
 EVEN = np.full((2, 2), 0.5)
-# The filter, who in it is asked, in order, and how many predictions it makes of those of the run.
+# The filter, who in it is asked, in order, and how many predictions and updates of a step it makes.
 FILTERS = {
-    "two rules": (kalman(rules=[gate(), counting(0), only("a", counting(1))]), [(0, 1), (1, 1)]),
-    "family": (imm(Family(asked, jnp.arange(2)), EVEN), [(0, 1), (1, 1)]),
-    "guarded": (guarded(asked(0), asked(1), "a", ["b"], [(0, 1)]), [(0, 1), (1, 1)]),
-    "master": (at_master(distributed(LOCALS[:1]), "held", asked(2)), [(0, 1), (2, 0)]),
-    "delayed": (delayed(asked(0), MODEL, 2), [(0, 1)]),
+    "two rules": (kalman(rules=[gate(), counting(0), only("a", counting(1))]), [(0, 2), (1, 2)]),
+    "family": (imm(Family(asked, jnp.arange(2)), EVEN), [(0, 2), (1, 2)]),
+    "guarded": (guarded(asked(0), asked(1), "a", ["b"], [(0, 1)]), [(0, 2), (1, 1)]),
+    "master": (at_master(distributed(LOCALS[:1]), "held", asked(2)), [(0, 2), (2, 1)]),
+    "delayed": (delayed(asked(0), MODEL, 2), [(0, 2)]),
     "deep": (
         federated([channel("a", imm([kalman(), asked(0)], EVEN)), LOCALS[1]]),
-        [(0, 1), (1, 1)],
+        [(0, 2), (1, 1)],
     ),
 }
 
 
 @pytest.mark.parametrize("name", FILTERS)
-def test_every_memory_is_asked_with_a_run_of_its_own(name):
+def test_every_rule_is_asked_with_a_run_of_its_own(name):
     filter_, expected = FILTERS[name]
     model = WITH_HELD if name == "master" else MODEL
     data = DATA | {"held": np.zeros((STEPS, 1))} if name == "master" else DATA
     HEARD.clear()
     run(filter_, model, START, data, time_s=np.arange(STEPS))
-    steps = [(who, STEPS * predicts) for who, predicts in expected]
-    assert [h[:4] for h in HEARD] == [(who, 0, n, 100 + n) for who, n in steps]
+    steps = [(who, STEPS * of_a_step) for who, of_a_step in expected]
+    assert [h[:4] for h in HEARD] == [(who, 0, n, 100 * n) for who, n in steps]
     assert all(len(h[4]) == STEPS for h in HEARD)
 
 
@@ -100,4 +107,4 @@ def test_one_by_one_there_is_no_other_run():
     HEARD.clear()
     online.predict()
     online.update(DATA["a"][0], "a")
-    assert HEARD == [(3, 1, 1, None, None)] * 2
+    assert [(3, n, n, None, None) for n in (1, 2)] == HEARD

@@ -23,6 +23,7 @@ from robins.filters import (
 )
 from robins.filters.composite.delayed import Late, delayed
 from robins.filters.rules import gate
+from robins.filters.values import Numbers, value
 from robins.manifold import Angle
 
 SHIFT, DEPTH, T, SEEDS = 3, 6, 24, 4
@@ -344,6 +345,53 @@ def test_numbers_of_the_model_are_those_of_the_run():
         want += live.update(row, "a").log_likelihood
     np.testing.assert_allclose(late[1], want, rtol=1e-12)
     np.testing.assert_allclose(slope[1], (late[2] - late[0]) / 2e-5, rtol=1e-7)
+
+
+HEARD: list[tuple] = []
+
+
+@value
+class Asked(Rule):
+    """Counts predictions by `each`, and tells with what it is asked."""
+
+    each: Numbers
+
+    def init(self, belief, dims):
+        return jnp.zeros(())
+
+    def process(self, memory, transition):
+        return memory + self.each, transition
+
+    def report(self, start, final, again, time):
+        other = None if again is None else float(again(replace(self, each=2.0 * self.each)))
+        HEARD.append((float(start), float(final), other, time))
+
+
+def test_the_filter_that_is_delayed_is_asked_with_a_run_of_its_own():
+    one = delayed(kalman(rules=[gate(), Asked(np.ones(()))]), LINEAR, 3)
+    time_s = np.arange(8)
+    run(one, LINEAR, BEGIN, {"a": Y["a"]}, time_s=time_s)
+    live = OnlineFilter(one, LINEAR, BEGIN)
+    live.predict()
+    assert [(0.0, 8.0, 16.0, time_s), (0.0, 1.0, None, None)] == HEARD
+    assert one.reports
+    assert not BACK.reports
+
+
+def test_other_numbers_share_what_was_compiled():
+    traced = []
+
+    def counted(x, u):
+        traced.append(x)
+        return jnp.array(A) @ x
+
+    for share, sigma in ((0.99, 0.1), (0.9, 0.2)):
+        model = Model(Motion(counted, np.full(2, sigma)), LINEAR.sensors)
+        live = OnlineFilter(delayed(kalman(rules=[gate(share)]), model, 1), model, BEGIN)
+        live.predict()
+        if share == 0.99:
+            once = len(traced)
+    assert len(traced) == once > 0
 
 
 def test_bad_arguments_are_named():

@@ -17,6 +17,8 @@ from dense_h_infinity import (
 from dense_kalman import SPLIT_W, kalman_filter, random_system, simulate, split
 
 from robins.filters import Belief, Code, OnlineFilter, kalman, run
+from robins.filters.composite.imm import imm
+from robins.filters.rules import gate
 from robins.filters.rules.h_infinity import Infeasible, h_infinity, with_gamma
 from robins.manifold import Angle
 
@@ -31,9 +33,9 @@ L = np.array([[1.0, 0.5, 0.0, -0.3], [0.0, 2.0, 1.0, 0.0]])
 ONE = kalman(rules=[h_infinity(np.inf, L)])
 
 
-def at(gamma, one=ONE, model=MODEL, start=START):
-    """A first state with another gamma; nothing compiles anew."""
-    return with_gamma(one.init(start, model.dims), gamma)
+def at(gamma):
+    """The filter with another gamma; nothing compiles anew."""
+    return with_gamma(ONE, gamma)
 
 
 def agrees(solution, dense, rtol=1e-9):
@@ -59,7 +61,7 @@ def least():
 
 @pytest.mark.parametrize("share", [1.02, 1.5, 4.0])
 def test_the_recursion_is_that_of_the_book(share, least):
-    solution = run(ONE, MODEL, at(share * least), Y)
+    solution = run(at(share * least), MODEL, START, Y)
     dense = h_infinity_filter(SYSTEM, Y, L, share * least)
     agrees(solution, dense)
     notes = solution.steps.info["y"].notes
@@ -72,7 +74,7 @@ def test_the_recursion_is_that_of_the_book(share, least):
 
 @pytest.mark.parametrize("huge", [1e12, 1e200, 1e300])
 def test_a_huge_gamma_comes_near_the_kalman_filter(huge):
-    far, want = run(ONE, MODEL, at(huge), Y), run(kalman(), MODEL, START, Y)
+    far, want = run(at(huge), MODEL, START, Y), run(kalman(), MODEL, START, Y)
     np.testing.assert_allclose(far.mean, want.mean, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(far.covariance, want.covariance, rtol=1e-9, atol=1e-12)
 
@@ -88,8 +90,7 @@ def test_three_forms_agree_to_1e_13(matching):
     s = in_unit("deg")
     gamma = 1.05 * 4.656093988
     model, start, F, aux = run_with(s)
-    state = at(gamma, matching, model, start)
-    solution = run(matching, model, state, np.zeros((400, 3)), F, aux)
+    solution = run(with_gamma(matching, gamma), model, start, np.zeros((400, 3)), F, aux)
     root = np.asarray(solution.steps.prediction.belief.covariance)
     joseph, krein = (
         form(s.F, s.G @ s.G.T, s.H, np.eye(3), np.diag(s.sigma**2), np.eye(9), gamma)
@@ -103,9 +104,9 @@ def test_three_forms_agree_to_1e_13(matching):
 
 def test_the_paper_in_arcminutes_is_refused_at_its_sixth_update(matching):
     model, start, F, aux = run_with(in_unit("arcmin"))
-    state, time_s = at(50.0, matching, model, start), PERIOD_S * np.arange(1, 401)
+    one, time_s = with_gamma(matching, 50.0), PERIOD_S * np.arange(1, 401)
     with pytest.raises(Infeasible) as caught:
-        run(matching, model, state, np.zeros((400, 3)), F, aux, time_s=time_s)
+        run(one, model, start, np.zeros((400, 3)), F, aux, time_s=time_s)
     assert caught.value.step == 5
     assert caught.value.time_s == pytest.approx(0.30)
     assert caught.value.gamma_min == pytest.approx(100.69, rel=1.1e-4)
@@ -115,7 +116,7 @@ def test_a_known_state_may_be_weighted():
     # P0 and Q singular: nothing of the square-root form asks for P^-1.
     known = SYSTEM._replace(P0=np.diag([1.0, 0.0, 2.0, 0.0]), G=np.zeros((4, 4)), F=np.eye(4))
     gamma, P = 12.0, known.P0
-    solution = run(ONE, known.model(), at(gamma, start=known.start()), Y)
+    solution = run(at(gamma), known.model(), known.start(), Y)
     for k, row in enumerate(Y):
         here = np.isfinite(row)
         H, R = known.H[here], known.R[np.ix_(here, here)]
@@ -146,7 +147,7 @@ def test_a_step_without_a_measurement_counts_only_if_asked_for(least):
     gamma = 3.0 * least
     counted = run(kalman(rules=[h_infinity(gamma, L, count_missing=True)]), MODEL, START, Y)
     agrees(counted, h_infinity_filter(SYSTEM, Y, L, gamma, count_missing=True))
-    left_out = run(ONE, MODEL, at(gamma), Y)
+    left_out = run(at(gamma), MODEL, START, Y)
     origin, posterior = left_out.steps.prediction.origin, left_out.steps.posterior
     np.testing.assert_array_equal(origin.factor[7], posterior.factor[6])
     assert np.all(origin.factor[6] != posterior.factor[5], where=np.tri(4, dtype=bool))
@@ -197,7 +198,7 @@ def test_what_is_not_feasible_is_refused_by_name(share, least):
     row, dense = first_broken(gamma)
     assert row == {0.97: 14, 0.9999: T - 1}[share]
     with pytest.raises(Infeasible) as caught:
-        run(ONE, MODEL, at(gamma), Y, time_s=10.0 + np.arange(T))
+        run(at(gamma), MODEL, START, Y, time_s=10.0 + np.arange(T))
     error = caught.value
     assert isinstance(error, ValueError)
     assert (error.step, error.time_s) == (row, 10.0 + row)
@@ -206,33 +207,49 @@ def test_what_is_not_feasible_is_refused_by_name(share, least):
     assert least * (1.0 - 1e-8) <= error.gamma_min <= least * 1.0001
     for part in (f"step {row}", f"t = {10 + row} s", f"{gamma:.6g}", "policy='raise_gamma'"):
         assert part in str(error)
-    run(ONE, MODEL, at(error.gamma_min), Y)
+    run(at(error.gamma_min), MODEL, START, Y)
 
 
 def test_a_run_that_goes_on_counts_its_own_steps(least):
-    half = run(ONE, MODEL, at(2.0 * least), Y)
+    half = run(at(2.0 * least), MODEL, START, Y)
     assert int(half.final.memory[0].steps) == T
     with pytest.raises(Infeasible) as caught:
-        run(ONE, MODEL, with_gamma(half.final, 0.5 * least), Y)
+        run(at(0.5 * least), MODEL, half.final, Y)
     assert caught.value.step == -1  # what the first run ended with
     fresh = half.final._replace(belief=START)
     with pytest.raises(Infeasible) as caught:
-        run(ONE, MODEL, with_gamma(fresh, 0.5 * least), Y)
+        run(at(0.5 * least), MODEL, fresh, Y)
     assert caught.value.step == first_broken(0.5 * least)[0]
+
+
+def test_events_of_a_gamma_are_not_those_of_another(least):
+    # In compiled code nothing is raised, and what was refused stays in the memory.
+    refused = jax.jit(lambda one: run(one, MODEL, START, Y).final)(at(0.9 * least))
+    assert int(refused.memory[0].events) > 0
+    begun = refused._replace(belief=START, memory=(refused.memory[0]._replace(measured=False),))
+    np.testing.assert_array_equal(
+        run(at(2.0 * least), MODEL, begun, Y).mean, run(at(2.0 * least), MODEL, START, Y).mean
+    )
+    row, dense = first_broken(0.97 * least)
+    with pytest.raises(Infeasible) as caught:
+        run(at(0.97 * least), MODEL, begun, Y)
+    assert caught.value.step == row
+    assert caught.value.local_bound == pytest.approx(dense.bound[row], rel=1e-9)
+    assert least * (1.0 - 1e-8) <= caught.value.gamma_min <= least * 1.0001
 
 
 def test_where_nothing_can_be_raised_the_codes_say_it(least):
     row, _ = first_broken(0.97 * least)
     gammas = jnp.array([0.97, 1.5, jnp.inf]) * least
-    states = jax.vmap(lambda gamma: at(gamma))(gammas)
-    batch = jax.jit(jax.vmap(lambda state: run(ONE, MODEL, state, Y)))(states)
+    filters = jax.vmap(at)(gammas)
+    batch = jax.jit(jax.vmap(lambda one: run(one, MODEL, START, Y)))(filters)
     code = np.asarray(batch.steps.prediction.code)
     np.testing.assert_array_equal(code[1:], Code.DONE)
     assert code[0].tolist()[: row + 2] == [Code.DONE] * (row + 1) + [Code.INFEASIBLE]
     assert float(batch.log_likelihood[0]) == -np.inf
     assert np.all(np.isfinite(batch.mean))
     for k, gamma in ((1, 1.5 * least), (2, np.inf)):
-        alone = run(ONE, MODEL, at(gamma), Y)
+        alone = run(at(gamma), MODEL, START, Y)
         np.testing.assert_allclose(batch.mean[k], alone.mean, rtol=1e-10, atol=1e-12)
     # a step that was refused leaves the belief where it was
     kept = batch.steps.prediction.belief.factor[0, row + 1]
@@ -241,15 +258,17 @@ def test_where_nothing_can_be_raised_the_codes_say_it(least):
 
 def test_a_stream_is_refused_when_the_step_is_closed(least):
     broken, _ = first_broken(0.97 * least)
-    live = OnlineFilter(ONE, MODEL, at(0.97 * least))
+    live = OnlineFilter(at(0.97 * least), MODEL, START)
     for row in Y[: broken + 1]:
         live.predict()
         live.update(row)
     with pytest.raises(Infeasible, match=f"at step {broken}") as caught:
         live.predict()
     assert caught.value.gamma_min is None
-    live.state = with_gamma(live.state, 2.0 * least)
-    assert int(live.predict().code) == Code.DONE
+    with pytest.raises(Infeasible, match=f"at step {broken}"):
+        live.predict()
+    other = OnlineFilter(at(2.0 * least), MODEL, live.state)
+    assert int(other.predict().code) == Code.DONE
 
 
 # --------------------------------------------------------------------------------------- policies
@@ -293,7 +312,7 @@ def test_derivatives_are_right_and_finite_where_nothing_is_feasible(least):
 
     def total(gamma, scale):
         start = Belief(START.mean, scale * START.factor)
-        solution = run(ONE, MODEL, at(gamma, start=start), Y)
+        solution = run(at(gamma), MODEL, start, Y)
         return jnp.sum(solution.mean**2) + jnp.sum(solution.covariance)
 
     slope = jax.jit(jax.grad(total, argnums=(0, 1)))
@@ -312,8 +331,27 @@ def test_derivatives_are_right_and_finite_where_nothing_is_feasible(least):
 # ------------------------------------------------------------------------------------- boundaries
 
 
+def test_infinity_in_the_place_of_a_gamma_is_the_kalman_filter_bit_for_bit():
+    one, plain = run(at(np.inf), MODEL, START, Y), run(kalman(), MODEL, START, Y)
+    np.testing.assert_array_equal(one.mean, plain.mean)
+    np.testing.assert_array_equal(one.steps.posterior.factor, plain.steps.posterior.factor)
+    assert float(one.log_likelihood) == float(plain.log_likelihood)
+
+
+def test_a_gamma_is_exchanged_wherever_the_rule_lies():
+    parts = imm([ONE, kalman(rules=[gate(), h_infinity(2.0, L)])], np.full((2, 2), 0.5))
+    first, second = with_gamma(parts, 4.0).modes
+    assert float(first.filter_.rules[0].inverse) == 0.25
+    assert float(second.filter_.rules[1].inverse) == 0.25
+    assert float(ONE.rules[0].inverse) == 0.0
+
+
 def test_a_weight_must_be_given_and_a_rule_be_there():
     with pytest.raises(TypeError, match="weight"):
         h_infinity(50.0)
     with pytest.raises(ValueError, match="no h_infinity rule"):
-        with_gamma(kalman().init(START, MODEL.dims), 3.0)
+        with_gamma(kalman(rules=[gate()]), 3.0)
+    with pytest.raises(ValueError, match="gamma must be positive"):
+        with_gamma(ONE, 0.0)
+    with pytest.raises(TypeError, match="gamma must be one real number"):
+        with_gamma(ONE, [1.0, 2.0])

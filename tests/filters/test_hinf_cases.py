@@ -52,7 +52,7 @@ def one_filter(L: tuple, estimate: str):
 def filtered(given: tuple, L: np.ndarray, estimate: str, gamma):
     one = one_filter(tuple(map(tuple, L)), estimate)
     model, start, *data = given
-    return run(one, model, with_gamma(one.init(start, model.dims), gamma), *data)
+    return run(with_gamma(one, gamma), model, start, *data)
 
 
 def weight_of(case: dict) -> tuple[np.ndarray, float]:

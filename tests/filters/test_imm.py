@@ -17,6 +17,7 @@ from robins.filters import (
     Family,
     Model,
     Motion,
+    Rule,
     Sensor,
     StepWarning,
     kalman,
@@ -26,6 +27,7 @@ from robins.filters import (
 from robins.filters.composite.imm import imm, mode
 from robins.filters.composite.mixture import log_normalised, matched, root
 from robins.filters.rules import gate
+from robins.filters.values import Numbers, value
 from robins.manifold import Angle
 from robins.rotation import Rotation
 
@@ -228,6 +230,70 @@ def test_a_family_is_the_modes_one_by_one(solution):
     assert "imm.1.gate.ratio" in once.steps.info["y"].notes
     settled = imm(Family(scaled, numbers), change).reset(once.final, START)
     np.testing.assert_array_equal(settled.memory.states.belief.factor[1], START.factor)
+
+
+HEARD = []
+
+
+@value
+class Told(Rule):
+    """Adds a step at each prediction, and says what it became, also with steps of 100."""
+
+    who: Numbers
+    step: Numbers
+
+    def init(self, belief, dims):
+        return jnp.zeros(())
+
+    def process(self, memory, transition):
+        return memory + self.step, transition
+
+    def report(self, start, final, again, time):
+        more = None if again is None else float(again(dataclasses.replace(self, step=100.0)))
+        HEARD.append((float(self.who), float(start), float(final), more, time))
+
+
+def told(who):
+    return kalman(rules=[Told(who, np.asarray(1.0))])
+
+
+@pytest.mark.parametrize("family", [False, True], ids=["modes", "family"])
+def test_every_mode_reports_a_run_with_its_own_rule_exchanged(family):
+    who = np.array([7.0, 8.0])
+    bank = imm(Family(told, who) if family else [told(w) for w in who], [[0.9, 0.1], [0.2, 0.8]])
+    start = bank.init(START, MODEL.dims)
+
+    def ended(one):
+        return one.predict(start, MODEL.motion)[0]
+
+    HEARD.clear()
+    bank.report(start, ended(bank), ended, None)
+    bank.report(start, ended(bank), None, 5.0)
+    rerun = [(7.0, 0.0, 1.0, 100.0, None), (8.0, 0.0, 1.0, 100.0, None)]
+    assert rerun + [(w, 0.0, 1.0, None, 5.0) for w in who] == HEARD
+
+
+def test_another_change_or_number_is_another_leaf_of_the_same_structure():
+    def bank(scale, p):
+        return imm(Family(scaled, (scale * np.ones(2), np.ones(2))), [[p, 1.0 - p], [0.2, 0.8]])
+
+    one, other = (jax.tree_util.tree_flatten(bank(*a)) for a in ((1.0, 0.9), (3.0, 0.7)))
+    assert one[1] == other[1]
+    assert all(leaf.dtype == float for leaf in one[0])
+    assert not all(np.array_equal(a, b) for a, b in zip(one[0], other[0], strict=True))
+
+
+def test_the_likelihood_has_a_slope_by_the_chance_of_a_change(solution):
+    """Also where another is zero."""
+    y = solution[0][0][:4]
+
+    def likelihood(p):
+        modes = [kalman(), mode(kalman(), linear(1)[0])]
+        bank = imm(modes, [[1.0 - p, p], [0.0, 1.0]], [1.0, 0.0])
+        return run(bank, MODEL, START, y).log_likelihood
+
+    value, slope = jax.jit(jax.vmap(jax.value_and_grad(likelihood)))(jnp.array([0.3, 0.301]))
+    np.testing.assert_allclose(slope.mean(), (value[1] - value[0]) / 1e-3, rtol=1e-3)
 
 
 def test_families_that_are_none_are_refused():

@@ -10,6 +10,7 @@ from scipy import integrate, stats
 
 from robins.filters import Belief, Code, Model, Motion, OnlineFilter, Sensor, kalman, run
 from robins.filters.composite.particle import Cloud, _systematic, particle, reseed
+from robins.filters.values import content
 from robins.manifold import Angle
 
 A = np.array([[1.0, 0.5], [-0.1, 0.9]])
@@ -292,6 +293,38 @@ def test_one_at_a_time_is_the_run_and_other_keys_are_other_draws(y):
     other = one.reset(reseed(start, 12), START)
     assert np.all(other.memory.particles.mean != start.memory.particles.mean)
     assert isinstance(other.memory, Cloud)
+
+
+def test_its_numbers_are_data_and_its_key_has_a_gradient_of_zero():
+    words = np.array([0xFFFFFFFF, 0xFFFFFFFE], np.uint32)
+    begun = particle(2, words).init(START, {})
+    again = particle(2, 0).reset(reseed(begun, words), START)  # whole numbers all the way
+    np.testing.assert_array_equal(begun.memory.particles.mean, again.memory.particles.mean)
+    assert content(particle(5, 7)) == content(particle(5, jax.random.key(7, impl="threefry2x32")))
+    assert content(particle(5, 7)) != content(particle(5, 8))
+
+    def far(filter_):
+        return jnp.sum(filter_.init(START, MODEL.dims).memory.particles.mean)
+
+    slopes = jax.grad(far)(particle(5, jax.random.key(7), regularise=0.1))
+    assert all(np.all(x == 0.0) for x in jax.tree.leaves(slopes))
+
+    traced = []
+
+    def counted(x, u):
+        traced.append(x)
+        return x
+
+    model = Model(Motion(counted, np.ones(2)), MODEL.sensors)
+    filters = [particle(5, k, resample=0.1 * k, regularise=0.2 * k) for k in (1, 2)]
+    means, counts = [], []
+    for one in filters:
+        live = OnlineFilter(one, model, START)
+        live.predict()
+        means.append(live.belief.mean)
+        counts.append(len(traced))
+    assert counts[0] == counts[1] > 0
+    assert np.all(means[0] != means[1])
 
 
 @pytest.mark.parametrize(

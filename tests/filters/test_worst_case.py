@@ -99,8 +99,7 @@ def test_the_bound_holds_is_reached_and_the_kalman_filter_is_above_it(estimate):
     least = dense_least(estimate)
 
     def of(gamma):
-        state = with_gamma(one.init(START, MODEL.dims), gamma)
-        return gain(run(one, MODEL, state, Y), estimate)
+        return gain(run(with_gamma(one, gamma), MODEL, START, Y), estimate)
 
     for share in (1.0001, 1.05, 1.5, 4.0):
         assert of(share * least) < share * least
@@ -148,8 +147,7 @@ def test_members_whose_bound_changes_keep_it_step_by_step():
 
 def test_the_operator_moves_errors_as_the_filter_does():
     # Run the filter on what disturbances make of the truth: its errors are the operator's.
-    one = MEMBERS["a-posteriori"]
-    state = with_gamma(one.init(START, MODEL.dims), 3.0 * dense_least("a-posteriori"))
+    one = with_gamma(MEMBERS["a-posteriori"], 3.0 * dense_least("a-posteriori"))
     rng = np.random.default_rng(1)
     x0, w, v = rng.normal(size=4), rng.normal(size=(T, 4)), rng.normal(size=(T, 3))
     x, y, truth = SYSTEM.m0 + np.linalg.cholesky(SYSTEM.P0) @ x0, np.empty((T, 3)), []
@@ -157,7 +155,7 @@ def test_the_operator_moves_errors_as_the_filter_does():
         x = SYSTEM.F @ x + SYSTEM.G @ w[k]
         y[k] = SYSTEM.H @ x + SYSTEM.W @ v[k]
         truth.append(x)
-    solution = run(one, MODEL, state, np.where(np.isfinite(Y), y, np.nan))
+    solution = run(one, MODEL, START, np.where(np.isfinite(Y), y, np.nan))
     error = (np.array(truth) - np.asarray(solution.mean)) @ L.T
     disturbance = np.concatenate([x0, np.concatenate([w, v], axis=1).ravel()])
     moved = (operator(solution) @ disturbance).reshape(T, 2)
@@ -170,10 +168,9 @@ def test_sensors_in_sequence_are_one():
     raising = h_infinity(1.0, L, policy="raise_gamma", estimate="predictor")  # gamma by sensor
     members = {"a-priori": MEMBERS["a-priori"], "predictor": kalman(rules=[raising])}
     for estimate, member in members.items():
-        gamma = {"a-priori": 9.0, "predictor": 1.0}[estimate]
-        state = with_gamma(member.init(START, two.dims), gamma)
-        parts = run(member, two, state, {"near": Y[:, :2], "far": Y[:, 2:]})
-        whole = run(member, one, with_gamma(member.init(START, one.dims), gamma), Y)
+        member = with_gamma(member, {"a-priori": 9.0, "predictor": 1.0}[estimate])
+        parts = run(member, two, START, {"near": Y[:, :2], "far": Y[:, 2:]})
+        whole = run(member, one, START, Y)
         got = worst_case_gain(two, START, parts, L, estimate=estimate)
         want = worst_case_gain(one, START, whole, L, estimate=estimate)
         assert got == pytest.approx(want, rel=1e-9)
@@ -223,8 +220,7 @@ def test_attitude_matching_has_the_published_worst_cases():
     one = kalman(rules=[h_infinity(np.inf, weight)])
     want = {1.0001: 1.0, np.inf: 1.0216}
     for share, ratio in want.items():
-        state = with_gamma(one.init(start, model.dims), share * least)
-        solution = run(one, model, state, y, F, aux)
+        solution = run(with_gamma(one, share * least), model, start, y, F, aux)
         found = worst_case_gain(model, start, solution, weight, F, aux) / least
         assert found == pytest.approx(ratio, abs=1e-6 if share == 1.0001 else 5e-5)
 

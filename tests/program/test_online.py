@@ -10,8 +10,18 @@ from machines import QUICK, apart
 from rule_table import ACTING, START, M, N, Y, line
 from two_sensors import SYSTEMS, split
 
-from robins.filters import Belief, Code, Model, Motion, OnlineFilter, Sensor, kalman, unscented
-from robins.filters.rules import Infeasible, h_infinity, with_gamma
+from robins.filters import (
+    Belief,
+    Code,
+    Model,
+    Motion,
+    OnlineFilter,
+    Sensor,
+    imm,
+    kalman,
+    unscented,
+)
+from robins.filters.rules import Infeasible, gate, h_infinity, with_gamma
 from robins.program import BuildError, Memory, ProgramError, trace
 
 # Compiled without optimisation, which is quicker for so few calls; the bits are the same.
@@ -143,9 +153,33 @@ def test_a_memory_that_reports_is_asked_after_every_call():
         with pytest.raises(Infeasible, match="at step") as caught:
             run_on(live)
         told.append((str(caught.value), live.counts))
-        live.state = with_gamma(live.state, 1e3)
-        assert int(live.predict().code) == Code.DONE
+        machine = C if live._machine.is_numpy else "jax"
+        onward = OnlineFilter(with_gamma(one, 1e3), MODEL, live.state, machine)
+        assert int(onward.predict().code) == Code.DONE
     assert told[0] == told[1]
+
+
+def test_numbers_of_a_filter_are_on_the_device_or_folded():
+    """By JAX none is handed over at each call; in C all are known when the program is made."""
+    live, c = both(kalman(rules=[gate()]), MODEL)
+    for one, kind in ((live, jax.Array), (c, np.ndarray)):
+        leaves = jax.tree.leaves(one._machine._filter)
+        assert leaves
+        assert all(isinstance(x, kind) for x in leaves)
+
+
+def test_a_filter_without_anything_to_report_is_not_asked(monkeypatch):
+    bound = kalman(rules=[h_infinity(3.0, np.eye(N))])
+    even = np.full((2, 2), 0.5)
+    silent = (kalman(rules=[gate()]), imm([kalman(), kalman()], even))
+    assert not any(one.reports for one in silent)
+    assert bound.reports
+    assert imm([kalman(), bound], even).reports
+    asked = []
+    monkeypatch.setattr(type(bound), "report", lambda *given: asked.append(given))
+    for one in (silent[0], bound):
+        OnlineFilter(one, MODEL, START).predict()
+    assert [given[0] for given in asked] == [bound]
 
 
 def swing(x, u):

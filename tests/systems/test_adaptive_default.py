@@ -65,6 +65,15 @@ def test_attitude_matching_supposes_structures_and_no_louder_gyros():
     np.testing.assert_allclose(probability.sum(), 1.0)
 
 
+def test_a_bank_made_again_is_the_same_and_its_numbers_are_leaves():
+    system = linear_system(load(AttitudeMatching, SCENARIOS["s1"]), 3, START)
+    one, other = (jax.tree_util.tree_flatten(blind(system, s, 0.1)) for s in (3e-4, 5e-4))
+    assert one[1] == other[1]
+    assert {leaf.dtype for leaf in one[0]} == {np.dtype(float)}
+    differ = [a for a, b in zip(one[0], other[0], strict=True) if np.any(a != b)]
+    assert differ == [3e-4]
+
+
 def test_each_hypothesis_is_the_kalman_filter_of_its_structure():
     """Against matrices of the linear system that is told that structure."""
     given = load(AttitudeMatching, SCENARIOS["s0"])

@@ -17,11 +17,14 @@ from robins.systems.ins_gnss.log import prepare
 from robins.systems.ins_gnss.model import ins_gnss_model
 from robins.systems.ins_gnss.recording import TYRES, in_body_axes, on_one_clock
 from robins.systems.ins_gnss.robust import (
+    AS_TOLD,
     HYPOTHESES,
     STRAYED,
     Hypothesis,
     changes,
+    fresh,
     in_hindsight,
+    robust,
     stretches,
     supposed,
     widened,
@@ -220,6 +223,23 @@ def test_the_linear_motion_of_each_hypothesis_is_the_slope_of_its_step(log):
         ]
         np.testing.assert_allclose(np.asarray(Phi)[:, -4:], np.stack(wide, -1), atol=1e-5)
         assert noise.shape[0] == n
+
+
+def test_a_bank_and_a_model_made_again_have_the_same_structure():
+    parameters = Replay()
+
+    def made(patience_s):
+        own = ins_gnss_model(parameters.imu, parameters.gnss, parameters.aids)
+        bank = robust(own, 0.25, patience_s)
+        return [jax.tree_util.tree_flatten(x) for x in (bank, supposed(own, AS_TOLD), fresh(own))]
+
+    each = list(zip(made(10.0), made(30.0), strict=True))
+    for one, other in each:
+        assert one[1] == other[1]
+        assert {np.asarray(leaf).dtype for leaf in one[0]} == {np.dtype(float)}
+    bank, other = each[0]
+    differ = [a for a, b in zip(bank[0], other[0], strict=True) if np.any(a != b)]
+    assert [np.shape(a) for a in differ] == [(9, 9)]  # the changes
 
 
 def test_hindsight_is_that_of_all_sequences_of_modes():

@@ -230,8 +230,8 @@ def mean_and_sigma(step):
 
 def estimates(one, system, sigma, gamma, z):
     model, (u, aux) = system.model(sigma), system.inputs()
-    state = with_gamma(one.init(system.start(), model.dims), gamma)
-    return [np.asarray(a) for a in run(one, model, state, z, u, aux, keep=mean_and_sigma).steps]
+    found = run(with_gamma(one, gamma), model, system.start(), z, u, aux, keep=mean_and_sigma)
+    return [np.asarray(a) for a in found.steps]
 
 
 def test_the_paper_in_a_unit_is_its_weights_in_radians():

@@ -1,5 +1,6 @@
 """The hypotheses of the adaptive product filter: what each makes of a transition."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -7,7 +8,13 @@ from robins.earth import Geodetic
 from robins.filters.linearise import Transition
 from robins.ins.state import InsState
 from robins.rotation import Rotation
-from robins.systems.transfer_alignment.product.filters import QUIET, Hypothesis, changes, supposing
+from robins.systems.transfer_alignment.product.filters import (
+    QUIET,
+    Hypothesis,
+    changes,
+    seven,
+    supposing,
+)
 from robins.systems.transfer_alignment.product.model import ProductState
 
 INS = InsState(
@@ -66,3 +73,12 @@ def test_changes_are_probabilities_that_hardly_cross():
     np.testing.assert_allclose(T.sum(axis=1), 1.0, atol=1e-12)
     np.testing.assert_allclose(T[:3, 3:].sum(axis=1), 1e-5)
     np.testing.assert_allclose(T[3:, :3].sum(axis=1), 1e-5)
+
+
+def test_the_bank_made_again_is_the_same_and_its_numbers_are_leaves():
+    one, other = (jax.tree_util.tree_flatten(seven()) for _ in range(2))
+    assert one[1] == other[1]
+    assert {leaf.dtype for leaf in one[0]} == {np.dtype(float)}
+    rows = [leaf.tolist() for leaf in one[0] if leaf.shape == (7,)]
+    assert [1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0] in rows  # stiff
+    assert [1.0, 15.0, 15.0, 1.0, 1.0, 15.0, 15.0] in rows  # noise of the gyros

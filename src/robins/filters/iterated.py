@@ -4,16 +4,67 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief
-from robins.filters.linearise import Linearisation, taylor, ways
-from robins.filters.model import Sensor
+from robins.filters.linearise import Linearisation, Transition, taylor
+from robins.filters.model import Data, Motion, Sensor
 from robins.filters.observation import Observation, left_out, whiten
+from robins.filters.values import kind, value
+from robins.manifold import State
 
 # Below this share of the prior's spread, sigma points lie too close for their differences.
 _NARROW = 1e-6
+
+
+@value
+class Iterated(Linearisation):
+    """The way of `iterated`: e_i+1 = K_i (y - g(e_i) + H_i e_i)."""
+
+    way: Linearisation
+    iterations: int = kind()
+
+    def transition(self, belief: Belief, motion: Motion, u: Data) -> Transition:
+        return self.way.transition(belief, motion, u)
+
+    def observation(self, prior: Belief, sensor: Sensor, y: Data, aux: Data) -> Observation:
+        first = self.way.observation(prior, sensor, y, aux)
+        if self.iterations == 1:
+            return first
+        by_slope = first.excess.shape[1] == 0  # how uncertain the state is does not matter
+
+        def look(t, M):
+            return self.look(prior, sensor, y, aux, t, M)
+
+        t, M = jax.lax.fori_loop(
+            0,
+            self.iterations - 2,
+            lambda _, state: _updated(look(*state), by_slope),
+            _updated(first, by_slope),
+        )
+        return look(t, M)
+
+    def look(
+        self, prior: Belief, sensor: Sensor, y: Data, aux: Data, t: Array, M: Array
+    ) -> Observation:
+        """The measurement about retract(m, S t), regressed over S M, as the prior sees it."""
+        mean, S = _carried(prior, t)
+        seen = self.way.observation(Belief(mean, S @ M), sensor, y, aux)
+        spread = linalg.solve_lower_transposed(M, seen.spread.T).T
+        residual = jnp.where(seen.present, seen.residual + spread @ t, 0.0)
+        return seen._replace(prior=prior, residual=residual, spread=spread)
+
+
+def _updated(o: Observation, by_slope: bool) -> tuple[Array, Array]:
+    """The posterior in units of the prior: the state moves by S t, its factor is S M."""
+    unit = jnp.eye(o.prior.factor.shape[0])
+    spread, excess, noise, deficit, used = left_out(o)
+    S_y, cross, M = linalg.block_factor(spread, (excess, noise), unit, deficit)
+    t = cross @ whiten(S_y, used, o.residual).white
+    narrow = by_slope | jnp.any(jnp.diagonal(M) < _NARROW)
+    return t, jnp.where(narrow, unit, M)
 
 
 def iterated(linearise: Linearisation | None = None, iterations: int = 4) -> Linearisation:
@@ -51,38 +102,10 @@ def iterated(linearise: Linearisation | None = None, iterations: int = 4) -> Lin
             "use unscented(redraw=True)"
         )
 
-    def observation(prior: Belief, sensor: Sensor, y, aux) -> Observation:
-        first = way.observation(prior, sensor, y, aux)
-        if iterations == 1:
-            return first
-        unit = jnp.eye(prior.factor.shape[0])
-        by_slope = first.excess.shape[1] == 0  # how uncertain the state is does not matter
-
-        def look(t, M):
-            """The measurement about retract(m, S t), regressed over S M, as the prior sees it."""
-            mean, S = _carried(prior, t)
-            seen = way.observation(Belief(mean, S @ M), sensor, y, aux)
-            spread = linalg.solve_lower_transposed(M, seen.spread.T).T
-            residual = jnp.where(seen.present, seen.residual + spread @ t, 0.0)
-            return seen._replace(prior=prior, residual=residual, spread=spread)
-
-        def update(o):
-            """The posterior in units of the prior: the state moves by S t, its factor is S M."""
-            spread, excess, noise, deficit, used = left_out(o)
-            S_y, cross, M = linalg.block_factor(spread, (excess, noise), unit, deficit)
-            t = cross @ whiten(S_y, used, o.residual).white
-            narrow = by_slope | jnp.any(jnp.diagonal(M) < _NARROW)
-            return t, jnp.where(narrow, unit, M)
-
-        t, M = jax.lax.fori_loop(
-            0, iterations - 2, lambda _, state: update(look(*state)), update(first)
-        )
-        return look(t, M)
-
-    return ways(way.transition, observation)
+    return Iterated(way, iterations)
 
 
-def _carried(prior: Belief, t):
+def _carried(prior: Belief, t: Array) -> tuple[State, Array]:
     """The state retract(m, S t), and S seen from its tangent space."""
     S = prior.factor
     mean = manifold.retract(prior.mean, S @ t)

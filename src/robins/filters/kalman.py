@@ -16,20 +16,18 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.checks import one_of
 from robins.filters.linearise import Linearisation, Transition, taylor
-from robins.filters.model import Motion, Sensor
+from robins.filters.model import Data, Motion, Sensor
 from robins.filters.observation import Observation, contradicted, left_out, whiten
-from robins.filters.rule import Rule
-from robins.filters.sameness import same
+from robins.filters.rule import Memory, Rule
 from robins.filters.trees import finite, select
 from robins.filters.values import kind, value
 
-Again = Callable[[Any], Any]  # a filter -> the final state of the same run with it
 Form = Literal["sqrt", "joseph"]
 # What rules change of an observation; the rest follows from the belief that it is seen from.
 _OF_RULES = ("noise", "unweighed", "accepted", "notes")
@@ -54,57 +52,83 @@ class Prediction(NamedTuple):
 
 
 Follow = Callable[[Sequence[Belief], Belief], FilterState]
-
-
-def no_members(state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
-    """The default of `Filter.members`."""
-    return (), lambda beliefs, belief: state
+Again = Callable[["Filter"], FilterState]  # the same run with another filter, to its end
 
 
 class Filter:
-    """Pure functions; a run, a campaign, a bench or a loop of yours calls them.
+    """A filter: what a run, a campaign, a bench or a loop of yours steps.
 
-    Attributes:
-        init: ``(belief, dims) -> state``; dims maps sensor names to dimensions (`Model.dims`).
-        predict: ``(state, motion, u) -> (state, prediction)``.
-        update: ``(state, sensor, y, aux) -> (state, info)``.
-        reset: ``(state, belief) -> state``: go on from another belief, keeping what was learned of
-            the noise; for a filter inside a federated filter or a mixture.
-        members: ``state -> (beliefs, follow)``: what the local filters of a joined filter believe,
-            and ``follow(beliefs, belief) -> state``, the state in which they go on from others and
-            the whole from their fusion. The only question that a filter asks of the parts of
-            another one; by default there are none.
+    A filter of your own is a `robins.filters.values.value` with the methods below; those that users
+    call, `predict` and `update`, are made of them.
     """
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        """The state to begin with; dims maps sensor names to dimensions (`Model.dims`)."""
+        raise NotImplementedError
+
+    def _predict(
+        self, state: FilterState, motion: Motion, u: Data
+    ) -> tuple[FilterState, Prediction]:
+        raise NotImplementedError
+
+    def _update(
+        self, state: FilterState, sensor: Sensor, y: Data, aux: Data
+    ) -> tuple[FilterState, StepInfo]:
         raise NotImplementedError
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        """Go on from another belief, keeping what was learned of the noise.
+
+        For a filter inside a federated filter or a mixture.
+        """
         raise NotImplementedError
 
     def members(self, state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
-        return no_members(state)
+        """What the local filters of a joined filter believe, and how they go on from others.
 
-    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
-        """Raise what its rules have to report; ``again(filter)`` is the final state of a run anew."""
+        The only question that a filter asks of the parts of another one.
 
-    def _predict(self, state: FilterState, motion: Motion, u: Any):
-        raise NotImplementedError
+        Returns:
+            The beliefs, none by default, and ``follow(beliefs, belief) -> state``: the local
+            filters begin anew from beliefs, and the whole from their fusion.
+        """
+        return (), lambda beliefs, belief: state
 
-    def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
-        raise NotImplementedError
+    @property
+    def reports(self) -> bool:
+        """Whether there can be something to report; a stream asks once."""
+        return type(self).report is not Filter.report
+
+    def report(
+        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
+    ) -> None:
+        """Raise what the rules have to report of a run, which compiled code cannot.
+
+        Args:
+            start: state that the run began with.
+            final: the one that it ended with.
+            again: runs with another filter to another `final`; None where samples came one by one.
+            time: (T,) seconds of the steps.
+
+        Raises:
+            Exception: what a rule reports.
+        """
 
     @jax.jit
-    def predict(self, state: FilterState, motion: Motion, u: Any = None):
-        """`_predict`; the state remembers whether it was taken."""
+    def predict(
+        self, state: FilterState, motion: Motion, u: Data = None
+    ) -> tuple[FilterState, Prediction]:
+        """Predict over one step; the state remembers whether the prediction was taken."""
         state, prediction = self._predict(state, motion, u)
         # of a type of its own: with a weak one a stream would compile again after the first step
         current = (prediction.code == int(Code.DONE)).astype(bool)
         return state._replace(current=current), prediction
 
     @jax.jit
-    def update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
-        """`_update`; not after a prediction that was not taken.
+    def update(
+        self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None
+    ) -> tuple[FilterState, StepInfo]:
+        """Use a measurement, but none after a prediction that was not taken.
 
         The belief is then of an earlier time than the measurement: to fuse it would be to leave out
         the motion and its noise. It goes on with the next prediction that is taken, or a `reset`.
@@ -113,52 +137,6 @@ class Filter:
         ok = state.current | (info.code == int(Code.MISSING))
         new = select(state.current, new, state)
         return new, not_taken(ok, info, jnp.asarray(int(Code.NOT_PREDICTED)))
-
-    def _replace(self, **new: Any) -> Filter:
-        names = ("init", "predict", "update", "reset", "members")
-        return Functions(**{k: same(new.get(k, getattr(self, k))) for k in names})
-
-
-@value
-class Functions(Filter):
-    """A filter of functions; what is not converted yet."""
-
-    init: Any = kind()
-    predict: Any = kind()
-    update: Any = kind()
-    reset: Any = kind()
-    members: Any = kind(default=no_members)
-
-    def report(self, start: Any, final: Any, again: Any, time: Any) -> None:
-        from robins.filters.audit import audit
-
-        if again is None:
-            audit(start, final, None, time)
-
-
-def functions(*args: Any, **kw: Any) -> Filter:
-    return Functions(*map(same, args), **{k: same(v) for k, v in kw.items()})
-
-
-def compiled(filter_: Filter) -> Filter:
-    return filter_._replace(predict=jax.jit(filter_.predict), update=jax.jit(filter_.update))
-
-
-def in_step(filter_: Filter) -> Filter:
-    """Of a filter of functions what `Filter` does of the others."""
-
-    def predict(state: FilterState, motion: Motion, u: Any = None):
-        state, prediction = filter_.predict(state, motion, u)
-        current = (prediction.code == int(Code.DONE)).astype(bool)
-        return state._replace(current=current), prediction
-
-    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
-        new, info = filter_.update(state, sensor, y, aux)
-        ok = state.current | (info.code == int(Code.MISSING))
-        new = select(state.current, new, state)
-        return new, not_taken(ok, info, jnp.asarray(int(Code.NOT_PREDICTED)))
-
-    return compiled(filter_._replace(predict=predict, update=update))
 
 
 def predicted_factor(t: Transition, form: Form) -> Array:
@@ -298,32 +276,30 @@ class Kalman(Filter):
     rules: tuple[Rule, ...]
     form: Form = kind()
 
-    @property
-    def settling(self) -> bool:
-        return any(rule.settles for rule in self.rules)
-
-    def drawn(self, belief: Belief):
-        return () if self.way.reuse is None else self.way.reuse.draw(belief)
-
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
         memory = tuple(rule.init(belief, dims) for rule in self.rules)
-        return FilterState(belief, memory, self.drawn(belief))
+        return FilterState(belief, memory, self.way.drawn(belief))
 
-    def settle(self, state: FilterState):
-        """The belief of a step whose measurements are all in, as the rules leave it."""
+    @property
+    def settles(self) -> bool:
+        """Whether a rule does something once a step."""
+        return any(rule.settles for rule in self.rules)
+
+    def settled(self, state: FilterState) -> tuple[FilterState, Array]:
+        """The state of a step whose measurements are all in, as the rules leave it, and a code."""
         belief, memory, code = state.belief, list(state.memory), jnp.asarray(int(Code.DONE))
         for i, rule in enumerate(self.rules):
             memory[i], belief, found = rule.settle(memory[i], belief)
             code = jnp.where(code == int(Code.DONE), found, code)
-        return belief, tuple(memory), code
+        return state._replace(belief=belief, memory=tuple(memory)), code
 
-    def _predict(self, state: FilterState, motion: Motion, u: Any):
-        origin, held, settled = (
-            self.settle(state) if self.settling else (state.belief, state.memory, None)
-        )
-        transition = self.way.transition(origin, motion, u)
+    def _predict(
+        self, state: FilterState, motion: Motion, u: Data
+    ) -> tuple[FilterState, Prediction]:
+        begun, settled = self.settled(state) if self.settles else (state, None)
+        transition = self.way.transition(begun.belief, motion, u)
         memory = []
-        for rule, one in zip(self.rules, held, strict=True):
+        for rule, one in zip(self.rules, begun.memory, strict=True):
             one, transition = rule.process(one, transition)
             memory.append(one)
         belief = Belief(transition.mean, predicted_factor(transition, self.form))
@@ -334,33 +310,36 @@ class Kalman(Filter):
         if settled is not None:
             why = jnp.where(settled == int(Code.DONE), why, settled)
             ok = ok & (settled == int(Code.DONE))
-            kept = select(finite(held), held, state.memory)
-            state = state._replace(memory=kept)
+            state = state._replace(memory=select(finite(begun.memory), begun.memory, state.memory))
         code = jnp.where(ok, int(Code.DONE), why)
         new = select(ok, new, state)
-        transition = transition._replace(points=None)
-        return new, Prediction(transition, new.belief, code, origin if self.settling else None)
+        origin = begun.belief if self.settles else None
+        return new, Prediction(transition._replace(points=None), new.belief, code, origin)
 
-    def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
+    def seen(
+        self, state: FilterState, sensor: Sensor, y: Data, aux: Data
+    ) -> tuple[list[Memory], Belief, Observation]:
+        """The measurement as the rules leave it, the prior it is seen from, their memories."""
         prior, memory = state.belief, list(state.memory)
-        if self.way.reuse is None:
-            seen = self.way.observation(prior, sensor, y, aux)
-        else:
-            seen = self.way.reuse.observation(state.points, prior, sensor, y, aux)
+        seen = self.way.first_observation(state.points, prior, sensor, y, aux)
         for i, rule in enumerate(self.rules):
             memory[i], faded, seen = rule.before(memory[i], prior, seen)
             if faded is not prior:  # the rule built another prior; seen while tracing
                 prior = faded
                 again = self.way.observation(prior, sensor, y, aux)
-                kept = {name: getattr(seen, name) for name in _OF_RULES}
-                seen = again._replace(**kept)
-        seen = seen._replace(accepted=seen.accepted & seen.present)
+                seen = again._replace(**{name: getattr(seen, name) for name in _OF_RULES})
+        return memory, prior, seen._replace(accepted=seen.accepted & seen.present)
+
+    def _update(
+        self, state: FilterState, sensor: Sensor, y: Data, aux: Data
+    ) -> tuple[FilterState, StepInfo]:
+        memory, prior, seen = self.seen(state, sensor, y, aux)
         posterior, info = updated(prior, seen, self.form)
         # A contradiction alone has an infinite NIS that is no overflow.
         ok = finite(info.nis) | (info.code == int(Code.CONTRADICTED))
         for i, rule in enumerate(self.rules):
             memory[i], posterior, info = rule.after(memory[i], posterior, info, seen)
-        new = FilterState(posterior, tuple(memory), self.drawn(posterior))
+        new = FilterState(posterior, tuple(memory), self.way.drawn(posterior))
         ok = finite(new) & ok
         squares = (block * block for block in left_out(seen)[:3])
         inputs = (prior, jnp.where(info.used, seen.residual, 0.0), *squares)
@@ -368,12 +347,18 @@ class Kalman(Filter):
         return select(ok, new, state), not_taken(ok, info, why)
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
-        return FilterState(belief, state.memory, self.drawn(belief))
+        return FilterState(belief, state.memory, self.way.drawn(belief))
 
-    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
+    @property
+    def reports(self) -> bool:
+        return any(rule.reports for rule in self.rules)
+
+    def report(
+        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
+    ) -> None:
         for i, rule in enumerate(self.rules):
 
-            def anew(rule: Rule, i: int = i) -> Any:
+            def anew(rule: Rule, i: int = i) -> Memory:
                 assert again is not None
                 rules = (*self.rules[:i], rule, *self.rules[i + 1 :])
                 return again(dataclasses.replace(self, rules=rules)).memory[i]

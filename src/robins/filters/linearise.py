@@ -33,7 +33,6 @@ from robins import linalg, manifold
 from robins.filters.belief import Belief, Number
 from robins.filters.model import Motion, Sensor, as_noise
 from robins.filters.observation import Observation, innovation
-from robins.filters.sameness import same
 from robins.filters.values import kind, value
 from robins.manifold import State
 
@@ -66,9 +65,17 @@ class Reuse(NamedTuple):
 
 
 class Linearisation:
-    """A way to linearise."""
+    """A way to linearise; values of its kinds are made by `taylor`, `unscented` and their kin.
 
-    reuse: Any = None  # a `Reuse` where points are not drawn anew
+    Attributes:
+        transition: ``(belief, motion, u) -> Transition``: where the motion takes a belief, and how.
+        observation: ``(prior, sensor, y, aux) -> Observation``: a measurement as a belief sees it.
+        reuse: how to update with the points of the prediction; None where they are drawn anew.
+    """
+
+    @property
+    def reuse(self) -> Reuse | None:
+        return None
 
     def transition(self, belief: Belief, motion: Motion, u: Any) -> Transition:
         raise NotImplementedError
@@ -76,18 +83,15 @@ class Linearisation:
     def observation(self, prior: Belief, sensor: Sensor, y: Any, aux: Any) -> Observation:
         raise NotImplementedError
 
+    def drawn(self, belief: Belief) -> Any:
+        return () if self.reuse is None else self.reuse.draw(belief)
 
-@value
-class Ways(Linearisation):
-    """A way of functions; what is not converted yet."""
-
-    transition: Any = kind()
-    observation: Any = kind()
-    reuse: Any = kind(default=None)
-
-
-def ways(*functions: Any) -> Linearisation:
-    return Ways(*map(same, functions))
+    def first_observation(
+        self, points: Any, prior: Belief, sensor: Sensor, y: Any, aux: Any
+    ) -> Observation:
+        if self.reuse is None:
+            return self.observation(prior, sensor, y, aux)
+        return self.reuse.observation(points, prior, sensor, y, aux)
 
 
 def _form(x: Any) -> tuple[Any, tuple]:
@@ -265,7 +269,7 @@ class Unscented(Linearisation):
     redraw: bool = kind()
 
     @property
-    def reuse(self):
+    def reuse(self) -> Reuse | None:
         return None if self.redraw else Reuse(self.draw, self.observe_again)
 
     def transition(self, belief: Belief, motion: Motion, u) -> Transition:
@@ -296,9 +300,10 @@ class Unscented(Linearisation):
         _, *state, lack = _regress(points.states, n, *self.numbers)
         z, *reading, deficit = _regress(values, n, *self.numbers)
         if lack is not None or deficit is not None:
+            alpha, beta, kappa = self.numbers
             raise ValueError(
                 "sigma points can be used again only where kappa alpha^2 + n beta >= 0, got "
-                f"alpha, beta, kappa = {self.numbers}, n = {n}"
+                f"alpha = {alpha}, beta = {beta}, kappa = {kappa}, n = {n}"
             )
         # State and reading are the same combinations of the same unit deviations, the noise of the
         # motion aside: state = S T with T T' = I, so what of the reading lies along T is its
@@ -332,7 +337,8 @@ def unscented(
             from a measurement than could be, unless the noise is small. Only the first update after
             a prediction that no rule has faded has such points; the others draw.
     """
-    return Unscented((alpha, beta, kappa), redraw)
+    plain = (x if isinstance(x, (int, float)) else float(x) for x in (alpha, beta, kappa))
+    return Unscented(tuple(plain), redraw)
 
 
 def _square(noise: Array) -> Array:

@@ -19,7 +19,7 @@ from robins.filters.checks import one_of
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Model
 from robins.filters.run import Step, filter_step
-from robins.filters.values import content
+from robins.filters.values import content, on_device
 
 Name = Literal["jax", "c"]
 Codes = tuple[Any, dict[str, Any]]  # of a step: of its prediction, and by sensor
@@ -77,8 +77,8 @@ class ByJax:
     is_numpy = False
 
     def __init__(self, filter_: Filter, model: Model, state: FilterState):
-        """Of a filter and a model that `robins.filters.sameness` made the first of their kind."""
-        self._filter, self._model = filter_, model
+        """Of a filter and a model, whose numbers are handed to the device once."""
+        self._filter, self._model = on_device((filter_, model))
         self.state = state
 
     def predict(self, u: Any) -> Prediction:
@@ -106,7 +106,7 @@ class ByJax:
 class ByProgram:
     """A state in a memory, stepped by functions that the memory compiles for it.
 
-    Here the numbers of a model are known, and folded into the programs.
+    Here the numbers of a filter and of a model are known, and folded into the programs.
     """
 
     is_numpy = True
@@ -165,8 +165,8 @@ def on(
 
     Args:
         machine: "jax", "c", or what makes a memory.
-        filter_: from `robins.filters.sameness.same`.
-        model: from `same_model`.
+        filter_: what is stepped,
+        model: with what.
         state: to begin with.
 
     Raises:

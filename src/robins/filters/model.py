@@ -21,6 +21,7 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.values import kind, value
 
+Data = Any  # a pytree of arrays, such as a measurement or an input
 _LARGEST = float(np.sqrt(np.finfo(float).max))  # of a standard deviation
 
 

@@ -6,7 +6,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import tree_map
 
@@ -64,6 +63,8 @@ class OnlineFilter:
         self.filter, self.model = filter_, model
         state = settled(filter_.init(start, model.dims) if isinstance(start, Belief) else start)
         self._machine = on(machine, self.filter, self.model, state)
+        self._reports = filter_.reports
+        self._start = self._held()
         self.counts: Counter[str] = Counter()
         self._last: dict[str, deque[tuple[StepInfo, Any]]] = {}
 
@@ -75,6 +76,7 @@ class OnlineFilter:
     @state.setter
     def state(self, state: FilterState) -> None:
         self._machine.state = state
+        self._start = self._held()
 
     @property
     def belief(self) -> Belief:
@@ -173,12 +175,16 @@ class OnlineFilter:
             kept = tree_map(np.array, kept)
         self._last.setdefault(sensor, deque(maxlen=WINDOW)).append(kept)
 
+    def _held(self) -> FilterState:
+        """The state of now for later: what C computes next must not change it."""
+        return tree_map(np.array, self.state) if self._machine.is_numpy else self.state
+
     def _count(self, moved: Any, *used: Any) -> None:
-        """Count a prediction that was not taken, and updates; let the memories report."""
+        """Count a prediction that was not taken, and updates; let the filter report."""
         # whole numbers of Python: to compare one of NumPy with a `Code` takes as long as a step
         if (code := int(moved)) != _DONE:
             self.counts[_NAMES[code]] += 1
         for one in used:
             self.counts[_NAMES[int(one)]] += 1
-        state = tree_map(jnp.asarray, self.state) if self._machine.is_numpy else self.state
-        self.filter.report(state, state, None, None)
+        if self._reports:
+            self.filter.report(self._start, self.state, None, None)

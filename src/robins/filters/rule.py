@@ -6,17 +6,19 @@ state, so that a run stays one scan, a batch one `vmap`, and streaming use the s
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
+
+from jaxtyping import ArrayLike
 
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
-from robins.filters.sameness import same
 from robins.filters.values import kind, value
 
 Memory = Any  # a pytree of arrays; its shapes may not change from step to step
+Again = Callable[["Rule"], Memory]  # the same run with another rule, to its end
 
 
 class Rule:
@@ -75,55 +77,39 @@ class Rule:
         """Whether it does anything once a step."""
         return type(self).settle is not Rule.settle
 
-    def report(self, start: Memory, final: Memory, again: Any, time: Any) -> None:
-        """Raise what it has to report of a run; `again` runs with this rule exchanged."""
+    @property
+    def reports(self) -> bool:
+        """Whether there can be something to report."""
+        return type(self).report is not Rule.report
+
+    def report(
+        self, start: Memory, final: Memory, again: Again | None, time: ArrayLike | None
+    ) -> None:
+        """Raise what it has to report of a run, which compiled code cannot.
+
+        Args:
+            start: memory that the run began with.
+            final: the one that it ended with.
+            again: runs with another rule in the place of this one to another `final`; None where
+                samples came one by one.
+            time: (T,) seconds of the steps.
+        """
 
 
-def _no_memory(belief: Belief, dims: Mapping[str, int]) -> Memory:
-    return ()
-
-
-def _keep_transition(memory: Memory, transition: Transition) -> tuple[Memory, Transition]:
-    return memory, transition
-
-
-def _keep_prior(
-    memory: Memory, prior: Belief, observation: Observation
-) -> tuple[Memory, Belief, Observation]:
-    return memory, prior, observation
-
-
-def _keep_posterior(
-    memory: Memory, posterior: Belief, info: StepInfo, observation: Observation
-) -> tuple[Memory, Belief, StepInfo]:
-    return memory, posterior, info
-
-
-def keep_belief(memory: Memory, belief: Belief) -> tuple[Memory, Belief, int]:
-    """The default of `Rule.settle`."""
-    return memory, belief, int(Code.DONE)
+_SETTLE = partial(Rule.settle, None)
 
 
 @value
 class Hooks(Rule):
-    """A rule of functions; what is not converted yet."""
+    """A rule of functions of a user, each equal to itself only."""
 
-    init: Any = kind(default=_no_memory)
-    process: Any = kind(default=_keep_transition)
-    before: Any = kind(default=_keep_prior)
-    after: Any = kind(default=_keep_posterior)
+    init: Any = kind(default=partial(Rule.init, None))
+    process: Any = kind(default=partial(Rule.process, None))
+    before: Any = kind(default=partial(Rule.before, None))
+    after: Any = kind(default=partial(Rule.after, None))
     name: str = kind(default="rule")
-    settle: Any = kind(default=keep_belief)
+    settle: Any = kind(default=_SETTLE)
 
     @property
     def settles(self) -> bool:
-        return self.settle is not keep_belief
-
-    def _replace(self, **new: Any) -> Rule:
-        return dataclasses.replace(
-            self, **{k: same(v) if callable(v) else v for k, v in new.items()}
-        )
-
-
-def hooks(*args: Any, **kw: Any) -> Rule:
-    return Hooks(*map(same, args), **{k: same(v) if callable(v) else v for k, v in kw.items()})
+        return self.settle is not _SETTLE

@@ -142,8 +142,8 @@ def run(
     """Run a filter over measurements: for each step predict, then update with row k of y.
 
     One compiled scan: batch with `jax.vmap` over any of the data, differentiate with `jax.grad`.
-    A filter and a model that robins made again with equal arguments, a user's functions and `keep`
-    that are the same objects, with data of the same shapes, are compiled once.
+    Filters and models of other numbers, with a user's functions and `keep` that are the same
+    objects, and data of the same shapes, share what was compiled.
 
     Args:
         filter_: from `kalman` and its kin.
@@ -157,8 +157,8 @@ def run(
         time_s: (T,) time of each step [s], which errors then name.
 
     Raises:
-        Exception: what a memory has to report of the run (`robins.filters.audit`). In
-            transformed or compiled code nothing can be raised: the codes of the steps say it.
+        Exception: what the filter has to report of the run (`Filter.report`). In transformed or
+            compiled code nothing can be raised: the codes of the steps say it.
         TypeError: a measurement is not a real number.
         ValueError: lengths differ, a measurement names no sensor of the model or is not of the
             shape that its sensor reads.

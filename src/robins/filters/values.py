@@ -19,7 +19,7 @@ from jax.tree_util import GetAttrKey, Partial, register_pytree_with_keys
 from robins.errors import require
 
 T = TypeVar("T")
-Numbers = jax.Array | np.ndarray | np.generic  # of a leaf; the stand-ins of JAX are arrays too
+Numbers = jax.Array | np.ndarray | np.float64  # of a leaf; the stand-ins of JAX are arrays too
 
 
 def kind(**how: Any) -> Any:

@@ -8,20 +8,24 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 from scipy import integrate, optimize, special, stats
 
 from robins import linalg
-from robins.filters.belief import StepInfo
-from robins.filters.kalman import Filter, FilterState
+from robins.filters.belief import Belief
+from robins.filters.kalman import Again, Filter, FilterState
 from robins.filters.linearise import taylor
-from robins.filters.model import Sensor
+from robins.filters.model import Data, Motion, Sensor
 from robins.filters.observation import Normalised, normalised
 from robins.filters.run import Step
+from robins.filters.values import value
 
 OUTLIERS = 0.02  # share of measurements whose errors are `WIDER` times as large
 WIDER = 10.0
@@ -82,24 +86,53 @@ def log_density(seen: Normalised) -> Float[Array, ""]:
     return jnp.logaddexp(normal, wide) - spread - 0.5 * m * math.log(2.0 * math.pi)
 
 
+@value
+class Scored(Filter):
+    """The filter of `scored`: that inside, with the log density of each measurement noted."""
+
+    inner: Filter
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        return self.inner.init(belief, dims)
+
+    # The states are those of the filter inside, which leaves out itself what is not taken.
+    @jax.jit
+    def predict(self, state: FilterState, motion: Motion, u: Data = None):
+        """That of the filter inside."""
+        return self.inner.predict(state, motion, u)
+
+    @jax.jit
+    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None):
+        """That of the filter inside, with the score noted."""
+        seen = normalised(taylor().observation(state.belief, sensor, y, aux))
+        there = seen.dof > 0
+        density = jnp.where(there, jnp.where(state.current, log_density(seen), -jnp.inf), 0.0)
+        new, info = self.inner.update(state, sensor, y, aux)
+        return new, info.noted(_RULE, log_density=density, components=seen.dof)
+
+    def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        return self.inner.reset(state, belief)
+
+    def members(self, state: FilterState):
+        return self.inner.members(state)
+
+    def report(
+        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
+    ) -> None:
+        def anew(filter_: Filter) -> FilterState:
+            assert again is not None
+            return again(replace(self, inner=filter_))
+
+        self.inner.report(start, final, None if again is None else anew, time)
+
+
 def scored(filter_: Filter) -> Filter:
     """The same filter, whose updates note how well the measurement was predicted.
 
     Measurements are linearised about the mean of the belief (first-order Taylor). What is found is
     read by `predicted`; after a prediction that was not taken it is -inf.
     """
-    way = taylor()
-
-    def update(
-        state: FilterState, sensor: Sensor, y: Any, aux: Any = None
-    ) -> tuple[FilterState, StepInfo]:
-        seen = normalised(way.observation(state.belief, sensor, y, aux))
-        there = seen.dof > 0
-        density = jnp.where(there, jnp.where(state.current, log_density(seen), -jnp.inf), 0.0)
-        new, info = filter_.update(state, sensor, y, aux)
-        return new, info.noted(_RULE, log_density=density, components=seen.dof)
-
-    return filter_._replace(update=update)
+    return Scored(filter_)
 
 
 def predicted(step: Step) -> Predicted:

@@ -27,15 +27,11 @@ from robins.filters.belief import Belief, StepInfo
 from robins.filters.checks import matrix, positive
 from robins.filters.kalman import kalman
 from robins.filters.linearise import Linearisation, taylor
-from robins.filters.model import Model
-from robins.filters.rules._inflation import as_weight
-from robins.filters.rules.h_infinity import (
-    Estimate,
-    h_infinity,
-    least_gamma,
-    with_gamma,
-)
+from robins.filters.model import Model, Motion, Sensor
+from robins.filters.rules._inflation import as_weight, rows_of
+from robins.filters.rules.h_infinity import Estimate, h_infinity, least_gamma, with_gamma
 from robins.filters.run import Solution, run
+from robins.manifold import State
 
 
 def existence_margin(belief: Belief, weight: Any, gamma: Any) -> Float[Array, ""]:
@@ -56,11 +52,12 @@ def existence_margin(belief: Belief, weight: Any, gamma: Any) -> Float[Array, ""
     """
     if not isinstance(gamma, Tracer):
         positive("gamma", gamma, "the Kalman filter")
-    L = as_weight(weight, "existence_margin")(belief.mean) / jnp.asarray(gamma, float)
+    whose = "existence_margin"
+    L = rows_of(as_weight(weight, whose), belief.mean, whose) / jnp.asarray(gamma, float)
     n = belief.factor.shape[0]
     require(
         L.shape[1] == n,
-        f"existence_margin: weight has {L.shape[1]} columns, the state has {n} components",
+        f"{whose}: weight has {L.shape[1]} columns, the state has {n} components",
     )
     root = linalg.solve_lower(belief.factor, jnp.eye(n))
     return linalg.eigenvalue_bounds(root.T @ root - L.T @ L)[0]
@@ -247,8 +244,6 @@ def worst_case_gain(
 
 def _linearised(model: Model, start: Belief, steps: Any, weight: Any, u: Any, aux: dict[str, Any]):
     """Everything the recursion of the error needs, along a run."""
-    n, way, rows = manifold.dim(start.mean), taylor(), as_weight(weight, "worst_case_gain")
-    unit = partial(Belief, factor=jnp.eye(n))  # so that a spread is the Jacobian
     prediction = steps.prediction
     if prediction.origin is not None:
         before = prediction.origin.mean
@@ -259,31 +254,43 @@ def _linearised(model: Model, start: Belief, steps: Any, weight: Any, u: Any, au
             steps.posterior.mean,
         )
 
-    @jax.jit
-    @jax.vmap
-    def motion(mean, u):
-        t = way.transition(unit(mean), model.motion, u)
-        return t.spread, t.noise
-
-    F, G = motion(before, u)
+    F, G = _motion_along(model.motion, before, u)
     mean, channels = prediction.belief.mean, []
     for sensor in model.sensors:
         if sensor.name not in steps.info:
             continue
-
-        @jax.jit
-        @jax.vmap
-        def look(mean, info, aux, sensor=sensor):
-            z = sensor.read(mean, aux) if sensor.linear is None else sensor.linear(mean, aux)[0]
-            o = way.observation(unit(mean), sensor, z, aux)
-            residual = jnp.where(info.used, info.innovation, 0.0)
-            return o.spread, o.noise, manifold.retract(mean, info.gain @ residual)
-
         info = steps.info[sensor.name]
-        H, W, mean = look(mean, info, aux.get(sensor.name))
+        H, W, mean = _sensor_along(sensor, mean, info, aux.get(sensor.name))
         channels.append(Channel(np.asarray(info.gain), np.asarray(H), np.asarray(W)))
-    L = np.asarray(jax.vmap(rows)(steps.posterior.mean))
+    whose = "worst_case_gain"
+    rows = as_weight(weight, whose)
+    L = np.asarray(jax.vmap(lambda mean: rows_of(rows, mean, whose))(steps.posterior.mean))
     return np.asarray(start.factor), np.asarray(F), np.asarray(G), channels, L
+
+
+def _unit(mean: State) -> Belief:
+    """About a mean, so that a spread is the Jacobian."""
+    return Belief(mean, jnp.eye(manifold.dim(mean)))
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0, 0))
+def _motion_along(motion: Motion, mean: State, u: Any) -> tuple[Array, Array]:
+    """Transitions and noise factors at the means before them."""
+    t = taylor().transition(_unit(mean), motion, u)
+    return t.spread, t.noise
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0, 0, 0))
+def _sensor_along(
+    sensor: Sensor, mean: State, info: StepInfo, aux: Any
+) -> tuple[Array, Array, State]:
+    """Slopes and noise factors of a sensor, and the means that its updates led to."""
+    z = sensor.read(mean, aux) if sensor.linear is None else sensor.linear(mean, aux)[0]
+    o = taylor().observation(_unit(mean), sensor, z, aux)
+    residual = jnp.where(info.used, info.innovation, 0.0)
+    return o.spread, o.noise, manifold.retract(mean, info.gain @ residual)
 
 
 # -------------------------------------------------------------------------------------- steady

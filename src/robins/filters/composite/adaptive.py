@@ -36,6 +36,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
+from robins.filters.composite.bank import EVERY, transitions
 from robins.filters.composite.imm import Family, imm
 from robins.filters.composite.offsets import (
     Supposed,
@@ -46,9 +47,10 @@ from robins.filters.composite.offsets import (
 )
 from robins.filters.kalman import Filter, Form, kalman
 from robins.filters.linearise import Linearisation, Transition, taylor
-from robins.filters.rule import Rule, hooks
+from robins.filters.rule import Memory, Rule
 from robins.filters.rules import huber
 from robins.filters.rules._robust import PATIENCE
+from robins.filters.values import Numbers, kind, number, value
 
 SCALES = (1.0, 8.0, 64.0)
 UP, BACK = 1e-5, 1e-2
@@ -60,6 +62,26 @@ drives."""
 ALL = slice(None)
 
 
+@value
+class Excited(Rule):
+    """The rule of `excited`: the process noise of each part times its scale."""
+
+    scales: Numbers  # (parts,)
+    parts: tuple[tuple[Any, ...], ...] = kind()  # rows of each; `slice` and its three numbers
+
+    name = "excited"
+
+    def process(self, memory: Memory, transition: Transition):
+        return memory, transition._replace(noise=self.louder(transition.noise))
+
+    def louder(self, noise: Array) -> Array:
+        """A factor (n, q) of the process noise, each part of its rows times its scale."""
+        for i, part in enumerate(self.parts):
+            rows = slice(*part[1:]) if part[:1] == (slice,) else np.asarray(part, int)
+            noise = noise.at[rows].multiply(jnp.asarray(self.scales)[i])
+        return noise
+
+
 def excited(parts: Sequence[Part], scales: ArrayLike) -> Rule:
     """Process noise of another scale, part by part.
 
@@ -67,19 +89,12 @@ def excited(parts: Sequence[Part], scales: ArrayLike) -> Rule:
         parts: of the process noise.
         scales: (parts,) of the standard deviations of the noise.
     """
-
-    def process(memory: Any, t: Transition):
-        return memory, t._replace(noise=louder(t.noise, parts, scales))
-
-    return hooks(process=process, name="excited")
-
-
-def louder(noise: Array, parts: Sequence[Part], scales: ArrayLike) -> Array:
-    """A factor (n, q) of the process noise, each part of its rows times its scale."""
-    for i, part in enumerate(parts):
-        rows = part if isinstance(part, slice) else np.asarray(part, int)
-        noise = noise.at[rows].multiply(jnp.asarray(scales)[i])
-    return noise
+    # before Python 3.12 a slice has no hash
+    kinds = tuple(
+        (slice, p.start, p.stop, p.step) if isinstance(p, slice) else tuple(map(int, p))
+        for p in parts
+    )
+    return Excited(number("scales of excited must be real", scales), kinds)
 
 
 def changes(scales: Sequence[float | int], up: float = UP, back: float = BACK) -> np.ndarray:
@@ -91,12 +106,11 @@ def changes(scales: Sequence[float | int], up: float = UP, back: float = BACK) -
         ValueError: they are no probabilities.
     """
     s = np.asarray(scales, float)
-    change = np.where(s[None] < s[:, None], back, up)
-    np.fill_diagonal(change, 0.0)
-    stay = 1.0 - change.sum(axis=1)
-    good = 0.0 < up < 1.0 and 0.0 < back < 1.0 and bool(np.all(stay > 0.0))
+    chance = np.where(s[None] < s[:, None], back, up)
+    change = transitions(len(s), [(EVERY, EVERY, chance)])
+    good = 0.0 < up < 1.0 and 0.0 < back < 1.0 and bool(np.all(np.diag(change) > 0.0))
     require(good, "up and back of adaptive must leave a mode a chance to stay", (up, back))
-    return change + np.diag(stay)
+    return change
 
 
 def lasting(change: np.ndarray) -> np.ndarray:
@@ -106,6 +120,23 @@ def lasting(change: np.ndarray) -> np.ndarray:
     found, *_ = np.linalg.lstsq(A, np.append(np.zeros(count), 1.0))
     found = np.maximum(found, 0.0)
     return found / found.sum()
+
+
+@value
+class Adapted:
+    """What makes a mode of `adaptive` of the noise it believes in, and of what is off if any."""
+
+    way: Linearisation
+    weight: Rule
+    form: Form = kind()
+    off: tuple[str, ...] = kind()
+
+    def __call__(self, row: tuple[Excited, Supposed | None]) -> Filter:
+        noise, of = row
+        if of is None:
+            return kalman(self.way, (noise, self.weight), self.form)
+        weighed = kalman(self.way, (self.weight,), self.form)
+        return supposing(weighed, self.off, of, Partial(Excited.louder, noise))
 
 
 def adaptive(
@@ -149,22 +180,11 @@ def adaptive(
     own = np.repeat(np.eye(len(parts)), len(s) - 1, axis=0)
     gains = s[0] * np.ones((1 + len(more), len(parts)))
     gains[1:] = np.where(own > 0.0, more[:, None], gains[1:])
-    by, weight = taylor() if linearise is None else linearise, huber(robust, patience=patience)
-    change = changes([s[0], *more], up, back)
+    way, weight = taylor() if linearise is None else linearise, huber(robust, patience=patience)
+    one, change = Adapted(way, weight, form, tuple(off)), changes([s[0], *more], up, back)
     if not off:
-
-        def one(gain: Any) -> Filter:
-            return kalman(by, (excited(parts, gain), weight), form)
-
-        return imm(Family(one, gains), change, lasting(change))
-
-    weighed, plain = kalman(by, (weight,), form), len(gains)
-
-    def supposes(row: tuple[Any, Supposed]) -> Filter:
-        gain, of = row
-        return supposing(weighed, off, of, Partial(lambda g, N: louder(N, parts, g), gain))
-
-    change = with_offsets(change, len(off))
+        return imm(Family(one, (excited(parts, gains), None)), change, lasting(change))
+    plain, change = len(gains), with_offsets(change, len(off))
     gains = np.vstack([gains, np.repeat(gains[:1], len(change) - plain, axis=0)])
-    rows = gains, sensors_off(plain, len(off))
-    return narrowed(imm(Family(supposes, rows), change, lasting(change)), off)
+    rows = excited(parts, gains), sensors_off(plain, len(off))
+    return narrowed(imm(Family(one, rows), change, lasting(change)), off)

@@ -7,25 +7,24 @@ on its way to its local filter, the belief fused again after it, and steps that 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any, ClassVar, NamedTuple, Self
 
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import register_static
 from jaxtyping import Array
 
 from robins import manifold
 from robins.errors import require
-from robins.filters.audit import Again, audit
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.checks import sensor_names
 from robins.filters.composite.fusion import is_singular
 from robins.filters.kalman import (
+    Again,
     Filter,
     FilterState,
+    Follow,
     Prediction,
-    functions,
-    in_step,
     kalman,
     not_taken,
 )
@@ -47,41 +46,6 @@ class Channel:
     def name(self) -> str:
         """Its sensors, for messages."""
         return "+".join(self.sensors)
-
-
-@register_static
-class Names(tuple[str, ...]):
-    """Of the channels, in a state: no number, so no leaf."""
-
-
-class Joined(NamedTuple):
-    """What a filter of channels carries besides the fused belief."""
-
-    members: tuple[FilterState, ...]  # by channel; a master last, where there is one
-    shares: Array  # (members, 1 or n) of the information
-    silent: Array  # (channels,) steps since a measurement was used
-    singular: Array  # (members,) steps not taken because information was infinite
-    names: Names
-
-    def audit(self, start: Joined, again: Again | None, time: Any) -> None:
-        """Ask the members, then raise for steps not taken (`robins.filters.audit`)."""
-        rerun = None if again is None else lambda m: again(start._replace(members=m)).members
-        audit(start.members, self.members, rerun, time)
-        self.refuse_singular()
-
-    def refuse_singular(self) -> None:
-        """Raise for steps not taken because information was infinite."""
-        for i, count in enumerate(np.asarray(self.singular).tolist()):
-            name = f"channel '{self.names[i]}'" if i < len(self.names) else "the master"
-            require(
-                count == 0,
-                f"the covariance of {name} was singular in {count} steps, which were not taken: "
-                "infinite information cannot be fused. Give a constraint, a measurement or a state "
-                "without noise some noise, or constrain what is fused",
-            )
-
-
-Fuse = Callable[[Sequence[Belief]], Belief]
 
 
 def channel(sensors: str | Sequence[str], filter: Filter | None = None) -> Channel:
@@ -129,23 +93,177 @@ def local_dims(channels: Sequence[Channel], dims: Mapping[str, int]) -> list[dic
     return [{k: v for k, v in dims.items() if owner[k] == i} for i in range(len(channels))]
 
 
-def members_of(filters: Sequence[Filter]):
-    """The `members` of a joined filter: each goes on by its own `reset`."""
+# ------------------------------------------------------------------------------ filters of filters
 
-    def members(state: FilterState):
+
+class Composite(Filter):
+    """A filter of filters: what rules report is asked of each by itself.
+
+    Attributes:
+        filters: those it is made of.
+        with_filters: ``filters -> Filter``, the same made of others.
+        parts: ``state -> states``, theirs in its own.
+    """
+
+    @property
+    def filters(self) -> tuple[Filter, ...]:
+        raise NotImplementedError
+
+    def with_filters(self, filters: tuple[Filter, ...]) -> Filter:
+        raise NotImplementedError
+
+    def parts(self, state: FilterState) -> tuple[FilterState, ...]:
+        raise NotImplementedError
+
+    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
+        each = zip(self.filters, self.parts(start), self.parts(final), strict=True)
+        for i, (one, first, last) in enumerate(each):
+
+            def anew(other: Filter, i: int = i) -> FilterState:
+                assert again is not None
+                filters = (*self.filters[:i], other, *self.filters[i + 1 :])
+                return self.parts(again(self.with_filters(filters)))[i]
+
+            one.report(first, last, None if again is None else anew, time)
+
+
+class Joined(NamedTuple):
+    """What a filter of channels carries besides the fused belief."""
+
+    members: tuple[FilterState, ...]  # by channel; a master last, where there is one
+    shares: Array  # (members, 1 or n) of the information
+    silent: Array  # (channels,) steps since a measurement was used
+    singular: Array  # (members,) steps not taken because information was infinite
+
+
+class Moved(NamedTuple):
+    """Members after a prediction, and how it went with each filter that predicted."""
+
+    members: tuple[FilterState, ...]
+    codes: tuple[Any, ...]  # by member
+    belief: Belief  # fused
+    shares: Array
+    transition: Transition | None = None  # of a prediction common to all
+    code: Any = int(Code.DONE)  # of that prediction
+
+
+@value
+class JoinedFilter(Composite):
+    """Local filters whose beliefs are fused after each step; its memory is a `Joined`.
+
+    Attributes:
+        channels: the local filters, each with its sensors.
+        title: prefix of its notes.
+        fuse: ``beliefs -> Belief`` of all members.
+        apart: ``(beliefs, i) -> bool``, whether local filter i contradicts another.
+        first_shares: ``belief -> shares`` at the start.
+        parted: ``(belief, shares) -> beliefs`` by member.
+        moved: ``(state, motion, u) -> Moved``.
+    """
+
+    channels: tuple[Channel, ...]
+
+    title: ClassVar[str]
+
+    def fuse(self, beliefs: Sequence[Belief]) -> Belief:
+        raise NotImplementedError
+
+    def apart(self, beliefs: Sequence[Belief], i: int) -> Array:
+        return are_apart(beliefs, i, None)
+
+    def first_shares(self, belief: Belief) -> Array:
+        raise NotImplementedError
+
+    def parted(self, belief: Belief, shares: Array) -> list[Belief]:
+        raise NotImplementedError
+
+    def moved(self, state: FilterState, motion: Motion, u: Any) -> Moved:
+        raise NotImplementedError
+
+    @property
+    def filters(self) -> tuple[Filter, ...]:
+        return tuple(one.filter for one in self.channels)
+
+    def with_filters(self, filters: tuple[Filter, ...]) -> Self:
+        each = zip(self.channels, filters, strict=False)  # a master's is no channel's
+        return replace(self, channels=tuple(replace(c, filter=f) for c, f in each))
+
+    def parts(self, state: FilterState) -> tuple[FilterState, ...]:
+        return state.memory.members
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        given = local_dims(self.channels, dims)
+        given += [{}] * (len(self.filters) - len(given))
+        shares = self.first_shares(belief)
+        each = zip(self.filters, self.parted(belief, shares), given, strict=True)
+        members = tuple(f.init(own, d) for f, own, d in each)
+        silent, singular = (jnp.zeros(len(x), int) for x in (self.channels, members))
+        return FilterState(belief, Joined(members, shares, silent, singular))
+
+    def members(self, state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
         joined: Joined = state.memory
 
         def follow(beliefs: Sequence[Belief], belief: Belief) -> FilterState:
-            each = zip(filters, joined.members, beliefs, strict=True)
+            each = zip(self.filters, joined.members, beliefs, strict=True)
             states = tuple(f.reset(member, own) for f, member, own in each)
             return FilterState(belief, joined._replace(members=states))
 
         return tuple(member.belief for member in joined.members), follow
 
-    return members
+    def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        return self.members(state)[1](self.parted(belief, state.memory.shares), belief)
 
+    def moved_apart(
+        self, begun: Sequence[FilterState], motions: Sequence[Motion], u: Any, shares: Array
+    ) -> Moved:
+        """Members that each predict, from where they begin."""
+        each = zip(self.filters, begun, motions, strict=True)
+        done = [f.predict(member, motion, u) for f, member, motion in each]
+        members = tuple(member for member, _ in done)
+        codes = tuple(prediction.code for _, prediction in done)
+        return Moved(members, codes, self.fuse([m.belief for m in members]), shares)
 
-# ----------------------------------------------------------------------------- steps of the whole
+    def _predict(self, state: FilterState, motion: Motion, u: Any):
+        return concluded(state, self.moved(state, motion, u))
+
+    def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
+        owner = owners(self.channels)
+        if sensor.name not in owner:
+            raise ValueError(f"no channel uses sensor '{sensor.name}'; there are {sorted(owner)}")
+        joined: Joined = state.memory
+        i = owner[sensor.name]
+        before = joined.members[i]
+        after, info = self.channels[i].filter.update(before, sensor, y, aux)
+        members = (*joined.members[:i], after, *joined.members[i + 1 :])
+        silent = jnp.where(info.dof > 0, joined.silent.at[i].set(0), joined.silent)
+        # What a measurement did not touch stands bit for bit.
+        same = equal(before.belief, after.belief)
+        belief = select(same, state.belief, self.fuse([m.belief for m in members]))
+        info = self.compared(members, i, info)
+        singular = jnp.stack([is_singular(m.belief) for m in members])
+        ok = same | (finite(belief) & ~jnp.any(singular))
+        new = FilterState(belief, joined._replace(members=members, silent=silent))
+        info = not_taken(ok, info, jnp.asarray(int(Code.NOT_FINITE)))
+        info = info.noted(self.title, share=jnp.mean(joined.shares[i]), silent=silent[i])
+        return select(ok, new, _refused(state, singular)), info
+
+    def compared(self, members: Sequence[FilterState], i: int, info: StepInfo) -> StepInfo:
+        """What local filter i says of an update, or that it is now apart from another."""
+        locals_ = [m.belief for m in members[: len(self.channels)]]
+        apart = self.apart(locals_, i) & (info.code == int(Code.DONE))
+        return info._replace(code=jnp.where(apart, int(Code.APART), info.code))
+
+    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
+        super().report(start, final, again, time)
+        for i, count in enumerate(np.asarray(final.memory.singular).tolist()):
+            local = i < len(self.channels)
+            name = f"channel '{self.channels[i].name}'" if local else "the master"
+            require(
+                count == 0,
+                f"the covariance of {name} was singular in {count} steps, which were not taken: "
+                "infinite information cannot be fused. Give a constraint, a measurement or a state "
+                "without noise some noise, or constrain what is fused",
+            )
 
 
 FAR = 5.0  # standard deviations of a difference of local filters that chance does not make
@@ -164,52 +282,6 @@ def are_apart(beliefs: Sequence[Belief], index: int, common: int | None) -> Arra
         variance = own.sigma[:common] ** 2 + other.sigma[:common] ** 2
         found |= jnp.any((square > FAR**2 * variance) & (variance > 0.0))
     return found
-
-
-def updating(channels: Sequence[Channel], fuse: Fuse, name: str, common: int | None = None):
-    """The `update` of a joined filter: the sensor's local filter updates, then all are fused.
-
-    Its code is `Code.APART` where the local filters differ in the first ``common`` components (by
-    default in any).
-    """
-    owner = owners(channels)
-
-    def update(
-        state: FilterState, sensor: Sensor, y: Any, aux: Any = None
-    ) -> tuple[FilterState, StepInfo]:
-        if sensor.name not in owner:
-            raise ValueError(f"no channel uses sensor '{sensor.name}'; there are {sorted(owner)}")
-        joined: Joined = state.memory
-        i = owner[sensor.name]
-        before = joined.members[i]
-        after, info = channels[i].filter.update(before, sensor, y, aux)
-        members = (*joined.members[:i], after, *joined.members[i + 1 :])
-        silent = jnp.where(info.dof > 0, joined.silent.at[i].set(0), joined.silent)
-        # What a measurement did not touch stands bit for bit.
-        same = equal(before.belief, after.belief)
-        belief = select(same, state.belief, fuse([m.belief for m in members]))
-        apart = are_apart([m.belief for m in members[: len(channels)]], i, common)
-        apart = apart & (info.code == int(Code.DONE))
-        info = info._replace(code=jnp.where(apart, int(Code.APART), info.code))
-        singular = jnp.stack([is_singular(m.belief) for m in members])
-        ok = same | (finite(belief) & ~jnp.any(singular))
-        new = FilterState(belief, joined._replace(members=members, silent=silent))
-        info = not_taken(ok, info, jnp.asarray(int(Code.NOT_FINITE)))
-        info = info.noted(name, share=jnp.mean(joined.shares[i]), silent=silent[i])
-        return select(ok, new, _refused(state, singular)), info
-
-    return update
-
-
-class Moved(NamedTuple):
-    """Members after a prediction, and how it went with each filter that predicted."""
-
-    members: tuple[FilterState, ...]
-    codes: tuple[Any, ...]  # by member
-    belief: Belief  # fused
-    shares: Array
-    transition: Transition | None = None  # of a prediction common to all
-    code: Any = int(Code.DONE)  # of that prediction
 
 
 def concluded(state: FilterState, moved: Moved) -> tuple[FilterState, Prediction]:
@@ -241,15 +313,6 @@ def _refused(state: FilterState, singular: Array) -> FilterState:
     return state._replace(memory=joined._replace(singular=joined.singular + singular.astype(int)))
 
 
-def starting(
-    states: Sequence[FilterState], belief: Belief, shares: Array, channels: Sequence[Channel]
-) -> FilterState:
-    """The state of a joined filter at its start."""
-    silent, singular = (jnp.zeros(len(x), int) for x in (channels, states))
-    names = Names(c.name for c in channels)
-    return FilterState(belief, Joined(tuple(states), shares, silent, singular, names))
-
-
 def followed_by(
     motion: Motion,
     noise: Callable[[Array], Array],
@@ -271,11 +334,84 @@ def followed_by(
     )
 
 
+# ------------------------------------------------------------------------- sensors of the master
+
+
 class Mastered(NamedTuple):
     """What a joined filter with sensors at its master carries besides the belief given out."""
 
     joined: FilterState  # its belief is the one given out
     master: FilterState
+
+
+@value
+class AtMaster(Composite):
+    """The filter of `at_master`."""
+
+    joined: Filter
+    master: Filter
+    sensors: tuple[str, ...] = kind()
+
+    @property
+    def filters(self) -> tuple[Filter, ...]:
+        return self.joined, self.master
+
+    def with_filters(self, filters: tuple[Filter, ...]) -> Filter:
+        return replace(self, joined=filters[0], master=filters[1])
+
+    def parts(self, state: FilterState) -> tuple[FilterState, ...]:
+        return state.memory
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        self.check_order(dims)
+        joined = self.joined.init(belief, {k: m for k, m in dims.items() if k not in self.sensors})
+        require(
+            self.joined.members(joined)[0],
+            "at_master wants a filter of channels: one without locals uses the sensor itself",
+        )
+        own = self.master.init(belief, {k: m for k, m in dims.items() if k in self.sensors})
+        return FilterState(joined.belief, Mastered(joined, own))
+
+    def check_order(self, dims: Mapping[str, int]) -> None:
+        """Refuse a model that has not the sensors, or not as its last ones."""
+        if unknown := [name for name in self.sensors if name not in dims]:
+            raise ValueError(f"at_master: no sensor {unknown[0]!r}; this model has {sorted(dims)}")
+        last = list(dims)[-len(self.sensors) :]
+        if late := [name for name in last if name not in self.sensors]:
+            raise ValueError(
+                f"at_master: sensor {late[0]!r} comes after one of the master's: put "
+                f"{list(self.sensors)} last in the model"
+            )
+
+    def _predict(self, state: FilterState, motion: Motion, u: Any):
+        mastered: Mastered = state.memory
+        joined, prediction = self.joined.predict(mastered.joined, motion, u)
+        return FilterState(joined.belief, mastered._replace(joined=joined)), prediction
+
+    def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
+        mastered: Mastered = state.memory
+        if sensor.name not in self.sensors:
+            joined, info = self.joined.update(mastered.joined, sensor, y, aux)
+            return FilterState(joined.belief, mastered._replace(joined=joined)), info
+        begun = self.master.reset(mastered.master, state.belief)
+        own, info = self.master.update(begun, sensor, y, aux)
+        joined = mastered.joined._replace(belief=own.belief)
+        return FilterState(own.belief, Mastered(joined, own)), info
+
+    def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        mastered: Mastered = state.memory
+        joined = self.joined.reset(mastered.joined, belief)
+        own = self.master.reset(mastered.master, belief)
+        return FilterState(joined.belief, Mastered(joined, own))
+
+    def members(self, state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
+        mastered: Mastered = state.memory
+        beliefs, follow = self.joined.members(mastered.joined)
+
+        def followed(beliefs: Sequence[Belief], belief: Belief) -> FilterState:
+            return FilterState(belief, mastered._replace(joined=follow(beliefs, belief)))
+
+        return beliefs, followed
 
 
 def at_master(filter: Filter, sensors: str | Sequence[str], master: Filter | None = None) -> Filter:
@@ -305,55 +441,4 @@ def at_master(filter: Filter, sensors: str | Sequence[str], master: Filter | Non
             after it, or the filter is not a joined one.
     """
     names = sensor_names("at_master", sensors)
-    centre = kalman() if master is None else master
-
-    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        if unknown := [name for name in names if name not in dims]:
-            raise ValueError(f"at_master: no sensor {unknown[0]!r}; this model has {sorted(dims)}")
-        last = list(dims)[-len(names) :]
-        if late := [name for name in last if name not in names]:
-            raise ValueError(
-                f"at_master: sensor {late[0]!r} comes after one of the master's: put {list(names)} "
-                "last in the model"
-            )
-        joined = filter.init(belief, {k: m for k, m in dims.items() if k not in names})
-        require(
-            filter.members(joined)[0],
-            "at_master wants a filter of channels: one without locals uses the sensor itself",
-        )
-        own = centre.init(belief, {k: m for k, m in dims.items() if k in names})
-        return FilterState(joined.belief, Mastered(joined, own))
-
-    def predict(
-        state: FilterState, motion: Motion, u: Any = None
-    ) -> tuple[FilterState, Prediction]:
-        mastered: Mastered = state.memory
-        joined, prediction = filter.predict(mastered.joined, motion, u)
-        return FilterState(joined.belief, mastered._replace(joined=joined)), prediction
-
-    def update(
-        state: FilterState, sensor: Sensor, y: Any, aux: Any = None
-    ) -> tuple[FilterState, StepInfo]:
-        mastered: Mastered = state.memory
-        if sensor.name not in names:
-            joined, info = filter.update(mastered.joined, sensor, y, aux)
-            return FilterState(joined.belief, mastered._replace(joined=joined)), info
-        own, info = centre.update(centre.reset(mastered.master, state.belief), sensor, y, aux)
-        joined = mastered.joined._replace(belief=own.belief)
-        return FilterState(own.belief, Mastered(joined, own)), info
-
-    def reset(state: FilterState, belief: Belief) -> FilterState:
-        mastered: Mastered = state.memory
-        joined = filter.reset(mastered.joined, belief)
-        return FilterState(joined.belief, Mastered(joined, centre.reset(mastered.master, belief)))
-
-    def members(state: FilterState):
-        mastered: Mastered = state.memory
-        beliefs, follow = filter.members(mastered.joined)
-
-        def followed(beliefs: Sequence[Belief], belief: Belief) -> FilterState:
-            return FilterState(belief, mastered._replace(joined=follow(beliefs, belief)))
-
-        return beliefs, followed
-
-    return in_step(functions(init, predict, update, reset, members))
+    return AtMaster(filter, kalman() if master is None else master, names)

@@ -11,19 +11,22 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
-from robins.filters.audit import Again, audit
 from robins.filters.belief import Belief, Code, StepInfo, is_failure
-from robins.filters.kalman import Filter, FilterState, compiled, functions
-from robins.filters.model import Model, Motion, Sensor
+from robins.filters.kalman import Again, Filter, FilterState, Prediction
+from robins.filters.model import Data, Model, Motion, Sensor
+from robins.filters.sameness import same_model
 from robins.filters.trees import select
+from robins.filters.values import kind, value
 
 _WHOLE = 1e-6  # how far an age may be off a whole number: the rounding of a ratio of times
 
@@ -57,16 +60,205 @@ class Delay(NamedTuple):
     reach: Array  # how many steps back there are to go
     model: Model  # its numbers, as last seen
 
-    def audit(self, start: Delay, again: Again | None, time: Any) -> None:
-        """Ask the filter that is delayed, not its past (`robins.filters.audit`)."""
 
-        def rerun(inner: Any) -> Any:
+class _Place(NamedTuple):
+    """Where a measurement belongs in the buffer, and what becomes of it."""
+
+    which: int  # its sensor, in the model's order
+    at: Array  # the row of its step
+    now: Array  # the row of the present step
+    steps: Array  # from there to here
+    there: Array  # bool, it tells something
+    too_old: Array  # bool
+    used: Array  # bool, it is entered
+    at_once: Array  # bool, the filter takes it as it stands
+
+    @property
+    def again(self) -> Array:
+        """Whether steps are repeated for it."""
+        return self.used & ~self.at_once
+
+
+class _Redone(NamedTuple):
+    """What there is of the steps that are repeated."""
+
+    inner: FilterState
+    before: FilterState  # as in `_Past`
+    log_likelihood: Array  # likewise
+    own: StepInfo  # of the late measurement
+    taken: Array  # bool, all predictions were
+    failed: Array  # the first failure, a `Code`
+
+
+@value
+class Delayed(Filter):
+    """The filter of `delayed`."""
+
+    filter_: Filter
+    model: Model
+    u: Data  # one input
+    aux: dict[str, Data]  # one of each sensor
+    depth: int = kind()
+
+    @property
+    def size(self) -> int:
+        """Rows of the buffer."""
+        return self.depth + 1
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self.model.dims)
+
+    def begin(self, inner: FilterState, known: Model) -> FilterState:
+        """With an empty buffer; the present step has no prediction to repeat."""
+        size, extra = self.size, _numbers(self.aux)
+        asked = jnp.zeros((size, len(self.names)), bool)
+        past = _Past(
+            before=_rows(inner, size),
+            moved=jnp.zeros(size, bool),
+            u=_rows(_numbers(self.u), size),
+            y={s.name: _rows(_unread(s, inner, extra[s.name]), size) for s in known.sensors},
+            aux=_rows(extra, size),
+            asked=asked,
+            known=asked,
+            log_likelihood=jnp.zeros(asked.shape),
+        )
+        zero = jnp.zeros((), int)
+        return _outer(inner, Delay(inner.memory, past, zero, zero, known))
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        return self.begin(self.filter_.init(belief, dims), _numbers(self.model))
+
+    def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        # What was measured before the new belief is part of it, or meant to be forgotten.
+        return self.begin(self.filter_.reset(_inner(state), belief), state.memory.model)
+
+    # The filter itself knows whether its prediction was taken: what comes late can change that.
+
+    @jax.jit
+    def predict(
+        self, state: FilterState, motion: Motion, u: Data = None
+    ) -> tuple[FilterState, Prediction]:
+        """Predict, and begin a row of the buffer."""
+        held = state.memory
+        _check_same("the motion", motion, held.model.motion)
+        _check_same("an input u", u, _row(held.past.u, 0))
+        inner, now = _inner(state), held.now + 1
+        past = self.opened(held.past, now % self.size, inner, u)
+        inner, prediction = self.filter_.predict(inner, motion, u)
+        reach = jnp.minimum(held.reach + 1, self.depth)
+        known = Model(_numbers(motion), held.model.sensors)
+        new = _outer(inner, Delay(inner.memory, past, now, reach, known))
+        return new, prediction._replace(transition=None, origin=None)
+
+    def opened(self, past: _Past, at: Array, inner: FilterState, u: Data) -> _Past:
+        """With a row for a step that begins."""
+        none = jnp.zeros(len(self.names), bool)
+        entry = _Past(
+            before=inner,
+            moved=jnp.ones((), bool),
+            u=_numbers(u),
+            y=jax.tree_util.tree_map(lambda a: jnp.full(a.shape[1:], jnp.nan), past.y),
+            aux=_row(past.aux, at),
+            asked=none,
+            known=none,
+            log_likelihood=jnp.zeros(len(self.names)),
+        )
+        return jax.tree_util.tree_map(lambda a, x: a.at[at].set(x), past, entry)
+
+    @jax.jit
+    def update(
+        self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None
+    ) -> tuple[FilterState, StepInfo]:
+        """Enter a measurement in its step, and filter again from there."""
+        held = state.memory
+        which, known = self.recognised(held.model, sensor, aux)
+        value, age = y if isinstance(y, Late) else (y, jnp.zeros(()))
+        place = self.placed(held, which, value, age)
+        fresh = jax.tree_util.tree_map(lambda v: jnp.where(place.at_once, v, jnp.nan), value)
+        inner, info = self.filter_.update(_inner(state), sensor, fresh, aux)
+        past = _entered(held.past, place, sensor.name, value, aux, info)
+        redone = self.redone(past, place, known, inner, info)
+        told = _told(past, place, redone)
+        inner = redone.inner
+        past = past._replace(before=redone.before, log_likelihood=redone.log_likelihood)
+        return _outer(inner, Delay(inner.memory, past, held.now, held.reach, known)), told
+
+    def recognised(self, model: Model, sensor: Sensor, aux: Data) -> tuple[int, Model]:
+        """Which sensor it is, and the model with its numbers."""
+        names = self.names
+        if sensor.name not in names:
+            raise ValueError(f"sensor '{sensor.name}' is new; delayed() was told of {list(names)}")
+        which = names.index(sensor.name)
+        _check_same(f"sensor '{sensor.name}'", sensor, model.sensors[which])
+        _check_same(f"aux of sensor '{sensor.name}'", aux, self.aux[sensor.name])
+        mine = _numbers(sensor)
+        sensors = tuple(mine if s.name == sensor.name else s for s in model.sensors)
+        return which, Model(model.motion, sensors)
+
+    def placed(self, held: Delay, which: int, value: Data, age: Any) -> _Place:
+        """Where a measurement of this age belongs."""
+        age = jnp.asarray(age, float)
+        there = jnp.any(jnp.stack([jnp.any(jnp.isfinite(x)) for x in jax.tree.leaves(value)]))
+        steps = jnp.round(jnp.where(jnp.isfinite(age), age, -1.0)).astype(int)
+        sound = (jnp.abs(age - steps.astype(float)) <= _WHOLE) & (steps >= 0)
+        too_old = there & sound & (steps > held.reach)
+        steps = jnp.clip(steps, 0, self.depth)
+        at, now = (held.now - steps) % self.size, held.now % self.size
+        used = there & sound & ~too_old & ~held.past.known[at, which]
+        # One of this step is used at once, unless a sensor whose turn comes later already was.
+        overtaken = jnp.any(held.past.known[now, which + 1 :])
+        at_once = used & (steps == 0) & ~overtaken
+        return _Place(which, at, now, steps, there, too_old, used, at_once)
+
+    def redone(
+        self, past: _Past, place: _Place, known: Model, inner: FilterState, info: StepInfo
+    ) -> _Redone:
+        """The steps from that of the measurement on, filtered again where they must be."""
+        inner = select(place.again, _row(past.before, place.at), inner)
+        fine = (jnp.ones((), bool), jnp.asarray(int(Code.DONE)))
+        return jax.lax.fori_loop(
+            0,
+            jnp.where(place.again, place.steps + 1, 0),
+            lambda i, done: self.step_again(past, place, known, i, done),
+            _Redone(inner, past.before, past.log_likelihood, info, *fine),
+        )
+
+    def step_again(
+        self, past: _Past, place: _Place, known: Model, i: Array, done: _Redone
+    ) -> _Redone:
+        """The step that is i steps after that of the measurement."""
+        inner, before, gained, own, taken, failed = done
+        j = (place.at + i) % self.size
+        row = _row(past, j)
+        before = jax.tree_util.tree_map(lambda a, x: a.at[j].set(x), before, inner)
+        moved, prediction = self.filter_.predict(inner, known.motion, row.u)
+        inner = select(row.moved, moved, inner)
+        taken = taken & (~row.moved | (prediction.code == int(Code.DONE)))
+        for k, each in enumerate(known.sensors):
+            after, seen = self.filter_.update(inner, each, row.y[each.name], row.aux[each.name])
+            inner = select(row.asked[k], after, inner)
+            gained = gained.at[j, k].set(jnp.where(row.asked[k], seen.log_likelihood, 0.0))
+            told = jnp.isneginf(row.log_likelihood[k])  # when it was first asked
+            failed = _first_failure(failed, row.asked[k] & ~told, seen.code)
+            if k == place.which:
+                own = select(i == 0, seen, own)
+        return _Redone(inner, before, gained, own, taken, failed)
+
+    @property
+    def reports(self) -> bool:
+        return self.filter_.reports
+
+    def report(
+        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
+    ) -> None:
+        """Ask the filter that is delayed, not its past."""
+
+        def anew(filter_: Filter) -> FilterState:
             assert again is not None
-            before = start.past.before._replace(memory=_rows(inner, len(start.past.moved)))
-            past = start.past._replace(before=before)
-            return again(start._replace(inner=inner, past=past)).inner
+            return _inner(again(replace(self, filter_=filter_)))
 
-        audit(start.inner, self.inner, None if again is None else rerun, time)
+        self.filter_.report(_inner(start), _inner(final), None if again is None else anew, time)
 
 
 def delayed(
@@ -109,139 +301,44 @@ def delayed(
     given = dict(aux or {})
     if unknown := set(given) - set(names):
         raise ValueError(f"aux names no sensor {sorted(unknown)}; the model has {sorted(names)}")
-    extra = {name: _numbers(given.get(name)) for name in names}
-    size = depth + 1
+    extra = {name: _plain(given.get(name)) for name in names}
+    return Delayed(filter_, same_model(model), _plain(u), extra, depth)
 
-    def begin(inner: FilterState, known: Model) -> FilterState:
-        """With an empty buffer; the present step has no prediction to repeat."""
-        asked = jnp.zeros((size, len(names)), bool)
-        past = _Past(
-            before=_rows(inner, size),
-            moved=jnp.zeros(size, bool),
-            u=_rows(_numbers(u), size),
-            y={s.name: _rows(_unread(s, inner, extra[s.name]), size) for s in known.sensors},
-            aux=_rows(extra, size),
-            asked=asked,
-            known=asked,
-            log_likelihood=jnp.zeros(asked.shape),
-        )
-        zero = jnp.zeros((), int)
-        return _outer(inner, Delay(inner.memory, past, zero, zero, known))
 
-    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        return begin(filter_.init(belief, dims), _numbers(model))
+def _entered(
+    past: _Past, place: _Place, name: str, value: Data, aux: Data, info: StepInfo
+) -> _Past:
+    """With a measurement in its own step; and in this one, where its sensor is asked for too."""
+    now, at, which, used = place.now, place.at, place.which, place.used
 
-    def predict(state: FilterState, motion: Motion, u: Any = None):
-        held = state.memory
-        _check_same("the motion", motion, held.model.motion)
-        _check_same("an input u", u, jax.tree_util.tree_map(lambda a: a[0], held.past.u))
-        inner = _inner(state)
-        now = held.now + 1
-        at = now % size
-        past = held.past
-        entry = _Past(
-            before=inner,
-            moved=jnp.ones((), bool),
-            u=_numbers(u),
-            y=jax.tree_util.tree_map(lambda a: jnp.full(a.shape[1:], jnp.nan), past.y),
-            aux=jax.tree_util.tree_map(lambda a: a[at], past.aux),
-            asked=jnp.zeros(len(names), bool),
-            known=jnp.zeros(len(names), bool),
-            log_likelihood=jnp.zeros(len(names)),
-        )
-        past = jax.tree_util.tree_map(lambda a, x: a.at[at].set(x), past, entry)
-        inner, prediction = filter_.predict(inner, motion, u)
-        reach = jnp.minimum(held.reach + 1, depth)
-        known = Model(_numbers(motion), held.model.sensors)
-        new = _outer(inner, Delay(inner.memory, past, now, reach, known))
-        return new, prediction._replace(transition=None, origin=None)
+    def entered(rows, v, here):
+        rows = rows.at[now].set(jnp.where(here, v, rows[now]))
+        return rows.at[at].set(jnp.where(used, v, rows[at]))
 
-    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
-        held = state.memory
-        if sensor.name not in names:
-            raise ValueError(f"sensor '{sensor.name}' is new; delayed() was told of {list(names)}")
-        which = names.index(sensor.name)
-        _check_same(f"sensor '{sensor.name}'", sensor, held.model.sensors[which])
-        _check_same(f"aux of sensor '{sensor.name}'", aux, extra[sensor.name])
-        mine = _numbers(sensor)
-        sensors = tuple(mine if s.name == sensor.name else s for s in held.model.sensors)
-        known = Model(held.model.motion, sensors)
-        past = held.past
+    first = ~past.asked[now, which]
+    asked = past.asked.at[now, which].set(True)
+    gained = jnp.where(place.again, 0.0, info.log_likelihood)
+    return past._replace(
+        y=_with(past.y, name, partial(entered, here=False), value),
+        aux=_with(past.aux, name, partial(entered, here=first), aux),
+        asked=asked.at[at, which].set(asked[at, which] | used),
+        known=past.known.at[at, which].set(past.known[at, which] | used),
+        log_likelihood=past.log_likelihood.at[now, which].add(gained),
+    )
 
-        value, age = y if isinstance(y, Late) else (y, jnp.zeros(()))
-        age = jnp.asarray(age, float)
-        there = jnp.any(jnp.stack([jnp.any(jnp.isfinite(x)) for x in jax.tree.leaves(value)]))
-        steps = jnp.round(jnp.where(jnp.isfinite(age), age, -1.0)).astype(int)
-        sound = (jnp.abs(age - steps.astype(float)) <= _WHOLE) & (steps >= 0)
-        too_old = there & sound & (steps > held.reach)
-        steps = jnp.clip(steps, 0, depth)
-        at, now = (held.now - steps) % size, held.now % size
-        used = there & sound & ~too_old & ~past.known[at, which]
-        # One of this step is used at once, unless a sensor whose turn comes later already was.
-        overtaken = jnp.any(past.known[now, which + 1 :])
-        at_once = used & (steps == 0) & ~overtaken
-        again = used & ~at_once
 
-        fresh = jax.tree_util.tree_map(lambda v: jnp.where(at_once, v, jnp.nan), value)
-        inner, info = filter_.update(_inner(state), sensor, fresh, aux)
-
-        def entered(rows, v, here):
-            """In its own step; and in this one, where the sensor has been asked for too."""
-            rows = rows.at[now].set(jnp.where(here, v, rows[now]))
-            return rows.at[at].set(jnp.where(used, v, rows[at]))
-
-        first = ~past.asked[now, which]
-        asked = past.asked.at[now, which].set(True)
-        past = past._replace(
-            y=_with(past.y, sensor.name, partial(entered, here=False), value),
-            aux=_with(past.aux, sensor.name, partial(entered, here=first), aux),
-            asked=asked.at[at, which].set(asked[at, which] | used),
-            known=past.known.at[at, which].set(past.known[at, which] | used),
-            log_likelihood=past.log_likelihood.at[now, which].add(
-                jnp.where(again, 0.0, info.log_likelihood)
-            ),
-        )
-
-        def repeat(i: Array, carry: tuple) -> tuple:
-            inner, before, gained, own, taken, failed = carry
-            j = (at + i) % size
-            row = jax.tree_util.tree_map(lambda a: a[j], past)
-            before = jax.tree_util.tree_map(lambda a, x: a.at[j].set(x), before, inner)
-            moved, prediction = filter_.predict(inner, known.motion, row.u)
-            inner = select(row.moved, moved, inner)
-            taken = taken & (~row.moved | (prediction.code == int(Code.DONE)))
-            for k, each in enumerate(known.sensors):
-                after, seen = filter_.update(inner, each, row.y[each.name], row.aux[each.name])
-                inner = select(row.asked[k], after, inner)
-                gained = gained.at[j, k].set(jnp.where(row.asked[k], seen.log_likelihood, 0.0))
-                told = jnp.isneginf(row.log_likelihood[k])  # when it was first asked
-                failed = _first_failure(failed, row.asked[k] & ~told, seen.code)
-                if k == which:
-                    own = select(i == 0, seen, own)
-            return inner, before, gained, own, taken, failed
-
-        start = jax.tree_util.tree_map(lambda a: a[at], past.before)
-        inner = select(again, start, inner)
-        fine = (jnp.ones((), bool), jnp.asarray(int(Code.DONE)))
-        carry = (inner, past.before, past.log_likelihood, info, *fine)
-        inner, before, gained, own, taken, failed = jax.lax.fori_loop(
-            0, jnp.where(again, steps + 1, 0), repeat, carry
-        )
-        added = _change(jnp.sum(past.log_likelihood), jnp.sum(gained), own, taken)
-        own = own._replace(code=_first_failure(own.code, again, failed))
-        past = past._replace(before=before, log_likelihood=gained)
-        code = jnp.where(too_old, int(Code.TOO_OLD), jnp.where(used, own.code, int(Code.REFUSED)))
-        own = own._replace(
-            log_likelihood=jnp.where(again, added, own.log_likelihood),
-            code=jnp.where(there, code, own.code),
-        )
-        return _outer(inner, Delay(inner.memory, past, held.now, held.reach, known)), own
-
-    def reset(state: FilterState, belief: Belief) -> FilterState:
-        # What was measured before the new belief is part of it, or meant to be forgotten.
-        return begin(filter_.reset(_inner(state), belief), state.memory.model)
-
-    return compiled(functions(init, predict, update, reset))
+def _told(past: _Past, place: _Place, redone: _Redone) -> StepInfo:
+    """What an update tells: of its own step, with what it changes in the whole."""
+    own, again = redone.own, place.again
+    total = jnp.sum(past.log_likelihood), jnp.sum(redone.log_likelihood)
+    added = _change(*total, own, redone.taken)
+    code = _first_failure(own.code, again, redone.failed)
+    placed = jnp.where(place.used, code, int(Code.REFUSED))
+    placed = jnp.where(place.too_old, int(Code.TOO_OLD), placed)
+    return own._replace(
+        log_likelihood=jnp.where(again, added, own.log_likelihood),
+        code=jnp.where(place.there, placed, code),
+    )
 
 
 def _inner(state: FilterState) -> FilterState:
@@ -257,6 +354,15 @@ def _numbers(tree: Any) -> Any:
     return jax.tree_util.tree_map(jnp.asarray, tree)
 
 
+def _plain(tree: Any) -> Any:
+    """The same with arrays for numbers of Python, which are of weak types."""
+    return jax.tree_util.tree_map(lambda x: x if isinstance(x, jax.Array) else np.asarray(x), tree)
+
+
+def _row(tree: Any, at: Any) -> Any:
+    return jax.tree_util.tree_map(lambda a: a[at], tree)
+
+
 def _rows(tree: Any, count: int) -> Any:
     return jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), tree)
 
@@ -266,7 +372,7 @@ def _with(rows: dict[str, Any], name: str, enter: Any, value: Any) -> dict[str, 
     return {**rows, name: jax.tree_util.tree_map(enter, rows[name], value)}
 
 
-def _unread(sensor: Sensor, state: FilterState, aux: Any) -> Any:
+def _unread(sensor: Sensor, state: FilterState, aux: Data) -> Any:
     """A measurement of a sensor that tells nothing."""
     like = jax.eval_shape(sensor.read, state.belief.mean, aux)
     return jax.tree_util.tree_map(lambda leaf: jnp.full(leaf.shape, jnp.nan), like)

@@ -23,27 +23,16 @@ rest follows from what the first local makes of it.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.checks import one_of
-from robins.filters.composite.channels import (
-    Channel,
-    Fuse,
-    Joined,
-    Moved,
-    concluded,
-    local_dims,
-    members_of,
-    owners,
-    starting,
-    updating,
-)
+from robins.filters.composite.channels import Channel, JoinedFilter, Moved, are_apart, owners
 from robins.filters.composite.fusion import (
     Criterion,
     check_criterion,
@@ -51,8 +40,9 @@ from robins.filters.composite.fusion import (
     information_sum,
     intersection_weights,
 )
-from robins.filters.kalman import Filter, FilterState, functions, in_step
+from robins.filters.kalman import Filter, FilterState
 from robins.filters.model import Motion
+from robins.filters.values import Numbers, kind, number, value
 
 Feedback = Literal["own", "mean", "full"]
 
@@ -61,6 +51,69 @@ FULL = (
     "next fusion: the covariance shrinks without bound (NEES of 1e7 was measured); use 'own', or "
     "the federated filter"
 )
+
+
+@value
+class SideBySide(JoinedFilter):
+    """Local filters with the whole prior and process noise."""
+
+    feedback: Feedback = kind()
+
+    def first_shares(self, belief: Belief) -> Array:
+        return jnp.ones((len(self.channels), 1))
+
+    def parted(self, belief: Belief, shares: Array) -> list[Belief]:
+        return [belief] * len(self.channels)
+
+    def fed_back(self, state: FilterState) -> list[FilterState]:
+        """The local filters as the feedback leaves them at the start of a step."""
+        members, fused = state.memory.members, state.belief
+        if self.feedback == "own":
+            return list(members)
+        full = self.feedback == "full"
+        return [
+            c.filter.reset(m, fused if full else Belief(fused.mean, m.belief.factor))
+            for c, m in zip(self.channels, members, strict=True)
+        ]
+
+    def moved(self, state: FilterState, motion: Motion, u: Any) -> Moved:
+        motions = [motion] * len(self.channels)
+        return self.moved_apart(self.fed_back(state), motions, u, state.memory.shares)
+
+
+@value
+class Distributed(SideBySide):
+    """The filter of `distributed`."""
+
+    common: int | None = kind()
+
+    title = "distributed"
+
+    def first_shares(self, belief: Belief) -> Array:
+        n = belief.factor.shape[0]
+        if self.common is not None and n < self.common:
+            raise ValueError(f"distributed: {self.common} components are common, the state has {n}")
+        return super().first_shares(belief)
+
+    def apart(self, beliefs: Sequence[Belief], i: int) -> Array:
+        return are_apart(beliefs, i, self.common)
+
+    def fuse(self, beliefs: Sequence[Belief]) -> Belief:
+        if self.common is None:
+            return information_sum(beliefs)
+        return common_information_sum(beliefs, common=self.common)
+
+
+@value
+class Intersecting(SideBySide):
+    """The filter of `intersecting`."""
+
+    criterion: Criterion | Numbers  # or (channels,) weights
+
+    title = "intersecting"
+
+    def fuse(self, beliefs: Sequence[Belief]) -> Belief:
+        return information_sum(beliefs, intersection_weights(beliefs, self.criterion))
 
 
 def distributed(
@@ -91,11 +144,10 @@ def distributed(
     one_of("feedback", feedback, Feedback)
     if feedback == "full":
         warnings.warn(FULL, UserWarning, stacklevel=2)
-    if common is None:
-        return _side_by_side(channels, information_sum, feedback, "distributed")
-    require(common >= 1, "distributed: at least one component must be common", common)
-    summed = partial(common_information_sum, common=common)
-    return _side_by_side(channels, summed, feedback, "distributed", common)
+    if common is not None:
+        require(common >= 1, "distributed: at least one component must be common", common)
+    owners(channels)
+    return Distributed(tuple(channels), feedback, common)
 
 
 def intersecting(
@@ -119,55 +171,6 @@ def intersecting(
     """
     one_of("feedback", feedback, Feedback)
     check_criterion(criterion, len(channels))
-
-    def intersect(beliefs: Sequence[Belief]) -> Belief:
-        return information_sum(beliefs, intersection_weights(beliefs, criterion))
-
-    return _side_by_side(channels, intersect, feedback, "intersecting")
-
-
-def _side_by_side(
-    channels: Sequence[Channel],
-    fuse: Fuse,
-    feedback: Feedback,
-    name: str,
-    common: int | None = None,
-) -> Filter:
-    channels = tuple(channels)
     owners(channels)
-    count = len(channels)
-
-    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        each = local_dims(channels, dims)
-        if belief.factor.shape[0] < (common or 1):
-            raise ValueError(
-                f"distributed: {common} components are common, the state has "
-                f"{belief.factor.shape[0]}"
-            )
-        states = [c.filter.init(belief, d) for c, d in zip(channels, each, strict=True)]
-        return starting(states, belief, jnp.ones((count, 1)), channels)
-
-    def fed_back(state: FilterState) -> list[FilterState]:
-        joined: Joined = state.memory
-        if feedback == "own":
-            return list(joined.members)
-        fused = state.belief
-        return [
-            c.filter.reset(m, fused if feedback == "full" else Belief(fused.mean, m.belief.factor))
-            for c, m in zip(channels, joined.members, strict=True)
-        ]
-
-    def predict(state: FilterState, motion: Motion, u: Any = None):
-        members, codes = [], []
-        for one, member in zip(channels, fed_back(state), strict=True):
-            member, prediction = one.filter.predict(member, motion, u)
-            members.append(member)
-            codes.append(prediction.code)
-        fused = fuse([m.belief for m in members])
-        return concluded(state, Moved(tuple(members), tuple(codes), fused, state.memory.shares))
-
-    def reset(state: FilterState, belief: Belief) -> FilterState:
-        return members(state)[1]([belief] * count, belief)
-
-    members = members_of([c.filter for c in channels])
-    return in_step(functions(init, predict, updating(channels, fuse, name, common), reset, members))
+    given = criterion if isinstance(criterion, str) else number("weights must be real", criterion)
+    return Intersecting(tuple(channels), feedback, given)

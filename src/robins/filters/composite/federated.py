@@ -36,9 +36,9 @@ the state of the same number. D, the standard deviations of the belief, makes th
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import jax
 import jax.numpy as jnp
@@ -49,14 +49,18 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number
 from robins.filters.checks import one_of
-from robins.filters.composite import channels as _channels
-from robins.filters.composite.channels import Channel, Moved, followed_by
+from robins.filters.composite.channels import (
+    Channel,
+    JoinedFilter,
+    Moved,
+    followed_by,
+    owners,
+)
 from robins.filters.composite.fusion import Sharing, check_sharing, information_sum, part
 from robins.filters.kalman import Filter, FilterState, kalman
 from robins.filters.linearise import Linearisation, taylor
-from robins.filters.model import Model, Motion, Sensor
-from robins.filters.values import Numbers, number, value
-from robins.filters.values import kind as kind_of
+from robins.filters.model import Model, Motion
+from robins.filters.values import Numbers, is_known, kind, number, value
 
 # Without a floor a share of zero is an infinite covariance.
 FLOOR = 0.05
@@ -154,100 +158,101 @@ _TRACE = 1e-8
 
 
 @value
-class Federated(Filter):
+class Federated(JoinedFilter):
     """The filter of `federated`."""
 
-    channels: tuple[Channel, ...]
     centre: Filter  # how the fused belief and the master's are predicted
-    fixed: Numbers | None  # shares of the channels, where they are given
+    fixed: Numbers | None  # (channels,) or (channels, n) shares, where they are given
     master: Numbers  # () its share
     keep: Numbers  # () c of mode "rescale"
-    timeout: Numbers | None
-    mode: Mode = kind_of()
-    sharing: Sharing = kind_of()
-    kind: str = kind_of()
-    has_master: bool = kind_of()
-    late: bool = kind_of()
+    timeout: Numbers | None  # () steps
+    mode: Mode = kind()
+    sharing: Sharing = kind()
+    weighing: str = kind()  # "given", or how shares are chosen
+    has_master: bool = kind()
+    late: bool = kind()  # shared after the prediction
+
+    title = "federated"
 
     @property
     def count(self) -> int:
+        """Of channels."""
         return len(self.channels)
 
     @property
-    def filters(self) -> list[Filter]:
-        """By member."""
-        return [*(c.filter for c in self.channels), *([self.centre] if self.has_master else [])]
+    def filters(self) -> tuple[Filter, ...]:
+        return (*super().filters, self.centre) if self.has_master else super().filters
 
-    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        given = [*_channels.local_dims(self.channels, dims), *([{}] if self.has_master else [])]
-        a = self.initial_shares(belief)
-        parts = self.parted(belief, a)
-        states = [f.init(p, d) for f, p, d in zip(self.filters, parts, given, strict=True)]
-        return _channels.starting(states, belief, a, self.channels)
+    def with_filters(self, filters: tuple[Filter, ...]) -> Self:
+        centre = filters[-1] if self.has_master else self.centre
+        return replace(super().with_filters(filters), centre=centre)
 
-    def initial_shares(self, belief: Belief) -> Array:
+    def fuse(self, beliefs: Sequence[Belief]) -> Belief:
+        return information_sum(beliefs)
+
+    def parted(self, belief: Belief, shares: Array) -> list[Belief]:
+        return [Belief(belief.mean, one) for one in part(belief.factor, shares, self.sharing)]
+
+    def first_shares(self, belief: Belief) -> Array:
         n = belief.factor.shape[0]
         if self.mode == "zero-reset":
             return jnp.array([[_TRACE]] * self.count + [[1.0 - self.count * _TRACE]])
         if self.fixed is None:
             a = equal_shares(self.count)
-            return self.with_master(a if self.kind != "diagonal" else jnp.tile(a, (1, n)))
+            return self.with_master(a if self.weighing != "diagonal" else jnp.tile(a, (1, n)))
         if self.fixed.ndim == 2 and self.fixed.shape[1] != n:
             raise ValueError(f"shares are for {self.fixed.shape[1]} states, the belief has {n}")
         return self.with_master(floored(jnp.asarray(self.fixed.reshape(self.count, -1))))
 
     def with_master(self, a: Array) -> Array:
+        """Shares of the channels, left by the master's, and its own."""
         if not self.has_master:
             return a
         own = jnp.full((1, a.shape[1]), self.master)
         return jnp.concatenate([(1.0 - self.master) * a, own])
 
     def next_shares(self, state: FilterState) -> Array:
+        """Those of a step: chosen, and handed over by local filters that have been silent."""
         a = self.chosen_shares(state)
         if self.timeout is None:
             return a
-        # The self.master's share is its own; where all are silent there is nobody to hand over to.
-        heard = (state.memory.silent < self.timeout)[:, None]
-        left = floored(jnp.where(heard, a[: self.count], 0.0)) * jnp.sum(
-            a[: self.count], axis=0, keepdims=True
-        )
+        # The master's share is its own; where all are silent there is nobody to hand over to.
+        heard = (state.memory.silent.astype(float) < self.timeout)[:, None]
+        mine = a[: self.count]
+        left = floored(jnp.where(heard, mine, 0.0)) * jnp.sum(mine, axis=0, keepdims=True)
         return jnp.where(jnp.any(heard), a.at[: self.count].set(left), a)
 
     def chosen_shares(self, state: FilterState) -> Array:
+        """Those given, or by what the local filters believe."""
         locals_ = [m.belief for m in state.memory.members[: self.count]]
-        if self.kind == "trace":
+        if self.weighing == "trace":
             return self.with_master(trace_shares(locals_, state.belief.sigma))
-        if self.kind == "diagonal":
+        if self.weighing == "diagonal":
             return self.with_master(diagonal_shares(locals_))
-        return self.initial_shares(state.belief)
-
-    def parted(self, belief: Belief, a: Array) -> list[Belief]:
-        return [Belief(belief.mean, factor) for factor in part(belief.factor, a, self.sharing)]
+        return self.first_shares(state.belief)
 
     def begun(self, state: FilterState, a: Array) -> list[FilterState]:
-        """Members as the self.mode leaves them at the start of a step."""
+        """Members as the mode leaves them at the start of a step."""
         members = state.memory.members
         if self.mode == "no-reset":
             return list(members)
-        beliefs = (
-            self.parted(state.belief, a)
-            if self.mode == "fusion-reset"
-            else _rescaled(members, self.keep)
-        )
+        reset = self.mode == "fusion-reset"
+        beliefs = self.parted(state.belief, a) if reset else _rescaled(members, self.keep)
         return [f.reset(m, b) for f, m, b in zip(self.filters, members, beliefs, strict=True)]
 
-    def predict_apart(self, state: FilterState, motion: Motion, u: Any) -> Moved:
+    def moved(self, state: FilterState, motion: Motion, u: Any) -> Moved:
         a = self.next_shares(state)
-        members, codes = [], []
-        for i, (f, member) in enumerate(zip(self.filters, self.begun(state, a), strict=True)):
-            own = followed_by(motion, lambda noise, i=i: part(noise, a, self.sharing)[i])
-            member, prediction = f.predict(member, own, u)
-            members.append(member)
-            codes.append(prediction.code)
-        return Moved(tuple(members), tuple(codes), information_sum([m.belief for m in members]), a)
+        if self.late:
+            return self.moved_together(state, motion, u, a)
 
-    def predict_together(self, state: FilterState, motion: Motion, u: Any) -> Moved:
-        a = self.next_shares(state)
+        def own(i: int) -> Motion:
+            return followed_by(motion, lambda noise: part(noise, a, self.sharing)[i])
+
+        motions = [own(i) for i in range(len(self.filters))]
+        return self.moved_apart(self.begun(state, a), motions, u, a)
+
+    def moved_together(self, state: FilterState, motion: Motion, u: Any, a: Array) -> Moved:
+        """What was fused is predicted, then shared out."""
         _, common = self.centre.predict(self.centre.init(state.belief, {}), motion, u)
         members, codes, own = [], [], False
         beliefs = self.parted(common.belief, a)
@@ -262,37 +267,10 @@ class Federated(Filter):
                 code = prediction.code
             members.append(member)
             codes.append(code)
-        # Half self.sharing does not add up to what was shared, and rules may have changed a share.
+        # Half sharing does not add up to what was shared, and rules may have changed a share.
         lossless = not own and (self.sharing != "half" or a.shape[1] == 1)
-        fused = common.belief if lossless else information_sum([m.belief for m in members])
+        fused = common.belief if lossless else self.fuse([m.belief for m in members])
         return Moved(tuple(members), tuple(codes), fused, a, common.transition, common.code)
-
-    def _predict(self, state: FilterState, motion: Motion, u: Any):
-        moved = (self.predict_together if self.late else self.predict_apart)(state, motion, u)
-        return _channels.concluded(state, moved)
-
-    def reset(self, state: FilterState, belief: Belief) -> FilterState:
-        return self.members(state)[1](self.parted(belief, state.memory.shares), belief)
-
-    def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
-        return _channels.updating(self.channels, information_sum, "federated")(
-            state, sensor, y, aux
-        )
-
-    def members(self, state: FilterState):
-        return _channels.members_of(self.filters)(state)
-
-    def report(self, start: FilterState, final: FilterState, again: Any, time: Any) -> None:
-        for i, one in enumerate(self.channels):
-
-            def other(filter_: Filter, i: int = i) -> FilterState:
-                own = replace(self.channels[i], filter=filter_)
-                channels = (*self.channels[:i], own, *self.channels[i + 1 :])
-                return again(replace(self, channels=channels)).memory.members[i]
-
-            first, last = start.memory.members[i], final.memory.members[i]
-            one.filter.report(first, last, None if again is None else other, time)
-        final.memory.refuse_singular()
 
 
 def federated(
@@ -345,41 +323,43 @@ def federated(
             has not; at `init`, a sensor without a channel.
     """
     channels = tuple(channels)
-    _channels.owners(channels)
+    owners(channels)
     one_of("mode", mode, Mode)
     check_sharing(sharing)
-    _check_master(mode, shares, master, keep)
-    fixed = _fixed_shares(shares, len(channels), master)
-    kind = shares if isinstance(shares, str) else "given"
-    if sharing == "scalar" and (kind == "diagonal" or (fixed is not None and fixed.ndim == 2)):
+    within = "the master's share must lie from 0 to below 1"
+    of_master = number(within, master, lambda b: (b >= 0.0) & (b < 1.0))
+    kept = number("keep must lie between 0 and 1", keep, lambda c: (c > 0.0) & (c < 1.0))
+    has_master = _has_master(mode, shares, of_master)
+    fixed = _fixed_shares(shares, len(channels), of_master)
+    weighing = shares if isinstance(shares, str) else "given"
+    if sharing == "scalar" and (weighing == "diagonal" or (fixed is not None and fixed.ndim == 2)):
         raise ValueError("scalar sharing takes one share a channel: use 'root' for one a state")
     if after_prediction and mode != "fusion-reset":
         raise ValueError(f"sharing after the prediction is of mode 'fusion-reset', not {mode!r}")
+    patience = None
     if timeout is not None:
         require(mode == "fusion-reset", f"mode {mode!r} does not share anew: it has no timeout")
-        require(timeout >= 1, "federated timeout must be at least one step", timeout)
+        short = "federated timeout must be at least one step"
+        patience = number(short, timeout, lambda steps: steps >= 1)
     if sharing == "half":
         warnings.warn(HALF, UserWarning, stacklevel=2)
+    usual = sharing == "root" if after_prediction is None else after_prediction
     return Federated(
         channels=channels,
         centre=kalman(linearise),
         fixed=fixed,
-        master=number("master", master),
-        keep=number("keep", keep),
-        timeout=None if timeout is None else np.asarray(timeout),
+        master=of_master,
+        keep=kept,
+        timeout=patience,
         mode=mode,
         sharing=sharing,
-        kind=kind,
-        has_master=master > 0.0 or mode == "zero-reset",
-        late=mode == "zero-reset"
-        or (
-            mode == "fusion-reset"
-            and (sharing == "root" if after_prediction is None else after_prediction)
-        ),
+        weighing=weighing,
+        has_master=has_master,
+        late=mode == "zero-reset" or (mode == "fusion-reset" and usual),
     )
 
 
-def _rescaled(members: Sequence[FilterState], keep: Number) -> list[Belief]:
+def _rescaled(members: Sequence[FilterState], keep: Numbers) -> list[Belief]:
     """Locals with c Y_i; the master with Y_g - c sum Y_i = Y_m + (1 - c) sum Y_i: no difference."""
     *locals_, master = (m.belief for m in members)
     kept = [Belief(b.mean, b.factor / jnp.sqrt(keep)) for b in locals_]
@@ -403,19 +383,20 @@ def _through(motion: Motion, common: Belief, mine: Belief) -> Motion:
     return followed_by(motion, lambda noise: T @ noise, moved, lambda F: T @ F)
 
 
-def _check_master(mode: str, shares: Any, master: Number, keep: Number) -> None:
-    require(0.0 <= master < 1.0, "the master's share must lie from 0 to below 1", master)
-    require(0.0 < keep < 1.0, "keep must lie between 0 and 1", keep)
-    if mode == "rescale" and master == 0.0:
+def _has_master(mode: str, shares: Any, master: Numbers) -> bool:
+    """Whether there is one; refused where it does not go with the mode."""
+    some = not is_known(master) or bool(master > 0.0)
+    if mode == "rescale" and not some:
         raise ValueError(
             "mode 'rescale' needs a master to take what the locals give away: give it a share"
         )
-    chosen = master != 0.0 or not isinstance(shares, str) or shares != "equal"
+    chosen = some or not isinstance(shares, str) or shares != "equal"
     if mode == "zero-reset" and chosen:
         raise ValueError("mode 'zero-reset' leaves everything to the master: shares have no say")
+    return some or mode == "zero-reset"
 
 
-def _fixed_shares(shares: Any, count: int, master: Number) -> np.ndarray | None:
+def _fixed_shares(shares: Any, count: int, master: Numbers) -> Numbers | None:
     """Shares of the channels, scaled to sum to one; None where they are not given as numbers."""
     if isinstance(shares, str):
         if shares == "observability":
@@ -428,13 +409,13 @@ def _fixed_shares(shares: Any, count: int, master: Number) -> np.ndarray | None:
                 f"shares must be 'equal', 'trace', 'diagonal' or numbers, got {shares!r}"
             )
         return None
-    a = np.asarray(shares, dtype=float)
+    a = np.asarray(shares, dtype=float) if is_known(shares) else jnp.asarray(shares, dtype=float)
     if a.ndim not in (1, 2) or a.shape[0] != count:
         raise ValueError(f"shares have shape {a.shape}: ({count},) or ({count}, n) is wanted")
-    if not np.all(np.isfinite(a)) or np.any(a < 0.0):
+    if is_known(a) and (not np.all(np.isfinite(a)) or np.any(a < 0.0)):
         raise ValueError(f"shares must be finite and not negative, got {a.tolist()}")
-    total = np.sum(a, axis=0)
-    if np.any(np.abs(total + master - 1.0) > 1e-9):
+    total = a.sum(axis=0)
+    if is_known((total, master)) and np.any(np.abs(total + master - 1.0) > 1e-9):
         raise ValueError(
             f"shares sum to {total.tolist()}, with the master's {master} they must sum to one"
         )

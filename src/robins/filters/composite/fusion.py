@@ -39,7 +39,7 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.checks import one_of
-from robins.filters.run import is_traced
+from robins.filters.values import is_known
 
 Sharing = Literal["scalar", "root", "half"]
 Criterion = Literal["trace", "det"]
@@ -72,7 +72,7 @@ def fuse(beliefs: Sequence[Belief]) -> Belief:
 def _looked_at(beliefs: Sequence[Belief], doing: str) -> list[Belief]:
     beliefs = list(beliefs)
     require(beliefs, f"nothing to {doing}: at least one belief is wanted")
-    if not is_traced(beliefs):
+    if is_known(beliefs):
         for i, belief in enumerate(beliefs):
             if bool(is_singular(belief)):
                 raise ValueError(
@@ -163,7 +163,7 @@ def share(
     """
     check_sharing(sharing)
     n = belief.factor.shape[0]
-    if not is_traced(shares):
+    if is_known(shares):
         shares = np.asarray(shares, dtype=float)
         if not np.all((shares > 0.0) & (shares < np.inf)):
             raise ValueError(f"shares must be positive numbers, got {shares.tolist()}")
@@ -311,7 +311,7 @@ def check_criterion(criterion: Any, count: int) -> None:
         raise ValueError(
             f"weights have shape {np.shape(criterion)}: one for each of {count} beliefs is wanted"
         )
-    if not is_traced(criterion):
+    if is_known(criterion):
         w = np.asarray(criterion, dtype=float)
         if not (np.all(w >= 0.0) and abs(w.sum() - 1.0) < 1e-9):
             raise ValueError(f"weights must not be negative and must sum to one, got {w.tolist()}")

@@ -34,6 +34,7 @@ evidence that is summed up as Page (1954) has it for the quickest detection of a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -44,9 +45,11 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo, is_failure
 from robins.filters.checks import sensor_names
-from robins.filters.kalman import Filter, FilterState, Prediction, functions, in_step
+from robins.filters.composite.channels import Composite
+from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import select
+from robins.filters.values import Numbers, kind, number, value
 
 Groups = Sequence[Sequence[int]]
 
@@ -82,6 +85,144 @@ class Watch(NamedTuple):
     def weight(self) -> Array:
         """() w."""
         return 1.0 / (1.0 + jnp.maximum(self.beta - _CHANCE, 0.0))
+
+
+@value
+class Guarded(Composite):
+    """The filter of `guarded`."""
+
+    filter: Filter
+    reference: Filter
+    ratio: Numbers
+    limit: Numbers
+    patience: Numbers
+    leap: Numbers
+    assumed: tuple[str, ...] = kind()
+    judging: tuple[str, ...] = kind()
+    groups: tuple[tuple[int, ...], ...] | None = kind()
+    trusted: bool = kind()
+
+    @property
+    def filters(self) -> tuple[Filter, ...]:
+        return self.filter, self.reference
+
+    def with_filters(self, filters: tuple[Filter, ...]) -> Filter:
+        return replace(self, filter=filters[0], reference=filters[1])
+
+    def parts(self, state: FilterState) -> tuple[FilterState, ...]:
+        return state.memory.filter, state.memory.reference
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        if unknown := [name for name in (*self.assumed, *self.judging) if name not in dims]:
+            raise ValueError(f"guarded: no sensor {unknown[0]!r}; this model has {sorted(dims)}")
+        count = len(_members(self.groups, belief.factor.shape[0]))
+        without = {name: m for name, m in dims.items() if name not in self.assumed}
+        watch = Watch(
+            self.filter.init(belief, dims),
+            self.reference.init(belief, without),
+            jnp.zeros(count),
+            jnp.full(count, 0.0 if self.trusted else _SURE * SLACK),
+            jnp.zeros(count),
+            jnp.zeros(count),
+            jnp.zeros((), int),
+        )
+        return _given_out(watch)
+
+    def taken_over(self, watch: Watch) -> FilterState:
+        """The filter gone on from what the reference believes.
+
+        Where both are filters of as many locals, local by local: a joined filter that is reset to
+        one belief would have it in every local, and so count it more than once.
+        """
+        mine, follow = self.filter.members(watch.filter)
+        others, _ = self.reference.members(watch.reference)
+        if mine and len(mine) == len(others):
+            return follow(others, watch.reference.belief)
+        return self.filter.reset(watch.filter, watch.reference.belief)
+
+    def judged(self, watch: Watch, failed: Array, renewed: Array | float) -> Watch:
+        """What is learnt of a step, and whether the filter goes on from its reference."""
+        square, gained = _difference(watch.filter.belief, watch.reference.belief)
+        renewed = jnp.broadcast_to(jnp.asarray(renewed), square.shape)
+        M = _members(self.groups, len(square))
+        fresh = M @ (renewed * (square - self.ratio * gained - SLACK))
+        evidence = jnp.maximum(watch.evidence + fresh, 0.0)
+        sure = failed | ((M @ (square > self.leap**2).astype(float)) > 0.0)
+        wrong = jnp.any(sure | (evidence > self.limit))
+        mean = M / np.sum(M, axis=1, keepdims=True)
+        return self.learnt(watch, mean, renewed, square, gained, sure)._replace(
+            filter=select(wrong, self.taken_over(watch), watch.filter),
+            evidence=jnp.where(wrong, 0.0, evidence),
+            trips=watch.trips + wrong.astype(int),
+        )
+
+    def learnt(
+        self,
+        watch: Watch,
+        mean: np.ndarray,
+        renewed: Array,
+        square: Array,
+        gained: Array,
+        sure: Array,
+    ) -> Watch:
+        """The sums after a step, each by group: a mean over its components."""
+        looks = mean @ renewed
+        # One clock for all, or a group that no judge sees would never forget.
+        kept = jnp.exp(-jnp.max(looks) / self.patience)
+        gain = kept * watch.gained + mean @ (renewed * gained)
+        looks = kept * watch.looks + looks
+        excess = jnp.minimum(square, _SURE) * (2.0 / self.ratio) - gained
+        excess = kept * watch.excess + mean @ (renewed * excess)
+        most = _SURE * (gain + SLACK * jnp.maximum(looks, 1.0))
+        return watch._replace(excess=jnp.where(sure, most, excess), gained=gain, looks=looks)
+
+    def renewed(self, sensor: Sensor, before: Belief, after: Belief, dof: Array) -> Array | float:
+        """What share of what the reference knows a measurement renewed; of a judge."""
+        if sensor.name not in self.judging:
+            return 0.0
+        was, now = before.sigma, after.sigma
+        share = jnp.clip(1.0 - _quotient(now**2, was**2), 0.0, 1.0)
+        return jnp.where((dof > 0) & (was > 0.0), share, 0.0)
+
+    def _predict(self, state: FilterState, motion: Motion, u: Any):
+        watch: Watch = state.memory
+        mine, first = self.filter.predict(watch.filter, motion, u)
+        other, second = self.reference.predict(watch.reference, motion, u)
+        # Without its reference a filter cannot be judged: they take a step together.
+        together = second.code == int(Code.DONE)
+        moved = watch._replace(filter=select(together, mine, watch.filter), reference=other)
+        new = _given_out(self.judged(moved, together & (first.code != int(Code.DONE)), 0.0))
+        return new, Prediction(None, new.belief, second.code)
+
+    def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
+        watch: Watch = state.memory
+        mine, info = self.filter.update(watch.filter, sensor, y, aux)
+        notes, failed = dict(info.notes), is_failure(info.code)
+        both = watch._replace(filter=mine)
+        if sensor.name in self.assumed:
+            renewed, other = 0.0, _not_believed(info)
+        else:
+            reference, other = self.reference.update(watch.reference, sensor, y, aux)
+            both = both._replace(reference=reference)
+            before, after = watch.reference.belief, reference.belief
+            renewed = self.renewed(sensor, before, after, other.dof)
+            failed = failed & ~is_failure(other.code)
+            notes |= {f"reference.{name}": value for name, value in other.notes.items()}
+        new = self.judged(both, failed, renewed)
+        said = select(watch.weight >= 0.5, info._replace(notes={}), other._replace(notes={}))
+        notes["guarded.weight"] = new.weight
+        notes["guarded.evidence"] = jnp.max(new.evidence) / self.limit
+        notes["guarded.trips"] = new.trips
+        return _given_out(new), said._replace(notes=notes)
+
+    def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        watch: Watch = state.memory
+        return _given_out(
+            watch._replace(
+                filter=self.filter.reset(watch.filter, belief),
+                reference=self.reference.reset(watch.reference, belief),
+            )
+        )
 
 
 def guarded(
@@ -135,118 +276,28 @@ def guarded(
             or a parameter is not of its range; at `init`, the model has no sensor of such a name,
             or the state no such component.
     """
-    assumed, judging = (
-        sensor_names("guarded assumption", assumption),
-        sensor_names("guarded judges", judges),
-    )
+    assumed = sensor_names("guarded assumption", assumption)
+    judging = sensor_names("guarded judges", judges)
     both = sorted(set(assumed) & set(judging))
     require(not both, f"guarded: {both} cannot judge, it belongs to the assumption")
     named = groups is None or (len(groups) > 0 and all(len(one) > 0 for one in groups))
     require(named, "guarded groups must each name a component", groups)
-    require(ratio >= 1.0, "guarded ratio must be at least 1", ratio)
-    for name, value in (("limit", limit), ("patience", patience), ("leap", leap)):
-        require(value > 0.0, f"guarded {name} must be positive", value)
-
-    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        if unknown := [name for name in (*assumed, *judging) if name not in dims]:
-            raise ValueError(f"guarded: no sensor {unknown[0]!r}; this model has {sorted(dims)}")
-        count = len(_members(groups, belief.factor.shape[0]))
-        without = {name: m for name, m in dims.items() if name not in assumed}
-        watch = Watch(
-            filter.init(belief, dims),
-            reference.init(belief, without),
-            jnp.zeros(count),
-            jnp.full(count, 0.0 if trusted else _SURE * SLACK),
-            jnp.zeros(count),
-            jnp.zeros(count),
-            jnp.zeros((), int),
-        )
-        return _given_out(watch)
-
-    def taken_over(watch: Watch) -> FilterState:
-        """The filter gone on from what the reference believes.
-
-        Where both are filters of as many locals, local by local: a joined filter that is reset to
-        one belief would have it in every local, and so count it more than once.
-        """
-        mine, follow = filter.members(watch.filter)
-        others, _ = reference.members(watch.reference)
-        if mine and len(mine) == len(others):
-            return follow(others, watch.reference.belief)
-        return filter.reset(watch.filter, watch.reference.belief)
-
-    def judged(watch: Watch, failed: Array, renewed: Array | float) -> Watch:
-        """What is learnt of a step, and whether the filter goes on from its reference."""
-        square, gained = _difference(watch.filter.belief, watch.reference.belief)
-        renewed = jnp.broadcast_to(jnp.asarray(renewed), square.shape)
-        M = _members(groups, len(square))
-        mean = M / np.sum(M, axis=1, keepdims=True)
-        fresh = M @ (renewed * (square - ratio * gained - SLACK))
-        evidence = jnp.maximum(watch.evidence + fresh, 0.0)
-        sure = failed | ((M @ (square > leap**2).astype(float)) > 0.0)
-        wrong = jnp.any(sure | (evidence > limit))
-
-        looks = mean @ renewed
-        # One clock for all, or a group that no judge sees would never forget.
-        kept = jnp.exp(-jnp.max(looks) / patience)
-        gain = kept * watch.gained + mean @ (renewed * gained)
-        looks = kept * watch.looks + looks
-        excess = jnp.minimum(square, _SURE) * (2.0 / ratio) - gained
-        excess = kept * watch.excess + mean @ (renewed * excess)
-        most = _SURE * (gain + SLACK * jnp.maximum(looks, 1.0))
-        return Watch(
-            select(wrong, taken_over(watch), watch.filter),
-            watch.reference,
-            jnp.where(wrong, 0.0, evidence),
-            jnp.where(sure, most, excess),
-            gain,
-            looks,
-            watch.trips + wrong.astype(int),
-        )
-
-    def predict(state: FilterState, motion: Motion, u: Any = None):
-        watch: Watch = state.memory
-        mine, first = filter.predict(watch.filter, motion, u)
-        other, second = reference.predict(watch.reference, motion, u)
-        # Without its reference a filter cannot be judged: they take a step together.
-        together = second.code == int(Code.DONE)
-        moved = watch._replace(filter=select(together, mine, watch.filter), reference=other)
-        new = _given_out(judged(moved, together & (first.code != int(Code.DONE)), 0.0))
-        return new, Prediction(None, new.belief, second.code)
-
-    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
-        watch: Watch = state.memory
-        mine, info = filter.update(watch.filter, sensor, y, aux)
-        notes = dict(info.notes)
-        if sensor.name in assumed:
-            new = judged(watch._replace(filter=mine), is_failure(info.code), 0.0)
-            said = select(watch.weight >= 0.5, info._replace(notes={}), _not_believed(info))
-        else:
-            other, plain = reference.update(watch.reference, sensor, y, aux)
-            renewed = 0.0
-            if sensor.name in judging:
-                before, after = watch.reference.belief.sigma, other.belief.sigma
-                share = jnp.clip(1.0 - _quotient(after**2, before**2), 0.0, 1.0)
-                renewed = jnp.where((plain.dof > 0) & (before > 0.0), share, 0.0)
-            both = watch._replace(filter=mine, reference=other)
-            new = judged(both, is_failure(info.code) & ~is_failure(plain.code), renewed)
-            notes |= {f"reference.{name}": value for name, value in plain.notes.items()}
-            said = select(watch.weight >= 0.5, info._replace(notes={}), plain._replace(notes={}))
-        notes["guarded.weight"] = new.weight
-        notes["guarded.evidence"] = jnp.max(new.evidence) / limit
-        notes["guarded.trips"] = new.trips
-        return _given_out(new), said._replace(notes=notes)
-
-    def reset(state: FilterState, belief: Belief) -> FilterState:
-        watch: Watch = state.memory
-        return _given_out(
-            watch._replace(
-                filter=filter.reset(watch.filter, belief),
-                reference=reference.reset(watch.reference, belief),
-            )
-        )
-
-    return in_step(functions(init, predict, update, reset))
+    times = number("guarded ratio must be at least 1", ratio, lambda x: x >= 1.0)
+    given = {"limit": limit, "patience": patience, "leap": leap}
+    positive = {
+        name: number(f"guarded {name} must be positive", x, lambda x: x > 0.0)
+        for name, x in given.items()
+    }
+    return Guarded(
+        filter=filter,
+        reference=reference,
+        ratio=times,
+        **positive,
+        assumed=assumed,
+        judging=judging,
+        groups=None if groups is None else tuple(map(tuple, groups)),
+        trusted=trusted,
+    )
 
 
 def _given_out(watch: Watch) -> FilterState:

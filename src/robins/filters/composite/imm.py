@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -26,10 +27,13 @@ from jaxtyping import Array, ArrayLike
 from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.composite.mixture import innovation, log_normalised, matched
-from robins.filters.kalman import Filter, FilterState, Prediction
+from robins.filters.kalman import Again, Filter, FilterState, Prediction
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import equal, select
-from robins.filters.values import Numbers, kind, value
+from robins.filters.values import Numbers, is_known, kind, value
+
+Of = Callable[..., tuple[Any, Any, dict[str, Array]]]
+Every = tuple[Any, Any, Sequence[dict[str, Array]]]
 
 
 @value
@@ -54,6 +58,50 @@ class Mode:
 
 
 @value
+class Several:
+    """Modes of any kind, each a part of the program; their states are a tuple."""
+
+    modes: tuple[Mode, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of modes."""
+        return len(self.modes)
+
+    def mode(self, i: int) -> Mode:
+        """One of them."""
+        return self.modes[i]
+
+    def every(self, of: Of, states: Any, *rows: Any) -> Every:
+        """States, what was found with a leading axis of modes, and the notes of each.
+
+        Args:
+            of: ``(mode, state, *row) -> (state, found, notes)``.
+            states: of the modes.
+            rows: pytrees with a leading axis of modes.
+        """
+        done = [
+            of(mode, state, *_at(rows, i))
+            for i, (mode, state) in enumerate(zip(self.modes, states, strict=True))
+        ]
+        after, found, notes = zip(*done, strict=True)
+        return after, _stack(found), notes
+
+    def beliefs(self, states: Any) -> Belief:
+        """With a leading axis of modes."""
+        return _stack([s.belief for s in states])
+
+    def state(self, states: Any, i: int) -> FilterState:
+        """That of one mode."""
+        return states[i]
+
+    def exchanged(self, i: int, filter_: Filter) -> Several:
+        """The modes with another filter in one of them."""
+        own = replace(self.modes[i], filter_=filter_)
+        return Several((*self.modes[:i], own, *self.modes[i + 1 :]))
+
+
+@value
 class Family:
     """Modes that differ in numbers only.
 
@@ -62,76 +110,61 @@ class Family:
 
     Attributes:
         make: makes a filter, or what `mode` makes of one, of one row of the numbers. What depends
-            on a number is computed with it, not decided by it: the numbers are stand-ins then.
+            on a number is computed with it, not decided by it: the numbers are stand-ins then. A
+            function that is made anew at each call compiles anew: give a `Partial` of a module's.
         numbers: pytree of arrays, one row a mode.
     """
 
-    make: Callable[[Any], Filter | Mode] = kind()
+    make: Callable[[Any], Filter | Mode]
     numbers: Any
+
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+        lengths = {jnp.shape(x)[:1] for x in jax.tree_util.tree_leaves(self.numbers)}
+        if len(lengths) != 1 or lengths == {()}:
+            raise ValueError(
+                "the numbers of a family must be arrays with one row a mode; "
+                f"their shapes begin with {sorted(lengths)}"
+            )
+        return next(iter(lengths))[0]
 
     def of(self, row: Any) -> Mode:
         """The mode of one row."""
         return _as_mode(self.make(row))
 
+    def mode(self, i: int) -> Mode:
+        """That of row i."""
+        return self.of(_at(jax.tree_util.tree_map(np.asarray, self.numbers), i))
 
-class Bank(NamedTuple):
-    """The modes as one: states are kept as the layout likes, beliefs have a leading axis of modes.
+    def every(self, of: Of, states: Any, *rows: Any) -> Every:
+        """As `Several.every`; one mode is traced, for all, and states have a leading axis."""
+        numbers = jax.tree_util.tree_map(jnp.asarray, self.numbers)
+        one = jax.vmap(lambda row, *part: of(self.of(row), *part))
+        after, found, notes = one(numbers, states, *rows)
+        return after, found, [_at(notes, i) for i in range(self.size)]
 
-    Attributes:
-        size: number of modes.
-        every: ``(of, states, *rows) -> (states, found, notes)``, what ``of(mode, state, *row)``
-            makes of every mode: states, what was found with a leading axis of modes, as ``rows``
-            have, and a dict of notes for each.
-        beliefs: ``states -> Belief``.
-    """
+    def beliefs(self, states: Any) -> Belief:
+        """With a leading axis of modes."""
+        return states.belief
 
-    size: int
-    every: Callable[..., tuple[Any, Any, Sequence[dict[str, Array]]]]
-    beliefs: Callable[[Any], Belief]
+    def state(self, states: Any, i: int) -> FilterState:
+        """That of one mode."""
+        return _at(states, i)
 
-
-def bank(modes: Sequence[Filter | Mode] | Family) -> Bank:
-    """The modes as one."""
-    if isinstance(modes, Family):
-        return _batched(modes)
-    return _each(tuple(map(_as_mode, modes)))
+    def exchanged(self, i: int, filter_: Filter) -> Family:
+        """The modes with another filter in one of them, which differs in numbers only."""
+        modes = jax.vmap(self.of)(jax.tree_util.tree_map(jnp.asarray, self.numbers))
+        put = jax.tree_util.tree_map(lambda x, new: x.at[i].set(new), modes.filter_, filter_)
+        return Family(_as_mode, replace(modes, filter_=put))
 
 
 def _as_mode(one: Filter | Mode) -> Mode:
     return one if isinstance(one, Mode) else Mode(one)
 
 
-def _each(modes: tuple[Mode, ...]) -> Bank:
-    """A tuple of states; each mode is traced by itself."""
-
-    def every(of, states, *rows):
-        done = []
-        for j, (mode, state) in enumerate(zip(modes, states, strict=True)):
-            row = jax.tree_util.tree_map(lambda a, j=j: a[j], rows)
-            done.append(of(mode, state, *row))
-        after, found, notes = zip(*done, strict=True)
-        return after, _stack(found), notes
-
-    return Bank(len(modes), every, lambda states: _stack([s.belief for s in states]))
-
-
-def _batched(family: Family) -> Bank:
-    """States with a leading axis of modes; one mode is traced, for all."""
-    numbers = jax.tree_util.tree_map(jnp.asarray, family.numbers)
-    lengths = {jnp.shape(x)[:1] for x in jax.tree_util.tree_leaves(numbers)}
-    if len(lengths) != 1 or lengths == {()}:
-        raise ValueError(
-            "the numbers of a family must be arrays with one row a mode; "
-            f"their shapes begin with {sorted(lengths)}"
-        )
-    ((count,),) = lengths
-
-    def every(of, *parts):
-        one = jax.vmap(lambda row, *part: of(family.of(row), *part))
-        after, found, notes = one(numbers, *parts)
-        return after, found, [{k: v[i] for k, v in notes.items()} for i in range(count)]
-
-    return Bank(count, every, lambda states: states.belief)
+def _at(tree: Any, i: Any) -> Any:
+    return jax.tree_util.tree_map(lambda a: a[i], tree)
 
 
 def _stack(trees: Sequence[Any]) -> Any:
@@ -165,14 +198,10 @@ def mode(filter_: Filter, motion: Motion | None = None, sensors: Sequence[Sensor
 class Imm(Filter):
     """The filter of `imm`."""
 
-    modes: tuple[Mode, ...] | Family
+    modes: Several | Family
     log_change: Numbers  # (modes, modes)
     log_first: Numbers  # (modes,)
     likeliest: bool = kind()
-
-    @property
-    def bank(self) -> Bank:
-        return bank(self.modes)
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
         own = set()
@@ -181,7 +210,7 @@ class Imm(Filter):
             own.update(s.name for s in mode.sensors)
             return mode.filter_.init(belief, dims), None, {}
 
-        states, *_ = self.bank.every(begin, (None,) * self.bank.size)
+        states, *_ = self.modes.every(begin, (None,) * self.modes.size)
         if unknown := own - set(dims):
             raise ValueError(f"modes of imm bring {sorted(unknown)}; the model has {list(dims)}")
         return FilterState(belief, Interaction(states, jnp.asarray(self.log_first)))
@@ -191,7 +220,7 @@ class Imm(Filter):
         joint = log_now[:, None] + jnp.asarray(self.log_change)
         log_weight, log_next = jax.vmap(log_normalised, in_axes=1)(joint)
         weight = jnp.exp(log_weight)  # (to, from)
-        beliefs = self.bank.beliefs(states)
+        beliefs = self.modes.beliefs(states)
         begun = jax.vmap(matched, in_axes=(None, 0, 0))(beliefs, weight, beliefs.mean)
         # A mode that receives nothing goes on alone, as does one that mixes with none, bit for bit.
         alone = ~jnp.isfinite(log_next) | (jnp.diagonal(weight) == 1.0)
@@ -199,69 +228,61 @@ class Imm(Filter):
         def restart(mode: Mode, state: FilterState, belief: Belief, alone: Array):
             return select(alone, state, mode.filter_.reset(state, belief)), None, {}
 
-        return self.bank.every(restart, states, begun, alone)[0], log_next
+        return self.modes.every(restart, states, begun, alone)[0], log_next
 
     def _predict(self, state: FilterState, motion: Motion, u: Any):
         states, log_now = state.memory
-        begun, log_next = (states, log_now) if self.bank.size == 1 else self.mixed(states, log_now)
-        after, code, _ = self.bank.every(lambda m, s: m.predict(s, motion, u), begun)
+        begun, log_next = (states, log_now) if self.modes.size == 1 else self.mixed(states, log_now)
+        after, code, _ = self.modes.every(lambda m, s: m.predict(s, motion, u), begun)
         taken = code == int(Code.DONE)
         log_next = _among(taken, log_next)
         failed = code[jnp.argmax(log_now)]
-        belief = _mixture(self.bank.beliefs(after), log_next)
+        belief = _mixture(self.modes.beliefs(after), log_next)
         outcome = jnp.where(jnp.any(taken), int(Code.DONE), failed)
         return FilterState(belief, Interaction(after, log_next)), Prediction(None, belief, outcome)
 
     def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
         states, log_prior = state.memory
-        after, seen, each = self.bank.every(lambda m, s: m.update(s, sensor, y, aux), states)
-        sound = ~jnp.isneginf(seen.log_likelihood)
-        of_all = jnp.any(seen.used & sound[:, None], axis=0)
-        alike = jnp.all((seen.used == of_all[None]) | ~sound[:, None])
-        gained = jnp.where(sound & ~alike, 0.0, seen.log_likelihood)
-        log_post, _ = log_normalised(log_prior + gained)
-        log_post = jnp.where(jnp.any(sound), log_post, log_prior)
-        if self.bank.size == 1:
-            info = jax.tree_util.tree_map(lambda a: a[0], seen)
-        else:
-            info = _seen(seen, jnp.where(sound, log_prior, -jnp.inf), log_post, of_all)
-        if self.likeliest:
-            one = jax.tree_util.tree_map(lambda a: a[jnp.argmax(log_post)], seen)
-            info = one._replace(gain=info.gain, log_likelihood=info.log_likelihood)
+        after, seen, each = self.modes.every(lambda m, s: m.update(s, sensor, y, aux), states)
+        log_prior, log_post, used = _judged(seen, log_prior)
         notes = {f"imm.{i}.{k}": v for i, own in enumerate(each) for k, v in own.items()}
         notes["imm.probability"] = jnp.exp(log_post)
+        info = self.told(seen, log_prior, log_post, used)._replace(notes=notes)
         # Where no mode has moved the mixture stands bit for bit.
-        was, now = self.bank.beliefs(states), self.bank.beliefs(after)
+        was, now = self.modes.beliefs(states), self.modes.beliefs(after)
         belief = select(equal(now, was), state.belief, _mixture(now, log_post))
-        return FilterState(belief, Interaction(after, log_post)), info._replace(notes=notes)
+        return FilterState(belief, Interaction(after, log_post)), info
+
+    def told(self, seen: StepInfo, log_prior: Array, log_post: Array, used: Array) -> StepInfo:
+        """What the modes saw, as one."""
+        info = _at(seen, 0) if self.modes.size == 1 else _seen(seen, log_prior, log_post, used)
+        if not self.likeliest:
+            return info
+        one = _at(seen, jnp.argmax(log_post))
+        return one._replace(gain=info.gain, log_likelihood=info.log_likelihood)
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
-        inner = state.memory
-        states, *_ = self.bank.every(
-            lambda m, s: (m.filter_.reset(s, belief), None, {}), inner.states
-        )
-        return FilterState(belief, inner._replace(states=states))
+        def moved(mode: Mode, one: FilterState):
+            return mode.filter_.reset(one, belief), None, {}
 
-    def report(self, start: FilterState, final: FilterState, again: Any, time: Any) -> None:
-        for i in range(self.bank.size):
-            if isinstance(self.modes, Family):
-                mode = self.modes.of(
-                    jax.tree_util.tree_map(lambda x: np.asarray(x)[i], self.modes.numbers)
-                )
-                first, last = (
-                    jax.tree_util.tree_map(lambda x: x[i], s.memory.states) for s in (start, final)
-                )
-                mode.filter_.report(first, last, None, time)
-                continue
+        states, *_ = self.modes.every(moved, state.memory.states)
+        return FilterState(belief, state.memory._replace(states=states))
 
-            def other(filter_: Filter, i: int = i) -> FilterState:
-                own = replace(self.modes[i], filter_=filter_)
-                return again(
-                    replace(self, modes=(*self.modes[:i], own, *self.modes[i + 1 :]))
-                ).memory.states[i]
+    @property
+    def reports(self) -> bool:
+        return any(self.modes.mode(i).filter_.reports for i in range(self.modes.size))
 
-            first, last = start.memory.states[i], final.memory.states[i]
-            self.modes[i].filter_.report(first, last, None if again is None else other, time)
+    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
+        for i in range(self.modes.size):
+            first = self.modes.state(start.memory.states, i)
+            last = self.modes.state(final.memory.states, i)
+            anew = None if again is None else partial(self.anew, again, i)
+            self.modes.mode(i).filter_.report(first, last, anew, time)
+
+    def anew(self, again: Again, i: int, filter_: Filter) -> FilterState:
+        """The final state of mode i in a run with another filter in its place."""
+        final = again(replace(self, modes=self.modes.exchanged(i, filter_)))
+        return self.modes.state(final.memory.states, i)
 
 
 def imm(
@@ -295,25 +316,42 @@ def imm(
         ValueError: no modes, or probabilities that are negative, of a wrong shape or do not sum to
             one. When a run begins: a mode brings a sensor that the model does not have.
     """
-    modes = modes if isinstance(modes, Family) else tuple(map(_as_mode, modes))
-    count = bank(modes).size
+    all_ = modes if isinstance(modes, Family) else Several(tuple(map(_as_mode, modes)))
+    count = all_.size
     require(count, "imm needs at least one mode")
     even = np.full(count, 1.0 / count)
-    first = _probabilities("start", even if start is None else start, (count,))
-    with np.errstate(divide="ignore"):
-        log_change = np.log(_probabilities("transition", transition, (count, count)))
-        return Imm(modes, log_change, np.log(first), likeliest)
+    log_first = _log_probabilities("start", even if start is None else start, (count,))
+    log_change = _log_probabilities("transition", transition, (count, count))
+    return Imm(all_, log_change, log_first, likeliest)
 
 
-def _probabilities(name: str, given: Rows, shape: tuple[int, ...]) -> np.ndarray:
-    value = np.asarray(given, dtype=float)
-    require(value.shape == shape, f"{name} of imm has shape {value.shape}, its modes need {shape}")
-    total = value.sum(axis=-1)
-    if not (np.all(value >= 0.0) and np.all(np.abs(total - 1.0) <= _ONE)):
+def _log_probabilities(name: str, given: Rows, shape: tuple[int, ...]) -> Numbers:
+    known = is_known(given)
+    chance = np.asarray(given, float) if known else jnp.asarray(given)
+    require(
+        chance.shape == shape, f"{name} of imm has shape {chance.shape}, its modes need {shape}"
+    )
+    total = chance.sum(axis=-1)
+    if not known:
+        some = chance > 0.0  # twice: the slope of the logarithm of zero is infinite
+        return jnp.where(some, jnp.log(jnp.where(some, chance / total[..., None], 1.0)), -jnp.inf)
+    if not (np.all(chance >= 0.0) and np.all(np.abs(total - 1.0) <= _ONE)):
         raise ValueError(
-            f"{name} of imm must hold probabilities, rows that sum to one: got {value.tolist()}"
+            f"{name} of imm must hold probabilities, rows that sum to one: got {chance.tolist()}"
         )
-    return value / total[..., None]
+    with np.errstate(divide="ignore"):
+        return np.log(chance / total[..., None])
+
+
+def _judged(seen: StepInfo, log_prior: Array) -> tuple[Array, Array, Array]:
+    """Log-probabilities before and after, and what was used; of modes whose step failed none."""
+    sound = ~jnp.isneginf(seen.log_likelihood)
+    used = jnp.any(seen.used & sound[:, None], axis=0)
+    alike = jnp.all((seen.used == used[None]) | ~sound[:, None])
+    gained = jnp.where(sound & ~alike, 0.0, seen.log_likelihood)
+    log_post, _ = log_normalised(log_prior + gained)
+    log_post = jnp.where(jnp.any(sound), log_post, log_prior)
+    return jnp.where(sound, log_prior, -jnp.inf), log_post, used
 
 
 def _among(taken: Array, log_probability: Array) -> Array:
@@ -325,7 +363,7 @@ def _among(taken: Array, log_probability: Array) -> Array:
 def _mixture(beliefs: Belief, log_probability: Array) -> Belief:
     """Moments of all modes; those of one that is certain are its own, bit for bit."""
     likely = jnp.argmax(log_probability)
-    best = jax.tree_util.tree_map(lambda a: a[likely], beliefs)
+    best = _at(beliefs, likely)
     if len(log_probability) == 1:
         return best
     weight = jnp.exp(log_probability)

@@ -24,8 +24,10 @@ sensors is wrong, the offset is learnt, and what the records say of changes of x
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
@@ -33,8 +35,10 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief
-from robins.filters.kalman import Filter, FilterState, Prediction, functions
+from robins.filters.composite.bank import EVERY, transitions
+from robins.filters.kalman import Again, Filter, FilterState, Prediction
 from robins.filters.model import Motion, Sensor
+from robins.filters.values import Numbers, kind, value
 
 BEGINS = 10.0  # sigma of an offset that begins, in standard deviations of the records
 WANDERS = 0.03  # by which it wanders in a step, in the same
@@ -77,15 +81,10 @@ def with_offsets(change: np.ndarray, sensors: int) -> np.ndarray:
     """
     plain, count = len(change), len(change) + 2 * sensors
     begins = plain + 2 * np.arange(sensors)
-    p = np.zeros((count, count))
-    p[:plain, :plain] = change
-    p[plain:, 0] = END
-    p[:, begins] = BEGIN
     at = np.arange(count)
-    rest = np.where(np.isin(at, begins), at + 1, at)
-    p[at, rest] = 0.0
-    p[at, rest] = 1.0 - p.sum(axis=1)
-    return p
+    told = slice(plain)
+    edges = [(told, told, change), (slice(plain, None), 0, END), (EVERY, begins, BEGIN)]
+    return transitions(count, edges, np.where(np.isin(at, begins), at + 1, at))
 
 
 # ----------------------------------------------------------------------------- the model of a mode
@@ -131,18 +130,66 @@ def _read_noise(sensor: Sensor, x: Wide, aux: Any):
     return sensor.noise_factor(x.state, aux)
 
 
-def _read_off(sensor: Sensor, at: int, off: Array, x: Wide, aux: Any):
-    sigma = jnp.sqrt(jnp.sum(sensor.noise_factor(x.state, aux) ** 2, axis=1))
-    return manifold.retract(sensor.reading(x.state, aux), off * sigma * x.offset[at])
+@value
+class ReadOff:
+    """A reading that is off by an offset of the state."""
+
+    sensor: Sensor
+    off: Numbers  # () one where it is, else zero
+    at: int = kind()  # which offset
+
+    def __call__(self, x: Wide, aux: Any):
+        noise = self.sensor.noise_factor(x.state, aux)
+        sigma = jnp.sqrt(jnp.sum(noise**2, axis=1))
+        by = jnp.asarray(self.off) * sigma * x.offset[self.at]
+        return manifold.retract(self.sensor.reading(x.state, aux), by)
 
 
 def _wide_sensor(sensor: Sensor, names: Sequence[str], of: Supposed) -> Sensor:
     """Of the wide state; a `linear` of its own is not used."""
-    read = Partial(_read, sensor)
+    read: Any = Partial(_read, sensor)
     if sensor.name in names:
         at = names.index(sensor.name)
-        read = Partial(lambda s, off, x, aux: _read_off(s, at, off, x, aux), sensor, of.off[at])
+        read = ReadOff(sensor, of.off[at], at)
     return Sensor(read, Partial(_read_noise, sensor), sensor.dim, sensor.name)
+
+
+@value
+class Supposing(Filter):
+    """The filter of `supposing`."""
+
+    inner: Filter
+    of: Supposed
+    scaled: Scaled
+    names: tuple[str, ...] = kind()
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        return self.inner.init(belief, dims)
+
+    @jax.jit
+    def predict(self, state: FilterState, motion: Motion, u: Any = None):
+        linear = None
+        if motion.linear is not None:
+            linear = Partial(_step_linear, motion, self.of, self.scaled)
+        noise = Partial(_noise, motion, self.of, self.scaled)
+        return self.inner.predict(state, Motion(Partial(_step, motion, self.of), noise, linear), u)
+
+    @jax.jit
+    def update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
+        return self.inner.update(state, _wide_sensor(sensor, self.names, self.of), y, aux)
+
+    def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        return self.inner.reset(state, belief)
+
+    def members(self, state: FilterState):
+        return self.inner.members(state)
+
+    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
+        def anew(inner: Filter) -> FilterState:
+            assert again is not None
+            return again(replace(self, inner=inner))
+
+        self.inner.report(start, final, None if again is None else anew, time)
 
 
 def supposing(filter_: Filter, names: Sequence[str], of: Supposed, scaled: Scaled) -> Filter:
@@ -154,16 +201,58 @@ def supposing(filter_: Filter, names: Sequence[str], of: Supposed, scaled: Scale
         of: the hypothesis; its numbers may be traced.
         scaled: what the mode makes of a factor of the process noise; data of a program.
     """
+    return Supposing(filter_, of, scaled, tuple(names))
 
-    def predict(state: FilterState, motion: Motion, u: Any = None):
-        linear = None if motion.linear is None else Partial(_step_linear, motion, of, scaled)
-        noise = Partial(_noise, motion, of, scaled)
-        return filter_.predict(state, Motion(Partial(_step, motion, of), noise, linear), u)
 
-    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
-        return filter_.update(state, _wide_sensor(sensor, names, of), y, aux)
+def _widened(belief: Belief, offset: tuple[Array, ...], factor: Array) -> Belief:
+    return Belief(Wide(belief.mean, offset), linalg.block_diagonal(belief.factor, factor))
 
-    return filter_._replace(predict=predict, update=update)
+
+def _narrow(wide: FilterState) -> FilterState:
+    mean, n = wide.belief.mean.state, manifold.dim(wide.belief.mean.state)
+    # the first rows of a lower triangle are the factor of the first components
+    return FilterState(Belief(mean, wide.belief.factor[:n, :n]), wide, (), wide.current)
+
+
+@value
+class Narrowed(Filter):
+    """The filter of `narrowed`."""
+
+    inner: Filter
+    names: tuple[str, ...] = kind()
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        if unknown := set(self.names) - set(dims):
+            raise ValueError(
+                f"off names {sorted(unknown)}: name sensors of the model, which has {list(dims)}"
+            )
+        offset = tuple(jnp.zeros(dims[name]) for name in self.names)
+        factor = BEGINS * jnp.eye(sum(dims[name] for name in self.names))
+        return _narrow(self.inner.init(_widened(belief, offset, factor), dims))
+
+    @jax.jit
+    def predict(self, state: FilterState, motion: Motion, u: Any = None):
+        wide, prediction = self.inner.predict(state.memory, motion, u)
+        new = _narrow(wide)
+        return new, Prediction(None, new.belief, prediction.code)
+
+    @jax.jit
+    def update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
+        wide, info = self.inner.update(state.memory, sensor, y, aux)
+        new = _narrow(wide)
+        return new, info._replace(gain=info.gain[: len(new.belief.factor)])
+
+    def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        wide = state.memory.belief
+        factor = linalg.tria(wide.factor[len(belief.factor) :])
+        return _narrow(self.inner.reset(state.memory, _widened(belief, wide.mean.offset, factor)))
+
+    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
+        def anew(inner: Filter) -> FilterState:
+            assert again is not None
+            return again(replace(self, inner=inner)).memory
+
+        self.inner.report(start.memory, final.memory, None if again is None else anew, time)
 
 
 def narrowed(filter_: Filter, names: Sequence[str]) -> Filter:
@@ -176,37 +265,4 @@ def narrowed(filter_: Filter, names: Sequence[str]) -> Filter:
     Raises:
         ValueError: when a run begins: the model has no sensor of one of these names.
     """
-
-    def widened(belief: Belief, offset: tuple[Array, ...], factor: Array) -> Belief:
-        return Belief(Wide(belief.mean, offset), linalg.block_diagonal(belief.factor, factor))
-
-    def narrow(wide: FilterState) -> FilterState:
-        mean, n = wide.belief.mean.state, manifold.dim(wide.belief.mean.state)
-        # the first rows of a lower triangle are the factor of the first components
-        return FilterState(Belief(mean, wide.belief.factor[:n, :n]), wide, (), wide.current)
-
-    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        if unknown := set(names) - set(dims):
-            raise ValueError(
-                f"off names {sorted(unknown)}: name sensors of the model, which has {list(dims)}"
-            )
-        offset = tuple(jnp.zeros(dims[name]) for name in names)
-        factor = BEGINS * jnp.eye(sum(dims[name] for name in names))
-        return narrow(filter_.init(widened(belief, offset, factor), dims))
-
-    def predict(state: FilterState, motion: Motion, u: Any = None):
-        wide, prediction = filter_.predict(state.memory, motion, u)
-        new = narrow(wide)
-        return new, Prediction(None, new.belief, prediction.code)
-
-    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
-        wide, info = filter_.update(state.memory, sensor, y, aux)
-        new = narrow(wide)
-        return new, info._replace(gain=info.gain[: len(new.belief.factor)])
-
-    def reset(state: FilterState, belief: Belief) -> FilterState:
-        wide = state.memory.belief
-        factor = linalg.tria(wide.factor[len(belief.factor) :])
-        return narrow(filter_.reset(state.memory, widened(belief, wide.mean.offset, factor)))
-
-    return functions(init, predict, update, reset)
+    return Narrowed(filter_, tuple(names))

@@ -31,18 +31,11 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo
 from robins.filters.composite.mixture import innovation, log_normalised, matched
-from robins.filters.kalman import (
-    Filter,
-    FilterState,
-    Prediction,
-    functions,
-    in_step,
-    predicted_factor,
-    updated,
-)
+from robins.filters.kalman import Filter, FilterState, Prediction, predicted_factor, updated
 from robins.filters.linearise import Linearisation, taylor
-from robins.filters.model import Motion, Sensor
+from robins.filters.model import Data, Motion, Sensor
 from robins.filters.trees import finite, select
+from robins.filters.values import Numbers, is_known, kind, number, value
 
 _GENERATOR = "threefry2x32"  # named, so that a key gives the same draws under any setting of JAX
 
@@ -53,6 +46,132 @@ class Cloud(NamedTuple):
     particles: Belief  # leading axis; rows of sampled components are zero in the factors
     log_weight: Array  # (count,), the weights sum to one
     key: Array  # (2,) uint32, of the draws to come
+
+
+@value
+class Particle(Filter):
+    """The filter of `particle`."""
+
+    way: Linearisation
+    key: Numbers  # (2,) its words, as floats: JAX derives by no whole number
+    resample: Numbers  # () share of the count
+    jitter: Numbers  # (2,) what a copy keeps of its deviation, and what it is moved by
+    count: int = kind()
+    chosen: tuple[int, ...] | None = kind()
+    moves: bool = kind()  # copies
+
+    def order(self, n: int) -> tuple[np.ndarray, int]:
+        """Tangent components with the sampled ones first, and how many these are."""
+        first = tuple(range(n)) if self.chosen is None else self.chosen
+        return np.array([*first, *(i for i in range(n) if i not in first)], dtype=int), len(first)
+
+    def even(self) -> Array:
+        """The logarithm of the weight of each, where all have the same."""
+        return -jnp.log(float(self.count))
+
+    def drawn(self, key: Array, means: Any, factors: Array) -> Belief:
+        """Particles with the sampled components drawn and the rest conditioned on the draw."""
+        n = factors.shape[1]
+        order, k = self.order(n)
+        back = np.argsort(order)
+        xi = jax.random.normal(key, (self.count, k))
+
+        def one(xi, mean, S):
+            S = S if np.all(order == np.arange(n)) else linalg.tria(S[order])
+            left = jnp.where((jnp.arange(n) < k)[None], 0.0, S)
+            return Belief(manifold.retract(mean, (S[:, :k] @ xi)[back]), left[back])
+
+        return jax.vmap(one)(xi, means, factors)
+
+    def spread(self, belief: Belief, key: Array) -> FilterState:
+        """A new cloud from a Gaussian belief."""
+        key, now = _split(key, 1)
+        same = jax.tree_util.tree_map(
+            lambda x: jnp.broadcast_to(x, (self.count, *jnp.shape(x))), belief
+        )
+        weight = jnp.full(self.count, self.even())
+        return FilterState(belief, Cloud(self.drawn(now, *same), weight, key))
+
+    def gaussian(self, cloud: Cloud) -> Belief:
+        """The cloud's moments."""
+        return _moments(cloud, self.order(cloud.particles.factor.shape[1])[1])
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        n = belief.factor.shape[0]
+        if self.chosen is not None and max(self.chosen, default=0) >= n:
+            raise ValueError(f"sampled components {self.chosen}: the state has only {n}")
+        return self.spread(belief, jnp.asarray(self.key).astype(jnp.uint32))
+
+    def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        return self.spread(belief, state.memory.key)
+
+    def refreshed(self, state: FilterState, choose: Array, jitter: Array) -> tuple[Belief, Array]:
+        """The cloud, resampled if its weights are too uneven."""
+        cloud = state.memory
+        weight = jnp.exp(cloud.log_weight)
+        due = _effective(weight) < jnp.asarray(self.resample) * float(self.count)
+        index = jnp.where(due, _systematic(choose, weight), jnp.arange(self.count))
+        particles = jax.tree_util.tree_map(lambda x: x[index], cloud.particles)
+        if self.moves:
+            particles = select(due, self.jittered(particles, state.belief, jitter), particles)
+        return particles, jnp.where(due, self.even(), cloud.log_weight)
+
+    def jittered(self, particles: Belief, cloud: Belief, key: Array) -> Belief:
+        """Particles moved at random, and towards the mean, so that they keep the moments."""
+        order, k = self.order(cloud.factor.shape[0])
+        some = order[:k]
+        L = linalg.tria(cloud.factor[some])
+        keep, move = jnp.asarray(self.jitter)
+
+        def one(x, xi):
+            d = manifold.local(cloud.mean, x)
+            d = d.at[some].set(keep * d[some] + move * (L @ xi))
+            return manifold.retract(cloud.mean, d)
+
+        xi = jax.random.normal(key, (self.count, k))
+        return particles._replace(mean=jax.vmap(one)(particles.mean, xi))
+
+    def _predict(
+        self, state: FilterState, motion: Motion, u: Data
+    ) -> tuple[FilterState, Prediction]:
+        key, choose, jitter, draw = _split(state.memory.key, 3)
+        before, log_weight = self.refreshed(state, choose, jitter)
+
+        def ahead(b: Belief):
+            t = self.way.transition(b, motion, u)
+            return t.mean, predicted_factor(t, "sqrt")
+
+        after = self.drawn(draw, *jax.vmap(ahead)(before))
+        sound = jax.vmap(finite)(after)
+        log_weight, total = log_normalised(jnp.where(sound, log_weight, -jnp.inf))
+        taken = jnp.isfinite(total)
+        cloud = Cloud(_each(sound, after, before), log_weight, key)
+        new = FilterState(self.gaussian(cloud), cloud)
+        new = select(taken, new, state._replace(memory=state.memory._replace(key=key)))
+        code = jnp.where(taken, int(Code.DONE), int(Code.NOT_FINITE))
+        return new, Prediction(None, new.belief, code)
+
+    def _update(
+        self, state: FilterState, sensor: Sensor, y: Data, aux: Data
+    ) -> tuple[FilterState, StepInfo]:
+        before, log_prior, key = state.memory
+
+        def one(b: Belief):
+            o = self.way.observation(b, sensor, y, aux)
+            posterior, info = updated(b, o, "sqrt")
+            return posterior, info, b.factor @ jnp.where(info.used[:, None], o.spread, 0.0).T
+
+        after, infos, cross = jax.vmap(one)(before)
+        sound = jax.vmap(finite)((after, infos.log_likelihood))
+        gained = jnp.where(sound, infos.log_likelihood, -jnp.inf)
+        log_post, total = log_normalised(log_prior + gained)
+        lost = ~jnp.isfinite(total)
+        cloud = Cloud(_each(sound, after, before), log_post, key)
+        cloud = select(lost, state.memory, cloud)
+        used = jnp.any(infos.used & sound[:, None], axis=0) & ~lost
+        belief = select(jnp.any(used), self.gaussian(cloud), state.belief)
+        info = _told(state, jnp.where(sound, log_prior, -jnp.inf), infos, cross, cloud, used, total)
+        return FilterState(belief, cloud), info
 
 
 def particle(
@@ -95,130 +214,23 @@ def particle(
     """
     count = operator.index(count)
     require(count >= 1, "a particle filter needs a positive count of particles", count)
-    for name, share in (("resample", resample), ("regularise", regularise)):
-        require(0.0 <= share <= 1.0, f"{name} of a particle filter must lie in 0..1", share)
+    share, moved = (
+        number(f"{name} of a particle filter must lie in 0..1", x, lambda s: (s >= 0) & (s <= 1))
+        for name, x in (("resample", resample), ("regularise", regularise))
+    )
     chosen = None if sampled is None else tuple(operator.index(i) for i in sampled)
     if chosen is not None and (len(set(chosen)) < len(chosen) or min(chosen, default=0) < 0):
         raise ValueError(f"sampled components must be different and not negative, got {chosen}")
-    way = taylor() if linearise is None else linearise
-
-    def drawn(key: Array, means: Any, factors: Array) -> Belief:
-        """Particles with the sampled components drawn and the rest conditioned on the draw."""
-        n = factors.shape[1]
-        order, k = _order(chosen, n)
-        back = np.argsort(order)
-        xi = jax.random.normal(key, (count, k))
-
-        def one(xi, mean, S):
-            S = S if np.all(order == np.arange(n)) else linalg.tria(S[order])
-            left = jnp.where((jnp.arange(n) < k)[None], 0.0, S)
-            return Belief(manifold.retract(mean, (S[:, :k] @ xi)[back]), left[back])
-
-        return jax.vmap(one)(xi, means, factors)
-
-    def spread(belief: Belief, key: Array) -> FilterState:
-        """A new cloud from a Gaussian belief."""
-        key, now = _split(key, 1)
-        same = jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), belief)
-        even = jnp.full(count, -jnp.log(float(count)))
-        return FilterState(belief, Cloud(drawn(now, *same), even, key))
-
-    def gaussian(cloud: Cloud) -> Belief:
-        return _moments(cloud, _order(chosen, cloud.particles.factor.shape[1])[1])
-
-    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        n = belief.factor.shape[0]
-        if chosen is not None and max(chosen, default=0) >= n:
-            raise ValueError(f"sampled components {chosen}: the state has only {n}")
-        return spread(belief, _as_key(key))
-
-    def reset(state: FilterState, belief: Belief) -> FilterState:
-        return spread(belief, state.memory.key)
-
-    def refreshed(state: FilterState, choose: Array, jitter: Array) -> tuple[Belief, Array]:
-        """The cloud, resampled if its weights are too uneven."""
-        cloud = state.memory
-        weight = jnp.exp(cloud.log_weight)
-        due = _effective(weight) < resample * count
-        index = jnp.where(due, _systematic(choose, weight), jnp.arange(count))
-        particles = jax.tree_util.tree_map(lambda x: x[index], cloud.particles)
-        if regularise > 0.0:
-            particles = select(due, jittered(particles, state.belief, jitter), particles)
-        return particles, jnp.where(due, -jnp.log(float(count)), cloud.log_weight)
-
-    def jittered(particles: Belief, cloud: Belief, key: Array) -> Belief:
-        n = cloud.factor.shape[0]
-        order, k = _order(chosen, n)
-        some = order[:k]
-        L = linalg.tria(cloud.factor[some])
-        keep = float(np.sqrt(1.0 - regularise**2))
-
-        def one(x, xi):
-            d = manifold.local(cloud.mean, x)
-            d = d.at[some].set(keep * d[some] + regularise * (L @ xi))
-            return manifold.retract(cloud.mean, d)
-
-        xi = jax.random.normal(key, (count, k))
-        return particles._replace(mean=jax.vmap(one)(particles.mean, xi))
-
-    def predict(state: FilterState, motion: Motion, u: Any = None):
-        key, choose, jitter, draw = _split(state.memory.key, 3)
-        before, log_weight = refreshed(state, choose, jitter)
-
-        def ahead(b: Belief):
-            t = way.transition(b, motion, u)
-            return t.mean, predicted_factor(t, "sqrt")
-
-        after = drawn(draw, *jax.vmap(ahead)(before))
-        sound = jax.vmap(finite)(after)
-        log_weight, total = log_normalised(jnp.where(sound, log_weight, -jnp.inf))
-        taken = jnp.isfinite(total)
-        cloud = Cloud(_each(sound, after, before), log_weight, key)
-        new = FilterState(gaussian(cloud), cloud)
-        new = select(taken, new, state._replace(memory=state.memory._replace(key=key)))
-        code = jnp.where(taken, int(Code.DONE), int(Code.NOT_FINITE))
-        return new, Prediction(None, new.belief, code)
-
-    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
-        before, log_prior, key = state.memory
-
-        def one(b: Belief):
-            o = way.observation(b, sensor, y, aux)
-            posterior, info = updated(b, o, "sqrt")
-            return posterior, info, b.factor @ jnp.where(info.used[:, None], o.spread, 0.0).T
-
-        after, infos, cross = jax.vmap(one)(before)
-        sound = jax.vmap(finite)((after, infos.log_likelihood))
-        gained = jnp.where(sound, infos.log_likelihood, -jnp.inf)
-        log_post, total = log_normalised(log_prior + gained)
-        lost = ~jnp.isfinite(total)
-        cloud = Cloud(_each(sound, after, before), log_post, key)
-        cloud = select(lost, state.memory, cloud)
-        used = jnp.any(infos.used & sound[:, None], axis=0) & ~lost
-        belief = select(jnp.any(used), gaussian(cloud), state.belief)
-
-        weight = jnp.exp(log_normalised(jnp.where(sound, log_prior, -jnp.inf))[0])
-        expected = innovation(infos, weight, used)
-        gain = _gain(state.belief, before, infos, weight, cross, expected)
-        # Where no particle is left, each may have been contradicted: all sampled and R = 0.
-        best = jnp.argmax(cloud.log_weight)
-        wrong = infos.code[best] == int(Code.CONTRADICTED)
-        code = jnp.where(lost & ~wrong, int(Code.NOT_FINITE), infos.code[best])
-        info = StepInfo(
-            innovation=expected.mean,
-            expected=expected.expected,
-            factor=expected.factor,
-            gain=jnp.where(used[None], gain, 0.0),
-            used=used,
-            nis=jnp.where(wrong, jnp.inf, expected.nis),
-            dof=expected.dof,
-            log_likelihood=total,
-            code=code,
-            notes={"particle.ess": _effective(jnp.exp(cloud.log_weight))},
-        )
-        return FilterState(belief, cloud), info
-
-    return in_step(functions(init, predict, update, reset))
+    words, xp = _as_key(key).astype(float), np if is_known(moved) else jnp
+    return Particle(
+        way=taylor() if linearise is None else linearise,
+        key=np.asarray(words) if is_known(words) else words,
+        resample=share,
+        jitter=xp.stack([xp.sqrt(1.0 - moved**2), moved], axis=-1),
+        count=count,
+        chosen=chosen,
+        moves=not is_known(moved) or bool(np.any(moved > 0.0)),
+    )
 
 
 def reseed(state: FilterState, key: Any) -> FilterState:
@@ -246,12 +258,6 @@ def _split(key: Array, count: int) -> tuple[Array, ...]:
     return jax.random.key_data(keys[0]), *keys[1:]
 
 
-def _order(chosen: tuple[int, ...] | None, n: int) -> tuple[np.ndarray, int]:
-    """Tangent components with the sampled ones first, and how many these are."""
-    first = tuple(range(n)) if chosen is None else chosen
-    return np.array([*first, *(i for i in range(n) if i not in first)], dtype=int), len(first)
-
-
 def _systematic(key: Array, weight: Array) -> Array:
     """Which particles to take over, each about count * weight times (Kitagawa 1996, sec. 3)."""
     count = weight.shape[0]
@@ -271,6 +277,47 @@ def _moments(cloud: Cloud, k: int) -> Belief:
     best = jax.tree_util.tree_map(lambda x: x[jnp.argmax(cloud.log_weight)], cloud.particles.mean)
     slim = cloud.particles._replace(factor=cloud.particles.factor[:, :, k:])
     return matched(slim, jnp.exp(cloud.log_weight), best)
+
+
+def _told(
+    state: FilterState,
+    log_prior: Array,
+    infos: StepInfo,
+    cross: Array,
+    cloud: Cloud,
+    used: Array,
+    total: Array,
+) -> StepInfo:
+    """What an update tells of the whole cloud.
+
+    Args:
+        state: before it.
+        log_prior: (count,) weights then, of those that can be updated.
+        infos: what it tells of each particle.
+        cross: (count, n, m) covariance of state and measurement in each.
+        cloud: after it.
+        used: (m,) components.
+        total: logarithm of the mean weight that it gives.
+    """
+    weight = jnp.exp(log_normalised(log_prior)[0])
+    expected = innovation(infos, weight, used)
+    gain = _gain(state.belief, state.memory.particles, infos, weight, cross, expected)
+    # Where no particle is left, each may have been contradicted: all sampled and R = 0.
+    best = jnp.argmax(cloud.log_weight)
+    wrong = infos.code[best] == int(Code.CONTRADICTED)
+    lost = ~jnp.isfinite(total)
+    return StepInfo(
+        innovation=expected.mean,
+        expected=expected.expected,
+        factor=expected.factor,
+        gain=jnp.where(used[None], gain, 0.0),
+        used=used,
+        nis=jnp.where(wrong, jnp.inf, expected.nis),
+        dof=expected.dof,
+        log_likelihood=total,
+        code=jnp.where(lost & ~wrong, int(Code.NOT_FINITE), infos.code[best]),
+        notes={"particle.ess": _effective(jnp.exp(cloud.log_weight))},
+    )
 
 
 def _gain(prior: Belief, cloud: Belief, infos: StepInfo, weight, cross, expected) -> Array:

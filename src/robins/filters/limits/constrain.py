@@ -30,12 +30,12 @@ from robins.filters.kalman import updated
 from robins.filters.linearise import taylor
 from robins.filters.model import Sensor, as_noise
 from robins.filters.observation import Observation, contradicted, normalised
-from robins.filters.values import as_data
+from robins.filters.values import as_data, is_known
 from robins.manifold import State
 
-Numbers = ArrayLike | Sequence[Any]
-Function = Numbers | Callable[[State], Any]  # a matrix D, for D x, or a function of the state
-Weight = Literal["covariance", "identity"] | Numbers
+Given = ArrayLike | Sequence[Any]
+Function = Given | Callable[[State], Any]  # a matrix D, for D x, or a function of the state
+Weight = Literal["covariance", "identity"] | Given
 
 ITERATIONS = 4
 
@@ -60,7 +60,7 @@ def constrain(
     g: Function,
     d: Any = None,
     weight: Weight = "covariance",
-    noise: Numbers | None = None,
+    noise: Given | None = None,
     hard: bool = False,
     iterations: int = ITERATIONS,
 ) -> Constrained:
@@ -127,7 +127,7 @@ def nearest(metric: Belief, o: Observation) -> tuple[State, Array, Array, Array]
     return mean, gain, seen.used, contradicted(o, seen)
 
 
-def as_sensor(mean: State, g: Function, d: Any, noise: Numbers | None) -> tuple[Sensor, Any]:
+def as_sensor(mean: State, g: Function, d: Any, noise: Given | None) -> tuple[Sensor, Any]:
     """A constraint as a sensor, and what that sensor reads."""
     read, linear, value = (g, None, g(mean)) if callable(g) else _by_matrix(mean, g)
     c = manifold.dim(value)
@@ -143,7 +143,7 @@ def as_sensor(mean: State, g: Function, d: Any, noise: Numbers | None) -> tuple[
     return Sensor(Partial(_of_state, as_data(read)), root, c, "constraint", linear), target
 
 
-def _by_matrix(mean: State, matrix: Numbers) -> tuple[Any, Any, Array]:
+def _by_matrix(mean: State, matrix: Given) -> tuple[Any, Any, Array]:
     """D x as a function, the same with its slope, and a value of it."""
     if any(manifold.is_element(leaf) for leaf in manifold.leaves(mean)):
         raise ValueError(
@@ -228,15 +228,22 @@ def check_rows(D: np.ndarray, d: np.ndarray, exact: np.ndarray) -> None:
     )
 
 
-def check_weight(rule: str, weight: Weight, n: int | None = None) -> None:
-    """The metric W of a rule; with n, whether it fits a state of that dimension."""
+def as_weight(rule: str, weight: Weight) -> Weight:
+    """The metric W of a rule, checked: a name, or a matrix as a leaf."""
     if isinstance(weight, str):
-        if weight not in ("covariance", "identity"):
-            raise ValueError(
-                f"{rule} weight must be 'covariance', 'identity' or a matrix, got {weight!r}"
-            )
-    elif n is not None:
-        if np.shape(weight) != (n, n):
-            raise ValueError(f"{rule} weight is {np.shape(weight)}, the state needs ({n}, {n})")
-    elif not np.all(np.diag(linalg.factor(np.asarray(weight, float), f"{rule} weight")) > 0.0):
+        known = weight in ("covariance", "identity")
+        sentence = f"{rule} weight must be 'covariance', 'identity' or a matrix"
+        require(known, sentence, repr(weight))
+        return weight
+    if not is_known(weight):
+        return weight
+    W = np.asarray(weight, float)
+    if not np.all(np.diag(linalg.factor(W, f"{rule} weight")) > 0.0):
         raise ValueError(f"{rule} weight is not positive definite: each state wants a weight")
+    return W
+
+
+def check_size(rule: str, weight: Weight, n: int) -> None:
+    """Refuse a metric W of another size than the state's."""
+    if not isinstance(weight, str) and np.shape(weight) != (n, n):
+        raise ValueError(f"{rule} weight is {np.shape(weight)}, the state needs ({n}, {n})")

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief
-from robins.filters.limits.constrain import Function, Numbers, Weight, as_sensor, metric_of, nearest
+from robins.filters.limits.constrain import Function, Given, Weight, as_sensor, metric_of, nearest
 from robins.filters.linearise import taylor
 from robins.filters.observation import CONTRADICTS, Observation
 from robins.filters.trees import select
@@ -38,7 +38,7 @@ def _seen(belief: Belief, g: Function) -> Observation:
 
 
 def clip(
-    belief: Belief, g: Function, lower: Numbers, upper: Numbers, weight: Weight = "covariance"
+    belief: Belief, g: Function, lower: Given, upper: Given, weight: Weight = "covariance"
 ) -> Bounded:
     """Move the mean m to the nearest state within ``lower <= g(x) <= upper``; P is kept.
 
@@ -132,7 +132,7 @@ def _active(o: Observation, low: Array, high: Array) -> tuple[Array, Array, Arra
     return end[1][:c], end[1][c:], end[4] | go_on((*end[:5], 0)), jnp.any(~free & beyond)
 
 
-def truncate(belief: Belief, g: Function, lower: Numbers, upper: Numbers) -> Bounded:
+def truncate(belief: Belief, g: Function, lower: Given, upper: Given) -> Bounded:
     """Cut the density at ``lower <= g(x) <= upper`` and keep its mean and covariance.
 
     Row by row: z = D_i x is N(mu, s^2), its density cut to the bounds has mean mu + s alpha and

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -16,6 +15,7 @@ from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief, Number
 from robins.filters.observation import Observation
+from robins.filters.values import Numbers
 
 Weights = ArrayLike | Sequence[Number] | None
 
@@ -82,20 +82,22 @@ def _root(noise: Array, taken: Array) -> tuple[Array, Array]:
     )
 
 
-def averaged(power: Array, white: White, keep: Number) -> Array:
+def averaged(power: Array, white: White, keep: Number | Numbers) -> Array:
     """A step of the exponential average of squared residuals; those that do not count stay."""
     fresh = keep * power + (1.0 - keep) * white.residual**2
     return jnp.where(white.counts, fresh, power)
 
 
-def significant(power: Array, white: White, keep: Number, sigmas: Number) -> Array:
+def significant(
+    power: Array, white: White, keep: Number | Numbers, sigmas: Number | Numbers
+) -> Array:
     """Whether averaged squares exceed what the filter expects by so many standard deviations.
 
     An average with weights (1 - keep) keep^i of squares of m unit normals has mean m and relative
     variance 2 (1 - keep) / ((1 + keep) m).
     """
     dof = jnp.maximum(white.dof, 1.0)
-    deviation = math.sqrt(2.0 * (1.0 - keep) / (1.0 + keep)) / jnp.sqrt(dof)
+    deviation = jnp.sqrt(2.0 * (1.0 - keep) / (1.0 + keep)) / jnp.sqrt(dof)
     return exceeds(power, white, 1.0 + sigmas * deviation)
 
 
@@ -127,7 +129,7 @@ def total(power: Array, white: White) -> Array:
     return jnp.sum(jnp.where(white.counts, power, 0.0))
 
 
-def ratio(N: Array, M: Array, limit: Number) -> Array:
+def ratio(N: Array, M: Array, limit: Number | Numbers) -> Array:
     """Fading factor max(1, N / M), up to a limit; 1 where there is nothing to fade."""
     solid = M > 0.0
     return jnp.where(solid, jnp.clip(N / jnp.where(solid, M, 1.0), 1.0, limit), 1.0)
@@ -165,7 +167,12 @@ def _where_seen(S: Array, white: White, factor: Array) -> Array:
 
 
 def faded(
-    S: Array, white: White, N: Array, form: str, weights: np.ndarray | None, limit: Number
+    S: Array,
+    white: White,
+    N: Array,
+    form: str,
+    weights: Numbers | None,
+    limit: Number | Numbers,
 ) -> tuple[Array, Array]:
     """A factor S of P faded such that the channel expects N more than its noise.
 
@@ -203,7 +210,7 @@ def checked_weights(rule: str, weights: Weights, form: str) -> np.ndarray | None
     return a / np.max(a)
 
 
-def check_size(rule: str, a: np.ndarray | None, belief: Belief) -> None:
+def check_size(rule: str, a: Numbers | None, belief: Belief) -> None:
     """Refuse more or fewer weights than the state has components."""
     n = belief.factor.shape[0]
     count = n if a is None else len(a)

@@ -8,65 +8,63 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.checks import finite_numbers
+from robins.filters.values import Numbers, is_known
 from robins.manifold import State
 
-Weight = Callable[[State], Array]  # mean -> (q, n)
+Weight = Numbers | Callable[[State], Any]  # (q, n) L, or mean -> (q, n) or (n,)
+Rows = Callable[[State], Array]  # mean -> (q, n)
 
 
 def as_weight(weight: Any, whose: str) -> Weight:
-    """L, the rows whose error is bounded, as a function of the mean.
+    """L, the rows whose error is bounded, as a leaf of a rule.
 
     Args:
-        weight: (q, n) matrix, (n,) diagonal, or ``mean -> `` one of these.
+        weight: (q, n) matrix, (n,) diagonal, or ``mean -> `` one of these, which stays as it is.
         whose: rule it belongs to, for messages.
     """
     if callable(weight):
-        return lambda mean: _rows(jnp.asarray(weight(mean), float), whose)
-    numbers = finite_numbers(f"{whose}: weight", weight)
-    require(np.any(numbers), f"{whose}: weight is zero, so no error would count")
-    if numbers.ndim == 1:
-        numbers = np.diag(numbers)
-    if numbers.ndim == 2:
-        numbers = numbers[np.any(numbers != 0.0, axis=1)]
-    L = _rows(jax.device_put(numbers), whose)
-    return lambda mean: L
-
-
-def as_numbers(weight: Any, whose: str) -> Any:
-    """L as a leaf, checked; a function as it is."""
-    if callable(weight):
         return weight
+    if not is_known(weight):
+        return _rows(jnp.asarray(weight, float), whose)
     numbers = finite_numbers(f"{whose}: weight", weight)
     require(np.any(numbers), f"{whose}: weight is zero, so no error would count")
     if numbers.ndim == 1:
         numbers = np.diag(numbers)
     if numbers.ndim == 2:
         numbers = numbers[np.any(numbers != 0.0, axis=1)]
-    return np.asarray(_rows(jnp.asarray(numbers), whose))
+    _check_shape(numbers, whose)
+    return numbers
 
 
-def rows_of(weight: Any, mean: State, whose: str) -> Array:
-    return _rows(jnp.asarray(weight(mean), float), whose) if callable(weight) else weight
+def rows_of(weight: Weight, mean: State, whose: str) -> Array:
+    """L at a mean."""
+    if callable(weight):
+        return _rows(jnp.asarray(weight(mean), float), whose)
+    return jnp.asarray(weight)
 
 
 def _rows(L: Array, whose: str) -> Array:
+    _check_shape(L, whose)
+    return linalg.as_factor(L)
+
+
+def _check_shape(L: Numbers, whose: str) -> None:
     if jnp.ndim(L) not in (1, 2):
         raise ValueError(
             f"{whose}: weight has shape {jnp.shape(L)}; a (q, n) matrix or an (n,) diagonal is "
             "wanted, in the units in which an error is to count"
         )
-    return linalg.as_factor(L)
 
 
-def weighted_factor(weight: Weight, belief: Belief, whose: str) -> Float[Array, "q n"]:
+def weighted_factor(rows: Rows, belief: Belief, whose: str) -> Float[Array, "q n"]:
     """L S, whose greatest singular value is the local bound."""
-    L, n = weight(belief.mean), belief.factor.shape[0]
+    L, n = rows(belief.mean), belief.factor.shape[0]
     if L.shape[1] != n:
         raise ValueError(f"{whose}: weight has {L.shape[1]} columns, the state has {n} components")
     return L @ belief.factor
@@ -91,7 +89,7 @@ def inflated(
 
 
 def deflated(
-    factor: Float[Array, "n n"], A: Float[Array, "q n"], share: float
+    factor: Float[Array, "n n"], A: Float[Array, "q n"], share: ArrayLike
 ) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     """Factor of the largest P that leaves L P L' within share gamma^2, and whether that is less.
 

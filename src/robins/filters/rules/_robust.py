@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import jax
@@ -131,6 +131,30 @@ def weighed(o: Observation, scale: Array) -> tuple[Observation, Array]:
     root = jnp.sqrt(jnp.where(lost, 1.0, scale))
     noise = jnp.broadcast_to(root, refused.shape)[:, None] * o.noise
     return o.raised(noise, o.accepted & ~refused), jnp.where(lost, 0.0, 1.0 / scale)
+
+
+def reweighted(o: Observation, weight: Callable[[Array], Array], iterations: int) -> Array:
+    """(m,) weights w(e_i), R_ij becoming R_ij / sqrt(w_i w_j); begun at the Kalman filter, w = 1.
+
+    Args:
+        o: the measurement.
+        weight: (m,) residuals *after* that update, in deviations of their own noise (0 where there
+            is none), to (m,) weights.
+        iterations: of the weights.
+    """
+    of = shares(o)
+    L, white, R = of.seen.factor, of.seen.white[:, None], variance(of.noise)
+    own = jnp.where(R > 0.0, jnp.sqrt(jnp.where(R > 0.0, R, 1.0)), jnp.inf)
+
+    def better(_, w: Array) -> Array:
+        scaled = of.noise / jnp.sqrt(w)[:, None]
+        W = linalg.solve_lower(L, scaled)
+        root = linalg.cholesky(of.prior + W @ W.T + of.idle)
+        # What is left of the residual after the update is R S^-1 r.
+        e = scaled @ (W.T @ linalg.solve_spd(root, white))
+        return weight(e[:, 0] / own)
+
+    return jax.lax.fori_loop(0, iterations, better, jnp.ones(len(own)))
 
 
 @value

@@ -7,11 +7,12 @@ matter, and a nominal noise that changes from step to step stays what it is: the
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
-from robins.errors import require
 from robins.filters.belief import Number
 from robins.filters.observation import Observation
+from robins.filters.values import Numbers, number
 
 
 def variance(factor: Array) -> Array:
@@ -41,9 +42,15 @@ def numbered(name: str, values: Array) -> dict[str, Array]:
     return {f"{name}.{i}": values[i] for i in range(len(values))}
 
 
-def check(rule: str, forgetting: Number, floor: Number, ceiling: Number) -> None:
-    """The share that is kept from sample to sample, and the bounds of a scale that begins at 1."""
-    require(0.0 < forgetting <= 1.0, f"{rule} forgetting must lie in (0, 1]", forgetting)
-    require(0.0 < floor <= 1.0, f"{rule} floor must lie in (0, 1]", floor)
-    finite = 1.0 <= ceiling < float("inf")
-    require(finite, f"{rule} ceiling must be finite and not below 1", ceiling)
+def bounded(rule: str, forgetting: Number, floor: Number, ceiling: Number) -> dict[str, Numbers]:
+    """The share that is kept from sample to sample, and the bounds of a scale that begins at 1.
+
+    Raises:
+        ValueError: one is not of its range.
+    """
+    share, above = lambda x: (x > 0.0) & (x <= 1.0), lambda x: (x >= 1.0) & (x < np.inf)
+    return {
+        "forgetting": number(f"{rule} forgetting must lie in (0, 1]", forgetting, share),
+        "floor": number(f"{rule} floor must lie in (0, 1]", floor, share),
+        "ceiling": number(f"{rule} ceiling must be finite and not below 1", ceiling, above),
+    }

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule, hooks
-from robins.filters.rules import _inflation
+from robins.filters.rule import Rule
+from robins.filters.rules._inflation import (
+    Weight,
+    as_weight,
+    deflated,
+    inflated,
+    local_bound,
+    rows_of,
+    weighted_factor,
+)
+from robins.filters.values import Numbers, is_known, kind, number, value
 
 NAME = "adaptive_h_infinity"
 SHARE = 0.95  # of xi^2 that a compensated P is left with
@@ -25,6 +36,84 @@ class AdaptiveMemory(NamedTuple):
     dof: Array  # (window,) components used in them
     at: Array  # () where in the ring this step is
     inverse: Array  # () 1 / xi of the last step; 0 before there was one
+
+
+@value
+class AdaptiveHInfinity(Rule):
+    """The rule of `adaptive_h_infinity`: P becomes (P^-1 - xi^-2 L'L)^-1 before a prediction."""
+
+    weight: Weight
+    zeta: Numbers
+    floor: Numbers
+    ceiling: Numbers
+    window: int = kind()
+    compensate_first: bool = kind()
+
+    name = NAME
+
+    def weighted(self, belief: Belief) -> Array:
+        """(q, n) L S."""
+        return weighted_factor(lambda mean: rows_of(self.weight, mean, NAME), belief, NAME)
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> AdaptiveMemory:
+        self.weighted(belief)  # refuses a weight of another number of states
+        ring = jnp.zeros(self.window)
+        return AdaptiveMemory(ring, ring, jnp.zeros((), int), jnp.zeros(()))
+
+    def chosen(self, memory: AdaptiveMemory) -> tuple[Array, Array]:
+        """Q and alpha."""
+        dof = jnp.sum(memory.dof)
+        q = jnp.where(dof > 0.0, jnp.sum(memory.nis) / jnp.maximum(dof, 1.0), 1.0)
+        alpha = 1.0 + 1.0 / (self.zeta * jnp.maximum(q - 1.0, 1e-6))
+        return q, jnp.clip(alpha, self.floor, self.ceiling)
+
+    def compensated(self, memory: AdaptiveMemory, factor: Array, weighted: Array):
+        """The factor that allows the last xi, and whether it had to be made."""
+        asked = memory.inverse * local_bound(weighted) >= 1.0
+        shrunk, _ = deflated(factor, memory.inverse * weighted, SHARE)
+        return jnp.where(asked, shrunk, factor), asked
+
+    def after(self, memory: AdaptiveMemory, posterior: Belief, info: StepInfo, o: Observation):
+        here = memory.at
+        memory = memory._replace(
+            nis=memory.nis.at[here].add(jnp.minimum(info.nis, LARGEST)),
+            dof=memory.dof.at[here].add(info.dof.astype(float)),
+        )
+        weighted = self.weighted(posterior)
+        bound = local_bound(weighted)
+        q, alpha = self.chosen(memory)
+        notes = {"q": q, "alpha": alpha, "xi": jnp.sqrt(alpha) * bound, "bound": bound}
+        if self.compensate_first:
+            factor, asked = self.compensated(memory, posterior.factor, weighted)
+            left = local_bound(self.weighted(posterior._replace(factor=factor)))
+            notes |= {"xi": jnp.sqrt(alpha) * left, "compensated": asked & (memory.dof[here] > 0.0)}
+        return memory, posterior, info.noted(NAME, **notes)
+
+    def settle(self, memory: AdaptiveMemory, belief: Belief):
+        counts = memory.dof[memory.at] > 0.0
+        weighted = self.weighted(belief)
+        factor, asked = belief.factor, jnp.array(False)
+        if self.compensate_first:
+            factor, asked = self.compensated(memory, factor, weighted)
+            weighted = self.weighted(belief._replace(factor=factor))
+        alpha, bound = self.chosen(memory)[1], local_bound(weighted)
+        xi = jnp.sqrt(alpha) * bound
+        inverse = jnp.where(xi > 0.0, 1.0 / jnp.where(xi > 0.0, xi, 1.0), 0.0)
+        wide, exists = inflated(factor, inverse * weighted)
+        acts = counts & exists & (asked | (inverse > 0.0))
+        code = jnp.where(counts & ~exists, int(Code.INFEASIBLE), int(Code.DONE))
+        new = belief._replace(factor=jnp.where(acts, wide, belief.factor))
+        return self.following(memory, counts, inverse), new, code
+
+    def following(self, memory: AdaptiveMemory, counts: Array, inverse: Array) -> AdaptiveMemory:
+        """The memory of the next step, with its place in the ring made empty."""
+        following = jnp.where(counts, (memory.at + 1) % self.window, memory.at)
+        return AdaptiveMemory(
+            nis=memory.nis.at[following].multiply(jnp.where(counts, 0.0, 1.0)),
+            dof=memory.dof.at[following].multiply(jnp.where(counts, 0.0, 1.0)),
+            at=following,
+            inverse=jnp.where(counts, inverse, memory.inverse),
+        )
 
 
 def adaptive_h_infinity(
@@ -71,66 +160,14 @@ def adaptive_h_infinity(
         ValueError: zeta is not positive, the window less than 1, floor not above 1, ceiling below
             floor, or the weight is not finite or of the wrong shape.
     """
-    require(zeta > 0.0, "zeta must be positive", zeta)
     require(window >= 1, "window must be at least one step", window)
-    if not 1.0 < floor <= ceiling:
+    if is_known((floor, ceiling)) and not np.all((floor > 1.0) & (floor <= ceiling)):
         raise ValueError(f"1 < floor <= ceiling is wanted, got floor {floor}, ceiling {ceiling}")
-    rows = _inflation.as_weight(weight, NAME)
-
-    def choose(memory: AdaptiveMemory):
-        dof = jnp.sum(memory.dof)
-        q = jnp.where(dof > 0.0, jnp.sum(memory.nis) / jnp.maximum(dof, 1.0), 1.0)
-        return q, jnp.clip(1.0 + 1.0 / (zeta * jnp.maximum(q - 1.0, 1e-6)), floor, ceiling)
-
-    def init(belief: Belief, dims):
-        _inflation.weighted_factor(rows, belief, NAME)
-        ring = jnp.zeros(window)
-        return AdaptiveMemory(ring, ring, jnp.zeros((), int), jnp.zeros(()))
-
-    def compensate(memory: AdaptiveMemory, factor: Array, weighted: Array):
-        """The factor that allows the last xi, and whether it had to be made."""
-        asked = memory.inverse * _inflation.local_bound(weighted) >= 1.0
-        shrunk, _ = _inflation.deflated(factor, memory.inverse * weighted, SHARE)
-        return jnp.where(asked, shrunk, factor), asked
-
-    def after(memory: AdaptiveMemory, posterior: Belief, info: StepInfo, o: Observation):
-        here = memory.at
-        memory = memory._replace(
-            nis=memory.nis.at[here].add(jnp.minimum(info.nis, LARGEST)),
-            dof=memory.dof.at[here].add(info.dof.astype(float)),
-        )
-        weighted = _inflation.weighted_factor(rows, posterior, NAME)
-        bound = _inflation.local_bound(weighted)
-        q, alpha = choose(memory)
-        notes = {"q": q, "alpha": alpha, "xi": jnp.sqrt(alpha) * bound, "bound": bound}
-        if compensate_first:
-            factor, asked = compensate(memory, posterior.factor, weighted)
-            left = _inflation.local_bound(
-                _inflation.weighted_factor(rows, posterior._replace(factor=factor), NAME)
-            )
-            notes |= {"xi": jnp.sqrt(alpha) * left, "compensated": asked & (memory.dof[here] > 0.0)}
-        return memory, posterior, info.noted(NAME, **notes)
-
-    def settle(memory: AdaptiveMemory, belief: Belief):
-        counts = memory.dof[memory.at] > 0.0
-        weighted = _inflation.weighted_factor(rows, belief, NAME)
-        factor, asked = belief.factor, jnp.array(False)
-        if compensate_first:
-            factor, asked = compensate(memory, factor, weighted)
-            weighted = _inflation.weighted_factor(rows, belief._replace(factor=factor), NAME)
-        alpha, bound = choose(memory)[1], _inflation.local_bound(weighted)
-        xi = jnp.sqrt(alpha) * bound
-        inverse = jnp.where(xi > 0.0, 1.0 / jnp.where(xi > 0.0, xi, 1.0), 0.0)
-        wide, exists = _inflation.inflated(factor, inverse * weighted)
-        acts = counts & exists & (asked | (inverse > 0.0))
-        following = jnp.where(counts, (memory.at + 1) % window, memory.at)
-        memory = AdaptiveMemory(
-            nis=memory.nis.at[following].multiply(jnp.where(counts, 0.0, 1.0)),
-            dof=memory.dof.at[following].multiply(jnp.where(counts, 0.0, 1.0)),
-            at=following,
-            inverse=jnp.where(counts, inverse, memory.inverse),
-        )
-        code = jnp.where(counts & ~exists, int(Code.INFEASIBLE), int(Code.DONE))
-        return memory, belief._replace(factor=jnp.where(acts, wide, belief.factor)), code
-
-    return hooks(init=init, after=after, name=NAME, settle=settle)
+    return AdaptiveHInfinity(
+        weight=as_weight(weight, NAME),
+        zeta=number("zeta must be positive", zeta, lambda z: z > 0.0),
+        floor=number("floor must be a real number", floor),
+        ceiling=number("ceiling must be a real number", ceiling),
+        window=window,
+        compensate_first=compensate_first,
+    )

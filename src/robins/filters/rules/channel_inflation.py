@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from robins.errors import require
@@ -13,8 +14,41 @@ from robins.filters.belief import Belief, Number
 from robins.filters.checks import finite_numbers
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule, hooks
+from robins.filters.rule import Memory, Rule
+from robins.filters.values import Numbers, is_known, kind, number, value
 from robins.manifold import State
+
+
+@value
+class ChannelInflation(Rule):
+    """The rule of `channel_inflation`: Q + lambda B B'."""
+
+    size: Numbers  # () lambda
+    B: Any  # (n, q), or a function of the mean
+    acts: bool = kind()  # lambda is not 0, which has no columns
+
+    name = "channel_inflation"
+
+    def rows(self, mean: State, n: int) -> Array:
+        """B at a mean of n components."""
+        given = jnp.asarray(self.B(mean) if callable(self.B) else self.B, float)
+        fits = given.ndim == 2 and given.shape[0] == n
+        require(fits, f"channel_inflation B is {given.shape}, the state needs ({n}, q)")
+        return given
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
+        self.rows(belief.mean, belief.factor.shape[0])
+        return ()
+
+    def process(self, memory: Memory, transition: Transition):
+        if not self.acts:
+            return memory, transition
+        channel = jnp.sqrt(self.size) * self.rows(transition.mean, transition.spread.shape[0])
+        noise = jnp.concatenate([transition.noise, channel], axis=1)
+        return memory, transition._replace(noise=noise)
+
+    def before(self, memory: Memory, prior: Belief, o: Observation):
+        return memory, prior, o.noted(self.name, lambda_=jnp.asarray(self.size))
 
 
 def channel_inflation(lambda_: Number, B: Any) -> Rule:
@@ -40,31 +74,9 @@ def channel_inflation(lambda_: Number, B: Any) -> Rule:
         ValueError: lambda is negative or not finite, B is no matrix or not finite; when the filter
             is run, B has another number of rows than the state has components.
     """
-    finite = 0.0 <= lambda_ < math.inf
-    require(finite, "channel_inflation lambda must be a number from 0 on", lambda_)
-    fixed = None if callable(B) else jnp.asarray(finite_numbers("channel_inflation B", B))
-    shape = (0, 0) if fixed is None else fixed.shape
-    require(len(shape) == 2, f"channel_inflation B has shape {shape}, (n, q) is wanted")
-    share = math.sqrt(lambda_)
-
-    def rows(mean: State, n: int) -> Array:
-        given = jnp.asarray(B(mean), float) if fixed is None else fixed
-        fits = given.ndim == 2 and given.shape[0] == n
-        require(fits, f"channel_inflation B is {given.shape}, the state needs ({n}, q)")
-        return given
-
-    def init(belief: Belief, dims):
-        rows(belief.mean, belief.factor.shape[0])
-        return ()
-
-    def process(memory, transition: Transition):
-        if share == 0.0:
-            return memory, transition
-        channel = share * rows(transition.mean, transition.spread.shape[0])
-        noise = jnp.concatenate([transition.noise, channel], axis=1)
-        return memory, transition._replace(noise=noise)
-
-    def before(memory, prior: Belief, o: Observation):
-        return memory, prior, o.noted("channel_inflation", lambda_=jnp.asarray(float(lambda_)))
-
-    return hooks(init=init, process=process, before=before, name="channel_inflation")
+    negative = "channel_inflation lambda must be a number from 0 on"
+    size = number(negative, lambda_, lambda x: (x >= 0.0) & (x < np.inf))
+    if not callable(B):
+        B = finite_numbers("channel_inflation B", B)
+        require(B.ndim == 2, f"channel_inflation B has shape {B.shape}, (n, q) is wanted")
+    return ChannelInflation(size, B, acts=not is_known(size) or bool(np.any(size)))

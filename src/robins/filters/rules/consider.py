@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -13,7 +13,48 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule, hooks
+from robins.filters.rule import Memory, Rule
+from robins.filters.values import kind, value
+
+
+@value
+class Consider(Rule):
+    """The rule of `consider`: K_c = (I - M) K, P+ = P_best + (M K) S_y (M K)'."""
+
+    states: tuple[int, ...] = kind()  # considered
+    size: int | None = kind()  # of the mask that they were given by
+
+    name = "consider"
+
+    def held(self, n: int) -> np.ndarray:
+        """M, of a state of n components."""
+        fits = self.size in (None, n)
+        require(fits, f"consider mask is ({self.size},), the state needs ({n},)")
+        last = max(self.states, default=-1)
+        require(last < n, f"consider has state {last}, the last one is {n - 1}")
+        mask = np.zeros(n, bool)
+        mask[list(self.states)] = True
+        return mask
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
+        self.held(belief.factor.shape[0])
+        return ()
+
+    def after(self, memory: Memory, posterior: Belief, info: StepInfo, o: Observation):
+        held = self.held(posterior.factor.shape[0])
+        if not np.any(held):
+            return memory, posterior, info.noted(self.name, withheld=jnp.zeros(()))
+        some = jnp.any(info.used)
+        column = jnp.asarray(held)[:, None]
+        told = jnp.where(column, info.gain @ info.factor, 0.0)
+        factor = jnp.where(some, linalg.tria(posterior.factor, told), posterior.factor)
+        move = manifold.local(o.prior.mean, posterior.mean)
+        mean = manifold.retract(o.prior.mean, jnp.where(held, 0.0, move))
+        sigma = o.prior.sigma
+        share = jnp.where(held & (sigma > 0.0), jnp.abs(move), 0.0)
+        withheld = jnp.max(share / jnp.where(sigma > 0.0, sigma, 1.0))
+        info = info._replace(gain=jnp.where(column, 0.0, info.gain))
+        return memory, Belief(mean, factor), info.noted(self.name, withheld=withheld)
 
 
 def consider(states: Sequence[Any] | ArrayLike) -> Rule:
@@ -43,34 +84,11 @@ def consider(states: Sequence[Any] | ArrayLike) -> Rule:
         ValueError: an index is negative, repeated or no integer; by `init`, the state has fewer
             components or the mask another size.
     """
-    chosen = _chosen(states)
-
-    def init(belief: Belief, dims):
-        n = belief.factor.shape[0]
-        _mask(chosen, n)
-        return ()
-
-    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        held = _mask(chosen, posterior.factor.shape[0])
-        if not np.any(held):
-            return memory, posterior, info.noted("consider", withheld=jnp.zeros(()))
-        some = jnp.any(info.used)
-        column = jnp.asarray(held)[:, None]
-        told = jnp.where(column, info.gain @ info.factor, 0.0)
-        factor = jnp.where(some, linalg.tria(posterior.factor, told), posterior.factor)
-        move = manifold.local(o.prior.mean, posterior.mean)
-        mean = manifold.retract(o.prior.mean, jnp.where(held, 0.0, move))
-        sigma = o.prior.sigma
-        share = jnp.where(held & (sigma > 0.0), jnp.abs(move), 0.0)
-        withheld = jnp.max(share / jnp.where(sigma > 0.0, sigma, 1.0))
-        info = info._replace(gain=jnp.where(column, 0.0, info.gain))
-        return memory, Belief(mean, factor), info.noted("consider", withheld=withheld)
-
-    return hooks(init=init, after=after, name="consider")
+    return Consider(*_chosen(states))
 
 
-def _chosen(states: Sequence[Any] | ArrayLike) -> np.ndarray:
-    """Indices, or a mask of booleans."""
+def _chosen(states: Sequence[Any] | ArrayLike) -> tuple[tuple[int, ...], int | None]:
+    """Indices, and the size of the mask that they were given by."""
     given = np.asarray(states)
     given = given if given.size else np.zeros(0, int)
     indices = given.dtype.kind in "iu" and not np.any(given < 0)
@@ -80,15 +98,6 @@ def _chosen(states: Sequence[Any] | ArrayLike) -> np.ndarray:
         "consider states must be different indices, counted from 0, or a mask of booleans",
         states,
     )
-    return given
-
-
-def _mask(chosen: np.ndarray, n: int) -> np.ndarray:
-    if chosen.dtype == bool:
-        require(chosen.shape == (n,), f"consider mask is {chosen.shape}, the state needs ({n},)")
-        return chosen
-    last = np.max(chosen, initial=-1)
-    require(last < n, f"consider has state {last}, the last one is {n - 1}")
-    mask = np.zeros(n, bool)
-    mask[chosen] = True
-    return mask
+    if given.dtype == bool:
+        return tuple(np.flatnonzero(given).tolist()), given.size
+    return tuple(given.tolist()), None

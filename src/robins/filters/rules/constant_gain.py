@@ -14,14 +14,64 @@ from robins.filters.belief import Belief, StepInfo
 from robins.filters.checks import finite_numbers
 from robins.filters.kalman import FilterState
 from robins.filters.observation import Observation, left_out
-from robins.filters.rule import Rule, hooks
+from robins.filters.rule import Rule
 from robins.filters.trees import select
+from robins.filters.values import Numbers, value
 
 
 class Fixed(NamedTuple):
     """Memory of the rule. Gains are data: exchange them in a state, and nothing compiles anew."""
 
     gains: dict[str, Array]  # (n, m) by sensor
+
+
+@value
+class ConstantGain(Rule):
+    """The rule of `constant_gain`: `corrected` by the gains in the memory."""
+
+    gains: dict[str, Numbers]  # (n, m) by sensor, which a state begins with
+
+    name = "constant_gain"
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Fixed:
+        n = belief.factor.shape[0]
+        for name, K in self.gains.items():
+            require(name in dims, f"constant_gain: no sensor '{name}'; this model has {list(dims)}")
+            if K.shape != (n, dims[name]):
+                raise ValueError(
+                    f"constant_gain: the gain of '{name}' is {K.shape}, state and sensor need "
+                    f"({n}, {dims[name]})"
+                )
+        return Fixed({name: jnp.asarray(K) for name, K in self.gains.items()})
+
+    def after(self, memory: Fixed, posterior: Belief, info: StepInfo, o: Observation):
+        if o.sensor not in memory.gains:
+            return memory, posterior, info
+        return memory, *corrected(memory.gains[o.sensor], posterior, info, o)
+
+
+def corrected(
+    gain: Array, posterior: Belief, info: StepInfo, o: Observation
+) -> tuple[Belief, StepInfo]:
+    """x- + K (y - h(x-)) and (I - K H) P- (I - K H)' + K (Omega + R) K'; as it is if none is used.
+
+    Args:
+        gain: (n, m) K, whose columns of what was not used are left out.
+        posterior: of the usual update.
+        info: of the same.
+        o: the measurement, as the prior sees it.
+    """
+    spread, excess, noise, deficit, used = left_out(o)
+    used = used & info.used
+    K = jnp.where(used[None, :], gain, 0.0)
+    S = o.prior.factor
+    moved = K @ jnp.where(used, o.residual, 0.0)
+    factor = linalg.tria(S - K @ spread, K @ excess, K @ noise)
+    if deficit is not None:
+        factor = linalg.downdate(factor, K @ deficit)
+    belief = Belief(manifold.retract(o.prior.mean, moved), factor)
+    belief = select(jnp.any(used), belief, posterior)
+    return belief, info._replace(gain=K).noted("constant_gain", moved=jnp.max(jnp.abs(moved)))
 
 
 def constant_gain(gains: Mapping[str, Any]) -> Rule:
@@ -45,39 +95,12 @@ def constant_gain(gains: Mapping[str, Any]) -> Rule:
             model does not have or a gain that does not fit.
     """
     require(gains, "constant_gain: give at least one gain, {'sensor': (n, m) array}")
-    given = {
-        name: jnp.asarray(finite_numbers(f"constant_gain: the gain of '{name}'", value))
-        for name, value in gains.items()
-    }
-
-    def init(belief: Belief, dims: Mapping[str, int]) -> Fixed:
-        n = belief.factor.shape[0]
-        for name, K in given.items():
-            require(name in dims, f"constant_gain: no sensor '{name}'; this model has {list(dims)}")
-            if K.shape != (n, dims[name]):
-                raise ValueError(
-                    f"constant_gain: the gain of '{name}' is {K.shape}, state and sensor need "
-                    f"({n}, {dims[name]})"
-                )
-        return Fixed(given)
-
-    def after(memory: Fixed, posterior: Belief, info: StepInfo, o: Observation):
-        if o.sensor not in memory.gains:
-            return memory, posterior, info
-        spread, excess, noise, deficit, used = left_out(o)
-        used = used & info.used
-        K = jnp.where(used[None, :], memory.gains[o.sensor], 0.0)
-        S = o.prior.factor
-        moved = K @ jnp.where(used, o.residual, 0.0)
-        factor = linalg.tria(S - K @ spread, K @ excess, K @ noise)
-        if deficit is not None:
-            factor = linalg.downdate(factor, K @ deficit)
-        belief = Belief(manifold.retract(o.prior.mean, moved), factor)
-        belief = select(jnp.any(used), belief, posterior)
-        info = info._replace(gain=K).noted("constant_gain", moved=jnp.max(jnp.abs(moved)))
-        return memory, belief, info
-
-    return hooks(init=init, after=after, name="constant_gain")
+    return ConstantGain(
+        {
+            name: finite_numbers(f"constant_gain: the gain of '{name}'", value)
+            for name, value in gains.items()
+        }
+    )
 
 
 def with_gains(state: FilterState, gains: Mapping[str, Any]) -> FilterState:

@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief, Number
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule, hooks
-from robins.filters.rules._robust import MOST, PATIENCE, opening, shares, weighed
+from robins.filters.rule import Memory, Rule
+from robins.filters.rules._robust import MOST, PATIENCE, opening, reweighted, weighed
+from robins.filters.values import Numbers, kind, number, value
 
 
 def _least(e: Array) -> Array:
     """A weight as good as none that leaves digits: 1e-8, less if that pulled by a milli-sigma."""
     return 1e-3 / jnp.minimum(1e5 + jnp.abs(e), 1e-3 * MOST)
+
+
+@value
+class Correntropy(Rule):
+    """The rule of `correntropy`: R_ij / sqrt(w_i w_j), w_i = G(e_i) of what the update leaves."""
+
+    kernel: Numbers  # () sigma
+    iterations: int = kind()
+
+    name = "correntropy"
+
+    def before(self, memory: Memory, prior: Belief, o: Observation):
+        o, w = weighed(o, 1.0 / reweighted(o, self.weight, self.iterations))
+        return memory, prior, o.noted("correntropy", weight=jnp.min(w))
+
+    def weight(self, e: Array) -> Array:
+        """Of residuals in deviations of their noise."""
+        return jnp.maximum(jnp.exp(-0.5 * (e * (1.0 / self.kernel)) ** 2), _least(e))
 
 
 def correntropy(kernel: Number = 3.0, iterations: int = 3, patience: int | None = PATIENCE) -> Rule:
@@ -50,30 +67,6 @@ def correntropy(kernel: Number = 3.0, iterations: int = 3, patience: int | None 
     Raises:
         ValueError: the kernel is not positive, there is no iteration, or patience is negative.
     """
-    require(kernel > 0.0, "correntropy kernel must be positive", kernel)
+    sigma = number("correntropy kernel must be positive", kernel, lambda k: k > 0.0)
     require(iterations >= 1, "correntropy iterations must be at least 1", iterations)
-    sigma = float(kernel)
-
-    def weights(o: Observation) -> Array:
-        of = shares(o)
-        L, white = of.seen.factor, of.seen.white[:, None]
-        variance = jnp.sum(of.noise**2, axis=1)
-        noisy = variance > 0.0
-        own = jnp.where(noisy, jnp.sqrt(jnp.where(noisy, variance, 1.0)), jnp.inf)
-
-        def better(_, w):
-            scaled = of.noise / jnp.sqrt(w)[:, None]
-            W = linalg.solve_lower(L, scaled)
-            root = linalg.cholesky(of.prior + W @ W.T + of.idle)
-            # What is left of the residual after the update is R S^-1 r.
-            e = scaled @ (W.T @ linalg.solve_spd(root, white))
-            e = e[:, 0] / own
-            return jnp.maximum(jnp.exp(-0.5 * (e / sigma) ** 2), _least(e))
-
-        return jax.lax.fori_loop(0, iterations, better, jnp.ones(len(own)))
-
-    def before(memory, prior: Belief, o: Observation):
-        o, w = weighed(o, 1.0 / weights(o))
-        return memory, prior, o.noted("correntropy", weight=jnp.min(w))
-
-    return opening(hooks(before=before, name="correntropy"), patience)
+    return opening(Correntropy(sigma, iterations), patience)

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping
 from enum import IntEnum
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
-from robins.errors import require
 from robins.filters.belief import Belief, Number
 from robins.filters.checks import one_of
-from robins.filters.chi_square import limits, within
-from robins.filters.observation import Observation, normalised
-from robins.filters.rule import Rule, hooks
+from robins.filters.chi_square import MOST, limits, within
+from robins.filters.observation import Normalised, Observation, normalised
+from robins.filters.rule import Rule
 from robins.filters.rules import _fading
 from robins.filters.rules._robust import (
     is_hopeless,
@@ -22,6 +22,7 @@ from robins.filters.rules._robust import (
     weighed,
     widened_to_dof,
 )
+from robins.filters.values import Numbers, kind, number, value
 
 Fade = Literal["projected", "multiple"]
 Robust = Literal["huber", "gate"]
@@ -41,6 +42,68 @@ class Verdict(IntEnum):
 class _Memory(NamedTuple):
     power: dict[str, Array]  # (m,) averaged squares of each sensor's whitened residuals
     counter: dict[str, Array]  # () measurements in a row that were too large to be chance
+
+
+@value
+class Discriminator(Rule):
+    """The rule of `discriminator`: c innovations in a row, r' S^-1 r > k^2 of each."""
+
+    patience: Numbers  # () measurements in a row
+    quantile: Numbers  # (most + 1,) k^2 by the number of components used
+    rho: Numbers  # ()
+    levels: Numbers  # (most + 1,) of tr V over what is expected, by the number that count
+    limit: Numbers  # () of lambda
+    weights: Numbers | None  # (n,) a_j, greatest 1
+    fade: Fade = kind()
+    robust: Robust = kind()
+
+    name = "discriminator"
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> _Memory:
+        _fading.check_size(self.name, self.weights, belief)
+        power = {name: jnp.ones(m) for name, m in dims.items()}
+        return _Memory(power, {name: jnp.zeros((), int) for name in dims})
+
+    def before(self, memory: _Memory, prior: Belief, o: Observation):
+        seen = normalised(o)
+        # quantile by number of components used; none used is never too much
+        quantile = within(self.quantile, o.residual)[seen.dof]
+        longer = jnp.where(seen.nis > quantile, memory.counter[o.sensor] + 1, 0)
+        count = jnp.where(seen.dof == 0, memory.counter[o.sensor], longer)
+        row, some = count.astype(float), seen.dof > 0
+        outlier = some & (count > 0) & (row < self.patience)
+        opens = some & (row == self.patience) & is_hopeless(seen, quantile)
+        power, S, factor = self.faded(outlier | opens, memory.power[o.sensor], prior, o)
+        S = widened_to_dof(opens, Belief(prior.mean, S), o, seen).factor
+        o, weight = self.weighed(outlier, quantile, o, seen)
+        wrong = (factor > 1.0) | (some & (row >= self.patience))
+        state = jnp.where(outlier, int(Verdict.OUTLIER), jnp.where(wrong, int(Verdict.MODEL), 0))
+        o = o.noted(self.name, weight=weight, lambda_=factor, counter=count, state=state)
+        memory = _Memory(
+            {**memory.power, o.sensor: power},
+            {**memory.counter, o.sensor: count},
+        )
+        return memory, Belief(prior.mean, S), o
+
+    def faded(self, stands: Array, power: Array, prior: Belief, o: Observation):
+        """V, the prior's factor, and lambda; as they were where V stands."""
+        white = _fading.whitened(o)
+        power = jnp.where(stands, power, _fading.averaged(power, white, self.rho))
+        total = _fading.total(power, white)
+        level = within(self.levels, white.residual)[white.dof.astype(int)]
+        wrong = ~stands & _fading.exceeds(total, white, level)
+        N = jnp.where(wrong, total - white.dof, 0.0)
+        S, factor = _fading.faded(prior.factor, white, N, self.fade, self.weights, self.limit)
+        return power, S, factor
+
+    def weighed(
+        self, outlier: Array, quantile: Array, o: Observation, seen: Normalised
+    ) -> tuple[Observation, Array]:
+        """The measurement and its weight: less, or none, of an outlier."""
+        if self.robust == "gate":
+            weight = jnp.where(outlier, 0.0, 1.0)
+            return o._replace(accepted=o.accepted & ~outlier), weight
+        return weighed(o, jnp.where(outlier, scale_to_quantile(o, quantile, seen), 1.0))
 
 
 def discriminator(
@@ -109,59 +172,41 @@ def discriminator(
         ValueError: an argument is out of its range; when the filter starts, if the weights are not
             one a state.
     """
-    require(patience >= 1, "discriminator patience must be at least 1", patience)
-    require(0.0 < probability <= 1.0, "discriminator probability must lie in (0, 1]", probability)
-    require(0.0 < rho <= 1.0, "discriminator rho must lie in (0, 1]", rho)
+    lasting = number("discriminator patience must be at least 1", patience, lambda c: c >= 1.0)
+    share = "discriminator probability must lie in (0, 1]"
+    quantile = limits(number(share, probability, _is_share))
+    keep = number("discriminator rho must lie in (0, 1]", rho, _is_share)
     one_of("discriminator fade", fade, Fade)
     one_of("discriminator robust", robust, Robust)
-    positive = threshold is None or threshold >= 0.0
-    require(positive, "discriminator threshold must not be negative", threshold)
-    require(0.0 < false_alarm < 1.0, "discriminator false_alarm must lie in (0, 1)", false_alarm)
-    require(1.0 <= looks < math.inf, "discriminator looks must be at least 1 and finite", looks)
-    require(1.0 <= limit < math.inf, "discriminator limit must be at least 1 and finite", limit)
-    a = _fading.checked_weights("discriminator", weights, fade)
+    if threshold is not None:
+        negative = "discriminator threshold must not be negative"
+        threshold = number(negative, threshold, lambda x: x >= 0.0)
+    rare = "discriminator false_alarm must lie in (0, 1)"
+    chance = number(rare, false_alarm, lambda p: (p > 0.0) & (p < 1.0))
+    often = number("discriminator looks must be at least 1 and finite", looks, _is_finite)
+    return Discriminator(
+        patience=lasting,
+        quantile=quantile,
+        rho=keep,
+        levels=_levels(keep, threshold, chance / often),
+        limit=number("discriminator limit must be at least 1 and finite", limit, _is_finite),
+        weights=_fading.checked_weights("discriminator", weights, fade),
+        fade=fade,
+        robust=robust,
+    )
 
-    def init(belief: Belief, dims):
-        _fading.check_size("discriminator", a, belief)
-        power = {name: jnp.ones(m) for name, m in dims.items()}
-        return _Memory(power, {name: jnp.zeros((), int) for name in dims})
 
-    def significant(total: Array, white: _fading.White):
-        if threshold is not None:
-            return _fading.significant(total, white, rho, threshold)
-        levels = _fading.chance_levels(float(rho), len(white.residual), false_alarm / looks)
-        return _fading.exceeds(total, white, jnp.asarray(levels)[white.dof.astype(int)])
+def _is_share(x: np.ndarray) -> np.ndarray:
+    return (x > 0.0) & (x <= 1.0)
 
-    def before(memory: _Memory, prior: Belief, o: Observation):
-        seen = normalised(o)
-        # quantile by number of components used; none used is never too much
-        quantile = within(limits(probability), o.residual)[seen.dof]
-        count, power = memory.counter[o.sensor], memory.power[o.sensor]
-        longer = jnp.where(seen.nis > quantile, count + 1, 0)
-        count = jnp.where(seen.dof == 0, count, longer)
-        outlier = (seen.dof > 0) & (count > 0) & (count < patience)
-        opens = (seen.dof > 0) & (count == patience) & is_hopeless(seen, quantile)
 
-        white, stands = _fading.whitened(o), outlier | opens
-        power = jnp.where(stands, power, _fading.averaged(power, white, rho))
-        total = _fading.total(power, white)
-        N = jnp.where(~stands & significant(total, white), total - white.dof, 0.0)
-        S, factor = _fading.faded(prior.factor, white, N, fade, a, limit)
-        S = widened_to_dof(opens, Belief(prior.mean, S), o, seen).factor
+def _is_finite(x: np.ndarray) -> np.ndarray:
+    return (x >= 1.0) & (x < np.inf)
 
-        if robust == "gate":
-            weight = jnp.where(outlier, 0.0, 1.0)
-            o = o._replace(accepted=o.accepted & ~outlier)
-        else:
-            s = jnp.where(outlier, scale_to_quantile(o, quantile, seen), 1.0)
-            o, weight = weighed(o, s)
-        wrong = (factor > 1.0) | ((seen.dof > 0) & (count >= patience))
-        state = jnp.where(outlier, int(Verdict.OUTLIER), jnp.where(wrong, int(Verdict.MODEL), 0))
-        memory = _Memory(
-            {**memory.power, o.sensor: power},
-            {**memory.counter, o.sensor: count},
-        )
-        o = o.noted("discriminator", weight=weight, lambda_=factor, counter=count, state=state)
-        return memory, Belief(prior.mean, S), o
 
-    return hooks(init=init, before=before, name="discriminator")
+def _levels(rho: Numbers, threshold: Numbers | None, chance: Numbers) -> Numbers:
+    """(MOST + 1,) of what tr V exceeds by chance alone, or by a threshold of deviations."""
+    if threshold is None:
+        return _fading.chance_levels(float(rho), MOST, float(chance))
+    dof = np.maximum(np.arange(MOST + 1.0), 1.0)
+    return 1.0 + threshold * (((1.0 - rho) / (1.0 + rho) * 2.0) ** 0.5 / np.sqrt(dof))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from robins.errors import require
 from robins.filters import trees
@@ -15,24 +17,72 @@ from robins.filters.checks import finite_numbers
 from robins.filters.chi_square import limits, within
 from robins.filters.limits.constrain import (
     ITERATIONS,
+    Constrained,
     Function,
-    Numbers,
+    Given,
     Weight,
     as_sensor,
+    as_weight,
     check_rows,
-    check_weight,
+    check_size,
     constrain,
 )
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule, hooks
+from robins.filters.rule import Memory, Rule
+from robins.filters.values import Numbers, is_known, kind, number, value
+
+
+@value
+class Equality(Rule):
+    """The rule of `equality`: x - G (g(x) - d), G = V D' (D V D')^-1."""
+
+    g: Function
+    d: Any  # of the form of g(x); None is zero
+    weight: Weight
+    noise: Numbers | None
+    limit: Numbers | None  # (most + 1,) of the NIS by components, where there is a gate
+    hard: bool = kind()
+    iterations: int = kind()
+
+    name = "equality"
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
+        sensor, _ = as_sensor(belief.mean, self.g, self.d, self.noise)
+        n = belief.factor.shape[0]
+        check_size("equality", self.weight, n)
+        require(not sensor.dim > n, f"equality has {sensor.dim} components, the state only {n}")
+        return jnp.zeros((), bool)  # whether this step has used a noisy constraint
+
+    def process(self, memory: Memory, transition: Transition):
+        return jnp.zeros((), bool), transition
+
+    def after(self, memory: Memory, posterior: Belief, info: StepInfo, o: Observation):
+        held = constrain(
+            posterior, self.g, self.d, self.weight, self.noise, self.hard, self.iterations
+        )
+        refused = self.refused(held)
+        skip = refused | memory
+        belief = trees.select(skip, posterior, held.belief)
+        worst = jnp.max(jnp.abs(held.residual))
+        info = info.noted("equality", residual=worst, nis=held.nis, refused=refused)
+        info = info.contradicted_where(~skip & jnp.isinf(held.nis))
+        partly = refused & (info.code == int(Code.DONE))
+        code = jnp.where(partly, int(Code.PARTLY_MISSING), info.code)
+        return memory | (self.noise is not None), belief, info._replace(code=code)
+
+    def refused(self, held: Constrained) -> Array:
+        """() whether the gate refuses the constraint."""
+        if self.limit is None:
+            return jnp.zeros((), bool)
+        return held.nis > within(self.limit, held.residual)[held.dof]
 
 
 def equality(
     g: Function,
     d: Any = None,
     weight: Weight = "covariance",
-    noise: Numbers | None = None,
+    noise: Given | None = None,
     hard: bool = False,
     gate: Number | None = None,
     iterations: int = ITERATIONS,
@@ -70,56 +120,36 @@ def equality(
             numbers are not finite, a parameter is not of its range; and by `init`, D, noise or
             weight do not fit the state.
     """
-    if gate is not None and not 0.0 < gate < 1.0:
-        raise ValueError(f"equality gate must lie between 0 and 1, or be None, got {gate}")
+    between = "equality gate must lie between 0 and 1, or be None"
+    if gate is not None:
+        gate = number(between, gate, lambda p: (p > 0.0) & (p < 1.0))
     require(iterations >= 1, "equality iterations must be at least 1", iterations)
-    for name, value in (("d", d), ("noise", noise)):
-        for leaf in jax.tree_util.tree_leaves(value):
-            finite_numbers(f"equality {name}", leaf)
-    check_weight("equality", weight)
+    d = jax.tree_util.tree_map(
+        lambda leaf: _finite("d", leaf), d, is_leaf=lambda x: isinstance(x, list)
+    )
+    noise = None if noise is None else _finite("noise", noise)
+    weight = as_weight("equality", weight)
     if not callable(g):
-        _check_rows(g, d, noise)
-    once = noise is not None
-
-    def init(belief: Belief, dims):
-        sensor, _ = as_sensor(belief.mean, g, d, noise)
-        n = belief.factor.shape[0]
-        check_weight("equality", weight, n)
-        require(not sensor.dim > n, f"equality has {sensor.dim} components, the state only {n}")
-        return jnp.zeros((), bool)  # whether this step has used a noisy constraint
-
-    def process(used, transition: Transition):
-        return jnp.zeros((), bool), transition
-
-    def after(used, posterior: Belief, info: StepInfo, o: Observation):
-        held = constrain(posterior, g, d, weight, noise, hard, iterations)
-        refused = jnp.zeros((), bool)
-        if gate is not None:
-            refused = held.nis > within(limits(gate), held.residual)[held.dof]
-        skip = refused | used
-        belief = trees.select(skip, posterior, held.belief)
-        worst = jnp.max(jnp.abs(held.residual))
-        info = info.noted("equality", residual=worst, nis=held.nis, refused=refused)
-        info = info.contradicted_where(~skip & jnp.isinf(held.nis))
-        partly = refused & (info.code == int(Code.DONE))
-        code = jnp.where(partly, int(Code.PARTLY_MISSING), info.code)
-        return used | once, belief, info._replace(code=code)
-
-    return hooks(init=init, process=process, after=after, name="equality")
+        g = _finite("D", g)
+        if is_known((g, d, noise)):
+            _check_rows(g, d, noise)
+    limit = None if gate is None else limits(gate)
+    return Equality(g, d, weight, noise, limit, hard, iterations)
 
 
-def _check_rows(g: Numbers, d: Any, noise: Numbers | None) -> None:
-    D = finite_numbers("equality D", g)
+def _finite(name: str, given: Any) -> Any:
+    return finite_numbers(f"equality {name}", given) if is_known(given) else given
+
+
+def _check_rows(D: np.ndarray, d: Any, noise: np.ndarray | None) -> None:
     if D.ndim != 2 or D.shape[0] == 0:
         raise ValueError(f"equality D must be (c, n), a row for each constraint, got {D.shape}")
     value = np.zeros(len(D)) if d is None else np.asarray(d, float)
     if value.shape != (len(D),):
         raise ValueError(f"equality d is {value.shape}: ({len(D)},), one for each row of D")
     exact = np.ones(len(D), bool)
-    if noise is not None:
-        root = np.asarray(noise, float)
-        if root.shape[0] == len(D):  # other shapes are refused where they are used
-            exact = ~np.any(root.reshape(len(D), -1) != 0.0, axis=1)
+    if noise is not None and noise.shape[0] == len(D):  # others are refused where they are used
+        exact = ~np.any(noise.reshape(len(D), -1) != 0.0, axis=1)
     try:
         check_rows(D, value, exact)
     except ValueError as error:

@@ -5,11 +5,28 @@ from __future__ import annotations
 import math
 
 import jax.numpy as jnp
+import numpy as np
 
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule, hooks
+from robins.filters.rule import Memory, Rule
+from robins.filters.values import Numbers, number, value
+
+
+@value
+class FadingMemory(Rule):
+    """The rule of `fading_memory`: alpha^2 P before a prediction."""
+
+    factor: Numbers  # () alpha
+
+    name = "fading_memory"
+
+    def settle(self, memory: Memory, belief: Belief):
+        return memory, belief._replace(factor=self.factor * belief.factor), int(Code.DONE)
+
+    def before(self, memory: Memory, prior: Belief, o: Observation):
+        return memory, prior, o.noted(self.name, factor=jnp.asarray(self.factor))
 
 
 def fading_memory(factor: Number = 1.01) -> Rule:
@@ -34,18 +51,8 @@ def fading_memory(factor: Number = 1.01) -> Rule:
     Raises:
         ValueError: the factor is not finite or below 1.
     """
-    require(1.0 <= factor < math.inf, "fading_memory factor must be finite and not below 1", factor)
-
-    def init(belief: Belief, dims):
-        return jnp.asarray(float(factor))  # data of the state
-
-    def settle(memory, belief: Belief):
-        return memory, belief._replace(factor=memory * belief.factor), int(Code.DONE)
-
-    def before(memory, prior: Belief, o: Observation):
-        return memory, prior, o.noted("fading_memory", factor=memory)
-
-    return hooks(init=init, before=before, settle=settle, name="fading_memory")
+    below = "fading_memory factor must be finite and not below 1"
+    return FadingMemory(number(below, factor, lambda a: (a >= 1.0) & (a < np.inf)))
 
 
 def per_step(memory_s: Number, step_s: Number) -> float:

@@ -106,8 +106,9 @@ class Gate(Rule):
         """The prior, widened where recovery is due."""
         jump = jnp.where(chosen, o.residual, 0.0)
         if not self.kept:
-            excess = jnp.where(due, 1.0 - 1.0 / jnp.where(due, ratio, 2.0), 0.0)
-            jump = jump * jnp.sqrt(excess / q)
+            # a root of what is not 0 where none is due: its slope in q would be NaN
+            excess = 1.0 - 1.0 / jnp.where(due, ratio, 2.0)
+            jump = jump * jnp.where(due, jnp.sqrt(excess / q), 0.0)
         root = jump[:, None] if self.joint else jnp.diag(jump)
         if self.kept:
             root = jnp.concatenate([root, _OPEN**0.5 * o.noise], axis=1)

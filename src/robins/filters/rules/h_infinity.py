@@ -2,25 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeGuard, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from robins import manifold
 from robins.errors import RobinsError, require
 from robins.filters import trees
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.checks import one_of
+from robins.filters.kalman import Filter
+from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-from robins.filters.rules import _inflation
-from robins.filters.rules._inflation import inflated, local_bound
+from robins.filters.rules._inflation import (
+    Weight,
+    as_weight,
+    deflated,
+    inflated,
+    local_bound,
+    rows_of,
+    weighted_factor,
+)
 from robins.filters.values import Numbers, is_known, kind, number, value
+from robins.manifold import State
+
+__all__ = ["HInfinityMemory", "Infeasible", "h_infinity", "with_gamma"]
+
+Policy = Literal["raise", "raise_gamma", "compensate"]
+Estimate = Literal["a-posteriori", "a-priori", "predictor"]
+
+NAME = "h_infinity"
+F = TypeVar("F", bound=Filter)
+Again = Callable[["HInfinity"], "HInfinityMemory"]  # a rule -> the last memory of the run with it
 
 
 class Infeasible(RobinsError, ValueError):
@@ -87,20 +106,12 @@ def least_gamma(exists: Callable[[float], bool], lower: float, rtol: float = 1e-
     return high
 
 
-__all__ = ["HInfinityMemory", "Infeasible", "h_infinity", "with_gamma"]
-
-Policy = Literal["raise", "raise_gamma", "compensate"]
-Estimate = Literal["a-posteriori", "a-priori", "predictor"]
-
-NAME = "h_infinity"
-
-
 @value
 class HInfinity(Rule):
-    """The rule of `h_infinity`."""
+    """The rule of `h_infinity`: P becomes (P^-1 - gamma^-2 L'L)^-1 before a prediction."""
 
-    inverse: Numbers  # () 1 / gamma: 0 is the Kalman filter, and finite
-    weight: Any  # (q, n) L, or a function of the mean
+    inverse: Numbers  # () 1 / gamma: 0 is the Kalman filter, and has a finite derivative
+    weight: Weight  # (q, n) L, or a function of the mean
     margin: Numbers  # ()
     policy: Policy = kind()
     estimate: Estimate = kind()
@@ -110,27 +121,32 @@ class HInfinity(Rule):
 
     @property
     def judges_prior(self) -> bool:
+        """Whether the predicted P decides on existence."""
         return self.estimate == "a-priori"
 
     @property
     def moves_on(self) -> bool:
+        """Whether the estimate is the one before the measurement, and the mean moves later."""
         return self.estimate != "a-posteriori"
 
-    def rows(self, mean: Any) -> Array:
+    def rows(self, mean: State) -> Array:
         """L at a mean."""
-        return _inflation.rows_of(self.weight, mean, NAME)
+        return rows_of(self.weight, mean, NAME)
 
-    def in_force(self, bound: Array) -> Array:
+    def weighted(self, belief: Belief) -> Array:
+        """(q, n) L S."""
+        return weighted_factor(self.rows, belief, NAME)
+
+    def in_force(self, bound: Array) -> Any:
         """1 / gamma of this step, as the policy leaves it."""
         if self.policy != "raise_gamma":
             return self.inverse
         some = jnp.where(bound > 0.0, bound, 1.0)
-        return jnp.where(
-            bound > 0.0, jnp.minimum(self.inverse, (1.0 - self.margin) ** 0.5 / some), self.inverse
-        )
+        raised = jnp.minimum(self.inverse, (1.0 - self.margin) ** 0.5 / some)
+        return jnp.where(bound > 0.0, raised, self.inverse)
 
-    def init(self, belief: Belief, dims):
-        weighted = _inflation.weighted_factor(self.rows, belief, NAME)
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> HInfinityMemory:
+        weighted = self.weighted(belief)
         return HInfinityMemory(
             steps=jnp.zeros((), int),
             fresh=jnp.array(True),
@@ -142,25 +158,23 @@ class HInfinity(Rule):
             weighted_first=jnp.zeros_like(weighted),
         )
 
-    def process(self, memory: HInfinityMemory, transition):
+    def process(self, memory: HInfinityMemory, transition: Transition):
         if self.moves_on:
             memory = memory._replace(predicted=transition.mean)
         return memory, transition
 
     def before(self, memory: HInfinityMemory, prior: Belief, o: Observation):
         if self.judges_prior:
-            seen = _inflation.weighted_factor(self.rows, prior, NAME)
+            seen = self.weighted(prior)
             memory = memory._replace(weighted=jnp.where(memory.fresh, seen, memory.weighted))
         return memory._replace(fresh=jnp.array(False)), prior, o
 
     def after(self, memory: HInfinityMemory, posterior: Belief, info: StepInfo, o: Observation):
         if not self.judges_prior:
-            memory = memory._replace(
-                weighted=_inflation.weighted_factor(self.rows, posterior, NAME)
-            )
+            memory = memory._replace(weighted=self.weighted(posterior))
         memory = memory._replace(measured=memory.measured | jnp.any(info.used))
         # Noted but not remembered, so that a run which does not keep it does not compute it.
-        bound = _inflation.local_bound(memory.weighted)
+        bound = local_bound(memory.weighted)
         inverse = self.in_force(bound)
         left = 1.0 - (bound * inverse) ** 2
         notes = {"bound": bound, "gamma": 1.0 / inverse, "margin": left}
@@ -173,33 +187,47 @@ class HInfinity(Rule):
 
     def settle(self, memory: HInfinityMemory, belief: Belief):
         counts = memory.measured | (self.count_missing & (memory.steps > 0))
-        weighted = _inflation.weighted_factor(self.rows, belief, NAME)
-        judged = (
-            jnp.where(memory.fresh, weighted, memory.weighted) if self.judges_prior else weighted
-        )
-        inverse, factor, acted = self.inverse, belief.factor, jnp.array(False)
-        if self.policy == "raise_gamma":
-            inverse = self.in_force(_inflation.local_bound(judged))
-            acted = inverse < self.inverse
-        if self.policy == "compensate":
-            factor, acted = _inflation.deflated(factor, inverse * weighted, 1.0 - self.margin)
-            weighted = _inflation.weighted_factor(self.rows, belief._replace(factor=factor), NAME)
-        wide, exists = _inflation.inflated(factor, inverse * weighted)
+        weighted = self.weighted(belief)
+        judged = weighted
         if self.judges_prior:
-            exists = exists & _inflation.inflated(factor, inverse * judged)[1]
-        new = Belief(belief.mean, wide)
-        if self.moves_on:
-            # P~ L'L d / gamma^2 takes the mean on from P H'R^-1 r to P~ H'R^-1 r.
-            d = manifold.local(memory.predicted, belief.mean)
-            L = inverse * self.rows(belief.mean)
-            new = new._replace(mean=manifold.retract(belief.mean, wide @ ((L @ wide).T @ (L @ d))))
+            judged = jnp.where(memory.fresh, weighted, memory.weighted)
+        inverse, factor, weighted, acted = self.eased(belief, weighted, judged)
+        wide, exists = inflated(factor, inverse * weighted)
+        if self.judges_prior:
+            exists = exists & inflated(factor, inverse * judged)[1]
         active = counts & exists & (self.inverse > 0.0)
-        new = trees.select(active, new, belief)
-
+        new = trees.select(active, self.moved(memory, belief, inverse, wide), belief)
         missed = counts & ~exists
-        acted = missed | (counts & acted)
+        memory = self.noting(memory, missed | (counts & acted), missed, judged)
+        return memory, new, jnp.where(missed, int(Code.INFEASIBLE), int(Code.DONE))
+
+    def eased(self, belief: Belief, weighted: Array, judged: Array):
+        """1 / gamma, a factor and L S as the policy has them, and whether it had to act."""
+        if self.policy == "raise_gamma":
+            inverse = self.in_force(local_bound(judged))
+            return inverse, belief.factor, weighted, inverse < self.inverse
+        if self.policy == "compensate":
+            factor, acted = deflated(belief.factor, self.inverse * weighted, 1.0 - self.margin)
+            weighted = self.weighted(belief._replace(factor=factor))
+            return self.inverse, factor, weighted, acted
+        return self.inverse, belief.factor, weighted, jnp.array(False)
+
+    def moved(self, memory: HInfinityMemory, belief: Belief, inverse: Any, wide: Array) -> Belief:
+        """The belief with the inflated factor, and the mean that belongs to it."""
+        new = Belief(belief.mean, wide)
+        if not self.moves_on:
+            return new
+        # P~ L'L d / gamma^2 takes the mean on from P H'R^-1 r to P~ H'R^-1 r.
+        d = manifold.local(memory.predicted, belief.mean)
+        L = inverse * self.rows(belief.mean)
+        return new._replace(mean=manifold.retract(belief.mean, wide @ ((L @ wide).T @ (L @ d))))
+
+    def noting(
+        self, memory: HInfinityMemory, acted: Array, missed: Array, judged: Array
+    ) -> HInfinityMemory:
+        """What is remembered of a step that closes."""
         begins = acted & (memory.events == 0)
-        memory = memory._replace(
+        return memory._replace(
             steps=memory.steps + 1,
             fresh=jnp.array(True),
             measured=memory.measured & missed,
@@ -207,34 +235,51 @@ class HInfinity(Rule):
             first=jnp.where(begins, memory.steps - 1, memory.first),
             weighted_first=jnp.where(begins, judged, memory.weighted_first),
         )
-        return memory, new, jnp.where(missed, int(Code.INFEASIBLE), int(Code.DONE))
 
     def first_infeasible(
-        self, final: HInfinityMemory, whole: bool = True
+        self, final: HInfinityMemory, before: int = 0, whole: bool = True
     ) -> tuple[int, Array] | None:
         """Step, and L S there, where a run first had no filter; None if it had.
 
         Args:
             final: memory that the run ended with.
+            before: events in the one that it began with, which were another filter's.
             whole: judge the last step too, from which nothing has been predicted.
         """
-        if int(final.events) > 0:
-            return int(final.first), final.weighted_first
+        missed = int(final.events) - before
+        if missed > 0 and before == 0:
+            return int(final.first), jnp.asarray(final.weighted_first)  # of a stream in C
+        if missed > 0:  # the first was another filter's; where one step is missed the rest are
+            return int(final.steps) - 1 - missed, final.weighted
+        if not whole or not bool(final.measured):
+            return None
         n = final.weighted.shape[1]
         exists = inflated(jnp.eye(n), self.inverse * final.weighted)[1]
-        if whole and bool(final.measured) and not bool(exists):
-            return int(final.steps) - 1, final.weighted
-        return None
+        return None if bool(exists) else (int(final.steps) - 1, final.weighted)
 
-    def report(self, start: HInfinityMemory, final: HInfinityMemory, again: Any, time: Any) -> None:
-        """Under policy "raise": that the filter did not exist at some step.
+    @property
+    def reports(self) -> bool:
+        return self.policy == "raise"
+
+    def report(
+        self,
+        start: HInfinityMemory,
+        final: HInfinityMemory,
+        again: Again | None,
+        time: ArrayLike | None,
+    ) -> None:
+        """Say under policy "raise" that the filter did not exist at some step.
+
+        One sample at a time, a step is judged when the next prediction closes it: until then more
+        sensors may come.
 
         Raises:
             Infeasible: it did not.
         """
-        if self.policy != "raise":
+        if not self.reports:
             return
-        broken = self.first_infeasible(final, whole=again is not None)
+        before = int(start.events)
+        broken = self.first_infeasible(final, before, whole=again is not None)
         if broken is None:
             return
         step, weighted = broken
@@ -243,13 +288,14 @@ class HInfinity(Rule):
             step -= int(start.steps)
 
             def exists(one: float) -> bool:
-                other = replace(self, inverse=np.asarray(1.0 / one))
-                return other.first_infeasible(again(other)) is None
+                other = replace(self, inverse=1.0 / np.asarray(one))
+                return other.first_infeasible(again(other), before) is None
 
             least = least_gamma(exists, gamma)
         times = () if time is None else np.asarray(time)
         time_s = float(times[step]) if 0 <= step < len(times) else None
-        raise Infeasible(step, time_s, gamma, float(local_bound(weighted)), least)
+        bound = float(local_bound(jnp.asarray(weighted)))  # in C a stream has arrays of NumPy
+        raise Infeasible(step, time_s, gamma, bound, least)
 
 
 def h_infinity(
@@ -283,7 +329,7 @@ def h_infinity(
 
     Args:
         gamma: bound, in units of L x per unit of whitened noise; inf is the Kalman filter, bit for
-            bit. It lives in the memory as data: see `with_gamma`.
+            bit. It is a number of the rule, and another one compiles nothing: see `with_gamma`.
         weight: L, which errors count and in what units: (q, n) matrix, (n,) diagonal, or
             ``mean -> `` one of these. There is no default: gamma means nothing without it.
         policy: what to do where the filter does not exist. "raise": stop predicting, with code
@@ -304,41 +350,51 @@ def h_infinity(
         ValueError: gamma is not positive, the weight is not finite or of the wrong shape, policy or
             estimate is unknown or they do not go together, or the margin is not between 0 and 1.
     """
+    asked = _as_gamma(gamma)
     one_of("h_infinity policy", policy, Policy)
     one_of("h_infinity estimate", estimate, Estimate)
+    between = "margin must lie between 0 and 1"
+    margin = number(between, margin, lambda m: (m > 0.0) & (m < 1.0))
     if estimate == "a-priori" and policy == "compensate":
         raise ValueError(
             "policy='compensate' mends P after the measurement, estimate='a-priori' needs it "
             "before: use 'raise_gamma'"
         )
-    return HInfinity(
-        inverse=1.0 / _as_gamma(gamma),
-        weight=_inflation.as_numbers(weight, NAME),
-        margin=number("margin must lie between 0 and 1", margin, lambda m: (m > 0) & (m < 1)),
-        policy=policy,
-        estimate=estimate,
-        count_missing=count_missing,
-    )
+    L = as_weight(weight, NAME)
+    return HInfinity(1.0 / asked, L, margin, policy, estimate, count_missing)
 
 
 def _as_gamma(gamma: Any) -> Any:
     if not is_known(gamma):
-        return gamma
+        return jnp.asarray(gamma, float)
     value = np.asarray(gamma)
-    if value.dtype.kind not in "iuf":
+    if value.dtype.kind not in "iuf" or value.ndim:
         raise TypeError(f"gamma must be one real number, got {gamma!r}")
-    require(
-        np.all(value > 1e-300), f"gamma must be positive, or inf for the Kalman filter; got {gamma}"
-    )
-    return np.asarray(value, float)
+    require(value > 1e-300, f"gamma must be positive, or inf for the Kalman filter; got {gamma}")
+    return value.astype(float)
 
 
-def with_gamma(filter_: Any, gamma: Any) -> Any:
-    """The filter with another gamma in each of its `h_infinity` rules."""
+def with_gamma(filter_: F, gamma: Any) -> F:
+    """The filter with another gamma, positive or inf, in each of its `h_infinity` rules.
 
-    def put(rule: Any) -> Any:
-        return (
-            replace(rule, inverse=1.0 / _as_gamma(gamma)) if isinstance(rule, HInfinity) else rule
-        )
+    Gamma may be traced, so that a batch of gammas is one `jax.vmap`, and nothing compiles anew. A
+    state of the filter goes on with it.
 
-    return jax.tree_util.tree_map(put, filter_, is_leaf=lambda x: isinstance(x, HInfinity))
+    Args:
+        filter_: with such rules, also in its parts.
+        gamma: as `h_infinity` takes it.
+
+    Raises:
+        TypeError: gamma is not one real number.
+        ValueError: gamma is not positive, or the filter has no `h_infinity` rule.
+    """
+    inverse = 1.0 / _as_gamma(gamma)
+    parts, structure = jax.tree_util.tree_flatten(filter_, is_leaf=_is_rule)
+    none = "this filter has no h_infinity rule whose gamma could be exchanged"
+    require(any(map(_is_rule, parts)), none)
+    put = [replace(one, inverse=inverse) if _is_rule(one) else one for one in parts]
+    return jax.tree_util.tree_unflatten(structure, put)
+
+
+def _is_rule(one: object) -> TypeGuard[HInfinity]:
+    return isinstance(one, HInfinity)

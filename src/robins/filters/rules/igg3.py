@@ -2,15 +2,70 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping
 
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
 
 from robins.errors import require
 from robins.filters.belief import Belief, Number
-from robins.filters.observation import Observation, normalised
-from robins.filters.rule import Rule, hooks
+from robins.filters.observation import Normalised, Observation, normalised
+from robins.filters.rule import Memory, Rule
 from robins.filters.rules._robust import widened
+from robins.filters.values import Numbers, is_known, number, value
+
+
+@value
+class Igg3(Rule):
+    """The rule of `igg3`: R_ij / sqrt(w_i w_j), of weights in three zones of |r_i| / sqrt(S_ii)."""
+
+    k0: Numbers  # ()
+    k1: Numbers  # ()
+    floor: Numbers  # ()
+    patience: Numbers | None  # () measurements in a row
+
+    name = "igg3"
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
+        return {name: jnp.zeros((), int) for name in dims}  # in a row with no weight left
+
+    def before(self, memory: Memory, prior: Belief, o: Observation):
+        seen = normalised(o)
+        deviation = jnp.sqrt(jnp.sum(seen.factor**2, axis=1))
+        t = jnp.abs(jnp.where(seen.used, o.residual, 0.0)) / deviation
+        weight = self.weights(t)
+        measured = jnp.any(seen.used)
+        hopeless = measured & jnp.all(~seen.used | (weight <= self.floor))
+        earlier, recovered = memory[o.sensor], jnp.zeros((), bool)
+        if self.patience is not None:
+            recovered = hopeless & (earlier.astype(float) >= self.patience)
+            prior = self.recovered(recovered, t, prior, o, seen)
+        weight = jnp.where(recovered, 1.0, weight)
+        count = jnp.where(hopeless & ~recovered, earlier + 1, 0)
+        count = jnp.where(measured, count, earlier)
+        heavier = o.noise / jnp.sqrt(jnp.where(weight > 0.0, weight, 1.0))[:, None]
+        o = o.raised(heavier, o.accepted & (weight > 0.0))
+        o = o.noted("igg3", weight=jnp.min(weight), recovered=recovered)
+        return {**memory, o.sensor: count}, prior, o
+
+    def weights(self, t: Array) -> Array:
+        """Of innovations in their standard deviations."""
+        far = t > self.k0
+        beyond = jnp.where(far, t, self.k1)
+        share = jnp.maximum(self.k1 - beyond, 0.0) * (1.0 / (self.k1 - self.k0))
+        weight = jnp.where(far, jnp.maximum(self.k0 / beyond * share**2, self.floor), 1.0)
+        return jnp.where((t >= self.k1) & (self.floor * t > self.k0), 0.0, weight)
+
+    def recovered(
+        self, due: Array, t: Array, prior: Belief, o: Observation, seen: Normalised
+    ) -> Belief:
+        """The prior, widened where that is due until no t exceeds k0."""
+        far = t > self.k0
+        beyond = jnp.where(far, t, self.k1)
+        a = jnp.max(jnp.where(far, 1.0 / self.k0**2 - 1.0 / beyond**2, 0.0))
+        root = jnp.sqrt(jnp.where(due, a, 1.0)) * o.residual[:, None]
+        return widened(due, prior, o, seen.used, root)
 
 
 def igg3(
@@ -46,39 +101,14 @@ def igg3(
     Raises:
         ValueError: not 0 < k0 < k1 < inf, the floor is not in [0, 1), or patience is negative.
     """
-    require(0.0 < k0 < k1 < math.inf, f"igg3 needs 0 < k0 < k1 < inf, got k0 = {k0}, k1 = {k1}")
-    require(0.0 <= floor < 1.0, "igg3 floor must lie in [0, 1)", floor)
-    require(patience is None or patience >= 0, "igg3 patience must not be negative", patience)
-
-    def init(belief, dims):
-        return {name: jnp.zeros((), int) for name in dims}  # in a row with no weight left
-
-    def before(memory, prior: Belief, o: Observation):
-        seen = normalised(o)
-        deviation = jnp.sqrt(jnp.sum(seen.factor**2, axis=1))
-        t = jnp.abs(jnp.where(seen.used, o.residual, 0.0)) / deviation
-        far = t > k0
-        beyond = jnp.where(far, t, k1)
-        share = jnp.maximum(k1 - beyond, 0.0) / (k1 - k0)
-        weight = jnp.where(far, jnp.maximum(k0 / beyond * share**2, floor), 1.0)
-        weight = jnp.where((t >= k1) & (floor * t > k0), 0.0, weight)
-
-        measured = jnp.any(seen.used)
-        hopeless = measured & jnp.all(~seen.used | (weight <= floor))
-        earlier = memory[o.sensor]
-        if patience is None:
-            recovered = jnp.zeros((), bool)
-        else:
-            recovered = hopeless & (earlier >= patience)
-            a = jnp.max(jnp.where(far, 1.0 / k0**2 - 1.0 / beyond**2, 0.0))
-            root = jnp.sqrt(jnp.where(recovered, a, 1.0)) * o.residual[:, None]
-            prior = widened(recovered, prior, o, seen.used, root)
-        weight = jnp.where(recovered, 1.0, weight)
-        count = jnp.where(hopeless & ~recovered, earlier + 1, 0)
-        count = jnp.where(measured, count, earlier)
-        heavier = o.noise / jnp.sqrt(jnp.where(weight > 0.0, weight, 1.0))[:, None]
-        o = o.raised(heavier, o.accepted & (weight > 0.0))
-        o = o.noted("igg3", weight=jnp.min(weight), recovered=recovered)
-        return {**memory, o.sensor: count}, prior, o
-
-    return hooks(init=init, before=before, name="igg3")
+    if is_known((k0, k1)):
+        low, high = np.asarray(k0, float), np.asarray(k1, float)
+        rising = np.all((low > 0.0) & (low < high) & (high < np.inf))
+        require(rising, f"igg3 needs 0 < k0 < k1 < inf, got k0 = {k0}, k1 = {k1}")
+    negative = "igg3 patience must not be negative"
+    return Igg3(
+        k0=number("igg3 k0 must be a number", k0),
+        k1=number("igg3 k1 must be a number", k1),
+        floor=number("igg3 floor must lie in [0, 1)", floor, lambda x: (x >= 0.0) & (x < 1.0)),
+        patience=None if patience is None else number(negative, patience, lambda p: p >= 0.0),
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 import jax.numpy as jnp
@@ -11,19 +12,55 @@ from robins.errors import require
 from robins.filters import trees
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.checks import finite_numbers, one_of
-from robins.filters.limits.constrain import Function, Numbers, as_sensor
+from robins.filters.limits.constrain import Function, Given, as_sensor
 from robins.filters.limits.interval import clip, truncate
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule, hooks
+from robins.filters.rule import Memory, Rule
+from robins.filters.values import Numbers, is_known, kind, number, value
 
 Method = Literal["active-set", "truncation"]
 
 
+@value
+class Inequality(Rule):
+    """The rule of `inequality`: low <= g(x) <= high after each update."""
+
+    g: Function
+    low: Numbers  # (c,)
+    high: Numbers  # (c,)
+    method: Method = kind()
+
+    name = "inequality"
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
+        sensor, _ = as_sensor(belief.mean, self.g, None, None)
+        count = len(self.low)
+        if sensor.dim != count:
+            raise ValueError(f"inequality has {count} bounds for {sensor.dim} components of g")
+        return jnp.zeros((), bool)  # whether this step has been cut
+
+    def process(self, memory: Memory, transition: Transition):
+        return jnp.zeros((), bool), transition
+
+    def after(self, memory: Memory, posterior: Belief, info: StepInfo, o: Observation):
+        if self.method == "active-set":
+            kept = clip(posterior, self.g, self.low, self.high)
+            belief = kept.belief
+        else:
+            kept = truncate(posterior, self.g, self.low, self.high)
+            skip = memory & ~jnp.any(info.used)
+            belief = trees.select(skip, posterior, kept.belief)
+            memory = jnp.ones((), bool)
+        notes = {"outside": jnp.sum(kept.outside), "infeasible": kept.infeasible}
+        info = info.contradicted_where(kept.infeasible).noted("inequality", **notes)
+        return memory, belief, info
+
+
 def inequality(
     g: Function,
-    lower: Numbers | None = None,
-    upper: Numbers | None = None,
+    lower: Given | None = None,
+    upper: Given | None = None,
     method: Method = "active-set",
 ) -> Rule:
     """Keep ``lower <= g(x) <= upper`` after each update (Simon 2010, secs. 2.5 and 2.6).
@@ -55,42 +92,22 @@ def inequality(
     """
     one_of("inequality method", method, Method)
     low, high = _bounds(lower, upper)
-    if not callable(g):
-        _check_rows(g, len(low))
-
-    def init(belief: Belief, dims):
-        sensor, _ = as_sensor(belief.mean, g, None, None)
-        if sensor.dim != len(low):
-            raise ValueError(f"inequality has {len(low)} bounds for {sensor.dim} components of g")
-        return jnp.zeros((), bool)  # whether this step has been cut
-
-    def process(cut, transition: Transition):
-        return jnp.zeros((), bool), transition
-
-    def after(cut, posterior: Belief, info: StepInfo, o: Observation):
-        if method == "active-set":
-            kept = clip(posterior, g, low, high)
-            belief = kept.belief
-        else:
-            kept = truncate(posterior, g, low, high)
-            skip = cut & ~jnp.any(info.used)
-            belief = trees.select(skip, posterior, kept.belief)
-            cut = jnp.ones((), bool)
-        notes = {"outside": jnp.sum(kept.outside), "infeasible": kept.infeasible}
-        return cut, belief, info.contradicted_where(kept.infeasible).noted("inequality", **notes)
-
-    return hooks(init=init, process=process, after=after, name="inequality")
+    if not callable(g) and is_known(g):
+        g = _rows(g, len(low))
+    return Inequality(g, low, high, method)
 
 
-def _bounds(lower: Numbers | None, upper: Numbers | None) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(lower: Given | None, upper: Given | None) -> tuple[np.ndarray, np.ndarray]:
     require(lower is not None or upper is not None, "inequality wants lower or upper bounds")
-    high = np.asarray(np.inf if upper is None else upper, float)
-    low = np.full(high.shape, -np.inf) if lower is None else np.asarray(lower, float)
-    high = np.full(low.shape, np.inf) if upper is None else high
+    shape, real = np.shape(lower if upper is None else upper), "inequality bounds must be numbers"
+    low = np.full(shape, -np.inf) if lower is None else number(real, lower)
+    high = np.full(shape, np.inf) if upper is None else number(real, upper)
     if low.ndim != 1 or low.shape != high.shape or low.size == 0:
         raise ValueError(
             f"inequality bounds must be (c,) and alike, got lower {low.shape}, upper {high.shape}"
         )
+    if not is_known((low, high)):
+        return low, high
     if np.any(np.isnan(low) | np.isnan(high)):
         raise ValueError("inequality bounds hold NaN: use -inf and inf where there are none")
     if np.any(low > high) or np.any(low == np.inf) or np.any(high == -np.inf):
@@ -98,9 +115,10 @@ def _bounds(lower: Numbers | None, upper: Numbers | None) -> tuple[np.ndarray, n
     return low, high
 
 
-def _check_rows(g: Numbers, count: int) -> None:
+def _rows(g: Given, count: int) -> np.ndarray:
     D = finite_numbers("inequality D", g)
     if D.ndim != 2 or len(D) != count:
         raise ValueError(f"inequality D must be ({count}, n), a row for each bound, got {D.shape}")
     for row in np.flatnonzero(~np.any(D != 0.0, axis=1)):
         raise ValueError(f"inequality: row {row} of D is zero and bounds nothing")
+    return D

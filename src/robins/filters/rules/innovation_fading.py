@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from robins.errors import require
 from robins.filters.belief import Belief, Number
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule, hooks
+from robins.filters.rule import Rule
 from robins.filters.rules._variances import ratio, reading_variance, variance
+from robins.filters.values import Numbers, kind, number, value
 
 
 class Window(NamedTuple):
@@ -28,6 +31,55 @@ class Memory(NamedTuple):
     windows: dict[str, Window]
     faded: Array  # () bool
     start: Array  # (n,) standard deviations at the start, which `reach` is counted in
+
+
+@value
+class InnovationFading(Rule):
+    """The rule of `innovation_fading`: lambda P- by the mean innovation of a window."""
+
+    limit: Numbers  # () greatest lambda
+    reach: Numbers  # () greatest standard deviation, over the one at the start
+    window: int = kind()  # samples
+
+    name = "innovation_fading"
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
+        windows = {
+            name: Window(jnp.zeros((self.window, m)), jnp.zeros(m, int)) for name, m in dims.items()
+        }
+        return Memory(windows, jnp.zeros((), bool), belief.sigma)
+
+    def process(self, memory: Memory, transition: Transition):
+        return memory._replace(faded=jnp.zeros((), bool)), transition
+
+    def before(self, memory: Memory, prior: Belief, o: Observation):
+        R = variance(o.noise)
+        seen, counts = self.seen(memory.windows[o.sensor], o, R)
+        mean = jnp.sum(seen.surplus, axis=0) / self.window
+        unexplained = jnp.sum(jnp.where(counts, mean, 0.0))
+        explained = jnp.sum(jnp.where(counts, ratio(reading_variance(o), R), 0.0))
+        factor = jnp.clip(ratio(unexplained, explained), 1.0, self.limit)
+        factor = jnp.where(memory.faded | self.too_far(factor, memory, prior), 1.0, factor)
+        windows = {**memory.windows, o.sensor: seen}
+        memory = memory._replace(windows=windows, faded=memory.faded | (factor > 1.0))
+        prior = prior._replace(factor=jnp.sqrt(factor) * prior.factor)
+        return memory, prior, o.noted(self.name, lambda_=factor)
+
+    def seen(self, old: Window, o: Observation, R: Array) -> tuple[Window, Array]:
+        """The window with a sample more, and the components that count: used, and it is full."""
+        here = o.accepted & o.present & (R > 0.0)
+        e = jnp.where(here, o.residual, 0.0)
+        rolled = jnp.concatenate([(ratio(e**2, R) - 1.0)[None, :], old.surplus[:-1]])
+        surplus = jnp.where(here[None, :], rolled, old.surplus)
+        filled = jnp.minimum(old.filled + here.astype(int), self.window)
+        return Window(surplus, filled), here & (filled == self.window)
+
+    def too_far(self, factor: Array, memory: Memory, prior: Belief) -> Array:
+        """Whether a factor would take a standard deviation beyond the reach."""
+        # a state known exactly at the start has no scale to hold it to
+        scaled = memory.start > 0.0
+        most = self.reach * jnp.where(scaled, memory.start, 1.0)
+        return jnp.any(scaled & (jnp.sqrt(factor) * prior.sigma > most))
 
 
 def innovation_fading(window: int = 10, limit: Number = 5.0, reach: Number = float("inf")) -> Rule:
@@ -63,40 +115,8 @@ def innovation_fading(window: int = 10, limit: Number = 5.0, reach: Number = flo
         ValueError: a parameter is not of its range.
     """
     require(window >= 1, "innovation_fading window must be 1 sample or more", window)
-    if not 1.0 <= limit < float("inf"):
-        raise ValueError(f"innovation_fading limit must be finite and not below 1, got {limit}")
-    require(reach >= 1.0, "innovation_fading reach must be at least 1", reach)
+    below = "innovation_fading limit must be finite and not below 1"
+    most = number(below, limit, lambda x: (x >= 1.0) & (x < np.inf))
+    farthest = number("innovation_fading reach must be at least 1", reach, lambda x: x >= 1.0)
 
-    def init(belief: Belief, dims) -> Memory:
-        windows = {
-            name: Window(jnp.zeros((window, m)), jnp.zeros(m, int)) for name, m in dims.items()
-        }
-        return Memory(windows, jnp.zeros((), bool), belief.sigma)
-
-    def process(memory: Memory, transition: Transition):
-        return memory._replace(faded=jnp.zeros((), bool)), transition
-
-    def before(memory: Memory, prior: Belief, o: Observation):
-        R = variance(o.noise)
-        here = o.accepted & o.present & (R > 0.0)
-        e = jnp.where(here, o.residual, 0.0)
-        old = memory.windows[o.sensor]
-        rolled = jnp.concatenate([(ratio(e**2, R) - 1.0)[None, :], old.surplus[:-1]])
-        surplus = jnp.where(here[None, :], rolled, old.surplus)
-        filled = jnp.minimum(old.filled + here.astype(int), window)
-        counts = here & (filled == window)
-        mean = jnp.sum(surplus, axis=0) / window
-        unexplained = jnp.sum(jnp.where(counts, mean, 0.0))
-        explained = jnp.sum(jnp.where(counts, ratio(reading_variance(o), R), 0.0))
-        factor = jnp.clip(ratio(unexplained, explained), 1.0, limit)
-        # a state known exactly at the start has no scale to hold it to
-        scaled = memory.start > 0.0
-        most = reach * jnp.where(scaled, memory.start, 1.0)
-        beyond = jnp.any(scaled & (jnp.sqrt(factor) * prior.sigma > most))
-        factor = jnp.where(memory.faded | beyond, 1.0, factor)
-        windows = {**memory.windows, o.sensor: Window(surplus, filled)}
-        memory = memory._replace(windows=windows, faded=memory.faded | (factor > 1.0))
-        prior = prior._replace(factor=jnp.sqrt(factor) * prior.factor)
-        return memory, prior, o.noted("innovation_fading", lambda_=factor)
-
-    return hooks(init=init, process=process, before=before, name="innovation_fading")
+    return InnovationFading(most, farthest, window)

@@ -3,11 +3,59 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.checks import sensor_names
+from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory, Rule
+from robins.filters.values import kind, value
+
+
+@value
+class Only(Rule):
+    """The rule of `only`."""
+
+    inner: Rule
+    names: tuple[str, ...] = kind()
+
+    @property
+    def name(self) -> str:
+        """That of the rule inside."""
+        return self.inner.name
+
+    @property
+    def settles(self) -> bool:
+        return self.inner.settles
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
+        seen = {name: m for name, m in dims.items() if name in self.names}
+        if not seen:
+            raise ValueError(
+                f"only: the rule '{self.name}' is for {list(self.names)}, "
+                f"this filter has {list(dims)}"
+            )
+        return self.inner.init(belief, seen)
+
+    def process(self, memory: Memory, transition: Transition):
+        return self.inner.process(memory, transition)
+
+    def before(self, memory: Memory, prior: Belief, o: Observation):
+        known = o.sensor in self.names
+        return self.inner.before(memory, prior, o) if known else (memory, prior, o)
+
+    def after(self, memory: Memory, posterior: Belief, info: StepInfo, o: Observation):
+        known = o.sensor in self.names
+        return self.inner.after(memory, posterior, info, o) if known else (memory, posterior, info)
+
+    def settle(self, memory: Memory, belief: Belief):
+        return self.inner.settle(memory, belief)
+
+    def report(self, start: Memory, final: Memory, again: Any, time: Any) -> None:
+        anew = None if again is None else lambda inner: again(replace(self, inner=inner))
+        self.inner.report(start, final, anew, time)
 
 
 def only(sensors: str | Sequence[str], rule: Rule) -> Rule:
@@ -25,21 +73,4 @@ def only(sensors: str | Sequence[str], rule: Rule) -> Rule:
     Raises:
         ValueError: no sensor is named; by `init`, the filter has none of them.
     """
-    names = sensor_names(f"only, for the rule '{rule.name}'", sensors)
-
-    def init(belief: Belief, dims: Mapping[str, int]) -> Memory:
-        seen = {name: m for name, m in dims.items() if name in names}
-        if not seen:
-            raise ValueError(
-                f"only: the rule '{rule.name}' is for {list(names)}, this filter has {list(dims)}"
-            )
-        return rule.init(belief, seen)
-
-    def before(memory: Memory, prior: Belief, o: Observation):
-        return rule.before(memory, prior, o) if o.sensor in names else (memory, prior, o)
-
-    def after(memory: Memory, posterior: Belief, info: StepInfo, o: Observation):
-        known = o.sensor in names
-        return rule.after(memory, posterior, info, o) if known else (memory, posterior, info)
-
-    return rule._replace(init=init, before=before, after=after)
+    return Only(rule, sensor_names(f"only, for the rule '{rule.name}'", sensors))

@@ -10,9 +10,37 @@ from jaxtyping import Array
 from robins import linalg
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.checks import sensor_names
-from robins.filters.limits.constrain import Weight, check_weight, metric_of, nearest
+from robins.filters.limits.constrain import Weight, as_weight, check_size, metric_of, nearest
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule, hooks
+from robins.filters.rule import Memory, Rule
+from robins.filters.values import kind, value
+
+
+@value
+class Projection(Rule):
+    """The rule of `projection`: x - G (D x - d), G = V D' (D V D')^-1."""
+
+    weight: Weight
+    names: tuple[str, ...] = kind()
+    project_covariance: bool = kind()
+
+    name = "projection"
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
+        n = belief.factor.shape[0]
+        check_size("projection", self.weight, n)
+        for name, m in dims.items():
+            if name in self.names and m > n:
+                raise ValueError(f"sensor '{name}' has {m} components, the state only {n} to move")
+        return ()
+
+    def after(self, memory: Memory, posterior: Belief, info: StepInfo, o: Observation):
+        if o.sensor not in self.names:
+            return memory, posterior, info
+        belief, gain, used, wrong = projected(o, self.weight, self.project_covariance)
+        info = info._replace(gain=jnp.where(used[None, :], gain, 0.0))
+        info = info.contradicted_where(jnp.any(wrong))
+        return memory, belief, info.noted("projection", residual=jnp.max(jnp.abs(o.residual)))
 
 
 def projection(
@@ -54,25 +82,7 @@ def projection(
             dimension, or a sensor has more components than the state.
     """
     names = sensor_names("projection", sensors)
-    check_weight("projection", weight)
-
-    def init(belief: Belief, dims: Mapping[str, int]):
-        n = belief.factor.shape[0]
-        check_weight("projection", weight, n)
-        for name, m in dims.items():
-            if name in names and m > n:
-                raise ValueError(f"sensor '{name}' has {m} components, the state only {n} to move")
-        return ()
-
-    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        if o.sensor not in names:
-            return memory, posterior, info
-        belief, gain, used, wrong = projected(o, weight, project_covariance)
-        info = info._replace(gain=jnp.where(used[None, :], gain, 0.0))
-        info = info.contradicted_where(jnp.any(wrong))
-        return memory, belief, info.noted("projection", residual=jnp.max(jnp.abs(o.residual)))
-
-    return hooks(init=init, after=after, name="projection")
+    return Projection(as_weight("projection", weight), names, project_covariance)
 
 
 def projected(

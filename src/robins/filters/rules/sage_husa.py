@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -12,8 +13,9 @@ from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.checks import one_of
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule, hooks
+from robins.filters.rule import Memory, Rule
 from robins.filters.rules import _variances
+from robins.filters.values import Numbers, kind, value
 
 
 class Scale(NamedTuple):
@@ -31,6 +33,79 @@ class LastStep(NamedTuple):
     posterior: Array  # (n,) diagonal of P after the last update
     correction: Array  # (n,) sum of what the updates moved the mean by
     measured: Array  # () bool
+
+
+@value
+class SageHusa(Rule):
+    """The rule of `sage_husa`: R_k and Q_k by moments of the innovation, weighed by age."""
+
+    forgetting: Numbers  # () b
+    floor: Numbers  # () of a ratio
+    ceiling: Numbers  # ()
+    endless: bool = kind()  # b is 1
+    of_sensor: bool = kind()
+    of_motion: bool = kind()
+
+    name = "sage_husa"
+
+    def learnt(self, old: Scale, sample: Array, here: Array) -> Scale:
+        """The scale after a sample of those components that are here."""
+        k, b = (old.samples + 1).astype(float), self.forgetting
+        d = 1.0 / (k + 1.0) if self.endless else (1.0 - b) / (1.0 - b ** (k + 1.0))
+        new = jnp.clip((1.0 - d) * old.ratio + d * sample, self.floor, self.ceiling)
+        return Scale(jnp.where(here, new, old.ratio), old.samples + here.astype(int))
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
+        n = belief.factor.shape[0]
+        sensors = {name: _nominal(m) for name, m in dims.items()} if self.of_sensor else {}
+        nothing = jnp.zeros(n)
+        last = LastStep(nothing, nothing, nothing, nothing, jnp.zeros((), bool))
+        return sensors, (_nominal(n), last) if self.of_motion else ()
+
+    def process(self, memory: Memory, t: Transition):
+        if not self.of_motion:
+            return memory, t
+        sensors, (scale, last) = memory
+        sample = _variances.ratio(last.correction**2 + last.posterior - last.moved, last.nominal)
+        scale = self.learnt(scale, sample, last.measured & (last.nominal > 0.0))
+        moved = _variances.variance(t.spread) + _variances.variance(t.excess)
+        if t.deficit is not None:
+            moved = moved - t.deficit**2
+        nothing = jnp.zeros_like(moved)
+        last = LastStep(moved, _variances.variance(t.noise), nothing, nothing, jnp.zeros((), bool))
+        return (sensors, (scale, last)), t._replace(noise=_variances.scaled(t.noise, scale.ratio))
+
+    def before(self, memory: Memory, prior: Belief, o: Observation):
+        if not self.of_sensor:
+            return memory, prior, o
+        sensors, motion = memory
+        R = _variances.variance(o.noise)
+        here = o.accepted & o.present & (R > 0.0)
+        e = jnp.where(here, o.residual, 0.0)
+        sample = _variances.ratio(e**2 - _variances.reading_variance(o), R)
+        scale = self.learnt(sensors[o.sensor], sample, here)
+        o = o._replace(noise=_variances.scaled(o.noise, scale.ratio))
+        return ({**sensors, o.sensor: scale}, motion), prior, o
+
+    def after(self, memory: Memory, posterior: Belief, info: StepInfo, o: Observation):
+        sensors, motion = memory
+        notes = dict(info.notes)
+        if self.of_sensor:
+            notes |= _variances.numbered("sage_husa.r_scale", sensors[o.sensor].ratio)
+        if self.of_motion:
+            scale, last = motion
+            notes |= _variances.numbered("sage_husa.q_scale", scale.ratio)
+            last = last._replace(
+                posterior=_variances.variance(posterior.factor),
+                correction=last.correction + manifold.local(o.prior.mean, posterior.mean),
+                measured=last.measured | jnp.any(info.used),
+            )
+            motion = scale, last
+        return (sensors, motion), posterior, info._replace(notes=notes)
+
+
+def _nominal(k: int) -> Scale:
+    return Scale(jnp.ones(k), jnp.zeros(k, int))
 
 
 def sage_husa(
@@ -70,68 +145,8 @@ def sage_husa(
     Raises:
         ValueError: a parameter is not of its range.
     """
-    _variances.check("sage_husa", forgetting, floor, ceiling)
+    known = _variances.bounded("sage_husa", forgetting, floor, ceiling)
     one_of("sage_husa adapt", adapt, ("R", "Q", "QR"))
-    of_sensor, of_motion = "R" in adapt, "Q" in adapt
-
-    def nominal(k: int) -> Scale:
-        return Scale(jnp.ones(k), jnp.zeros(k, int))
-
-    def learn(old: Scale, sample: Array, here: Array) -> Scale:
-        k = (old.samples + 1).astype(float)
-        d = (
-            1.0 / (k + 1.0)
-            if forgetting == 1.0
-            else (1.0 - forgetting) / (1.0 - forgetting ** (k + 1.0))
-        )
-        new = jnp.clip((1.0 - d) * old.ratio + d * sample, floor, ceiling)
-        return Scale(jnp.where(here, new, old.ratio), old.samples + here.astype(int))
-
-    def init(belief: Belief, dims):
-        n = belief.factor.shape[0]
-        sensors = {name: nominal(m) for name, m in dims.items()} if of_sensor else {}
-        nothing = jnp.zeros(n)
-        last = LastStep(nothing, nothing, nothing, nothing, jnp.zeros((), bool))
-        return sensors, (nominal(n), last) if of_motion else ()
-
-    def process(memory, t: Transition):
-        sensors, (scale, last) = memory
-        sample = _variances.ratio(last.correction**2 + last.posterior - last.moved, last.nominal)
-        scale = learn(scale, sample, last.measured & (last.nominal > 0.0))
-        moved = _variances.variance(t.spread) + _variances.variance(t.excess)
-        if t.deficit is not None:
-            moved = moved - t.deficit**2
-        nothing = jnp.zeros_like(moved)
-        last = LastStep(moved, _variances.variance(t.noise), nothing, nothing, jnp.zeros((), bool))
-        return (sensors, (scale, last)), t._replace(noise=_variances.scaled(t.noise, scale.ratio))
-
-    def before(memory, prior: Belief, o: Observation):
-        sensors, motion = memory
-        R = _variances.variance(o.noise)
-        here = o.accepted & o.present & (R > 0.0)
-        e = jnp.where(here, o.residual, 0.0)
-        scale = learn(
-            sensors[o.sensor], _variances.ratio(e**2 - _variances.reading_variance(o), R), here
-        )
-        o = o._replace(noise=_variances.scaled(o.noise, scale.ratio))
-        return ({**sensors, o.sensor: scale}, motion), prior, o
-
-    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        sensors, motion = memory
-        notes = dict(info.notes)
-        if of_sensor:
-            notes |= _variances.numbered("sage_husa.r_scale", sensors[o.sensor].ratio)
-        if of_motion:
-            scale, last = motion
-            notes |= _variances.numbered("sage_husa.q_scale", scale.ratio)
-            last = last._replace(
-                posterior=_variances.variance(posterior.factor),
-                correction=last.correction + manifold.local(o.prior.mean, posterior.mean),
-                measured=last.measured | jnp.any(info.used),
-            )
-            motion = scale, last
-        return (sensors, motion), posterior, info._replace(notes=notes)
-
-    rule = hooks(init=init, after=after, name="sage_husa")
-    rule = rule._replace(before=before) if of_sensor else rule
-    return rule._replace(process=process) if of_motion else rule
+    return SageHusa(
+        **known, endless=bool(forgetting == 1.0), of_sensor="R" in adapt, of_motion="Q" in adapt
+    )

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from robins import linalg
-from robins.errors import require
 from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.checks import one_of
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule, hooks
+from robins.filters.rule import Rule
 from robins.filters.rules import _fading
+from robins.filters.values import Numbers, kind, number, value
 
 Form = Literal["outside", "lumped", "multiple", "projected"]
 Power = Literal["classic", "ewma"]
@@ -28,6 +29,68 @@ class _Memory(NamedTuple):
     moved: Array  # (n, 2n + 1) F S and what its linearisation left over
     noise: Array  # (n, n) factor of Q
     fresh: Array  # () bool: nothing has been used since the prediction
+
+
+@value
+class StrongTracking(Rule):
+    """The rule of `strong_tracking`: lambda = max(1, tr N / tr M) times what its form fades."""
+
+    keep: Numbers  # () share of V that is kept
+    beta: Numbers  # ()
+    sigmas: Numbers | None  # () by which V must exceed what is expected; None asks for nothing
+    limit: Numbers  # () greatest lambda
+    weights: Numbers | None  # (n,) a_j, the greatest 1
+    form: Form = kind()
+    power: Power = kind()
+
+    name = "strong_tracking"
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> _Memory:
+        n = belief.factor.shape[0]
+        _fading.check_size("strong_tracking", self.weights, belief)
+        return _Memory(
+            power={name: jnp.ones(m) for name, m in dims.items()},
+            begun={name: jnp.full(m, self.power != "classic") for name, m in dims.items()},
+            moved=jnp.zeros((n, 2 * n + 1)),
+            noise=jnp.zeros((n, n)),
+            fresh=jnp.array(False),
+        )
+
+    def process(self, memory: _Memory, t: Transition):
+        if self.form != "outside":
+            return memory, t
+        moved, noise = (jnp.concatenate([t.spread, t.excess], axis=1), t.noise)
+        moved, noise = _fitted(moved, memory.moved.shape[1]), _fitted(noise, len(noise))
+        return memory._replace(moved=moved, noise=noise, fresh=jnp.array(True)), t
+
+    def before(self, memory: _Memory, prior: Belief, o: Observation):
+        white = _fading.whitened(o)
+        V, begun = memory.power[o.sensor], memory.begun[o.sensor]
+        first = white.counts & ~begun
+        V = jnp.where(first, white.residual**2, _fading.averaged(V, white, self.keep))
+        S, factor = self.faded(memory, prior.factor, white, self.excess(V, white))
+        memory = memory._replace(
+            power={**memory.power, o.sensor: V},
+            begun={**memory.begun, o.sensor: begun | white.counts},
+        )
+        return memory, Belief(prior.mean, S), o.noted(self.name, lambda_=factor)
+
+    def excess(self, V: Array, white: _fading.White) -> Array:
+        """Tr V less beta times that of R; 0 where V is not large enough."""
+        total = _fading.total(V, white)
+        N = total - self.beta * white.dof
+        if self.sigmas is None:
+            return N
+        return jnp.where(_fading.significant(total, white, self.keep, self.sigmas), N, 0.0)
+
+    def faded(self, memory: _Memory, S: Array, white: _fading.White, N: Array):
+        """The factor S as the form fades it, and lambda."""
+        if self.form == "outside":
+            return _faded_outside(memory, S, white, N, self.limit)
+        return _fading.faded(S, white, N, self.form, self.weights, self.limit)
+
+    def after(self, memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
+        return memory._replace(fresh=memory.fresh & ~jnp.any(info.used)), posterior, info
 
 
 def strong_tracking(
@@ -83,61 +146,30 @@ def strong_tracking(
         ValueError: an argument is out of its range; when the filter starts, if the weights are not
             one a state.
     """
-    require(0.0 < rho <= 1.0, "strong_tracking rho must lie in (0, 1]", rho)
-    require(1.0 <= beta < math.inf, "strong_tracking beta must be at least 1 and finite", beta)
+    share = "strong_tracking rho must lie in (0, 1]"
+    rho = number(share, rho, lambda r: (r > 0.0) & (r <= 1.0))
+    below = "strong_tracking beta must be at least 1 and finite"
+    beta = number(below, beta, lambda b: (b >= 1.0) & (b < np.inf))
     one_of("strong_tracking form", form, Form)
     one_of("strong_tracking power", power, Power)
-    positive = threshold is None or threshold >= 0.0
-    require(positive, "strong_tracking threshold must not be negative", threshold)
-    require(1.0 <= limit < math.inf, "strong_tracking limit must be at least 1 and finite", limit)
-    a = _fading.checked_weights("strong_tracking", weights, form)
-    classic = power == "classic"
-    keep = rho / (1.0 + rho) if classic else rho
-    sigmas = threshold if classic or threshold is not None else 3.0
-
-    def init(belief: Belief, dims):
-        n = belief.factor.shape[0]
-        _fading.check_size("strong_tracking", a, belief)
-        return _Memory(
-            power={name: jnp.ones(m) for name, m in dims.items()},
-            begun={name: jnp.full(m, not classic) for name, m in dims.items()},
-            moved=jnp.zeros((n, 2 * n + 1)),
-            noise=jnp.zeros((n, n)),
-            fresh=jnp.array(False),
-        )
-
-    def process(memory: _Memory, t: Transition):
-        if form != "outside":
-            return memory, t
-        moved, noise = (jnp.concatenate([t.spread, t.excess], axis=1), t.noise)
-        moved, noise = _fitted(moved, memory.moved.shape[1]), _fitted(noise, len(noise))
-        return memory._replace(moved=moved, noise=noise, fresh=jnp.array(True)), t
-
-    def before(memory: _Memory, prior: Belief, o: Observation):
-        white = _fading.whitened(o)
-        V, begun = memory.power[o.sensor], memory.begun[o.sensor]
-        first = white.counts & ~begun
-        V = jnp.where(first, white.residual**2, _fading.averaged(V, white, keep))
-        N = _fading.total(V, white) - beta * white.dof
-        if sigmas is not None:
-            N = jnp.where(_fading.significant(_fading.total(V, white), white, keep, sigmas), N, 0.0)
-        if form == "outside":
-            S, factor = _faded_outside(memory, prior.factor, white, N, limit)
-        else:
-            S, factor = _fading.faded(prior.factor, white, N, form, a, limit)
-        memory = memory._replace(
-            power={**memory.power, o.sensor: V},
-            begun={**memory.begun, o.sensor: begun | white.counts},
-        )
-        return memory, Belief(prior.mean, S), o.noted("strong_tracking", lambda_=factor)
-
-    def after(memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
-        return memory._replace(fresh=memory.fresh & ~jnp.any(info.used)), posterior, info
-
-    return hooks(init=init, process=process, before=before, after=after, name="strong_tracking")
+    if threshold is None and power == "ewma":
+        threshold = 3.0
+    if threshold is not None:
+        negative = "strong_tracking threshold must not be negative"
+        threshold = number(negative, threshold, lambda t: t >= 0.0)
+    below = "strong_tracking limit must be at least 1 and finite"
+    return StrongTracking(
+        keep=rho / (1.0 + rho) if power == "classic" else rho,
+        beta=beta,
+        sigmas=threshold,
+        limit=number(below, limit, lambda x: (x >= 1.0) & (x < np.inf)),
+        weights=_fading.checked_weights("strong_tracking", weights, form),
+        form=form,
+        power=power,
+    )
 
 
-def _faded_outside(memory: _Memory, S: Array, white: _fading.White, N: Array, limit: Number):
+def _faded_outside(memory: _Memory, S: Array, white: _fading.White, N: Array, limit: Numbers):
     """P + (lambda - 1) F P F', which is lambda F P F' + Q; P itself instead of F P F' once used."""
     n = len(S)
     whole = jnp.concatenate([S, jnp.zeros((n, memory.moved.shape[1] - n))], axis=1)

@@ -13,10 +13,55 @@ from robins.errors import require
 from robins.filters.belief import Belief, Number
 from robins.filters.checks import one_of
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule, hooks
+from robins.filters.rule import Memory, Rule
 from robins.filters.rules._robust import MOST, PATIENCE, opening, shares, weighed
+from robins.filters.values import Numbers, kind, number, value
 
 Whose = Literal["R", "both"]
+
+
+@value
+class StudentT(Rule):
+    """The rule of `student_t`: covariances c R and b P of Gaussians with a scale of their own."""
+
+    dof: Numbers  # () nu
+    iterations: int = kind()
+    whose: Whose = kind()
+
+    name = "student_t"
+
+    def before(self, memory: Memory, prior: Belief, o: Observation):
+        b, c = self.scales(o, prior.factor.shape[0])
+        o, weight = weighed(o, c)
+        b = jnp.where(weight > 0.0, b, 1.0)
+        if self.whose == "both":
+            prior = prior._replace(factor=jnp.sqrt(b) * prior.factor)
+        return memory, prior, o.noted("student_t", weight=weight, prior=1.0 / b)
+
+    def scales(self, o: Observation, n: int) -> tuple[Array, Array]:
+        """B and c, of a state of n components."""
+        of = shares(o)
+        noisy = jnp.any(of.noise != 0.0, axis=1)
+        m = jnp.sum(noisy).astype(float)
+        exact = jnp.sum(of.seen.used & ~noisy).astype(float)
+        W, one, one_by_nu = of.white_noise, jnp.eye(len(noisy)), 1.0 / self.dof
+        R = W @ W.T
+        columns = jnp.concatenate([of.seen.white[:, None], W, one], axis=1)
+
+        def better(_, scale):
+            b, c = scale
+            root = linalg.cholesky(b * of.prior + c * R + of.idle)
+            X = linalg.solve_lower(root, columns)
+            w, W_, inverse = X[:, 0], X[:, 1 : -len(one)], X[:, -len(one) :]
+            v = inverse.T @ w
+            known = b * jnp.sum((inverse.T @ inverse) * of.prior)  # trace of S^-1 H P H'
+            left = c * c * jnp.sum((W_.T @ w) ** 2) + c * jnp.maximum(known - exact, 0.0)
+            if self.whose == "both":
+                moved = b * b * (v @ (of.prior @ v)) + b * (n - known)
+                b = jnp.minimum((1.0 + moved * one_by_nu) * (1.0 / (1.0 + n / self.dof)), MOST)
+            return b, jnp.minimum((1.0 + left * one_by_nu) / (1.0 + m * one_by_nu), MOST)
+
+        return jax.lax.fori_loop(0, self.iterations, better, (jnp.ones(()), jnp.ones(())))
 
 
 def student_t(
@@ -57,41 +102,7 @@ def student_t(
         ValueError: dof is not positive, there is no iteration, whose is neither, or patience is
             negative.
     """
-    require(dof > 0.0, "student_t dof must be positive", dof)
+    nu = number("student_t dof must be positive", dof, lambda nu: nu > 0.0)
     require(iterations >= 1, "student_t iterations must be at least 1", iterations)
     one_of("student_t whose", whose, Whose)
-    nu = float(dof)
-
-    def scales(o: Observation, n: int) -> tuple[Array, Array]:
-        of = shares(o)
-        noisy = jnp.any(of.noise != 0.0, axis=1)
-        m = jnp.sum(noisy).astype(float)
-        exact = jnp.sum(of.seen.used & ~noisy).astype(float)
-        W, one = of.white_noise, jnp.eye(len(noisy))
-        R = W @ W.T
-        columns = jnp.concatenate([of.seen.white[:, None], W, one], axis=1)
-
-        def better(_, scale):
-            b, c = scale
-            root = linalg.cholesky(b * of.prior + c * R + of.idle)
-            X = linalg.solve_lower(root, columns)
-            w, W_, inverse = X[:, 0], X[:, 1 : -len(one)], X[:, -len(one) :]
-            v = inverse.T @ w
-            known = b * jnp.sum((inverse.T @ inverse) * of.prior)  # trace of S^-1 H P H'
-            left = c * c * jnp.sum((W_.T @ w) ** 2) + c * jnp.maximum(known - exact, 0.0)
-            if whose == "both":
-                moved = b * b * (v @ (of.prior @ v)) + b * (n - known)
-                b = jnp.minimum((1.0 + moved / nu) / (1.0 + n / nu), MOST)
-            return b, jnp.minimum((1.0 + left / nu) / (1.0 + m / nu), MOST)
-
-        return jax.lax.fori_loop(0, iterations, better, (jnp.ones(()), jnp.ones(())))
-
-    def before(memory, prior: Belief, o: Observation):
-        b, c = scales(o, prior.factor.shape[0])
-        o, weight = weighed(o, c)
-        b = jnp.where(weight > 0.0, b, 1.0)
-        if whose == "both":
-            prior = prior._replace(factor=jnp.sqrt(b) * prior.factor)
-        return memory, prior, o.noted("student_t", weight=weight, prior=1.0 / b)
-
-    return opening(hooks(before=before, name="student_t"), patience)
+    return opening(StudentT(nu, iterations, whose), patience)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.observation import Observation, left_out
-from robins.filters.rule import Rule, hooks
+from robins.filters.rule import Rule
 from robins.filters.rules import _variances
+from robins.filters.values import Numbers, kind, number, value
 
 
 class InverseGamma(NamedTuple):
@@ -34,6 +37,72 @@ def _left(factor: Array, residual: Array, noise: Array) -> Array:
     white = linalg.solve_lower(factor, jnp.concatenate([residual[:, None], R], axis=1))
     G = white[:, 1:]
     return (G.T @ white[:, 0]) ** 2 + jnp.maximum(jnp.diagonal(R) - jnp.sum(G**2, axis=0), 0.0)
+
+
+Known = dict[str, InverseGamma]  # by sensor
+
+
+@value
+class VariationalBayes(Rule):
+    """The rule of `variational_bayes`: R = diag(b / a), with b of the posterior residual."""
+
+    forgetting: Numbers  # () rho
+    floor: Numbers  # () of a scale
+    ceiling: Numbers  # ()
+    initial_dof: Numbers  # ()
+    iterations: int = kind()
+
+    name = "variational_bayes"
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Known:
+        half = 0.5 * self.initial_dof
+        return {
+            name: InverseGamma(jnp.full(m, half), jnp.full(m, half), jnp.ones(m))
+            for name, m in dims.items()
+        }
+
+    def before(self, memory: Known, prior: Belief, o: Observation):
+        known = memory[o.sensor]
+        scale = self.iterated(known, o)
+        memory = {**memory, o.sensor: known._replace(scale=scale)}
+        return memory, prior, o._replace(noise=_variances.scaled(o.noise, scale))
+
+    def iterated(self, known: InverseGamma, o: Observation) -> Array:
+        """(m,) multiples of the nominal noise for the update; as they were of what is not used."""
+        a, b = self.forgetting * known.shape + 0.5, self.forgetting * known.rate
+        scale = jnp.clip(b / a, self.floor, self.ceiling)
+        spread, excess, noise, deficit, used = left_out(o._replace(accepted=o.accepted & o.present))
+        reading = linalg.tria(spread, excess) if self.iterations > 1 else spread
+        e, nominal = jnp.where(used, o.residual, 0.0), _variances.variance(noise)
+        for _ in range(self.iterations - 1):
+            R_root = _variances.scaled(noise, jnp.where(used, scale, 1.0))
+            S_root = linalg.tria(reading, R_root)
+            if deficit is not None:
+                S_root = linalg.downdate(S_root, deficit)
+            left = _variances.ratio(_left(S_root, e, R_root), nominal)
+            scale = jnp.clip((b + 0.5 * left) / a, self.floor, self.ceiling)
+        return jnp.where(used, scale, known.scale)
+
+    def after(self, memory: Known, posterior: Belief, info: StepInfo, o: Observation):
+        known = memory[o.sensor]
+        memory = {**memory, o.sensor: self.learnt(known, info, o)}
+        notes = info.notes | _variances.numbered("variational_bayes.r_scale", known.scale)
+        return memory, posterior, info._replace(notes=notes)
+
+    def learnt(self, known: InverseGamma, info: StepInfo, o: Observation) -> InverseGamma:
+        """What is known of the variances after an update."""
+        # Rules behind this one may have weighed the noise again: that is part of the nominal one.
+        R = _variances.variance(o.noise)
+        here = info.used & (R > 0.0)
+        noise = jnp.where(here[:, None], o.noise, 0.0)
+        left = _variances.ratio(
+            _left(info.factor, jnp.where(here, o.residual, 0.0), noise), R / known.scale
+        )
+        a = self.forgetting * known.shape + 0.5
+        b = self.forgetting * known.rate + 0.5 * left
+        shape = jnp.where(here, a, known.shape)
+        rate = jnp.where(here, jnp.clip(b, self.floor * a, self.ceiling * a), known.rate)
+        return InverseGamma(shape, rate, rate / shape)
 
 
 def variational_bayes(
@@ -76,50 +145,8 @@ def variational_bayes(
     Raises:
         ValueError: a parameter is not of its range.
     """
-    _variances.check("variational_bayes", forgetting, floor, ceiling)
+    known = _variances.bounded("variational_bayes", forgetting, floor, ceiling)
     require(iterations >= 1, "variational_bayes iterations must be 1 or more", iterations)
-    finite = 0.0 < initial_dof < float("inf")
-    require(finite, "variational_bayes initial_dof must be positive and finite", initial_dof)
-
-    def init(belief: Belief, dims):
-        half = 0.5 * initial_dof
-        return {
-            name: InverseGamma(jnp.full(m, half), jnp.full(m, half), jnp.ones(m))
-            for name, m in dims.items()
-        }
-
-    def before(memory, prior: Belief, o: Observation):
-        known = memory[o.sensor]
-        a, b = forgetting * known.shape + 0.5, forgetting * known.rate
-        scale = jnp.clip(b / a, floor, ceiling)
-        spread, excess, noise, deficit, used = left_out(o._replace(accepted=o.accepted & o.present))
-        reading = linalg.tria(spread, excess) if iterations > 1 else spread
-        e, nominal = jnp.where(used, o.residual, 0.0), _variances.variance(noise)
-        for _ in range(iterations - 1):
-            R_root = _variances.scaled(noise, jnp.where(used, scale, 1.0))
-            S_root = linalg.tria(reading, R_root)
-            if deficit is not None:
-                S_root = linalg.downdate(S_root, deficit)
-            left = _variances.ratio(_left(S_root, e, R_root), nominal)
-            scale = jnp.clip((b + 0.5 * left) / a, floor, ceiling)
-        scale = jnp.where(used, scale, known.scale)
-        memory = {**memory, o.sensor: known._replace(scale=scale)}
-        return memory, prior, o._replace(noise=_variances.scaled(o.noise, scale))
-
-    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        known = memory[o.sensor]
-        # Rules behind this one may have weighed the noise again: that is part of the nominal one.
-        R = _variances.variance(o.noise)
-        here = info.used & (R > 0.0)
-        noise = jnp.where(here[:, None], o.noise, 0.0)
-        left = _variances.ratio(
-            _left(info.factor, jnp.where(here, o.residual, 0.0), noise), R / known.scale
-        )
-        a, b = forgetting * known.shape + 0.5, forgetting * known.rate + 0.5 * left
-        shape = jnp.where(here, a, known.shape)
-        rate = jnp.where(here, jnp.clip(b, floor * a, ceiling * a), known.rate)
-        memory = {**memory, o.sensor: InverseGamma(shape, rate, rate / shape)}
-        notes = info.notes | _variances.numbered("variational_bayes.r_scale", known.scale)
-        return memory, posterior, info._replace(notes=notes)
-
-    return hooks(init=init, before=before, after=after, name="variational_bayes")
+    wrong = "variational_bayes initial_dof must be positive and finite"
+    dof = number(wrong, initial_dof, lambda x: (x > 0.0) & (x < np.inf))
+    return VariationalBayes(**known, initial_dof=dof, iterations=iterations)

@@ -38,7 +38,8 @@ from jaxtyping import Array, Float
 from robins import _float64  # noqa: F401
 from robins.earth import Geodetic, curvature_radii, earth_rate_n, gravity_n, transport_rate_n
 from robins.filters import Belief, Code, Motion, Rule
-from robins.filters.rule import hooks
+from robins.filters.rule import Memory
+from robins.filters.values import value
 from robins.ins.frames import swap
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
@@ -258,14 +259,20 @@ def _noise(noise: InsNoise, metres_per_radian: Array, fed: Fed, block: Increment
     return per_metre[:, None] * walk(noise, block.dt)
 
 
-def feedback() -> Rule:
-    """Take the estimated errors off the SINS, once a step when all its measurements are in."""
+@value
+class Feedback(Rule):
+    """The rule of `feedback`."""
 
-    def settle(memory: Any, belief: Belief):
+    name = "feedback"
+
+    def settle(self, memory: Memory, belief: Belief):
         nav = belief.mean.nav
         return memory, Belief(Fed(nav, jnp.zeros(9)), belief.factor), int(Code.DONE)
 
-    return hooks(settle=settle, name="feedback")
+
+def feedback() -> Rule:
+    """Take the estimated errors off the SINS, once a step when all its measurements are in."""
+    return Feedback()
 
 
 def _start_sigma(given: Airship, course: Course) -> list[np.ndarray]:

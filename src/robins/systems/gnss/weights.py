@@ -19,33 +19,63 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
+from jax.tree_util import Partial
 from jaxtyping import Array
 
-from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule, hooks
-from robins.filters.rules._robust import MOST, shares, weighed
+from robins.filters.rule import Memory, Rule
+from robins.filters.rules._robust import MOST, reweighted, weighed
+from robins.filters.values import Numbers, kind, number, value
 
 LEAST = 1.0 / MOST  # beyond it a component is refused
 
 
 def huber_weight(k: float) -> Callable[[Array], Array]:
     """Full weight up to k standard deviations, then a constant pull."""
-    return lambda e: k / jnp.maximum(jnp.abs(e), k)
+    return Partial(_huber, number("k must be a number", k))
+
+
+def _huber(k: Numbers, e: Array) -> Array:
+    return k / jnp.maximum(jnp.abs(e), k)
 
 
 def student_weight(dof: float) -> Callable[[Array], Array]:
     """Weight of a residual with the tails of Student's t."""
-    return lambda e: (dof + 1.0) / (dof + e**2)
+    return Partial(_student, number("dof must be a number", dof))
+
+
+def _student(dof: Numbers, e: Array) -> Array:
+    return (dof + 1.0) / (dof + e**2)
 
 
 def switch_weight(phi: float) -> Callable[[Array], Array]:
     """Square of the switch of a switchable constraint with prior weight phi."""
-    return lambda e: jnp.minimum(1.0, 2.0 * phi / (phi + e**2)) ** 2
+    return Partial(_switch, number("phi must be a number", phi))
+
+
+def _switch(phi: Numbers, e: Array) -> Array:
+    return jnp.minimum(1.0, 2.0 * phi / (phi + e**2)) ** 2
+
+
+@value
+class ByComponent(Rule):
+    """The rule of `by_component`: R_ij / sqrt(w_i w_j) of what the update leaves."""
+
+    weight: Callable[[Array], Array]
+    name: str = kind()
+    iterations: int = kind()
+
+    def before(self, memory: Memory, prior: Belief, o: Observation):
+        """Noise of each component by its own weight."""
+        w = reweighted(o, lambda e: jnp.maximum(self.weight(e), LEAST), self.iterations)
+        given, w = weighed(o, 1.0 / w)
+        there = o.present & o.accepted
+        least = jnp.min(jnp.where(there, w, 1.0))
+        mean = jnp.sum(jnp.where(there, w, 0.0)) / jnp.maximum(jnp.sum(there.astype(float)), 1.0)
+        return memory, prior, given.noted(self.name, least=least, mean=mean)
 
 
 def by_component(
@@ -64,28 +94,4 @@ def by_component(
         ValueError: there is no iteration.
     """
     require(iterations >= 1, "weights need at least 1 iteration", iterations)
-
-    def weights(o: Observation) -> Array:
-        of = shares(o)
-        L, white = of.seen.factor, of.seen.white[:, None]
-        variance = jnp.sum(of.noise**2, axis=1)
-        own = jnp.sqrt(jnp.where(variance > 0.0, variance, jnp.inf))
-
-        def better(_, w: Array) -> Array:
-            scaled = of.noise / jnp.sqrt(w)[:, None]
-            W = linalg.solve_lower(L, scaled)
-            root = linalg.cholesky(of.prior + W @ W.T + of.idle)
-            # what is left of the residual after the update is R S^-1 r
-            e = scaled @ (W.T @ linalg.solve_spd(root, white))
-            return jnp.maximum(weight(e[:, 0] / own), LEAST)
-
-        return jax.lax.fori_loop(0, iterations, better, jnp.ones(len(own)))
-
-    def before(memory, prior: Belief, o: Observation):
-        given, w = weighed(o, 1.0 / weights(o))
-        there = o.present & o.accepted
-        least = jnp.min(jnp.where(there, w, 1.0))
-        mean = jnp.sum(jnp.where(there, w, 0.0)) / jnp.maximum(jnp.sum(there.astype(float)), 1.0)
-        return memory, prior, given.noted(name, least=least, mean=mean)
-
-    return hooks(before=before, name=name)
+    return ByComponent(weight, name, iterations)

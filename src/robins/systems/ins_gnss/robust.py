@@ -32,10 +32,12 @@ from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.filters import Belief, Family, Filter, Model, Motion, Rule, Sensor, imm, kalman, taylor
+from robins.filters.composite.bank import EVERY, transitions
 from robins.filters.composite.imm import Mode
 from robins.filters.observation import Observation
-from robins.filters.rule import hooks
+from robins.filters.rule import Memory
 from robins.filters.rules import student_t
+from robins.filters.values import Numbers, as_data, value
 from robins.ins.state import InsState
 from robins.linalg import block_diagonal
 from robins.systems.ins_gnss.model import POSITION, VELOCITY, Velocity
@@ -82,7 +84,7 @@ _ROWS = [(s, float(off), float(off), 0.0, 0.0) for off in (0, 1) for s in SCALES
     (SCALES[1], 0.0, 0.0, 0.0, 1.0),
 ]
 HYPOTHESES = Hypothesis(*np.array(_ROWS).T)
-AS_TOLD = Hypothesis(*_ROWS[0])
+AS_TOLD = Hypothesis(*np.array(_ROWS[0]))
 
 
 def changes(step_s: float, patience_s: float) -> np.ndarray:
@@ -95,18 +97,12 @@ def changes(step_s: float, patience_s: float) -> np.ndarray:
     step_s = min(step_s, 0.5 * patience_s)
     begin, over = (-math.expm1(-step_s / length) for length in (SELDOM_S, patience_s))
     scale = np.array(SCALES)
-    p = np.zeros((len(_ROWS), len(_ROWS)))
-    for same in (RIGHT, LASTS):
-        p[same, same] = np.where(scale[None] > scale[:, None], RISE, FALL)
-    p[:, BEGINS] = begin
+    chance = np.where(scale[None] > scale[:, None], RISE, FALL)
+    edges: list[Any] = [(same, same, chance) for same in (RIGHT, LASTS)]
+    edges += [(EVERY, BEGINS, begin)]
     for off in (LASTS, BEGINS):
-        p[off, ENDS] = over
-        p[off, STRAYED] = over / LATER
-    # where the rest goes
-    at, rest = np.arange(len(p)), np.array([*range(2 * COUNT), COUNT, 0, 0])
-    p[at, rest] = 0.0
-    p[at, rest] = 1.0 - p.sum(axis=1)
-    return p
+        edges += [(off, ENDS, over), (off, STRAYED, over / LATER)]
+    return transitions(len(_ROWS), edges, rest=[*range(2 * COUNT), COUNT, 0, 0])
 
 
 # ------------------------------------------------------------------------------------ the model
@@ -126,11 +122,6 @@ def widened(start: Belief, asked: bool) -> Belief:
 def navigation(x: Any) -> InsState:
     """The navigation state of a wide one; another as it is."""
     return x.ins if isinstance(x, Wide) else x
-
-
-def _as_data(function: Any) -> Partial:
-    # a `Partial` of one would be equal to itself only, and every run would compile anew
-    return function if isinstance(function, Partial) else Partial(function)
 
 
 def _moved(of: Hypothesis, x: Wide) -> Wide:
@@ -182,7 +173,7 @@ def fresh(model: Model) -> Model:
     """The model whose velocities are those of the fix, whatever window ``aux`` says."""
 
     def sensor(s: Sensor) -> Sensor:
-        read = Partial(_read_fresh, _as_data(s.read))
+        read = Partial(_read_fresh, as_data(s.read))
         return Sensor(read, s.noise, s.dim, s.name) if s.name == VELOCITY else s
 
     return Model(model.motion, tuple(map(sensor, model.sensors)))
@@ -197,12 +188,12 @@ def supposed(model: Model, of: Hypothesis) -> Model:
     """
 
     def sensor(s: Sensor) -> Sensor:
-        own = _as_data(s.read)
+        own = as_data(s.read)
         if s.name == POSITION:
             read = Partial(_read_off, own, of.read)
         else:
             read = Partial(_read_share if s.name == VELOCITY else _read, own)
-        noise = Partial(_read, _as_data(s.noise)) if callable(s.noise) else s.noise
+        noise = Partial(_read, as_data(s.noise)) if callable(s.noise) else s.noise
         return Sensor(read, noise, s.dim, s.name)
 
     sensors = tuple(map(sensor, model.sensors))
@@ -253,27 +244,43 @@ def stretches(time_s: np.ndarray, which: np.ndarray) -> list[tuple[float, float]
 # ----------------------------------------------------------------------------------- the filters
 
 
+@value
+class Tails(Rule):
+    """The rule of `tails`: of a position s R with s = min(1 / weight, heaviest)."""
+
+    inner: Rule
+    heaviest: Numbers  # ()
+
+    name = "tails"
+
+    def before(self, memory: Memory, prior: Belief, observation: Observation):
+        """Noise by Student's t, of a position within bounds."""
+        memory, prior, seen = self.inner.before(memory, prior, observation)
+        if observation.sensor == POSITION:
+            scale = jnp.minimum(1.0 / seen.notes["student_t.weight"], jnp.asarray(self.heaviest))
+            seen = seen._replace(noise=jnp.sqrt(scale) * observation.noise)
+        return memory, prior, seen
+
+
 def tails() -> Rule:
     """Student's t on every measurement; of a position no more than `HEAVIEST`.
 
     A position far away is a matter of the hypotheses. A mode that explains it by a weight, again at
     every step, would stay likelier than what has to be believed once, and swallow it in the mixing.
     """
-    t = student_t(_TAILS, patience=None)  # the hypotheses are the way out
-
-    def before(memory: Any, prior: Belief, o: Observation):
-        memory, prior, seen = t.before(memory, prior, o)
-        if o.sensor == POSITION:
-            scale = jnp.minimum(1.0 / seen.notes["student_t.weight"], HEAVIEST)
-            seen = seen._replace(noise=jnp.sqrt(scale) * o.noise)
-        return memory, prior, seen
-
-    return hooks(before=before, name="tails")
+    # the hypotheses are the way out
+    return Tails(student_t(_TAILS, patience=None), np.asarray(HEAVIEST))
 
 
 def weighed() -> Filter:
     """A filter of one hypothesis; it can be smoothed."""
     return kalman(taylor(), [student_t(_TAILS)])
+
+
+def _mode(model: Model, rule: Rule, row: Hypothesis) -> Mode:
+    own = supposed(model, row)
+    mine = tuple(s for s in own.sensors if s.name == POSITION)
+    return Mode(kalman(taylor(), [rule]), own.motion, mine)
 
 
 def robust(model: Model, step_s: float, patience_s: float) -> Filter:
@@ -284,13 +291,8 @@ def robust(model: Model, step_s: float, patience_s: float) -> Filter:
         step_s: between fixes, or of the longest block where that is shorter.
         patience_s: how long positions are off where they are, in the mean.
     """
-
-    def mode(row: Hypothesis) -> Mode:
-        own = supposed(model, row)
-        mine = tuple(s for s in own.sensors if s.name == POSITION)
-        return Mode(kalman(taylor(), [tails()]), own.motion, mine)
-
     start = np.zeros(len(_ROWS))
     start[RIGHT] = 1.0 / COUNT
     # a position that may be off by `OFF_M` is seldom expected, and would hide what is
-    return imm(Family(mode, HYPOTHESES), changes(step_s, patience_s), start, likeliest=True)
+    family = Family(Partial(_mode, model, tails()), HYPOTHESES)
+    return imm(family, changes(step_s, patience_s), start, likeliest=True)

@@ -21,8 +21,9 @@ from robins.earth.magnetic import MagneticModelError, decimal_year, elements, fi
 from robins.errors import require_known
 from robins.filters import Belief, Code, Filter, kalman, rules
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
+from robins.filters.rule import Memory, Rule
 from robins.filters.trees import select
+from robins.filters.values import Numbers, number, value
 from robins.ins.frames import to_ned_frd
 from robins.results import Outcome, Progress, array, silent, variable
 from robins.systems import replaying
@@ -41,7 +42,7 @@ _HEADING = StateBlock("heading", slice(2, 3), "rad", "deg", "NED", ("heading",))
 _INCLINATION = StateBlock("inclination", slice(0, 2), "rad", "deg", "NED", ("north", "east"))
 
 
-def field_forgotten(prior: Belief, field_t: float) -> Belief:
+def field_forgotten(prior: Belief, field_t: Numbers | float) -> Belief:
     """Belief that knows nothing of the field any more, and all else as before.
 
     The heading too: the gyros know it better than a field that has changed. That the declination of
@@ -52,6 +53,26 @@ def field_forgotten(prior: Belief, field_t: float) -> Belief:
     S = jnp.where(forgotten[:, None] > 0.0, 0.0, prior.factor)
     mean = prior.mean._replace(declination=jnp.zeros_like(prior.mean.declination))
     return Belief(mean, linalg.tria(S, jnp.diag(forgotten)))
+
+
+@value
+class Undisturbed(Rule):
+    """The rule of `undisturbed`: a gate that forgets the field where it recovers."""
+
+    gate: Rule
+    field_t: Numbers  # () T
+
+    name = "undisturbed"
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
+        """Memory of the gate."""
+        return self.gate.init(belief, dims)
+
+    def before(self, memory: Memory, prior: Belief, o: Observation):
+        """What the gate makes of a measurement, but for the prior where it recovers."""
+        memory, reopened, o = self.gate.before(memory, prior, o)
+        new = o.notes["gate.recovered"]
+        return memory, select(new, field_forgotten(prior, self.field_t), Belief(*reopened)), o
 
 
 def undisturbed(probability: float, patience: int, field_t: float) -> Rule:
@@ -67,14 +88,9 @@ def undisturbed(probability: float, patience: int, field_t: float) -> Rule:
         patience: refusals in a row.
         field_t: T, spread of strength and vertical component after forgetting.
     """
-    inner = rules.gate(probability, patience, "reinitialise")
-
-    def before(memory, prior: Belief, o: Observation):
-        memory, reopened, o = inner.before(memory, prior, o)
-        new = o.notes["gate.recovered"]
-        return memory, select(new, field_forgotten(prior, field_t), Belief(*reopened)), o
-
-    return rules.only(model.MAGNETOMETER, inner._replace(before=before, name="undisturbed"))
+    gate = rules.gate(probability, patience, "reinitialise")
+    spread = number("field_t must be a number", field_t)
+    return rules.only(model.MAGNETOMETER, Undisturbed(gate, spread))
 
 
 def marg_filter(

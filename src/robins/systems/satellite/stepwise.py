@@ -20,21 +20,20 @@ Nothing is promised for a plant that varies: see `robins.filters.synthesis.lmi.E
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array
 
 from robins.filters import Belief, Code, Rule, StepInfo, StepWarning
 from robins.filters.kalman import FilterState
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
-from robins.filters.rule import hooks
-from robins.filters.rules.constant_gain import Fixed, constant_gain
+from robins.filters.rules.constant_gain import corrected
 from robins.filters.synthesis import (
     EveryStep,
     FrozenTimeWarning,
@@ -44,6 +43,7 @@ from robins.filters.synthesis import (
     current_form,
     kalman_design,
 )
+from robins.filters.values import is_known, value
 from robins.rotation import conjugate, multiply, to_rotvec
 from robins.systems.satellite.design import GainSpec, SensorNoise, axis_plant
 from robins.systems.satellite.nodes import NO_GAIN, STAR
@@ -132,15 +132,50 @@ class Redesigned(NamedTuple):
     gain: Array  # (6, 3) of the last frame whose design passed; before it that of `begun`
     failed: Array  # () frames whose design did not pass
 
-    def audit(self, start: Redesigned, again: Any, time: Any) -> None:
+
+@value
+class LmiStep(Rule):
+    """The rule of `redesigned`."""
+
+    name = NAME
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> Redesigned:
+        none = Frozen(*(jnp.zeros(shape) for shape in ((), (), (6, 6), (6, 3), (3,))))
+        q_ib = belief.mean.attitude.wxyz
+        return Redesigned(none, q_ib, jnp.zeros(3), jnp.zeros((6, 3)), jnp.asarray(0))
+
+    def settle(self, memory: Redesigned, belief: Belief):
+        return memory._replace(q_ib=belief.mean.attitude.wxyz), belief, int(Code.DONE)
+
+    def process(self, memory: Redesigned, transition: Transition):
+        turn = to_rotvec(multiply(conjugate(memory.q_ib), transition.mean.attitude.wxyz))
+        return memory._replace(turn=turn), transition
+
+    def after(self, memory: Redesigned, posterior: Belief, info: StepInfo, o: Observation):
+        shapes = jax.ShapeDtypeStruct((6, 3), float), jax.ShapeDtypeStruct((), bool)
+        solved = partial(jax.pure_callback, gain_at, shapes, vmap_method="sequential")
+        found, passed = jax.lax.cond(
+            jnp.any(info.used),
+            solved,
+            lambda rate_b, of: (memory.gain, jnp.asarray(True)),
+            memory.turn / memory.of.sample_s,
+            memory.of,
+        )
+        gain = jnp.where(passed, found, memory.gain)
+        if o.sensor == STAR:
+            posterior, info = corrected(gain, posterior, info, o)
+        memory = memory._replace(gain=gain, failed=memory.failed + (~passed).astype(int))
+        return memory, posterior, info.noted(NAME, **{_FAILED: ~passed})
+
+    def report(self, start: Redesigned, final: Redesigned, again: Any, time: Any) -> None:
         """Tell of the designs of a run that did not pass.
 
         Warns:
             StepWarning: there are such.
         """
-        if isinstance(self.failed, Tracer) or isinstance(start.failed, Tracer):
+        if not is_known((start.failed, final.failed)):
             return
-        if number := int(self.failed) - int(start.failed):
+        if number := int(final.failed) - int(start.failed):
             warnings.warn(
                 f"{number} designs at a star frame did not pass the test of their true norms: the "
                 "gain of the frame before stayed",
@@ -157,36 +192,7 @@ def redesigned() -> Rule:
 
     Notes: ``lmi_step.failed``, whether the design of this frame did not pass.
     """
-    held = constant_gain({STAR: np.zeros((6, 3))})
-
-    def init(belief: Belief, dims: Any) -> Redesigned:
-        none = Frozen(*(jnp.zeros(shape) for shape in ((), (), (6, 6), (6, 3), (3,))))
-        q_ib = belief.mean.attitude.wxyz
-        return Redesigned(none, q_ib, jnp.zeros(3), jnp.zeros((6, 3)), jnp.asarray(0))
-
-    def settle(memory: Redesigned, belief: Belief):
-        return memory._replace(q_ib=belief.mean.attitude.wxyz), belief, int(Code.DONE)
-
-    def process(memory: Redesigned, transition: Transition):
-        turn = to_rotvec(multiply(conjugate(memory.q_ib), transition.mean.attitude.wxyz))
-        return memory._replace(turn=turn), transition
-
-    def after(memory: Redesigned, posterior: Belief, info: StepInfo, o: Observation):
-        shapes = jax.ShapeDtypeStruct((6, 3), float), jax.ShapeDtypeStruct((), bool)
-        solved = partial(jax.pure_callback, gain_at, shapes, vmap_method="sequential")
-        found, passed = jax.lax.cond(
-            jnp.any(info.used),
-            solved,
-            lambda rate_b, of: (memory.gain, jnp.asarray(True)),
-            memory.turn / memory.of.sample_s,
-            memory.of,
-        )
-        gain = jnp.where(passed, found, memory.gain)
-        _, posterior, info = held.after(Fixed({STAR: gain}), posterior, info, o)
-        memory = memory._replace(gain=gain, failed=memory.failed + (~passed).astype(int))
-        return memory, posterior, info.noted(NAME, **{_FAILED: ~passed})
-
-    return hooks(init=init, process=process, after=after, name=NAME, settle=settle)
+    return LmiStep()
 
 
 def begun(state: FilterState, of: Frozen, gain: Any) -> FilterState:

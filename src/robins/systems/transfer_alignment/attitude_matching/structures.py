@@ -24,8 +24,11 @@ from jaxtyping import Array, ArrayLike
 
 from robins import units
 from robins.filters import Family, Filter, Motion, imm, kalman
+from robins.filters.composite.bank import EVERY, transitions
 from robins.filters.composite.imm import Mode
+from robins.filters.rule import Rule
 from robins.filters.rules import huber
+from robins.filters.values import Numbers, number
 from robins.sim.flexure import Flexure, transition
 from robins.systems.transfer_alignment.attitude_matching import model as am
 
@@ -65,23 +68,24 @@ def _moved(swing, noise, x, F):
     return F @ x, F, noise
 
 
+def _mode(weight: Rule, given: tuple[Numbers, ...], row: Supposed) -> Mode:
+    gyro, noise_rad, period_s = map(jnp.asarray, given)
+    Phi, L = transition(row.sigma, row.time, 1.0, period_s)
+    # a stiff structure forgets what the start supposes
+    swing = jnp.where(jnp.asarray(row.sigma) > 0.0, jnp.kron(Phi, jnp.eye(3)), 0.0)
+    drive = jnp.zeros((am.STATES_FLEXIBLE, 6)).at[am.STATES :].set(jnp.kron(L, jnp.eye(3)))
+    G = jnp.concatenate([gyro, drive], axis=1)
+    motion = Motion(Partial(_move, swing), G, linear=Partial(_moved, swing, G))
+    white = noise_rad * jnp.hypot(1.0, row.flutter)
+    return Mode(kalman(rules=(weight,)), motion, (am.reading(white),))
+
+
 def supposed(
     system: am.LinearSystem, noise_rad: float, period_s: float
 ) -> Callable[[Supposed], Mode]:
     """What makes the filter of a hypothesis (see `blind`)."""
-    gyro = jnp.asarray(system.G[:, :3])
-
-    def one(row: Supposed) -> Mode:
-        Phi, L = transition(row.sigma, row.time, 1.0, period_s)
-        # a stiff structure forgets what the start supposes
-        swing = jnp.where(jnp.asarray(row.sigma) > 0.0, jnp.kron(Phi, jnp.eye(3)), 0.0)
-        drive = jnp.zeros((am.STATES_FLEXIBLE, 6)).at[am.STATES :].set(jnp.kron(L, jnp.eye(3)))
-        G = jnp.concatenate([gyro, drive], axis=1)
-        motion = Motion(Partial(_move, swing), G, linear=Partial(_moved, swing, G))
-        white = noise_rad * jnp.hypot(1.0, row.flutter)
-        return Mode(kalman(rules=(huber(_WEIGHED),)), motion, (am.reading(white),))
-
-    return one
+    given = system.G[:, :3], noise_rad, period_s
+    return Partial(_mode, huber(_WEIGHED), tuple(number("numbers are real", x) for x in given))
 
 
 def blind(system: am.LinearSystem, noise_rad: float, period_s: float) -> Filter:
@@ -95,6 +99,5 @@ def blind(system: am.LinearSystem, noise_rad: float, period_s: float) -> Filter:
     rows = hypotheses()
     stiff = np.asarray(rows.sigma) == 0.0
     start = np.where(stiff, 0.5 / np.sum(stiff), 0.5 / np.sum(~stiff))
-    count = len(start)
-    change = np.full((count, count), _OTHER) + np.diag(np.full(count, 1.0 - count * _OTHER))
+    change = transitions(len(start), [(EVERY, EVERY, _OTHER)])
     return imm(Family(supposed(system, noise_rad, period_s), rows), change, start)

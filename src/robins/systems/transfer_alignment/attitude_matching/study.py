@@ -66,12 +66,12 @@ FILTERS = (*TOLD, *IN_UNIT, "hinf-weighted", "adaptive")
 
 
 def central_filter() -> Filter:
-    """H-infinity with L = I [rad]; gamma is data."""
+    """H-infinity with L = I [rad]; `with_gamma` gives it a bound."""
     return kalman(rules=[h_infinity(np.inf, np.eye(am.STATES))])
 
 
 def weighted_filter() -> Filter:
-    """H-infinity on the attitude alone, in arcminutes; gamma is data."""
+    """H-infinity on the attitude alone, in arcminutes; `with_gamma` gives it a bound."""
     return kalman(rules=[h_infinity(np.inf, np.eye(am.STATES)[am.PHI] / ARCMIN)])
 
 

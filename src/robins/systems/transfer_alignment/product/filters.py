@@ -28,12 +28,14 @@ from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike
+from jax.tree_util import Partial
+from jaxtyping import Array, ArrayLike
 
 from robins.filters import Family, Filter, imm, kalman, taylor, unscented
 from robins.filters.linearise import Transition
-from robins.filters.rule import Rule, hooks
+from robins.filters.rule import Memory, Rule
 from robins.filters.rules import huber
+from robins.filters.values import Numbers, number, value
 from robins.sim.flexure import Flexure
 from robins.systems.transfer_alignment.product.parameters import Structure
 
@@ -55,13 +57,21 @@ QUIET, NOISY, DRIFTING = Hypothesis(), Hypothesis(gyro=15.0), Hypothesis(gyro=15
 KICKED = Hypothesis(flexure=10.0)
 
 
-def supposing(hypothesis: Hypothesis, stiff: ArrayLike) -> Rule:
-    """Filter as if a hypothesis held; a stiff structure has no flexure worth the name."""
-    gyro, walk, flexure = hypothesis
-    grown = jnp.ones(_STATES).at[_ATTITUDE].set(gyro).at[_FLEXURE].set(flexure)
-    kept = jnp.ones(_STATES).at[_FLEXURE].set(jnp.where(stiff, _STIFF, 1.0))
+@value
+class Supposing(Rule):
+    """The rule of `supposing`."""
 
-    def process(memory, t: Transition):
+    hypothesis: Hypothesis
+    stiff: Numbers  # () one where the structure is, else zero
+
+    name = "supposing"
+
+    def process(self, memory: Memory, transition: Transition):
+        """Process noise of the hypothesis, and the flexure that it leaves."""
+        t, (gyro, walk, flexure) = transition, self.hypothesis
+        stiff = jnp.asarray(self.stiff) > 0.0
+        grown = jnp.ones(_STATES).at[_ATTITUDE].set(gyro).at[_FLEXURE].set(flexure)
+        kept = jnp.ones(_STATES).at[_FLEXURE].set(jnp.where(stiff, _STIFF, 1.0))
         # The noise factor is triangular, and gyro noise enters by its first three columns.
         one_axis = jnp.sqrt(jnp.sum(t.noise[_ATTITUDE] ** 2) / 3.0)
         wander = jnp.zeros((_STATES, 3)).at[_GYRO_BIAS].set(walk * one_axis * jnp.eye(3))
@@ -70,7 +80,11 @@ def supposing(hypothesis: Hypothesis, stiff: ArrayLike) -> Rule:
         spread, noise = t.spread * kept[:, None], noise * kept[:, None]
         return memory, t._replace(mean=mean, spread=spread, noise=noise)
 
-    return hooks(process=process, name="supposing")
+
+def supposing(hypothesis: Hypothesis, stiff: ArrayLike) -> Rule:
+    """Filter as if a hypothesis held; a stiff structure has no flexure worth the name."""
+    own = Hypothesis(*(number("a hypothesis is of real numbers", x) for x in hypothesis))
+    return Supposing(own, number("stiff is one or zero", stiff))
 
 
 # Changes in one step of the filter, tenths of a second: from the row's hypothesis to the column's.
@@ -104,16 +118,17 @@ def changes() -> np.ndarray:
     )
 
 
+def _mode(weight: Rule, row: tuple[Hypothesis, Array]) -> Filter:
+    return kalman(taylor(), (supposing(*row), weight), form="joseph")
+
+
 def seven() -> Filter:
     """The bank of hypotheses, for a product model with flexure states."""
-
-    def one(row: tuple[Hypothesis, ArrayLike]) -> Filter:
-        return kalman(taylor(), (supposing(*row), huber(_WEIGHED)), form="joseph")
-
     modes = (*_STIFF_MODES, *_FLEXING_MODES)
-    numbers = Hypothesis(*np.array(modes).T), np.arange(len(modes)) < len(_STIFF_MODES)
+    stiff = np.repeat([1.0, 0.0], [len(_STIFF_MODES), len(_FLEXING_MODES)])
+    numbers = Hypothesis(*np.array(modes).T), stiff
     start = 0.5 * np.array([*_STIFF_START, *_FLEXING_START])
-    return imm(Family(one, numbers), changes(), start)
+    return imm(Family(Partial(_mode, huber(_WEIGHED)), numbers), changes(), start)
 
 
 # ----------------------------------------------------------------------------------- by name
