@@ -240,7 +240,7 @@ class HInfinity(Rule):
 
     def first_infeasible(
         self, final: HInfinityMemory, before: int = 0, whole: bool = True
-    ) -> tuple[int, Array] | None:
+    ) -> tuple[int, Numbers] | None:
         """Step, and L S there, where a run first had no filter; None if it had.
 
         Args:
