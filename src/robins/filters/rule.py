@@ -53,23 +53,23 @@ class Rule:
         """``Rule(before=f)`` is a rule of functions."""
         return object.__new__(Hooks if cls is Rule else cls)
 
-    def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
+    def init(self, belief: Belief, dims: Mapping[str, int], /) -> Memory:
         return ()
 
-    def process(self, memory: Memory, transition: Transition) -> tuple[Memory, Transition]:
+    def process(self, memory: Memory, transition: Transition, /) -> tuple[Memory, Transition]:
         return memory, transition
 
     def before(
-        self, memory: Memory, prior: Belief, o: Observation
+        self, memory: Memory, prior: Belief, o: Observation, /
     ) -> tuple[Memory, Belief, Observation]:
         return memory, prior, o
 
     def after(
-        self, memory: Memory, posterior: Belief, info: StepInfo, o: Observation
+        self, memory: Memory, posterior: Belief, info: StepInfo, o: Observation, /
     ) -> tuple[Memory, Belief, StepInfo]:
         return memory, posterior, info
 
-    def settle(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief, Any]:
+    def settle(self, memory: Memory, belief: Belief, /) -> tuple[Memory, Belief, Any]:
         return memory, belief, int(Code.DONE)
 
     @property
@@ -96,17 +96,18 @@ class Rule:
         """
 
 
-_SETTLE = partial(Rule.settle, None)
+_ANY: Any = None  # the hooks of `Rule` look at nothing of theirs
+_SETTLE = partial(Rule.settle, _ANY)
 
 
 @value
 class Hooks(Rule):
     """A rule of functions of a user, each equal to itself only."""
 
-    init: Any = kind(default=partial(Rule.init, None))
-    process: Any = kind(default=partial(Rule.process, None))
-    before: Any = kind(default=partial(Rule.before, None))
-    after: Any = kind(default=partial(Rule.after, None))
+    init: Any = kind(default=partial(Rule.init, _ANY))
+    process: Any = kind(default=partial(Rule.process, _ANY))
+    before: Any = kind(default=partial(Rule.before, _ANY))
+    after: Any = kind(default=partial(Rule.after, _ANY))
     name: str = kind(default="rule")
     settle: Any = kind(default=_SETTLE)
 

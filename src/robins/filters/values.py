@@ -20,7 +20,7 @@ from robins.errors import require
 
 T = TypeVar("T")
 if TYPE_CHECKING:  # which knows no operator of a scalar of NumPy with an array of JAX
-    Numbers = jax.Array
+    Numbers = jax.Array | Any
 else:
     Numbers = jax.Array | np.ndarray | np.generic  # of a leaf; JAX's stand-ins are arrays too
 
