@@ -368,10 +368,11 @@ class Asked(Rule):
 
 
 def test_the_filter_that_is_delayed_is_asked_with_a_run_of_its_own():
-    one = delayed(kalman(rules=[gate(), Asked(np.ones(()))]), LINEAR, 3)
+    model = Model(LINEAR.motion, LINEAR.sensors[:1])
+    one = delayed(kalman(rules=[Asked(np.ones(()))]), model, 1)
     time_s = np.arange(8)
-    run(one, LINEAR, BEGIN, {"a": Y["a"]}, time_s=time_s)
-    live = OnlineFilter(one, LINEAR, BEGIN)
+    run(one, model, BEGIN, Y["a"], time_s=time_s)
+    live = OnlineFilter(one, model, BEGIN)
     live.predict()
     assert [(0.0, 8.0, 16.0, time_s), (0.0, 1.0, None, None)] == HEARD
     assert one.reports

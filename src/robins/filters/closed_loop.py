@@ -20,7 +20,6 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState
 from robins.filters.model import Model, Sensor
 from robins.filters.run import Step, check_names, everything, is_traced, nothing
-from robins.filters.sameness import same_model
 from robins.filters.tally import Tally, warn_not_taken
 from robins.filters.values import as_data
 
@@ -154,7 +153,6 @@ def run_closed(
     as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
     state, world, rows, due = (as_arrays(x) for x in (state, loop.world, loop.rows, loop.due))
     loop = Loop(as_data(loop.react), world, rows, due)
-    model = same_model(model)
     closed = Closed(*_scan(filter_, model, state, loop, keep))
     if not is_traced(closed.final):
 

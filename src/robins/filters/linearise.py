@@ -337,8 +337,12 @@ def unscented(
             from a measurement than could be, unless the noise is small. Only the first update after
             a prediction that no rule has faded has such points; the others draw.
     """
-    plain = (x if isinstance(x, (int, float)) else float(x) for x in (alpha, beta, kappa))
-    return Unscented(tuple(plain), redraw)
+    return Unscented((_plain(alpha), _plain(beta), _plain(kappa)), redraw)
+
+
+def _plain(given: Number) -> float:
+    """A number that is a kind, and so has a hash, which an array has not."""
+    return given if isinstance(given, (int, float)) else float(given)
 
 
 def _square(noise: Array) -> Array:

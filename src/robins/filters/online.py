@@ -15,7 +15,6 @@ from robins.filters.machine import Machine, on, settled
 from robins.filters.model import Model
 from robins.filters.observation import as_measurement, as_real
 from robins.filters.run import Step, everything
-from robins.filters.sameness import same_model
 from robins.filters.tally import Tally, doubts
 from robins.manifold import State
 
@@ -61,7 +60,7 @@ class OnlineFilter:
                 function does that has no place there is told by the call that needs it, with the
                 line of the model or the rule.
         """
-        self.filter, self.model = filter_, same_model(model)
+        self.filter, self.model = filter_, model
         state = settled(filter_.init(start, model.dims) if isinstance(start, Belief) else start)
         self._machine = on(machine, self.filter, self.model, state)
         self._reports = filter_.reports

@@ -60,12 +60,12 @@ class Rule:
         return memory, transition
 
     def before(
-        self, memory: Memory, prior: Belief, observation: Observation
+        self, memory: Memory, prior: Belief, o: Observation
     ) -> tuple[Memory, Belief, Observation]:
-        return memory, prior, observation
+        return memory, prior, o
 
     def after(
-        self, memory: Memory, posterior: Belief, info: StepInfo, observation: Observation
+        self, memory: Memory, posterior: Belief, info: StepInfo, o: Observation
     ) -> tuple[Memory, Belief, StepInfo]:
         return memory, posterior, info
 

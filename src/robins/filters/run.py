@@ -16,7 +16,6 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Model
 from robins.filters.observation import as_measurement
-from robins.filters.sameness import same_model
 from robins.filters.tally import Tally, warn_not_taken
 
 
@@ -175,7 +174,6 @@ def run(
     as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
     state, u, extra = as_arrays(state), as_arrays(u), as_arrays(extra)
-    model = same_model(model)
     solution = _scan(filter_, model, state, u, measurements, extra, keep)
     if not is_traced(solution.final):
 

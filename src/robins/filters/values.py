@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Hashable
-from typing import Any, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, TypeVar, dataclass_transform
 
 import jax
 import numpy as np
@@ -19,7 +19,10 @@ from jax.tree_util import GetAttrKey, Partial, register_pytree_with_keys
 from robins.errors import require
 
 T = TypeVar("T")
-Numbers = jax.Array | np.ndarray | np.float64  # of a leaf; the stand-ins of JAX are arrays too
+if TYPE_CHECKING:  # which knows no operator of a scalar of NumPy with an array of JAX
+    Numbers = jax.Array
+else:
+    Numbers = jax.Array | np.ndarray | np.generic  # of a leaf; JAX's stand-ins are arrays too
 
 
 def kind(**how: Any) -> Any:

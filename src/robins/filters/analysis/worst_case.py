@@ -29,7 +29,7 @@ from robins.filters.kalman import kalman
 from robins.filters.linearise import Linearisation, taylor
 from robins.filters.model import Model, Motion, Sensor
 from robins.filters.rules._inflation import as_weight, rows_of
-from robins.filters.rules.h_infinity import Estimate, h_infinity, least_gamma, with_gamma
+from robins.filters.rules.h_infinity import Estimate, h_infinity, least_gamma
 from robins.filters.run import Solution, run
 from robins.manifold import State
 
@@ -97,8 +97,7 @@ def gamma_min(
         ValueError: the Kalman filter itself cannot take every step, or rtol is below 1e-12.
     """
     require(rtol >= 1e-12, "rtol must be 1e-12 or more, for numbers have no more digits", rtol)
-    rule = h_infinity(np.inf, weight, estimate=estimate, count_missing=count_missing)
-    filter_ = kalman(linearise, [rule])
+    of = partial(h_infinity, weight=weight, estimate=estimate, count_missing=count_missing)
 
     def bounds(step):
         last = [info.notes["h_infinity.bound"] for info in step.info.values()][-1:]
@@ -106,15 +105,15 @@ def gamma_min(
         return jnp.where(counts, jnp.max(jnp.array(last), initial=0.0), 0.0)
 
     @jax.jit  # so that nothing is raised where the filter does not exist
-    def attempt(filter_):
-        done = run(filter_, model, start, y, u, aux, bounds)
+    def attempt(rule):
+        done = run(kalman(linearise, [rule]), model, start, y, u, aux, bounds)
         return done.final.memory[0], done.log_likelihood, done.steps
 
     def exists(gamma: float) -> bool:
-        one = with_gamma(filter_, gamma)
-        return one.rules[0].first_infeasible(attempt(one)[0]) is None
+        one = of(gamma)
+        return one.first_infeasible(attempt(one)[0]) is None
 
-    _, log_likelihood, noted = attempt(filter_)
+    _, log_likelihood, noted = attempt(of(np.inf))
     if not np.isfinite(log_likelihood):
         raise ValueError("gamma_min: a step of the Kalman filter cannot be taken: see its codes")
     lower = float(np.max(noted, initial=0.0))

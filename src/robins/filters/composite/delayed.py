@@ -24,7 +24,6 @@ from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo, is_failure
 from robins.filters.kalman import Again, Filter, FilterState, Prediction
 from robins.filters.model import Data, Model, Motion, Sensor
-from robins.filters.sameness import same_model
 from robins.filters.trees import select
 from robins.filters.values import kind, value
 
@@ -302,7 +301,7 @@ def delayed(
     if unknown := set(given) - set(names):
         raise ValueError(f"aux names no sensor {sorted(unknown)}; the model has {sorted(names)}")
     extra = {name: _plain(given.get(name)) for name in names}
-    return Delayed(filter_, same_model(model), _plain(u), extra, depth)
+    return Delayed(filter_, model, _plain(u), extra, depth)
 
 
 def _entered(

@@ -73,7 +73,9 @@ class AdaptiveHInfinity(Rule):
         shrunk, _ = deflated(factor, memory.inverse * weighted, SHARE)
         return jnp.where(asked, shrunk, factor), asked
 
-    def after(self, memory: AdaptiveMemory, posterior: Belief, info: StepInfo, o: Observation):
+    def after(
+        self, memory: AdaptiveMemory, posterior: Belief, info: StepInfo, observation: Observation
+    ):
         here = memory.at
         memory = memory._replace(
             nis=memory.nis.at[here].add(jnp.minimum(info.nis, LARGEST)),

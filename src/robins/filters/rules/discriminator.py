@@ -209,4 +209,5 @@ def _levels(rho: Numbers, threshold: Numbers | None, chance: Numbers) -> Numbers
     if threshold is None:
         return _fading.chance_levels(float(rho), MOST, float(chance))
     dof = np.maximum(np.arange(MOST + 1.0), 1.0)
-    return 1.0 + threshold * (((1.0 - rho) / (1.0 + rho) * 2.0) ** 0.5 / np.sqrt(dof))
+    with np.errstate(invalid="ignore"):  # V that never moves exceeds nothing
+        return 1.0 + threshold * (2.0 * (1.0 - rho) / ((1.0 + rho) * dof)) ** 0.5

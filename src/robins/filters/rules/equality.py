@@ -127,21 +127,21 @@ def equality(
     d = jax.tree_util.tree_map(
         lambda leaf: _finite("d", leaf), d, is_leaf=lambda x: isinstance(x, list)
     )
-    noise = None if noise is None else _finite("noise", noise)
-    weight = as_weight("equality", weight)
-    if not callable(g):
-        g = _finite("D", g)
-        if is_known((g, d, noise)):
-            _check_rows(g, d, noise)
+    root = None if noise is None else _finite("noise", noise)
+    metric = as_weight("equality", weight)
+    D = g if callable(g) else _rows(_finite("D", g), d, root)
     limit = None if gate is None else limits(gate)
-    return Equality(g, d, weight, noise, limit, hard, iterations)
+    return Equality(D, d, metric, root, limit, hard, iterations)
 
 
 def _finite(name: str, given: Any) -> Any:
     return finite_numbers(f"equality {name}", given) if is_known(given) else given
 
 
-def _check_rows(D: np.ndarray, d: Any, noise: np.ndarray | None) -> None:
+def _rows(D: Any, d: Any, noise: Any) -> Any:
+    """D, checked where all is known."""
+    if not is_known((D, d, noise)):
+        return D
     if D.ndim != 2 or D.shape[0] == 0:
         raise ValueError(f"equality D must be (c, n), a row for each constraint, got {D.shape}")
     value = np.zeros(len(D)) if d is None else np.asarray(d, float)
@@ -154,3 +154,4 @@ def _check_rows(D: np.ndarray, d: Any, noise: np.ndarray | None) -> None:
         check_rows(D, value, exact)
     except ValueError as error:
         raise ValueError(f"equality: {error}") from None
+    return D

@@ -88,8 +88,8 @@ class Gate(Rule):
 
     def due(self, was: _Channel, over: Array, used: Array, o: Observation):
         """Whether patience has ended, and the refusals remembered."""
-        due = over & (was.refused.astype(float) >= self.patience)
-        if not self.kept:
+        due, scatter = over & (was.refused.astype(float) >= self.patience), self.scatter
+        if scatter is None:
             return due, was.residual, was.known
         fresh = jnp.broadcast_to(over, used.shape)[None, :]
         residual = jnp.where(fresh, _push(was.residual, o.residual), was.residual)
@@ -97,7 +97,7 @@ class Gate(Rule):
         agree = _agree_as_one if self.joint else _agree_each
         due = jax.lax.cond(
             jnp.any(due),
-            lambda: due & agree(self.scatter, residual, known, o.noise),
+            lambda: due & agree(scatter, residual, known, o.noise),
             lambda: due,
         )
         return due, residual, known

@@ -163,13 +163,15 @@ class HInfinity(Rule):
             memory = memory._replace(predicted=transition.mean)
         return memory, transition
 
-    def before(self, memory: HInfinityMemory, prior: Belief, o: Observation):
+    def before(self, memory: HInfinityMemory, prior: Belief, observation: Observation):
         if self.judges_prior:
             seen = self.weighted(prior)
             memory = memory._replace(weighted=jnp.where(memory.fresh, seen, memory.weighted))
-        return memory._replace(fresh=jnp.array(False)), prior, o
+        return memory._replace(fresh=jnp.array(False)), prior, observation
 
-    def after(self, memory: HInfinityMemory, posterior: Belief, info: StepInfo, o: Observation):
+    def after(
+        self, memory: HInfinityMemory, posterior: Belief, info: StepInfo, observation: Observation
+    ):
         if not self.judges_prior:
             memory = memory._replace(weighted=self.weighted(posterior))
         memory = memory._replace(measured=memory.measured | jnp.any(info.used))
@@ -192,9 +194,9 @@ class HInfinity(Rule):
         if self.judges_prior:
             judged = jnp.where(memory.fresh, weighted, memory.weighted)
         inverse, factor, weighted, acted = self.eased(belief, weighted, judged)
-        wide, exists = inflated(factor, inverse * weighted)
+        wide, exists = inflated(factor, jnp.multiply(inverse, weighted))
         if self.judges_prior:
-            exists = exists & inflated(factor, inverse * judged)[1]
+            exists = exists & inflated(factor, jnp.multiply(inverse, judged))[1]
         active = counts & exists & (self.inverse > 0.0)
         new = trees.select(active, self.moved(memory, belief, inverse, wide), belief)
         missed = counts & ~exists
@@ -207,7 +209,8 @@ class HInfinity(Rule):
             inverse = self.in_force(local_bound(judged))
             return inverse, belief.factor, weighted, inverse < self.inverse
         if self.policy == "compensate":
-            factor, acted = deflated(belief.factor, self.inverse * weighted, 1.0 - self.margin)
+            A = jnp.multiply(self.inverse, weighted)
+            factor, acted = deflated(belief.factor, A, 1.0 - self.margin)
             weighted = self.weighted(belief._replace(factor=factor))
             return self.inverse, factor, weighted, acted
         return self.inverse, belief.factor, weighted, jnp.array(False)
@@ -238,7 +241,7 @@ class HInfinity(Rule):
 
     def first_infeasible(
         self, final: HInfinityMemory, before: int = 0, whole: bool = True
-    ) -> tuple[int, Array] | None:
+    ) -> tuple[int, Numbers] | None:
         """Step, and L S there, where a run first had no filter; None if it had.
 
         Args:
@@ -254,7 +257,7 @@ class HInfinity(Rule):
         if not whole or not bool(final.measured):
             return None
         n = final.weighted.shape[1]
-        exists = inflated(jnp.eye(n), self.inverse * final.weighted)[1]
+        exists = inflated(jnp.eye(n), jnp.multiply(self.inverse, final.weighted))[1]
         return None if bool(exists) else (int(final.steps) - 1, final.weighted)
 
     @property
@@ -305,7 +308,7 @@ def h_infinity(
     estimate: Estimate = "a-posteriori",
     margin: float = 0.05,
     count_missing: bool = False,
-) -> Rule:
+) -> HInfinity:
     """The central H-infinity filter (Hassibi, Sayed & Kailath 1999, ch. 4).
 
     Keeps the energy of the estimation error L (x - x_hat), summed over a run, below gamma^2 times
@@ -354,14 +357,14 @@ def h_infinity(
     one_of("h_infinity policy", policy, Policy)
     one_of("h_infinity estimate", estimate, Estimate)
     between = "margin must lie between 0 and 1"
-    margin = number(between, margin, lambda m: (m > 0.0) & (m < 1.0))
+    left = number(between, margin, lambda m: (m > 0.0) & (m < 1.0))
     if estimate == "a-priori" and policy == "compensate":
         raise ValueError(
             "policy='compensate' mends P after the measurement, estimate='a-priori' needs it "
             "before: use 'raise_gamma'"
         )
     L = as_weight(weight, NAME)
-    return HInfinity(1.0 / asked, L, margin, policy, estimate, count_missing)
+    return HInfinity(1.0 / asked, L, left, policy, estimate, count_missing)
 
 
 def _as_gamma(gamma: Any) -> Any:

@@ -92,14 +92,14 @@ def inequality(
     """
     one_of("inequality method", method, Method)
     low, high = _bounds(lower, upper)
-    if not callable(g) and is_known(g):
-        g = _rows(g, len(low))
-    return Inequality(g, low, high, method)
+    D = g if callable(g) or not is_known(g) else _rows(g, len(low))
+    return Inequality(D, low, high, method)
 
 
 def _bounds(lower: Given | None, upper: Given | None) -> tuple[np.ndarray, np.ndarray]:
     require(lower is not None or upper is not None, "inequality wants lower or upper bounds")
-    shape, real = np.shape(lower if upper is None else upper), "inequality bounds must be numbers"
+    real = "inequality bounds must be numbers"
+    shape = number(real, lower if upper is None else upper).shape
     low = np.full(shape, -np.inf) if lower is None else number(real, lower)
     high = np.full(shape, np.inf) if upper is None else number(real, upper)
     if low.ndim != 1 or low.shape != high.shape or low.size == 0:
