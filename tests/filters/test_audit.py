@@ -107,4 +107,4 @@ def test_one_by_one_there_is_no_other_run():
     HEARD.clear()
     online.predict()
     online.update(DATA["a"][0], "a")
-    assert [(3, n, n, None, None) for n in (1, 2)] == HEARD
+    assert [(3, 0, n, None, None) for n in (1, 2)] == HEARD

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -184,7 +184,7 @@ class JoinedFilter(Composite):
     def filters(self) -> tuple[Filter, ...]:
         return tuple(one.filter for one in self.channels)
 
-    def with_filters(self, filters: tuple[Filter, ...]) -> Self:
+    def with_filters(self, filters: tuple[Filter, ...]) -> Any:
         each = zip(self.channels, filters, strict=False)  # a master's is no channel's
         return replace(self, channels=tuple(replace(c, filter=f) for c, f in each))
 

@@ -38,7 +38,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -183,7 +183,7 @@ class Federated(JoinedFilter):
     def filters(self) -> tuple[Filter, ...]:
         return (*super().filters, self.centre) if self.has_master else super().filters
 
-    def with_filters(self, filters: tuple[Filter, ...]) -> Self:
+    def with_filters(self, filters: tuple[Filter, ...]) -> Any:
         centre = filters[-1] if self.has_master else self.centre
         return replace(super().with_filters(filters), centre=centre)
 
