@@ -15,7 +15,7 @@ from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief, Number
 from robins.filters.observation import Observation
-from robins.filters.values import Numbers
+from robins.filters.values import Numbers, number
 
 Weights = ArrayLike | Sequence[Number] | None
 
@@ -199,15 +199,17 @@ def faded(
     return jnp.sqrt(jnp.maximum(weights * factor, 1.0))[:, None] * S, factor
 
 
-def checked_weights(rule: str, weights: Weights, form: str) -> np.ndarray | None:
+def checked_weights(rule: str, weights: Weights, form: str) -> Numbers | None:
     """Weights a_j of the states for the form "multiple", scaled to a greatest of 1."""
     if weights is None:
         return None
     require(form == "multiple", f"{rule} weights are for 'multiple', not {form!r}")
-    a = np.asarray(weights, dtype=float)
-    sound = a.ndim == 1 and np.all(np.isfinite(a) & (a >= 0.0)) and np.any(a > 0.0)
-    require(sound, f"{rule} weights must be (n,) numbers >= 0, not all 0", weights)
-    return a / np.max(a)
+
+    def sound(a: np.ndarray) -> bool:
+        return bool(a.ndim == 1 and np.all(np.isfinite(a) & (a >= 0.0)) and np.any(a > 0.0))
+
+    a = number(f"{rule} weights must be (n,) numbers >= 0, not all 0", weights, sound)
+    return a / a.max()
 
 
 def check_size(rule: str, a: Numbers | None, belief: Belief) -> None:

@@ -77,6 +77,6 @@ def channel_inflation(lambda_: Number, B: Any) -> Rule:
     negative = "channel_inflation lambda must be a number from 0 on"
     size = number(negative, lambda_, lambda x: (x >= 0.0) & (x < np.inf))
     if not callable(B):
-        B = finite_numbers("channel_inflation B", B)
+        B = finite_numbers("channel_inflation B", B) if is_known(B) else B
         require(B.ndim == 2, f"channel_inflation B has shape {B.shape}, (n, q) is wanted")
     return ChannelInflation(size, B, acts=not is_known(size) or bool(np.any(size)))

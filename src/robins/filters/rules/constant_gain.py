@@ -16,7 +16,7 @@ from robins.filters.kalman import FilterState
 from robins.filters.observation import Observation, left_out
 from robins.filters.rule import Rule
 from robins.filters.trees import select
-from robins.filters.values import Numbers, value
+from robins.filters.values import Numbers, is_known, value
 
 
 class Fixed(NamedTuple):
@@ -95,12 +95,11 @@ def constant_gain(gains: Mapping[str, Any]) -> Rule:
             model does not have or a gain that does not fit.
     """
     require(gains, "constant_gain: give at least one gain, {'sensor': (n, m) array}")
-    return ConstantGain(
-        {
-            name: finite_numbers(f"constant_gain: the gain of '{name}'", value)
-            for name, value in gains.items()
-        }
-    )
+    return ConstantGain({name: _as_gain(name, K) for name, K in gains.items()})
+
+
+def _as_gain(name: str, K: Any) -> Any:
+    return finite_numbers(f"constant_gain: the gain of '{name}'", K) if is_known(K) else K
 
 
 def with_gains(state: FilterState, gains: Mapping[str, Any]) -> FilterState:

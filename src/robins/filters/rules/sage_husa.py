@@ -63,18 +63,19 @@ class SageHusa(Rule):
         last = LastStep(nothing, nothing, nothing, nothing, jnp.zeros((), bool))
         return sensors, (_nominal(n), last) if self.of_motion else ()
 
-    def process(self, memory: Memory, t: Transition):
+    def process(self, memory: Memory, transition: Transition):
         if not self.of_motion:
-            return memory, t
+            return memory, transition
         sensors, (scale, last) = memory
         sample = _variances.ratio(last.correction**2 + last.posterior - last.moved, last.nominal)
         scale = self.learnt(scale, sample, last.measured & (last.nominal > 0.0))
-        moved = _variances.variance(t.spread) + _variances.variance(t.excess)
-        if t.deficit is not None:
-            moved = moved - t.deficit**2
-        nothing = jnp.zeros_like(moved)
-        last = LastStep(moved, _variances.variance(t.noise), nothing, nothing, jnp.zeros((), bool))
-        return (sensors, (scale, last)), t._replace(noise=_variances.scaled(t.noise, scale.ratio))
+        moved = _variances.variance(transition.spread) + _variances.variance(transition.excess)
+        if transition.deficit is not None:
+            moved = moved - transition.deficit**2
+        nominal, nothing = _variances.variance(transition.noise), jnp.zeros_like(moved)
+        last = LastStep(moved, nominal, nothing, nothing, jnp.zeros((), bool))
+        noise = _variances.scaled(transition.noise, scale.ratio)
+        return (sensors, (scale, last)), transition._replace(noise=noise)
 
     def before(self, memory: Memory, prior: Belief, o: Observation):
         if not self.of_sensor:

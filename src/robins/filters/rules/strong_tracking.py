@@ -56,12 +56,13 @@ class StrongTracking(Rule):
             fresh=jnp.array(False),
         )
 
-    def process(self, memory: _Memory, t: Transition):
+    def process(self, memory: _Memory, transition: Transition):
         if self.form != "outside":
-            return memory, t
-        moved, noise = (jnp.concatenate([t.spread, t.excess], axis=1), t.noise)
+            return memory, transition
+        noise = transition.noise
+        moved = jnp.concatenate([transition.spread, transition.excess], axis=1)
         moved, noise = _fitted(moved, memory.moved.shape[1]), _fitted(noise, len(noise))
-        return memory._replace(moved=moved, noise=noise, fresh=jnp.array(True)), t
+        return memory._replace(moved=moved, noise=noise, fresh=jnp.array(True)), transition
 
     def before(self, memory: _Memory, prior: Belief, o: Observation):
         white = _fading.whitened(o)
@@ -147,21 +148,18 @@ def strong_tracking(
             one a state.
     """
     share = "strong_tracking rho must lie in (0, 1]"
-    rho = number(share, rho, lambda r: (r > 0.0) & (r <= 1.0))
+    kept = number(share, rho, lambda r: (r > 0.0) & (r <= 1.0))
     below = "strong_tracking beta must be at least 1 and finite"
-    beta = number(below, beta, lambda b: (b >= 1.0) & (b < np.inf))
+    weakened = number(below, beta, lambda b: (b >= 1.0) & (b < np.inf))
     one_of("strong_tracking form", form, Form)
     one_of("strong_tracking power", power, Power)
-    if threshold is None and power == "ewma":
-        threshold = 3.0
-    if threshold is not None:
-        negative = "strong_tracking threshold must not be negative"
-        threshold = number(negative, threshold, lambda t: t >= 0.0)
+    sigmas = 3.0 if threshold is None and power == "ewma" else threshold
+    negative = "strong_tracking threshold must not be negative"
     below = "strong_tracking limit must be at least 1 and finite"
     return StrongTracking(
-        keep=rho / (1.0 + rho) if power == "classic" else rho,
-        beta=beta,
-        sigmas=threshold,
+        keep=kept / (1.0 + kept) if power == "classic" else kept,
+        beta=weakened,
+        sigmas=None if sigmas is None else number(negative, sigmas, lambda t: t >= 0.0),
         limit=number(below, limit, lambda x: (x >= 1.0) & (x < np.inf)),
         weights=_fading.checked_weights("strong_tracking", weights, form),
         form=form,

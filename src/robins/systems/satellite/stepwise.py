@@ -43,7 +43,7 @@ from robins.filters.synthesis import (
     current_form,
     kalman_design,
 )
-from robins.filters.values import is_known, value
+from robins.filters.values import value
 from robins.rotation import conjugate, multiply, to_rotvec
 from robins.systems.satellite.design import GainSpec, SensorNoise, axis_plant
 from robins.systems.satellite.nodes import NO_GAIN, STAR
@@ -168,12 +168,12 @@ class LmiStep(Rule):
         return memory, posterior, info.noted(NAME, **{_FAILED: ~passed})
 
     def report(self, start: Redesigned, final: Redesigned, again: Any, time: Any) -> None:
-        """Tell of the designs of a run that did not pass.
+        """Tell of the designs of a run that did not pass; in a stream each note does.
 
         Warns:
             StepWarning: there are such.
         """
-        if not is_known((start.failed, final.failed)):
+        if again is None:
             return
         if number := int(final.failed) - int(start.failed):
             warnings.warn(
