@@ -1,5 +1,7 @@
 """Constraints that come with data, against dense projections; rules that see some sensors alone."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +23,7 @@ from robins.filters import (
     unscented,
 )
 from robins.filters.rules import gate, huber, igg3, only, projection, sage_husa
+from robins.filters.values import value
 
 S = random_system(4, n=4, m=3)
 D, T = np.array([[1.0, -1.0, 0.0, 2.0], [0.0, 1.0, 0.5, 0.0]]), 10
@@ -141,6 +144,33 @@ def test_a_rule_for_one_sensor_leaves_the_others_alone():
     np.testing.assert_array_equal(got.steps.info["held"].code, want.steps.info["held"].code)
     np.testing.assert_array_equal(got.steps.info["seen"].notes["deaf.count"], np.arange(1, T + 1))
     assert not got.steps.info["held"].notes
+
+
+@value
+class Reporting(Rule):
+    """Says in a report with what it was asked."""
+
+    number: Any
+
+    def settle(self, memory, belief):
+        return memory + self.number, belief, int(Code.DONE)
+
+    def report(self, start, final, again, time):
+        more = None if again is None else again(Reporting(self.number + 1.0))
+        raise LookupError(start, final, more, time)
+
+
+def test_a_rule_inside_settles_and_reports():
+    rule = only("seen", Reporting(np.asarray(2.0)))
+    assert rule.settles
+    assert not only("seen", gate()).settles
+    assert rule.settle(3.0, S.start())[0] == 5.0
+    with pytest.raises(LookupError) as told:
+        rule.report(0, 1, lambda other: (other.names, float(other.inner.number)), 9)
+    assert told.value.args == (0, 1, (("seen",), 3.0), 9)
+    with pytest.raises(LookupError) as told:
+        rule.report(0, 1, None, None)
+    assert told.value.args == (0, 1, None, None)
 
 
 def test_hooks_of_a_step_stay_and_one_rule_serves_several_filters():

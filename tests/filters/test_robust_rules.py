@@ -1,6 +1,7 @@
 """Robust rules against recursions written with inverses, their limits, and planted outliers."""
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -8,15 +9,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import random_system, simulate
+from jax.tree_util import Partial
 from scipy import optimize, stats
 
 from robins.filters import Belief, Code, Model, Motion, Sensor, kalman, run
-from robins.filters.rules.correntropy import correntropy
-from robins.filters.rules.gate import gate
-from robins.filters.rules.huber import huber
-from robins.filters.rules.igg3 import igg3
-from robins.filters.rules.student_t import student_t
+from robins.filters.rules import (
+    correntropy,
+    discriminator,
+    equality,
+    gate,
+    huber,
+    igg3,
+    inequality,
+    only,
+    projection,
+    student_t,
+)
 from robins.rotation import Rotation
+from robins.systems.gnss.weights import by_component, huber_weight
 
 T = 60
 SYSTEM = random_system(2)
@@ -166,6 +176,55 @@ def test_a_rule_by_the_book(name):
         assert note == "student_t.prior" or np.ptp(want) > 0.5
     if "igg3" in name:
         assert 0 < sum(n["igg3.recovered"] for n in notes if n) < 5
+
+
+# Each rule with two numbers of each kind, whole ones too, and with `None` where that is a number.
+NUMBERS = [
+    (igg3, {"k0": 1, "k1": 4, "floor": 0, "patience": 3}, {"k0": 1.5, "floor": 1e-3}),
+    (student_t, {"dof": 4, "patience": 2}, {"dof": 7.5, "patience": 30}),
+    (correntropy, {"kernel": 2}, {"kernel": math.inf, "patience": 3}),
+    (discriminator, {"patience": 2, "limit": 5, "threshold": 3}, {"rho": 0.5, "looks": 100}),
+    (
+        discriminator,
+        {"fade": "multiple", "weights": [1, 2]},
+        {"fade": "multiple", "weights": [3, 0.5], "robust": "huber"},
+    ),
+    (partial(projection, "y"), {"weight": np.eye(2, dtype=int)}, {"weight": 2.5 * np.eye(2)}),
+    (
+        partial(equality, [[1, 0]]),
+        {"d": [2], "noise": [1], "gate": 0.9},
+        {"d": np.array([0.5]), "noise": [0.1], "gate": 0.99},
+    ),
+    (partial(inequality, [[1, 0]]), {"lower": [1]}, {"lower": [-1.5], "upper": [3]}),
+    (by_component, {"weight": huber_weight(1.0)}, {"weight": huber_weight(2.5)}),
+    (partial(only, "y"), {"rule": gate(0.9, 2)}, {"rule": gate(0.99, 7)}),
+]
+
+
+@pytest.mark.parametrize(("rule", "given", "other"), NUMBERS)
+def test_numbers_are_data_of_64_bits_and_choose_no_program(rule, given, other):
+    (numbers, kinds), (others, same) = map(jax.tree.flatten, (rule(**given), rule(**other)))
+    assert kinds == same
+    assert {(type(x), x.dtype) for x in numbers} <= {
+        (np.ndarray, np.dtype(float)),
+        (np.float64, np.dtype(float)),
+    }
+    assert [x.shape for x in numbers] == [x.shape for x in others]
+    assert any(np.any(x != y) for x, y in zip(numbers, others, strict=True))
+
+
+@pytest.mark.parametrize(
+    "rule",
+    [
+        lambda x: by_component(Partial(jnp.multiply, x)),
+        lambda x: inequality(jnp.eye(4)[:1], -x[None] - 1.0),
+        lambda x: equality(x * jnp.eye(4)[:1], x[None], noise=x[None]),
+        lambda x: projection("y", x * jnp.eye(4) + 1.0),
+    ],
+)
+def test_a_constructor_takes_a_stand_in_for_a_number(rule):
+    made = jax.eval_shape(rule, jnp.asarray(1.5))
+    assert jax.tree.structure(made) == jax.tree.structure(rule(jnp.asarray(1.5)))
 
 
 # --------------------------------------------------------------------------------- planted outliers

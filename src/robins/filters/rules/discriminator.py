@@ -196,11 +196,11 @@ def discriminator(
     )
 
 
-def _is_share(x: np.ndarray):
+def _is_share(x: Numbers) -> Numbers:
     return (x > 0.0) & (x <= 1.0)
 
 
-def _is_finite(x: np.ndarray):
+def _is_finite(x: Numbers) -> Numbers:
     return (x >= 1.0) & (x < np.inf)
 
 

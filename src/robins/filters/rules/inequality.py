@@ -96,7 +96,7 @@ def inequality(
     return Inequality(D, low, high, method)
 
 
-def _bounds(lower: Given | None, upper: Given | None) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(lower: Given | None, upper: Given | None) -> tuple[Numbers, Numbers]:
     require(lower is not None or upper is not None, "inequality wants lower or upper bounds")
     real = "inequality bounds must be numbers"
     shape = number(real, lower if upper is None else upper).shape
