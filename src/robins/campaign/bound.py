@@ -22,6 +22,7 @@ from robins.filters.analysis.observability import (
     unobservable,
     worded,
 )
+from robins.filters.model import Data
 from robins.filters.run import nothing
 from robins.manifold import State, dim, is_element
 from robins.results import array, variable
@@ -102,7 +103,7 @@ def bound_sigma(problem: Problem, name: str, world: Any) -> np.ndarray:
     return np.sqrt(np.asarray(_variances(c.filter, c.model, c.case, c.reported, world)))
 
 
-def _case(filter_: Filter, model: Model, case: Callable[[Any], Case], world: Any) -> Case:
+def _case(filter_: Filter, model: Model, case: Callable[[Data], Case], world: Data) -> Case:
     """The case of a run. In closed loop it takes the filter to know where the vehicle went."""
     it = case(world)
     return it if it.loop is None else solved(filter_, model, it, nothing)[1]

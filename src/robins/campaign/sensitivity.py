@@ -29,6 +29,7 @@ from scipy import stats
 from robins.campaign.memory import CHUNK, MEMORY, width_of
 from robins.campaign.monte_carlo import one_record
 from robins.filters import Belief
+from robins.filters.model import Data
 from robins.program.liveness import bytes_of_jaxpr
 from robins.scenario import Parameters
 from robins.systems.study import Contender, Study, View
@@ -170,7 +171,7 @@ def depends(before: Any, course: Any, after: Any) -> bool:
     return any(_alike(a, b) and not _alike(a, c) for a, b, c in each)
 
 
-def _parts(x: Any) -> Iterator[Any]:
+def _parts(x: Data) -> Iterator[Data]:
     """The leaves of a pytree, and of the dataclasses among them."""
     for leaf in jax.tree_util.tree_leaves(x):
         if dataclasses.is_dataclass(leaf) and not isinstance(leaf, type):
@@ -179,7 +180,7 @@ def _parts(x: Any) -> Iterator[Any]:
             yield leaf
 
 
-def _alike(a: Any, b: Any) -> bool:
+def _alike(a: Data, b: Data) -> bool:
     if isinstance(a, np.ndarray | np.generic | jax.Array | float | int):
         return bool(np.array_equal(a, b, equal_nan=np.asarray(a).dtype.kind == "f"))
     return type(a) is type(b) and bool(a == b)

@@ -26,6 +26,8 @@ from robins.results import Progress, silent
 FARTHEST = math.log(1000.0)  # of a factor, either way
 TOO_WIDE = math.log(3.0)  # of a 95 % interval, either way: the data say too little
 FEWEST_PARTS = 6
+Tree = Any  # a pytree of arrays
+Measure = Callable[[Tree, Tree], Array]
 _STEP = 0.01  # of differences of runs
 _COARSE = 0.1  # where a run may leap, or compiles anew
 _CURVED = 0.05  # of differences of gradients
@@ -61,7 +63,7 @@ class Objective(NamedTuple):
     """
 
     trial: Callable[[np.ndarray], Trial]
-    measure: Callable[[Any, Any], Array]
+    measure: Measure
     total: Callable[[np.ndarray], float]
 
 
@@ -153,7 +155,7 @@ def choose(
 
 
 @jax.jit
-def _measured(measure: Callable[[Any, Any], Array], numbers: Any, arrays: Any) -> Array:
+def _measured(measure: Measure, numbers: Tree, arrays: Tree) -> Array:
     return measure(numbers, arrays)
 
 
@@ -172,7 +174,7 @@ class Slopes:
 
     @cached_property
     def gradient(self) -> bool:
-        """Whether numbers alone depend on the parameters, and what is measured does not leap."""
+        """True if numbers alone depend on the parameters, and what is measured does not leap."""
         try:
             near = [self._objective.trial(x) for x in (np.zeros(self._p), *_STEP * np.eye(self._p))]
         except ValueError:
@@ -219,7 +221,7 @@ class Slopes:
 
 
 def _form(trial: Trial) -> Hashable:
-    """What two trials must share, for a slope between them to be one."""
+    """Common part of two trials, without which a slope between them is none."""
     leaves, tree = jax.tree_util.tree_flatten(trial.numbers)
     return trial.kind, tree, tuple((np.shape(x), jnp.result_type(x)) for x in leaves)
 

@@ -18,7 +18,7 @@ from jaxtyping import ArrayLike
 from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState
-from robins.filters.model import Model, Sensor
+from robins.filters.model import Data, Model, Sensor
 from robins.filters.run import Step, check_names, everything, is_traced, nothing
 from robins.filters.tally import Tally, warn_not_taken
 from robins.filters.values import as_data
@@ -27,7 +27,7 @@ from robins.filters.values import as_data
 class Reading(NamedTuple):
     """What the world answers in a step."""
 
-    u: Any  # input of the filter's motion
+    u: Data  # input of the filter's motion
     y: Mapping[str, Any]  # measurements at the end of the step by sensor; NaN is missing
     truth: Any  # true state at the end of the step, of the structure of the filter's
     aux: Mapping[str, Any] = {}
@@ -55,7 +55,7 @@ class Loop(NamedTuple):
     due: Mapping[str, Any] = {}
 
 
-def _without(filter_: Filter, sensor: Sensor, state: FilterState, y: Any, aux: Any):
+def _without(filter_: Filter, sensor: Sensor, state: FilterState, y: Data, aux: Data):
     """The state as it is, and the information of an update that had nothing to use."""
     like = jax.eval_shape(lambda s, z, a: filter_.update(s, sensor, z, a)[1], state, y, aux)
     blank: StepInfo = jax.tree_util.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
@@ -92,7 +92,7 @@ def _scan(filter_, model, state, loop: Loop, keep):
     return steps, readings, state, world, tally
 
 
-def _update(filter_: Filter, sensor: Sensor, state: FilterState, y: Any, aux: Any):
+def _update(filter_: Filter, sensor: Sensor, state: FilterState, y: Data, aux: Data):
     return _apart(filter_.update, state, sensor, y, aux)
 
 

@@ -84,7 +84,7 @@ class Filter:
         raise NotImplementedError
 
     def members(self, state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
-        """What the local filters of a joined filter believe, and how they go on from others.
+        """Beliefs of the local filters of a joined filter, and how they go on from others.
 
         The only question that a filter asks of the parts of another one.
 
@@ -96,7 +96,7 @@ class Filter:
 
     @property
     def reports(self) -> bool:
-        """Whether there can be something to report; a stream asks once."""
+        """True if there can be something to report; a stream asks once."""
         return type(self).report is not Filter.report
 
     def report(
@@ -282,7 +282,7 @@ class Kalman(Filter):
 
     @property
     def settles(self) -> bool:
-        """Whether a rule does something once a step."""
+        """True if a rule does something once a step."""
         return any(rule.settles for rule in self.rules)
 
     def settled(self, state: FilterState) -> tuple[FilterState, Array]:

@@ -31,7 +31,7 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief, Number
-from robins.filters.model import Motion, Sensor, as_noise
+from robins.filters.model import Data, Motion, Sensor, as_noise
 from robins.filters.observation import Observation, innovation
 from robins.filters.values import kind, value
 from robins.manifold import State
@@ -77,17 +77,17 @@ class Linearisation:
     def reuse(self) -> Reuse | None:
         return None
 
-    def transition(self, belief: Belief, motion: Motion, u: Any) -> Transition:
+    def transition(self, belief: Belief, motion: Motion, u: Data) -> Transition:
         raise NotImplementedError
 
-    def observation(self, prior: Belief, sensor: Sensor, y: Any, aux: Any) -> Observation:
+    def observation(self, prior: Belief, sensor: Sensor, y: Data, aux: Data) -> Observation:
         raise NotImplementedError
 
     def drawn(self, belief: Belief) -> Any:
         return () if self.reuse is None else self.reuse.draw(belief)
 
     def first_observation(
-        self, points: Any, prior: Belief, sensor: Sensor, y: Any, aux: Any
+        self, points: Any, prior: Belief, sensor: Sensor, y: Data, aux: Data
     ) -> Observation:
         if self.reuse is None:
             return self.observation(prior, sensor, y, aux)
@@ -115,7 +115,7 @@ def _magnitude(x: State) -> Array:
 
 
 def _observe(
-    sensor: Sensor, prior: Belief, z: Any, y: Any, aux: Any, spread, excess, size, deficit=None
+    sensor: Sensor, prior: Belief, z: Any, y: Data, aux: Data, spread, excess, size, deficit=None
 ) -> Observation:
     """An observation from what a linearisation found."""
     if (reads := _form(z)) != (given := _form(y)):

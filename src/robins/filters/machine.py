@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from robins.filters.belief import StepInfo
 from robins.filters.checks import one_of
 from robins.filters.kalman import Filter, FilterState, Prediction
-from robins.filters.model import Model
+from robins.filters.model import Data, Model
 from robins.filters.run import Step, filter_step
 from robins.filters.values import content, on_device
 
@@ -77,22 +77,22 @@ class ByJax:
     is_numpy = False
 
     def __init__(self, filter_: Filter, model: Model, state: FilterState):
-        """Of a filter and a model, whose numbers are handed to the device once."""
+        """Take a filter and a model, whose numbers are handed to the device once."""
         self._filter, self._model = on_device((filter_, model))
         self.state = state
 
-    def predict(self, u: Any) -> Prediction:
+    def predict(self, u: Data) -> Prediction:
         """Move on by one step."""
         self.state, told = _predict(self._filter, self._model.motion, self.state, u)
         return told
 
-    def update(self, name: str, y: Any, aux: Any) -> StepInfo:
+    def update(self, name: str, y: Data, aux: Data) -> StepInfo:
         """Use a measurement of a sensor."""
         self.state, told = _update(self._filter, self._model.sensor(name), self.state, y, aux)
         return told
 
     def step(
-        self, u: Any, y: Mapping[str, Any], aux: Mapping[str, Any], keep: Callable[[Step], Any]
+        self, u: Data, y: Mapping[str, Any], aux: Mapping[str, Any], keep: Callable[[Step], Any]
     ) -> tuple[Any, Codes]:
         """A whole step: what is kept of it, and its codes."""
         self.state, told = _step(self._filter, self._model, self.state, u, y, aux, keep)
@@ -128,23 +128,23 @@ class ByProgram:
     def state(self, state: FilterState) -> None:
         self._memory.state = state
 
-    def predict(self, u: Any) -> Prediction:
+    def predict(self, u: Data) -> Prediction:
         """Move on by one step."""
         return self._memory.step("predict", self._predicted, u)
 
-    def _predicted(self, state: FilterState, u: Any) -> tuple[FilterState, Prediction]:
+    def _predicted(self, state: FilterState, u: Data) -> tuple[FilterState, Prediction]:
         return self._filter.predict(state, self._model.motion, u)
 
-    def update(self, name: str, y: Any, aux: Any) -> StepInfo:
+    def update(self, name: str, y: Data, aux: Data) -> StepInfo:
         """Use a measurement of a sensor."""
         return self._memory.step(*self._sensors[name], y, aux)
 
     def step(
-        self, u: Any, y: Mapping[str, Any], aux: Mapping[str, Any], keep: Callable[[Step], Any]
+        self, u: Data, y: Mapping[str, Any], aux: Mapping[str, Any], keep: Callable[[Step], Any]
     ) -> tuple[Any, Codes]:
         """A whole step: what is kept of it, and its codes."""
 
-        def stepped(state: FilterState, u: Any, y: Any, aux: Any) -> Any:
+        def stepped(state: FilterState, u: Data, y: Data, aux: Data) -> Any:
             return _stepped(self._filter, self._model, state, u, y, aux, keep)
 
         return self._memory.step(("step", keep), stepped, u, y, aux)

@@ -12,7 +12,7 @@ from jax.tree_util import tree_map
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.machine import Machine, on, settled
-from robins.filters.model import Model
+from robins.filters.model import Data, Model
 from robins.filters.observation import as_measurement, as_real
 from robins.filters.run import Step, everything
 from robins.filters.tally import Tally, doubts
@@ -83,7 +83,7 @@ class OnlineFilter:
         """What is believed now."""
         return self.state.belief
 
-    def predict(self, u: Any = None) -> Prediction:
+    def predict(self, u: Data = None) -> Prediction:
         """Move on by one step with input u."""
         prediction = self._machine.predict(u)
         self._count(prediction.code)
@@ -92,7 +92,7 @@ class OnlineFilter:
     def step(
         self,
         y: Mapping[str, Any],
-        u: Any = None,
+        u: Data = None,
         aux: Mapping[str, Any] | None = None,
         keep: Callable[[Step], Any] = everything,
     ) -> Any:
@@ -112,7 +112,7 @@ class OnlineFilter:
                 self._remember(sensor, info, y[sensor])
         return kept
 
-    def update(self, y: Any, sensor: str | None = None, aux: Any = None) -> StepInfo:
+    def update(self, y: Data, sensor: str | None = None, aux: Data = None) -> StepInfo:
         """Use a measurement; NaN is missing, per component.
 
         Args:

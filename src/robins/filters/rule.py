@@ -74,12 +74,12 @@ class Rule:
 
     @property
     def settles(self) -> bool:
-        """Whether it does anything once a step."""
+        """True if it does anything once a step."""
         return type(self).settle is not Rule.settle
 
     @property
     def reports(self) -> bool:
-        """Whether there can be something to report."""
+        """True if there can be something to report."""
         return type(self).report is not Rule.report
 
     def report(

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
-from robins.filters.model import Model
+from robins.filters.model import Data, Model
 from robins.filters.observation import as_measurement
 from robins.filters.tally import Tally, warn_not_taken
 
@@ -86,7 +86,7 @@ def check_names(model: Model, data: Mapping[str, Any]) -> None:
     require(not unknown, f"no sensor {sorted(unknown)}; this model has {sorted(model.dims)}")
 
 
-def _check_lengths(y: Mapping[str, Any], u: Any, aux: Mapping[str, Any]) -> None:
+def _check_lengths(y: Mapping[str, Any], u: Data, aux: Mapping[str, Any]) -> None:
     """All that runs along must have one length in time."""
     named = {"u": u, **{f"y['{k}']": v for k, v in y.items()}}
     named |= {f"aux['{k}']": v for k, v in aux.items()}
@@ -102,7 +102,7 @@ def _check_lengths(y: Mapping[str, Any], u: Any, aux: Mapping[str, Any]) -> None
 
 
 def filter_step(
-    filter_: Filter, model: Model, state: FilterState, u: Any, y: Mapping[str, Any], aux: Any
+    filter_: Filter, model: Model, state: FilterState, u: Data, y: Mapping[str, Any], aux: Data
 ) -> tuple[FilterState, Step]:
     """Predict over one step, then update with each sensor that has a measurement in y."""
     state, prediction = filter_.predict(state, model.motion, u)
@@ -133,8 +133,8 @@ def run(
     filter_: Filter,
     model: Model,
     start: Belief | FilterState,
-    y: Any,
-    u: Any = None,
+    y: Data,
+    u: Data = None,
     aux: Mapping[str, Any] | None = None,
     keep: Callable[[Step], Any] = everything,
     time_s: ArrayLike | None = None,

@@ -31,7 +31,7 @@ def kind(**how: Any) -> Any:
 
 
 def is_kind(x: object) -> bool:
-    """Whether JAX cannot look inside: a name or a plain function.
+    """True of a name or a plain function, into which JAX cannot look.
 
     A `Partial`, or a callable that is a pytree such as a network, is data.
     """
@@ -77,7 +77,7 @@ def value(cls: type[T]) -> type[T]:
 
 
 def is_known(x: object) -> bool:
-    """Whether it holds no stand-in of a transformation."""
+    """True if it holds no stand-in of a transformation."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree_util.tree_leaves(x))
 
 
@@ -114,7 +114,7 @@ def on_device(tree: T) -> T:
 
 
 def content(*trees: Any) -> Hashable:
-    """What values must share to be the same, numbers included: a key for programs that fold them.
+    """Key of values with equal kinds and numbers, for programs that fold them.
 
     Functions are the same by identity.
     """

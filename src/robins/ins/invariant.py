@@ -28,7 +28,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
-from robins.filters.model import Motion, Sensor
+from robins.filters.model import Data, Motion, Sensor
 from robins.ins.extended_pose import ExtendedPose
 from robins.ins.increments import Increments
 from robins.ins.state import InsNoise
@@ -139,7 +139,7 @@ def position_sensor(sigma: Sigma, lever_b: Vector = (0.0, 0.0, 0.0), name="posit
     return Sensor(Partial(_read_position, _each(lever_b)), _each(sigma), 3, name)
 
 
-def _read_position(lever_b: Array, x: InvariantState, aux: Any) -> Array:
+def _read_position(lever_b: Array, x: InvariantState, aux: Data) -> Array:
     return x.pose.position + x.pose.rotation.apply(lever_b)
 
 
@@ -148,7 +148,7 @@ def velocity_sensor(sigma: Sigma, name: str = "velocity") -> Sensor:
     return Sensor(_read_velocity, _each(sigma), 3, name)
 
 
-def _read_velocity(x: InvariantState, aux: Any) -> Array:
+def _read_velocity(x: InvariantState, aux: Data) -> Array:
     return x.pose.velocity
 
 
@@ -160,7 +160,7 @@ def landmark_sensor(sigma: Sigma, landmark: Vector, name: str = "landmark") -> S
     return Sensor(Partial(_read_landmark, _each(landmark)), _each(sigma), 3, name)
 
 
-def _read_landmark(point: Array, x: InvariantState, aux: Any) -> Array:
+def _read_landmark(point: Array, x: InvariantState, aux: Data) -> Array:
     return x.pose.rotation.inverse().apply(point - x.pose.position)
 
 
@@ -172,7 +172,7 @@ def direction_sensor(sigma: Sigma, direction: Vector, name: str = "direction") -
     return Sensor(Partial(_read_direction, _each(direction)), _each(sigma), 3, name)
 
 
-def _read_direction(way: Array, x: InvariantState, aux: Any) -> Array:
+def _read_direction(way: Array, x: InvariantState, aux: Data) -> Array:
     return x.pose.rotation.inverse().apply(way)
 
 

@@ -130,7 +130,6 @@ def on_runs(
     if by not in (ERROR, INNOVATIONS, *names):
         known = ", ".join([ERROR, INNOVATIONS, *names])
         raise InputError(f"is none of {known}", f"--by {by}", "choose one of these.")
-    measured = OfRuns(blocks_of(problem), problem.count_from, problem.count_to)
     progress(0.0, "simulating")
     batch = batch_of(problem)
     worlds = batch(jnp.arange(runs)), batch(jnp.arange(runs, 2 * runs))
@@ -152,7 +151,11 @@ def on_runs(
     return Asked(
         filter=chosen,
         vary=tuned,
-        objective=Objective(trial, measured, total_of(by, names)),
+        objective=Objective(
+            trial,
+            OfRuns(blocks_of(problem), problem.count_from, problem.count_to),
+            total_of(by, names),
+        ),
         chosen_on=Data(worlds[0]),
         judged_on=Data(worlds[1]),
         parts="runs",

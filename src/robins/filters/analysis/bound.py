@@ -25,7 +25,7 @@ from robins import linalg, manifold
 from robins.filters.belief import Belief
 from robins.filters.kalman import updated
 from robins.filters.linearise import taylor
-from robins.filters.model import Model
+from robins.filters.model import Data, Model
 from robins.filters.observation import Observation, as_measurement
 from robins.manifold import State
 
@@ -79,7 +79,7 @@ def linearised(
     start: Belief,
     truth: State,
     y: Mapping[str, Any],
-    u: Any = None,
+    u: Data = None,
     aux: Mapping[str, Any] | None = None,
 ) -> Linearised:
     """Linearise a model about a true trajectory.
@@ -143,7 +143,7 @@ def covariance_bound(
     start: Belief,
     truth: State,
     y: Mapping[str, Any],
-    u: Any = None,
+    u: Data = None,
     aux: Mapping[str, Any] | None = None,
     use: Any = None,
     known: Sequence[int] = (),

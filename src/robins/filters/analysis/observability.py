@@ -35,7 +35,7 @@ from robins.errors import require
 from robins.filters.analysis.bound import Linearised, linearised
 from robins.filters.belief import Belief
 from robins.filters.checks import matrix
-from robins.filters.model import Model
+from robins.filters.model import Data, Model
 from robins.filters.observation import left_out
 from robins.manifold import State
 
@@ -48,7 +48,7 @@ def observability(
     start: Belief,
     truth: State,
     y: Mapping[str, Any],
-    u: Any = None,
+    u: Data = None,
     aux: Mapping[str, Any] | None = None,
     use: Any = None,
     window: int | None = None,

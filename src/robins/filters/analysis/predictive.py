@@ -98,12 +98,12 @@ class Scored(Filter):
     # The states are those of the filter inside, which leaves out itself what is not taken.
     @jax.jit
     def predict(self, state: FilterState, motion: Motion, u: Data = None):
-        """That of the filter inside."""
+        """Predict by the filter inside."""
         return self.inner.predict(state, motion, u)
 
     @jax.jit
     def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None):
-        """That of the filter inside, with the score noted."""
+        """Update by the filter inside, and note the score."""
         seen = normalised(taylor().observation(state.belief, sensor, y, aux))
         there = seen.dof > 0
         density = jnp.where(there, jnp.where(state.current, log_density(seen), -jnp.inf), 0.0)

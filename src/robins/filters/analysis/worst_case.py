@@ -27,7 +27,7 @@ from robins.filters.belief import Belief, StepInfo
 from robins.filters.checks import matrix, positive
 from robins.filters.kalman import kalman
 from robins.filters.linearise import Linearisation, taylor
-from robins.filters.model import Model, Motion, Sensor
+from robins.filters.model import Data, Model, Motion, Sensor
 from robins.filters.rules._inflation import as_weight, rows_of
 from robins.filters.rules.h_infinity import Estimate, h_infinity, least_gamma
 from robins.filters.run import Solution, run
@@ -66,9 +66,9 @@ def existence_margin(belief: Belief, weight: Any, gamma: Any) -> Float[Array, ""
 def gamma_min(
     model: Model,
     start: Belief,
-    y: Any,
+    y: Data,
     weight: Any,
-    u: Any = None,
+    u: Data = None,
     aux: Mapping[str, Any] | None = None,
     linearise: Linearisation | None = None,
     rtol: float = 1e-4,
@@ -197,7 +197,7 @@ def worst_case_gain(
     start: Belief,
     solution: Solution,
     weight: Any,
-    u: Any = None,
+    u: Data = None,
     aux: Mapping[str, Any] | None = None,
     estimate: Estimate = "a-posteriori",
     count_missing: bool = False,
@@ -241,7 +241,7 @@ def worst_case_gain(
     return spectral_norm(error_operator(S0, F, G, channels, L, gain_on))
 
 
-def _linearised(model: Model, start: Belief, steps: Any, weight: Any, u: Any, aux: dict[str, Any]):
+def _linearised(model: Model, start: Belief, steps: Any, weight: Any, u: Data, aux: dict[str, Any]):
     """Everything the recursion of the error needs, along a run."""
     prediction = steps.prediction
     if prediction.origin is not None:
@@ -274,7 +274,7 @@ def _unit(mean: State) -> Belief:
 
 @jax.jit
 @partial(jax.vmap, in_axes=(None, 0, 0))
-def _motion_along(motion: Motion, mean: State, u: Any) -> tuple[Array, Array]:
+def _motion_along(motion: Motion, mean: State, u: Data) -> tuple[Array, Array]:
     """Transitions and noise factors at the means before them."""
     t = taylor().transition(_unit(mean), motion, u)
     return t.spread, t.noise
@@ -283,7 +283,7 @@ def _motion_along(motion: Motion, mean: State, u: Any) -> tuple[Array, Array]:
 @jax.jit
 @partial(jax.vmap, in_axes=(None, 0, 0, 0))
 def _sensor_along(
-    sensor: Sensor, mean: State, info: StepInfo, aux: Any
+    sensor: Sensor, mean: State, info: StepInfo, aux: Data
 ) -> tuple[Array, Array, State]:
     """Slopes and noise factors of a sensor, and the means that its updates led to."""
     z = sensor.read(mean, aux) if sensor.linear is None else sensor.linear(mean, aux)[0]

@@ -124,7 +124,7 @@ def lasting(change: np.ndarray) -> np.ndarray:
 
 @value
 class Adapted:
-    """What makes a mode of `adaptive` of the noise it believes in, and of what is off if any."""
+    """Maker of a mode of `adaptive`, of the noise it believes in and of what is off if any."""
 
     way: Linearisation
     weight: Rule

@@ -1,4 +1,4 @@
-"""What banks of hypotheses share: hypotheses are rows, and changes between them are edges."""
+"""Banks of hypotheses: hypotheses are rows, and changes between them are edges."""
 
 from __future__ import annotations
 

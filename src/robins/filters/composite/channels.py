@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from robins import manifold
 from robins.errors import require
@@ -29,7 +29,7 @@ from robins.filters.kalman import (
     not_taken,
 )
 from robins.filters.linearise import Transition
-from robins.filters.model import Motion, Sensor, as_noise
+from robins.filters.model import Data, Motion, Sensor, as_noise
 from robins.filters.trees import equal, finite, select
 from robins.filters.values import kind, value
 from robins.manifold import State
@@ -115,7 +115,9 @@ class Composite(Filter):
     def parts(self, state: FilterState) -> tuple[FilterState, ...]:
         raise NotImplementedError
 
-    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
+    def report(
+        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
+    ):
         each = zip(self.filters, self.parts(start), self.parts(final), strict=True)
         for i, (one, first, last) in enumerate(each):
 
@@ -177,7 +179,7 @@ class JoinedFilter(Composite):
     def parted(self, belief: Belief, shares: Array) -> list[Belief]:
         raise NotImplementedError
 
-    def moved(self, state: FilterState, motion: Motion, u: Any) -> Moved:
+    def moved(self, state: FilterState, motion: Motion, u: Data) -> Moved:
         raise NotImplementedError
 
     @property
@@ -214,7 +216,7 @@ class JoinedFilter(Composite):
         return self.members(state)[1](self.parted(belief, state.memory.shares), belief)
 
     def moved_apart(
-        self, begun: Sequence[FilterState], motions: Sequence[Motion], u: Any, shares: Array
+        self, begun: Sequence[FilterState], motions: Sequence[Motion], u: Data, shares: Array
     ) -> Moved:
         """Members that each predict, from where they begin."""
         each = zip(self.filters, begun, motions, strict=True)
@@ -223,10 +225,10 @@ class JoinedFilter(Composite):
         codes = tuple(prediction.code for _, prediction in done)
         return Moved(members, codes, self.fuse([m.belief for m in members]), shares)
 
-    def _predict(self, state: FilterState, motion: Motion, u: Any):
+    def _predict(self, state: FilterState, motion: Motion, u: Data):
         return concluded(state, self.moved(state, motion, u))
 
-    def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
+    def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data):
         owner = owners(self.channels)
         if sensor.name not in owner:
             raise ValueError(f"no channel uses sensor '{sensor.name}'; there are {sorted(owner)}")
@@ -248,12 +250,14 @@ class JoinedFilter(Composite):
         return select(ok, new, _refused(state, singular)), info
 
     def compared(self, members: Sequence[FilterState], i: int, info: StepInfo) -> StepInfo:
-        """What local filter i says of an update, or that it is now apart from another."""
+        """The information of local filter i, or that it is now apart from another."""
         locals_ = [m.belief for m in members[: len(self.channels)]]
         apart = self.apart(locals_, i) & (info.code == int(Code.DONE))
         return info._replace(code=jnp.where(apart, int(Code.APART), info.code))
 
-    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
+    def report(
+        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
+    ):
         super().report(start, final, again, time)
         for i, count in enumerate(np.asarray(final.memory.singular).tolist()):
             local = i < len(self.channels)
@@ -383,12 +387,12 @@ class AtMaster(Composite):
                 f"{list(self.sensors)} last in the model"
             )
 
-    def _predict(self, state: FilterState, motion: Motion, u: Any):
+    def _predict(self, state: FilterState, motion: Motion, u: Data):
         mastered: Mastered = state.memory
         joined, prediction = self.joined.predict(mastered.joined, motion, u)
         return FilterState(joined.belief, mastered._replace(joined=joined)), prediction
 
-    def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
+    def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data):
         mastered: Mastered = state.memory
         if sensor.name not in self.sensors:
             joined, info = self.joined.update(mastered.joined, sensor, y, aux)

@@ -42,7 +42,7 @@ class _Past(NamedTuple):
 
     before: FilterState  # the state a step begins with
     moved: Array  # bool, begins with a prediction; False where the run or a reset begins
-    u: Any
+    u: Data
     y: dict[str, Any]  # by sensor, NaN where nothing is known yet
     aux: dict[str, Any]
     asked: Array  # (., sensors) bool, the filter has been asked to update with the sensor
@@ -61,7 +61,7 @@ class Delay(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """Where a measurement belongs in the buffer, and what becomes of it."""
+    """Place of a measurement in the buffer, and what becomes of it."""
 
     which: int  # its sensor, in the model's order
     at: Array  # the row of its step
@@ -74,12 +74,12 @@ class _Place(NamedTuple):
 
     @property
     def again(self) -> Array:
-        """Whether steps are repeated for it."""
+        """True if steps are repeated for it."""
         return self.used & ~self.at_once
 
 
 class _Redone(NamedTuple):
-    """What there is of the steps that are repeated."""
+    """Results of the steps that are repeated."""
 
     inner: FilterState
     before: FilterState  # as in `_Past`
@@ -151,7 +151,7 @@ class Delayed(Filter):
         return new, prediction._replace(transition=None, origin=None)
 
     def opened(self, past: _Past, at: Array, inner: FilterState, u: Data) -> _Past:
-        """With a row for a step that begins."""
+        """Open a row for a step that begins."""
         none = jnp.zeros(len(self.names), bool)
         entry = _Past(
             before=inner,
@@ -196,7 +196,7 @@ class Delayed(Filter):
         return which, Model(model.motion, sensors)
 
     def placed(self, held: Delay, which: int, value: Data, age: Any) -> _Place:
-        """Where a measurement of this age belongs."""
+        """Place of a measurement of this age."""
         age = jnp.asarray(age, float)
         there = jnp.any(jnp.stack([jnp.any(jnp.isfinite(x)) for x in jax.tree.leaves(value)]))
         steps = jnp.round(jnp.where(jnp.isfinite(age), age, -1.0)).astype(int)
@@ -261,7 +261,7 @@ class Delayed(Filter):
 
 
 def delayed(
-    filter_: Filter, model: Model, depth: int, u: Any = None, aux: Mapping[str, Any] | None = None
+    filter_: Filter, model: Model, depth: int, u: Data = None, aux: Mapping[str, Any] | None = None
 ) -> Filter:
     """A filter that takes measurements up to ``depth`` steps late, in any order.
 
@@ -307,7 +307,7 @@ def delayed(
 def _entered(
     past: _Past, place: _Place, name: str, value: Data, aux: Data, info: StepInfo
 ) -> _Past:
-    """With a measurement in its own step; and in this one, where its sensor is asked for too."""
+    """Enter a measurement in its own step; and in this one, where its sensor is asked for too."""
     now, at, which, used = place.now, place.at, place.which, place.used
 
     def entered(rows, v, here):
@@ -327,7 +327,7 @@ def _entered(
 
 
 def _told(past: _Past, place: _Place, redone: _Redone) -> StepInfo:
-    """What an update tells: of its own step, with what it changes in the whole."""
+    """Information of an update: of its own step, with what it changes in the whole."""
     own, again = redone.own, place.again
     total = jnp.sum(past.log_likelihood), jnp.sum(redone.log_likelihood)
     added = _change(*total, own, redone.taken)

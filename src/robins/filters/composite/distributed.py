@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -41,7 +41,7 @@ from robins.filters.composite.fusion import (
     intersection_weights,
 )
 from robins.filters.kalman import Filter, FilterState
-from robins.filters.model import Motion
+from robins.filters.model import Data, Motion
 from robins.filters.values import Numbers, kind, number, value
 
 Feedback = Literal["own", "mean", "full"]
@@ -76,7 +76,7 @@ class SideBySide(JoinedFilter):
             for c, m in zip(self.channels, members, strict=True)
         ]
 
-    def moved(self, state: FilterState, motion: Motion, u: Any) -> Moved:
+    def moved(self, state: FilterState, motion: Motion, u: Data) -> Moved:
         motions = [motion] * len(self.channels)
         return self.moved_apart(self.fed_back(state), motions, u, state.memory.shares)
 

@@ -59,7 +59,7 @@ from robins.filters.composite.channels import (
 from robins.filters.composite.fusion import Sharing, check_sharing, information_sum, part
 from robins.filters.kalman import Filter, FilterState, kalman
 from robins.filters.linearise import Linearisation, taylor
-from robins.filters.model import Model, Motion
+from robins.filters.model import Data, Model, Motion
 from robins.filters.values import Numbers, is_known, kind, number, value
 
 # Without a floor a share of zero is an infinite covariance.
@@ -105,7 +105,7 @@ def observability_shares(
     belief: Belief,
     channels: Sequence[Channel],
     steps: int | None = None,
-    u: Any = None,
+    u: Data = None,
     aux: dict[str, Any] | None = None,
 ) -> np.ndarray:
     """(N, n) shares by how well each channel sees each state; computed once, before a run.
@@ -176,7 +176,7 @@ class Federated(JoinedFilter):
 
     @property
     def count(self) -> int:
-        """Of channels."""
+        """Number of channels."""
         return len(self.channels)
 
     @property
@@ -212,7 +212,7 @@ class Federated(JoinedFilter):
         return jnp.concatenate([(1.0 - self.master) * a, own])
 
     def next_shares(self, state: FilterState) -> Array:
-        """Those of a step: chosen, and handed over by local filters that have been silent."""
+        """Shares of a step: chosen, and handed over by local filters that have been silent."""
         a = self.chosen_shares(state)
         if self.timeout is None:
             return a
@@ -223,7 +223,7 @@ class Federated(JoinedFilter):
         return jnp.where(jnp.any(heard), a.at[: self.count].set(left), a)
 
     def chosen_shares(self, state: FilterState) -> Array:
-        """Those given, or by what the local filters believe."""
+        """Shares as given, or by what the local filters believe."""
         locals_ = [m.belief for m in state.memory.members[: self.count]]
         if self.weighing == "trace":
             return self.with_master(trace_shares(locals_, state.belief.sigma))
@@ -240,7 +240,7 @@ class Federated(JoinedFilter):
         beliefs = self.parted(state.belief, a) if reset else _rescaled(members, self.keep)
         return [f.reset(m, b) for f, m, b in zip(self.filters, members, beliefs, strict=True)]
 
-    def moved(self, state: FilterState, motion: Motion, u: Any) -> Moved:
+    def moved(self, state: FilterState, motion: Motion, u: Data) -> Moved:
         a = self.next_shares(state)
         if self.late:
             return self.moved_together(state, motion, u, a)
@@ -251,8 +251,8 @@ class Federated(JoinedFilter):
         motions = [own(i) for i in range(len(self.filters))]
         return self.moved_apart(self.begun(state, a), motions, u, a)
 
-    def moved_together(self, state: FilterState, motion: Motion, u: Any, a: Array) -> Moved:
-        """What was fused is predicted, then shared out."""
+    def moved_together(self, state: FilterState, motion: Motion, u: Data, a: Array) -> Moved:
+        """Predict what was fused, then share it out."""
         _, common = self.centre.predict(self.centre.init(state.belief, {}), motion, u)
         members, codes, own = [], [], False
         beliefs = self.parted(common.belief, a)
@@ -384,7 +384,7 @@ def _through(motion: Motion, common: Belief, mine: Belief) -> Motion:
 
 
 def _has_master(mode: str, shares: Any, master: Numbers) -> bool:
-    """Whether there is one; refused where it does not go with the mode."""
+    """True if there is one; refused where it does not go with the mode."""
     some = not is_known(master) or bool(master > 0.0)
     if mode == "rescale" and not some:
         raise ValueError(

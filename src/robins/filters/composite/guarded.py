@@ -35,7 +35,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -47,7 +47,7 @@ from robins.filters.belief import Belief, Code, Number, StepInfo, is_failure
 from robins.filters.checks import sensor_names
 from robins.filters.composite.channels import Composite
 from robins.filters.kalman import Filter, FilterState, Prediction
-from robins.filters.model import Motion, Sensor
+from robins.filters.model import Data, Motion, Sensor
 from robins.filters.trees import select
 from robins.filters.values import Numbers, kind, number, value
 
@@ -177,14 +177,14 @@ class Guarded(Composite):
         return watch._replace(excess=jnp.where(sure, most, excess), gained=gain, looks=looks)
 
     def renewed(self, sensor: Sensor, before: Belief, after: Belief, dof: Array) -> Array | float:
-        """What share of what the reference knows a measurement renewed; of a judge."""
+        """Share of what the reference knows that a measurement of a judge renewed."""
         if sensor.name not in self.judging:
             return 0.0
         was, now = before.sigma, after.sigma
         share = jnp.clip(1.0 - _quotient(now**2, was**2), 0.0, 1.0)
         return jnp.where((dof > 0) & (was > 0.0), share, 0.0)
 
-    def _predict(self, state: FilterState, motion: Motion, u: Any):
+    def _predict(self, state: FilterState, motion: Motion, u: Data):
         watch: Watch = state.memory
         mine, first = self.filter.predict(watch.filter, motion, u)
         other, second = self.reference.predict(watch.reference, motion, u)
@@ -194,7 +194,7 @@ class Guarded(Composite):
         new = _given_out(self.judged(moved, together & (first.code != int(Code.DONE)), 0.0))
         return new, Prediction(None, new.belief, second.code)
 
-    def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
+    def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data):
         watch: Watch = state.memory
         mine, info = self.filter.update(watch.filter, sensor, y, aux)
         notes, failed = dict(info.notes), is_failure(info.code)

@@ -28,7 +28,7 @@ from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.composite.mixture import innovation, log_normalised, matched
 from robins.filters.kalman import Again, Filter, FilterState, Prediction
-from robins.filters.model import Motion, Sensor
+from robins.filters.model import Data, Motion, Sensor
 from robins.filters.trees import equal, select
 from robins.filters.values import Numbers, is_known, kind, value
 
@@ -44,13 +44,13 @@ class Mode:
     motion: Motion | None = None
     sensors: tuple[Sensor, ...] = ()
 
-    def predict(self, state: FilterState, motion: Motion, u: Any):
+    def predict(self, state: FilterState, motion: Motion, u: Data):
         """State, code and no notes of a prediction, by the motion of this mode if it has one."""
         own = motion if self.motion is None else self.motion
         state, prediction = self.filter_.predict(state, own, u)
         return state, prediction.code, {}
 
-    def update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
+    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data):
         """State, information and notes of an update, by its own sensor of that name if any."""
         own = next((s for s in self.sensors if s.name == sensor.name), sensor)
         state, info = self.filter_.update(state, own, y, aux)
@@ -88,11 +88,11 @@ class Several:
         return after, _stack(found), notes
 
     def beliefs(self, states: Any) -> Belief:
-        """With a leading axis of modes."""
+        """Beliefs with a leading axis of modes."""
         return _stack([s.belief for s in states])
 
     def state(self, states: Any, i: int) -> FilterState:
-        """That of one mode."""
+        """State of one mode."""
         return states[i]
 
     def exchanged(self, i: int, filter_: Filter) -> Several:
@@ -134,7 +134,7 @@ class Family:
         return _as_mode(self.make(row))
 
     def mode(self, i: int) -> Mode:
-        """That of row i."""
+        """Mode of row i."""
         return self.of(_at(jax.tree_util.tree_map(np.asarray, self.numbers), i))
 
     def every(self, of: Of, states: Any, *rows: Any) -> Every:
@@ -145,11 +145,11 @@ class Family:
         return after, found, [_at(notes, i) for i in range(self.size)]
 
     def beliefs(self, states: Any) -> Belief:
-        """With a leading axis of modes."""
+        """Beliefs with a leading axis of modes."""
         return states.belief
 
     def state(self, states: Any, i: int) -> FilterState:
-        """That of one mode."""
+        """State of one mode."""
         return _at(states, i)
 
     def exchanged(self, i: int, filter_: Filter) -> Family:
@@ -230,7 +230,7 @@ class Imm(Filter):
 
         return self.modes.every(restart, states, begun, alone)[0], log_next
 
-    def _predict(self, state: FilterState, motion: Motion, u: Any):
+    def _predict(self, state: FilterState, motion: Motion, u: Data):
         states, log_now = state.memory
         begun, log_next = (states, log_now) if self.modes.size == 1 else self.mixed(states, log_now)
         after, code, _ = self.modes.every(lambda m, s: m.predict(s, motion, u), begun)
@@ -241,7 +241,7 @@ class Imm(Filter):
         outcome = jnp.where(jnp.any(taken), int(Code.DONE), failed)
         return FilterState(belief, Interaction(after, log_next)), Prediction(None, belief, outcome)
 
-    def _update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
+    def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data):
         states, log_prior = state.memory
         after, seen, each = self.modes.every(lambda m, s: m.update(s, sensor, y, aux), states)
         log_prior, log_post, used = _judged(seen, log_prior)
@@ -254,7 +254,7 @@ class Imm(Filter):
         return FilterState(belief, Interaction(after, log_post)), info
 
     def told(self, seen: StepInfo, log_prior: Array, log_post: Array, used: Array) -> StepInfo:
-        """What the modes saw, as one."""
+        """Information of the modes as one."""
         info = _at(seen, 0) if self.modes.size == 1 else _seen(seen, log_prior, log_post, used)
         if not self.likeliest:
             return info
@@ -272,7 +272,9 @@ class Imm(Filter):
     def reports(self) -> bool:
         return any(self.modes.mode(i).filter_.reports for i in range(self.modes.size))
 
-    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
+    def report(
+        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
+    ):
         for i in range(self.modes.size):
             first = self.modes.state(start.memory.states, i)
             last = self.modes.state(final.memory.states, i)

@@ -31,13 +31,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief
 from robins.filters.composite.bank import EVERY, transitions
 from robins.filters.kalman import Again, Filter, FilterState, Prediction
-from robins.filters.model import Motion, Sensor
+from robins.filters.model import Data, Motion, Sensor
 from robins.filters.values import Numbers, kind, value
 
 BEGINS = 10.0  # sigma of an offset that begins, in standard deviations of the records
@@ -106,15 +106,15 @@ def _drawn(x: Wide, of: Supposed) -> Array:
 Scaled = Partial  # what a mode makes of a factor of the process noise
 
 
-def _step(motion: Motion, of: Supposed, x: Wide, u: Any) -> Wide:
+def _step(motion: Motion, of: Supposed, x: Wide, u: Data) -> Wide:
     return Wide(motion.moved(x.state, u), _kept(x, of))
 
 
-def _noise(motion: Motion, of: Supposed, scaled: Scaled, x: Wide, u: Any) -> Array:
+def _noise(motion: Motion, of: Supposed, scaled: Scaled, x: Wide, u: Data) -> Array:
     return linalg.block_diagonal(scaled(motion.noise_factor(x.state, u)), _drawn(x, of))
 
 
-def _step_linear(motion: Motion, of: Supposed, scaled: Scaled, x: Wide, u: Any):
+def _step_linear(motion: Motion, of: Supposed, scaled: Scaled, x: Wide, u: Data):
     assert motion.linear is not None
     state, F, noise = motion.linear(x.state, u)
     F = linalg.block_diagonal(F, jnp.diag(_components(x, of.lasts)))
@@ -122,11 +122,11 @@ def _step_linear(motion: Motion, of: Supposed, scaled: Scaled, x: Wide, u: Any):
     return Wide(state, _kept(x, of)), F, noise
 
 
-def _read(sensor: Sensor, x: Wide, aux: Any):
+def _read(sensor: Sensor, x: Wide, aux: Data):
     return sensor.reading(x.state, aux)
 
 
-def _read_noise(sensor: Sensor, x: Wide, aux: Any):
+def _read_noise(sensor: Sensor, x: Wide, aux: Data):
     return sensor.noise_factor(x.state, aux)
 
 
@@ -138,7 +138,7 @@ class ReadOff:
     off: Numbers  # () one where it is, else zero
     at: int = kind()  # which offset
 
-    def __call__(self, x: Wide, aux: Any):
+    def __call__(self, x: Wide, aux: Data):
         noise = self.sensor.noise_factor(x.state, aux)
         sigma = jnp.sqrt(jnp.sum(noise**2, axis=1))
         by = jnp.asarray(self.off) * sigma * x.offset[self.at]
@@ -167,7 +167,7 @@ class Supposing(Filter):
         return self.inner.init(belief, dims)
 
     @jax.jit
-    def predict(self, state: FilterState, motion: Motion, u: Any = None):
+    def predict(self, state: FilterState, motion: Motion, u: Data = None):
         linear = None
         if motion.linear is not None:
             linear = Partial(_step_linear, motion, self.of, self.scaled)
@@ -175,7 +175,7 @@ class Supposing(Filter):
         return self.inner.predict(state, Motion(Partial(_step, motion, self.of), noise, linear), u)
 
     @jax.jit
-    def update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
+    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None):
         return self.inner.update(state, _wide_sensor(sensor, self.names, self.of), y, aux)
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
@@ -184,7 +184,9 @@ class Supposing(Filter):
     def members(self, state: FilterState):
         return self.inner.members(state)
 
-    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
+    def report(
+        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
+    ):
         def anew(inner: Filter) -> FilterState:
             assert again is not None
             return again(replace(self, inner=inner))
@@ -231,13 +233,13 @@ class Narrowed(Filter):
         return _narrow(self.inner.init(_widened(belief, offset, factor), dims))
 
     @jax.jit
-    def predict(self, state: FilterState, motion: Motion, u: Any = None):
+    def predict(self, state: FilterState, motion: Motion, u: Data = None):
         wide, prediction = self.inner.predict(state.memory, motion, u)
         new = _narrow(wide)
         return new, Prediction(None, new.belief, prediction.code)
 
     @jax.jit
-    def update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
+    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None):
         wide, info = self.inner.update(state.memory, sensor, y, aux)
         new = _narrow(wide)
         return new, info._replace(gain=info.gain[: len(new.belief.factor)])
@@ -247,7 +249,9 @@ class Narrowed(Filter):
         factor = linalg.tria(wide.factor[len(belief.factor) :])
         return _narrow(self.inner.reset(state.memory, _widened(belief, wide.mean.offset, factor)))
 
-    def report(self, start: FilterState, final: FilterState, again: Again | None, time: Any):
+    def report(
+        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
+    ):
         def anew(inner: Filter) -> FilterState:
             assert again is not None
             return again(replace(self, inner=inner)).memory

@@ -288,7 +288,7 @@ def _told(
     used: Array,
     total: Array,
 ) -> StepInfo:
-    """What an update tells of the whole cloud.
+    """Information of the whole cloud.
 
     Args:
         state: before it.

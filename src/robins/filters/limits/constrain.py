@@ -28,7 +28,7 @@ from robins.filters.belief import Belief
 from robins.filters.iterated import iterated
 from robins.filters.kalman import updated
 from robins.filters.linearise import taylor
-from robins.filters.model import Sensor, as_noise
+from robins.filters.model import Data, Sensor, as_noise
 from robins.filters.observation import Observation, contradicted, normalised
 from robins.filters.values import as_data, is_known
 from robins.manifold import State
@@ -159,7 +159,7 @@ def _by_matrix(mean: State, matrix: Given) -> tuple[Any, Any, Array]:
     return Partial(_product, D), Partial(_product_linear, D), jnp.zeros(len(D))
 
 
-def _of_state(read: Callable[[State], Any], x: State, aux: Any) -> Any:
+def _of_state(read: Callable[[State], Any], x: State, aux: Data) -> Any:
     """A function of the state alone, as a sensor reads."""
     return read(x)
 
@@ -168,7 +168,7 @@ def _product(D: Array, x: State) -> Array:
     return D @ jnp.concatenate([jnp.reshape(leaf, -1) for leaf in manifold.leaves(x)])
 
 
-def _product_linear(D: Array, x: State, aux: Any) -> tuple[Array, Array]:
+def _product_linear(D: Array, x: State, aux: Data) -> tuple[Array, Array]:
     return _product(D, x), D
 
 

@@ -166,7 +166,7 @@ class Opening(Rule):
 
     @property
     def name(self) -> str:
-        """That of the rule inside."""
+        """Name of the rule inside."""
         return self.inner.name
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
@@ -174,7 +174,7 @@ class Opening(Rule):
         return self.inner.init(belief, dims), {name: jnp.zeros((), int) for name in dims}
 
     def before(self, memory: Memory, prior: Belief, o: Observation):
-        """What the rule inside makes of a measurement, or the measurement as it was."""
+        """Let the rule inside weigh a measurement, or take it as it was."""
         inner, counts = memory
         inner, faded, given = self.inner.before(inner, prior, o)
         counting, hopeless = _judged(o, given)
@@ -192,7 +192,7 @@ class Opening(Rule):
 
 
 def _judged(o: Observation, given: Observation) -> tuple[Array, Array]:
-    """Whether a rule could weigh a measurement, and whether it left it hardly any weight."""
+    """Two bools: a rule could weigh a measurement, and left it hardly any weight."""
     R, raised = variance(o.noise), variance(given.noise)
     counting = o.accepted & o.present & (R > 0.0)
     hopeless = jnp.all(~counting | ~given.accepted | (ratio(R, raised) < _HARDLY))

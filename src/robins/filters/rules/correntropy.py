@@ -32,7 +32,7 @@ class Correntropy(Rule):
         return memory, prior, o.noted("correntropy", weight=jnp.min(w))
 
     def weight(self, e: Array) -> Array:
-        """Of residuals in deviations of their noise."""
+        """Weights of residuals in deviations of their noise."""
         return jnp.maximum(jnp.exp(-0.5 * (e * (1.0 / self.kernel)) ** 2), _least(e))
 
 

@@ -87,7 +87,7 @@ class Gate(Rule):
         return self.limit[1], square / variance / self.limit[1], seen.used, seen.used
 
     def due(self, was: _Channel, over: Array, used: Array, o: Observation):
-        """Whether patience has ended, and the refusals remembered."""
+        """End of patience, and the refusals remembered."""
         due, scatter = over & (was.refused.astype(float) >= self.patience), self.scatter
         if scatter is None:
             return due, was.residual, was.known

@@ -121,12 +121,12 @@ class HInfinity(Rule):
 
     @property
     def judges_prior(self) -> bool:
-        """Whether the predicted P decides on existence."""
+        """True if the predicted P decides on existence."""
         return self.estimate == "a-priori"
 
     @property
     def moves_on(self) -> bool:
-        """Whether the estimate is the one before the measurement, and the mean moves later."""
+        """True if the estimate is the one before the measurement, and the mean moves later."""
         return self.estimate != "a-posteriori"
 
     def rows(self, mean: State) -> Array:
@@ -228,7 +228,7 @@ class HInfinity(Rule):
     def noting(
         self, memory: HInfinityMemory, acted: Array, missed: Array, judged: Array
     ) -> HInfinityMemory:
-        """What is remembered of a step that closes."""
+        """Memory of a step that closes."""
         begins = acted & (memory.events == 0)
         return memory._replace(
             steps=memory.steps + 1,

@@ -50,7 +50,7 @@ class Igg3(Rule):
         return {**memory, o.sensor: count}, prior, o
 
     def weights(self, t: Array) -> Array:
-        """Of innovations in their standard deviations."""
+        """Weights of innovations in their standard deviations."""
         far = t > self.k0
         beyond = jnp.where(far, t, self.k1)
         share = jnp.maximum(self.k1 - beyond, 0.0) * (1.0 / (self.k1 - self.k0))

@@ -75,7 +75,7 @@ class InnovationFading(Rule):
         return Window(surplus, filled), here & (filled == self.window)
 
     def too_far(self, factor: Array, memory: Memory, prior: Belief) -> Array:
-        """Whether a factor would take a standard deviation beyond the reach."""
+        """True if a factor would take a standard deviation beyond the reach."""
         # a state known exactly at the start has no scale to hold it to
         scaled = memory.start > 0.0
         most = self.reach * jnp.where(scaled, memory.start, 1.0)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+
+from jaxtyping import ArrayLike
 
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.checks import sensor_names
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
-from robins.filters.rule import Memory, Rule
+from robins.filters.rule import Again, Memory, Rule
 from robins.filters.values import kind, value
 
 
@@ -23,8 +24,12 @@ class Only(Rule):
 
     @property
     def name(self) -> str:
-        """That of the rule inside."""
+        """Name of the rule inside."""
         return self.inner.name
+
+    @property
+    def reports(self) -> bool:
+        return self.inner.reports
 
     @property
     def settles(self) -> bool:
@@ -53,7 +58,9 @@ class Only(Rule):
     def settle(self, memory: Memory, belief: Belief):
         return self.inner.settle(memory, belief)
 
-    def report(self, start: Memory, final: Memory, again: Any, time: Any) -> None:
+    def report(
+        self, start: Memory, final: Memory, again: Again | None, time: ArrayLike | None
+    ) -> None:
         anew = None if again is None else lambda inner: again(replace(self, inner=inner))
         self.inner.report(start, final, anew, time)
 

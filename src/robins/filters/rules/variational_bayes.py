@@ -90,7 +90,7 @@ class VariationalBayes(Rule):
         return memory, posterior, info._replace(notes=notes)
 
     def learnt(self, known: InverseGamma, info: StepInfo, o: Observation) -> InverseGamma:
-        """What is known of the variances after an update."""
+        """Knowledge of the variances after an update."""
         # Rules behind this one may have weighed the noise again: that is part of the nominal one.
         R = _variances.variance(o.noise)
         here = info.used & (R > 0.0)

@@ -69,7 +69,7 @@ class Undisturbed(Rule):
         return self.gate.init(belief, dims)
 
     def before(self, memory: Memory, prior: Belief, o: Observation):
-        """What the gate makes of a measurement, but for the prior where it recovers."""
+        """Judge a measurement as the gate does, but for the prior where it recovers."""
         memory, reopened, o = self.gate.before(memory, prior, o)
         new = o.notes["gate.recovered"]
         return memory, select(new, field_forgotten(prior, self.field_t), Belief(*reopened)), o

@@ -6,8 +6,8 @@ The two studies share the body, the gyro and the disturbances. Their instruments
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Callable, Mapping
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -158,7 +158,7 @@ def instruments(given: Flight) -> tuple[Instrument, ...]:
     """Those whose readings are measurements; in "field-vector" the gyro drives the motion."""
     if isinstance(given, MagneticAttitude):
         return (RATE_GYRO if given.gyro_reads == "rate" else INTEGRATED_GYRO, MAGNETIC_ATTITUDE)
-    taken = TakenField(given.magnetometer.full_scale)
+    taken = taken_field(given.magnetometer.full_scale)
     return (
         Instrument(FIELD, _FIELD_AXES, _field, _believed_field, taken),
         Instrument(SNAPSHOT, _FIELD_AXES, None, partial(_believed_field, name=SNAPSHOT), taken),
@@ -220,15 +220,14 @@ def _believed_field(given: Flight, course: Course, name: str = FIELD) -> Sensor:
     return field_sensor(jnp.asarray(math.sin(given.magnetometer.noise)), name)
 
 
-class TakenField(NamedTuple):
-    """What a filter takes of the magnetometer; a tuple, so that equal ones are the same."""
+@lru_cache
+def taken_field(full_scale_t: float | None) -> Callable[[World], tuple[Array, Array]]:
+    """Plausible readings of the magnetometer and the field expected; one function for one scale."""
 
-    full_scale_t: float | None
+    def taken(world: World) -> tuple[Array, Array]:
+        return plausible(world.readings[FIELD], world.field_n, full_scale_t), world.field_n
 
-    def __call__(self, world: World) -> tuple[Array, Array]:
-        """Its plausible readings, and the field that is expected."""
-        field_n = world.field_n
-        return plausible(world.readings[FIELD], field_n, self.full_scale_t), field_n
+    return taken
 
 
 _RATE_AXES = SensorAxes("rad/s", "FRD", ("p", "q", "r"), "deg/s")

@@ -217,7 +217,7 @@ def contender(parameters: Replay, name: str) -> Contender:
 
 
 def _case(parameters: Replay, simulated: Recipe, run: PairRun) -> Case:
-    """As of a simulated pair, but for the start."""
+    """The case of a simulated pair, but for the start."""
     given = simulated(run)
     return given._replace(start=start_belief(given.start, parameters))
 
