@@ -20,8 +20,8 @@ from jaxtyping import Array
 from robins import scenario
 from robins.campaign.monte_carlo import Blocks, batch_of, blocks_of, one_record
 from robins.campaign.sensitivity import depends
-from robins.campaign.tuning import Data, Objective, TooLittle, Trial
-from robins.filters import run
+from robins.campaign.tuning import Data, Objective, TooLittle, Tree, Trial
+from robins.filters import Filter, run
 from robins.filters.analysis.predictive import predicted, scored
 from robins.filters.values import as_data, content, kind, value
 from robins.results import Progress
@@ -130,6 +130,7 @@ def on_runs(
     if by not in (ERROR, INNOVATIONS, *names):
         known = ", ".join([ERROR, INNOVATIONS, *names])
         raise InputError(f"is none of {known}", f"--by {by}", "choose one of these.")
+    measured = OfRuns(blocks_of(problem), problem.count_from, problem.count_to)
     progress(0.0, "simulating")
     batch = batch_of(problem)
     worlds = batch(jnp.arange(runs)), batch(jnp.arange(runs, 2 * runs))
@@ -145,17 +146,12 @@ def on_runs(
     def trial(x: np.ndarray) -> Trial:
         given = parsed(settings_at(tuned, x))
         c = read.study.contender(given, lay_out(given) if moves else course, chosen)
-        filter_ = scored(c.filter)
-        return Trial(content(filter_), (filter_, c.model, as_data(c.case), c.reported))
+        return _trial(c.filter, c.model, as_data(c.case), c.reported)
 
     return Asked(
         filter=chosen,
         vary=tuned,
-        objective=Objective(
-            trial,
-            OfRuns(blocks_of(problem), problem.count_from, problem.count_to),
-            total_of(by, names),
-        ),
+        objective=Objective(trial, measured, total_of(by, names)),
         chosen_on=Data(worlds[0]),
         judged_on=Data(worlds[1]),
         parts="runs",
@@ -169,6 +165,12 @@ def on_runs(
         "filter believes is tuned.",
         checked=parsed,
     )
+
+
+def _trial(filter_: Filter, *others: Tree) -> Trial:
+    """A filter with what it is measured by; another number of it may leap, as a threshold."""
+    filter_ = scored(filter_)
+    return Trial(content(filter_), (filter_, *others))
 
 
 def overridden(text: str, settings: Sequence[str]) -> dict[str, Any]:
@@ -241,10 +243,8 @@ def on_log(
     def trial(x: np.ndarray) -> Trial:
         taken = system.recorded(dataset, parsed(settings_at(tuned, x)))
         c = taken.contender(chosen)
-        filter_ = scored(c.filter)
         cases = [c.case(piece.world) for piece in taken.pieces]
-        given = [(case.start, case.y, case.u, case.aux) for case in cases]
-        return Trial(content(filter_), (filter_, c.model, given))
+        return _trial(c.filter, c.model, [(it.start, it.y, it.u, it.aux) for it in cases])
 
     with refusing(opened.source):
         first = trial(np.zeros(len(tuned)))
