@@ -194,9 +194,9 @@ class HInfinity(Rule):
         if self.judges_prior:
             judged = jnp.where(memory.fresh, weighted, memory.weighted)
         inverse, factor, weighted, acted = self.eased(belief, weighted, judged)
-        wide, exists = inflated(factor, jnp.multiply(inverse, weighted))
+        wide, exists = inflated(factor, inverse * weighted)
         if self.judges_prior:
-            exists = exists & inflated(factor, jnp.multiply(inverse, judged))[1]
+            exists = exists & inflated(factor, inverse * judged)[1]
         active = counts & exists & (self.inverse > 0.0)
         new = trees.select(active, self.moved(memory, belief, inverse, wide), belief)
         missed = counts & ~exists
@@ -209,7 +209,7 @@ class HInfinity(Rule):
             inverse = self.in_force(local_bound(judged))
             return inverse, belief.factor, weighted, inverse < self.inverse
         if self.policy == "compensate":
-            A = jnp.multiply(self.inverse, weighted)
+            A = self.inverse * weighted
             factor, acted = deflated(belief.factor, A, 1.0 - self.margin)
             weighted = self.weighted(belief._replace(factor=factor))
             return self.inverse, factor, weighted, acted
@@ -257,7 +257,7 @@ class HInfinity(Rule):
         if not whole or not bool(final.measured):
             return None
         n = final.weighted.shape[1]
-        exists = inflated(jnp.eye(n), jnp.multiply(self.inverse, final.weighted))[1]
+        exists = inflated(jnp.eye(n), self.inverse * final.weighted)[1]
         return None if bool(exists) else (int(final.steps) - 1, final.weighted)
 
     @property
