@@ -140,9 +140,10 @@ def test_what_ratchets_count_is_found(tmp_path):
         '        """Whether it is."""\n' + "        x += 1\n" * 60
     )
     back = "def g():\n    from robins.room.a import A\n    return A\n"
+    back += "@value\nclass V:\n    x: int\n"  # stands for a function, and is not counted
     (tmp_path / "room" / "b.py").write_text(back)
     found = ratchets.measured(tmp_path)
     assert found == {"room": {"clauses": 2, "classes": 1, "circular": 2, "long": 1, "loose": 3}}
     assert ratchets.risen(found, found) == []
     less = {"room": {**found["room"], "classes": 0}}
-    assert ratchets.risen(found, less) == ["room: 1 classes, 0 allowed"]
+    assert ratchets.risen(found, less) == ["room: 1 classes that are no values, 0 allowed"]

@@ -1,0 +1,176 @@
+"""Error and NEES of every rule over its threshold: the figure of docs/filters/thresholds.md.
+
+python docs/studies/thresholds.py [picture]
+
+A point is tracked in a plane, once with clean measurements and once with 5 % of them off by ten
+standard deviations. Each rule runs with a thousand values of its number as one batch.
+"""
+
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+from robins.filters import Belief, Model, Motion, Rule, Sensor, kalman, run
+from robins.filters.analysis.consistency import normalised_sq
+from robins.filters.rules import (
+    adaptive_h_infinity,
+    correntropy,
+    discriminator,
+    fading_memory,
+    gate,
+    h_infinity,
+    huber,
+    igg3,
+    innovation_fading,
+    sage_husa,
+    strong_tracking,
+    student_t,
+    variational_bayes,
+)
+
+PICTURE = Path(__file__).resolve().parents[1] / "pictures" / "thresholds.png"
+SEED, RUNS, STEPS, COUNT = 11, 12, 120, 1000
+SETTLED = 10  # steps that are not counted
+OFF, SHARE = 10.0, 0.05  # size and share of what is wrong
+F = jnp.kron(jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.eye(2))
+G = 0.03 * jnp.kron(jnp.array([[0.5], [1.0]]), jnp.eye(2))
+
+
+def probability(k: float) -> float:
+    """That the two components of a measurement are within k standard deviations."""
+    return -math.expm1(-0.5 * k**2)
+
+
+class Swept(NamedTuple):
+    """A rule of a number, and from where to where that goes."""
+
+    make: Callable[[float], Rule]
+    what: str
+    low: float
+    high: float
+
+
+RULES = {
+    "gate": Swept(lambda k: gate(probability(k)), "k, q = k²", 1.0, 8.0),
+    "huber": Swept(lambda k: huber(threshold=k), "k", 0.3, 30.0),
+    "igg3": Swept(lambda k: igg3(k, 2.67 * k), "k0, k1 = 2.67 k0", 0.3, 30.0),
+    "student_t": Swept(student_t, "degrees of freedom", 0.5, 100.0),
+    "correntropy": Swept(correntropy, "width of the kernel", 0.7, 30.0),
+    "discriminator": Swept(
+        lambda k: discriminator(probability=probability(k)), "k, q = k²", 1.0, 8.0
+    ),
+    "strong_tracking": Swept(
+        lambda x: strong_tracking(threshold=x), "threshold, deviations", 0.1, 30.0
+    ),
+    "innovation_fading": Swept(lambda x: innovation_fading(limit=x), "limit of λ", 1.0, 100.0),
+    "fading_memory": Swept(lambda x: fading_memory(1.0 + x), "factor - 1", 1e-3, 1.0),
+    "sage_husa": Swept(lambda x: sage_husa(1.0 - x), "1 - forgetting", 1e-3, 0.5),
+    "variational_bayes": Swept(lambda x: variational_bayes(1.0 - x), "1 - forgetting", 1e-3, 0.5),
+    "h_infinity": Swept(
+        lambda x: h_infinity(x, jnp.eye(4), policy="raise_gamma"), "gamma", 0.3, 30.0
+    ),
+    "adaptive_h_infinity": Swept(
+        lambda x: adaptive_h_infinity(jnp.eye(4), zeta=x), "zeta", 0.1, 10.0
+    ),
+}
+MODEL = Model(
+    Motion(lambda x, u: F @ x, G),
+    (Sensor(lambda x, aux: x[:2], jnp.ones(2), 2),),
+)
+START = Belief.of(jnp.zeros(4), jnp.eye(4))
+
+
+def worlds() -> tuple[np.ndarray, np.ndarray]:
+    """(RUNS, STEPS, 4) true states, and (2, RUNS, STEPS, 2) measurements, clean and faulty."""
+    rng = np.random.default_rng(SEED)
+    x, states = rng.normal(size=(RUNS, 4)), []
+    for _ in range(STEPS):
+        x = x @ np.asarray(F).T + rng.normal(size=(RUNS, 2)) @ np.asarray(G).T
+        states.append(x)
+    truth = np.stack(states, axis=1)
+    angle = rng.uniform(0.0, 2.0 * np.pi, size=(RUNS, STEPS))
+    wrong = OFF * np.stack([np.cos(angle), np.sin(angle)], axis=2)
+    clean = truth[..., :2] + rng.normal(size=(RUNS, STEPS, 2))
+    return truth, np.stack([clean, clean + wrong * (rng.random((RUNS, STEPS, 1)) < SHARE)])
+
+
+@jax.jit
+def judged(rules: Rule, truth: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mean square error of the position and mean NEES over 4, one for each of a stack of rules."""
+
+    def one(rule: Rule, truth: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        found = run(kalman(rules=[rule]), MODEL, START, y, keep=lambda step: step.posterior).steps
+        error = truth - found.mean
+        square = jnp.sum(error[SETTLED:, :2] ** 2, axis=1)
+        nees = jax.vmap(normalised_sq)(error, found.factor)[SETTLED:]
+        return jnp.mean(square), jnp.mean(nees) / 4.0
+
+    of_runs = jax.vmap(one, in_axes=(None, 0, 0))
+    square, nees = jax.lax.map(lambda rule: of_runs(rule, truth, y), rules, batch_size=100)
+    return jnp.mean(square, axis=1), jnp.mean(nees, axis=1)
+
+
+def stacked(swept: Swept, values: np.ndarray) -> Rule:
+    """Rules of many numbers as one, with a leading axis."""
+    return jax.tree_util.tree_map(lambda *x: np.stack(x), *(swept.make(v) for v in values))
+
+
+def draw(found: dict, least: np.ndarray, target: Path) -> None:
+    """One column of two panels a rule: error and NEES, clean and faulty."""
+    figure, axes = plt.subplots(7, 4, figsize=(11.0, 15.0), layout="constrained")
+    for i, (name, (values, each)) in enumerate(found.items()):
+        row, column = divmod(i, 2)
+        for k, (label, ylabel) in enumerate((("error", "error / KF, clean"), ("NEES", "NEES / 4"))):
+            one = axes[row, 2 * column + k]
+            for (square, nees), colour, kind in zip(
+                each, ("C0", "C3"), ("clean", "5 % at 10 σ"), strict=True
+            ):
+                shown = np.sqrt(square / least[0]) if k == 0 else nees
+                one.loglog(values, shown, color=colour, label=kind)
+            if k == 0:
+                one.axhline(np.sqrt(least[1] / least[0]), color="C3", ls=":", lw=1.0)
+            one.axhline(1.0, color="0.5", lw=0.8)
+            one.set(title=f"{name}: {label}", xlabel=RULES[name].what, ylabel=ylabel)
+            one.set_ylim((0.8, 6.0) if k == 0 else (0.05, 100.0))
+    for one in axes.flat[2 * len(found) :]:
+        one.set_axis_off()
+    axes[0, 0].legend(fontsize=8)
+    figure.savefig(target, dpi=80)
+
+
+def main(picture: Path) -> None:
+    """Print the best number of each rule and the counts of programs, save the picture."""
+    truth, y = worlds()
+    plain = stacked(Swept(lambda k: huber(threshold=k), "", 1.0, 1.0), np.array([math.inf]))
+    least = np.array([float(judged(plain, truth, one)[0][0]) for one in y])
+    print("| rule | its number | best on faulty data | error there | on clean data | NEES there |")
+    print("|---" * 6 + "|")
+    found = {}
+    for name, swept in RULES.items():
+        values = np.geomspace(swept.low, swept.high, COUNT)
+        rules = stacked(swept, values)
+        each = [tuple(map(np.asarray, judged(rules, truth, one))) for one in y]
+        found[name] = values, each
+        best = int(np.nanargmin(each[1][0]))
+        errors = [math.sqrt(square[best] / least[0]) for square, _ in each]
+        print(
+            f"| `{name}` | {swept.what} | {values[best]:.3g} | {errors[1]:.3g} | {errors[0]:.3g} "
+            f"| {each[1][1][best]:.3g} |",
+            flush=True,
+        )
+    print(f"Kalman filter on faulty data: {math.sqrt(least[1] / least[0]):.3g}")
+    print(f"{judged._cache_size()} programs for {len(RULES)} rules of {COUNT} numbers")
+    draw(found, least, picture)
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_platforms", "cpu")
+    plt.switch_backend("agg")
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else PICTURE)
