@@ -340,7 +340,7 @@ def test_infinity_in_the_place_of_a_gamma_is_the_kalman_filter_bit_for_bit():
 
 def test_a_gamma_is_exchanged_wherever_the_rule_lies():
     parts = imm([ONE, kalman(rules=[gate(), h_infinity(2.0, L)])], np.full((2, 2), 0.5))
-    first, second = with_gamma(parts, 4.0).modes
+    first, second = with_gamma(parts, 4.0).modes.modes
     assert float(first.filter_.rules[0].inverse) == 0.25
     assert float(second.filter_.rules[1].inverse) == 0.25
     assert float(ONE.rules[0].inverse) == 0.0
