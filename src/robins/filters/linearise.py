@@ -340,7 +340,7 @@ def unscented(
     return Unscented((_plain(alpha), _plain(beta), _plain(kappa)), redraw)
 
 
-def _plain(given: Number) -> float:
+def _plain(given: Number) -> Number:
     """A number that is a kind, and so has a hash, which an array has not."""
     return given if isinstance(given, (int, float)) else float(given)
 

@@ -16,7 +16,7 @@ EVERY = slice(None)
 
 def transitions(
     count: int,
-    edges: Sequence[tuple[Hypotheses, Hypotheses, ArrayLike]],
+    edges: Sequence[tuple[Hypotheses, Hypotheses, ArrayLike | Sequence[float]]],
     rest: Sequence[int] | np.ndarray | None = None,
 ) -> np.ndarray:
     """(count, count) probabilities of a change in one step, row i those from hypothesis i.
