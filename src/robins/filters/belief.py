@@ -13,9 +13,11 @@ from jaxtyping import Array, ArrayLike, Float
 
 from robins import linalg, manifold
 from robins.filters.checks import finite_numbers
+from robins.filters.values import Numbers
 from robins.manifold import State
 
-Number = float | int  # where types are checked an int is no float
+# Of a user. Where types are checked an int is no float; a batch and a stand-in of JAX are arrays.
+Number = float | int | Numbers
 
 
 class Belief(NamedTuple):

@@ -337,12 +337,8 @@ def unscented(
             from a measurement than could be, unless the noise is small. Only the first update after
             a prediction that no rule has faded has such points; the others draw.
     """
-    return Unscented((_plain(alpha), _plain(beta), _plain(kappa)), redraw)
-
-
-def _plain(given: Number) -> Number:
-    """A number that is a kind, and so has a hash, which an array has not."""
-    return given if isinstance(given, (int, float)) else float(given)
+    # kinds have a hash, which an array has not
+    return Unscented((float(alpha), float(beta), float(kappa)), redraw)
 
 
 def _square(noise: Array) -> Array:
