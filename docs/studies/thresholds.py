@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from robins.filters import Belief, Model, Motion, Rule, Sensor, kalman, run
 from robins.filters.analysis.consistency import normalised_sq
@@ -123,26 +124,29 @@ def stacked(swept: Swept, values: np.ndarray) -> Rule:
 
 
 def draw(found: dict, least: np.ndarray, target: Path) -> None:
-    """One column of two panels a rule: error and NEES, clean and faulty."""
-    figure, axes = plt.subplots(7, 4, figsize=(11.0, 15.0), layout="constrained")
-    for i, (name, (values, each)) in enumerate(found.items()):
-        row, column = divmod(i, 2)
-        for k, (label, ylabel) in enumerate((("error", "error / KF, clean"), ("NEES", "NEES / 4"))):
-            one = axes[row, 2 * column + k]
-            for (square, nees), colour, kind in zip(
-                each, ("C0", "C3"), ("clean", "5 % at 10 σ"), strict=True
-            ):
-                shown = np.sqrt(square / least[0]) if k == 0 else nees
-                one.loglog(values, shown, color=colour, label=kind)
-            if k == 0:
-                one.axhline(np.sqrt(least[1] / least[0]), color="C3", ls=":", lw=1.0)
+    """A row of two panels for each rule: error and NEES, clean and faulty."""
+    size = 6.5, 1.75 * len(found)
+    figure, axes = plt.subplots(len(found), 2, figsize=size, layout="constrained")
+    colours, kinds = ("C0", "C3"), ("clean", f"{100 * SHARE:.0f} % at {OFF:.0f} σ")
+    for row, (name, (values, each)) in zip(axes, found.items(), strict=True):
+        for (square, nees), colour, label in zip(each, colours, kinds, strict=True):
+            row[0].loglog(values, np.sqrt(square / least[0]), color=colour, label=label)
+            row[1].loglog(values, nees, color=colour)
+        row[0].axhline(np.sqrt(least[1] / least[0]), color="C3", ls=":", lw=1.0)
+        row[0].set(ylim=(0.8, 6.0), ylabel="error / KF, clean")
+        row[1].set(ylim=(0.05, 100.0), ylabel="NEES / 4")
+        for one, what in zip(row, ("error", "NEES"), strict=True):
             one.axhline(1.0, color="0.5", lw=0.8)
-            one.set(title=f"{name}: {label}", xlabel=RULES[name].what, ylabel=ylabel)
-            one.set_ylim((0.8, 6.0) if k == 0 else (0.05, 100.0))
-    for one in axes.flat[2 * len(found) :]:
-        one.set_axis_off()
+            one.set_title(f"{name}: {what}", fontsize=10)
+            one.set_xlabel(RULES[name].what)
+            ticks = LogLocator(subs=(1.0, 2.0, 5.0) if values[-1] < 100.0 * values[0] else (1.0,))
+            one.xaxis.set_major_locator(ticks)
+            one.xaxis.set_major_formatter("{x:g}")
+            one.xaxis.set_minor_formatter(NullFormatter())
+        row[0].set_yticks([1, 2, 5], ["1", "2", "5"])
+        row[0].yaxis.set_minor_formatter(NullFormatter())
     axes[0, 0].legend(fontsize=8)
-    figure.savefig(target, dpi=80)
+    figure.savefig(target, dpi=100)
 
 
 def main(picture: Path) -> None:
