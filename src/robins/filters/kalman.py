@@ -64,24 +64,24 @@ class Filter:
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
         """The state to begin with; dims maps sensor names to dimensions (`Model.dims`)."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must have `init`")
 
     def _predict(
         self, state: FilterState, motion: Motion, u: Data
     ) -> tuple[FilterState, Prediction]:
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must have `_predict`")
 
     def _update(
         self, state: FilterState, sensor: Sensor, y: Data, aux: Data
     ) -> tuple[FilterState, StepInfo]:
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must have `_update`")
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
         """Go on from another belief, keeping what was learned of the noise.
 
         For a filter inside a federated filter or a mixture.
         """
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must have `reset`")
 
     def members(self, state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
         """Beliefs of the local filters of a joined filter, and how they go on from others.
@@ -93,6 +93,14 @@ class Filter:
             filters begin anew from beliefs, and the whole from their fusion.
         """
         return (), lambda beliefs, belief: state
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """Names of instruments, or "motion", that the filter may find wrong; none by default.
+
+        Its updates note the probability of each as ``imm.wrong``, in this order.
+        """
+        return ()
 
     @property
     def reports(self) -> bool:
@@ -137,6 +145,69 @@ class Filter:
         ok = state.current | (info.code == int(Code.MISSING))
         new = select(state.current, new, state)
         return new, not_taken(ok, info, jnp.asarray(int(Code.NOT_PREDICTED)))
+
+
+class Composite(Filter):
+    """A filter of filters; the reports of rules are asked of each by itself.
+
+    Attributes:
+        filters: the filters it is made of.
+        with_filters: ``filters -> Filter``, the same made of others.
+        parts: ``state -> states``, theirs in its own.
+    """
+
+    @property
+    def filters(self) -> tuple[Filter, ...]:
+        raise NotImplementedError(f"{type(self).__name__} must have `filters`")
+
+    def with_filters(self, filters: tuple[Filter, ...]) -> Filter:
+        raise NotImplementedError(f"{type(self).__name__} must have `with_filters`")
+
+    def parts(self, state: FilterState) -> tuple[FilterState, ...]:
+        raise NotImplementedError(f"{type(self).__name__} must have `parts`")
+
+    @property
+    def reports(self) -> bool:
+        return any(one.reports for one in self.filters)
+
+    def report(
+        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
+    ) -> None:
+        each = zip(self.filters, self.parts(start), self.parts(final), strict=True)
+        for i, (one, first, last) in enumerate(each):
+
+            def rerun(other: Filter, i: int = i) -> FilterState:
+                assert again is not None
+                filters = (*self.filters[:i], other, *self.filters[i + 1 :])
+                return self.parts(again(self.with_filters(filters)))[i]
+
+            one.report(first, last, None if again is None else rerun, time)
+
+
+class Around(Composite):
+    """A filter around another one, `inner`, whose state it has where it says nothing else."""
+
+    inner: Filter
+
+    @property
+    def filters(self) -> tuple[Filter, ...]:
+        return (self.inner,)
+
+    def with_filters(self, filters: tuple[Filter, ...]) -> Any:
+        return dataclasses.replace(self, inner=filters[0])  # type: ignore[type-var]
+
+    def parts(self, state: FilterState) -> tuple[FilterState, ...]:
+        return (state,)
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        return self.inner.suspects
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        return self.inner.init(belief, dims)
+
+    def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        return self.inner.reset(state, belief)
 
 
 def predicted_factor(t: Transition, form: Form) -> Array:

@@ -8,19 +8,17 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
-from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 from scipy import integrate, optimize, special, stats
 
 from robins import linalg
 from robins.filters.belief import Belief
-from robins.filters.kalman import Again, Filter, FilterState
+from robins.filters.kalman import Around, Filter, FilterState, Follow
 from robins.filters.linearise import taylor
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.observation import Normalised, normalised
@@ -87,13 +85,10 @@ def log_density(seen: Normalised) -> Float[Array, ""]:
 
 
 @value
-class Scored(Filter):
+class Scored(Around):
     """The filter of `scored`: that inside, with the log density of each measurement noted."""
 
     inner: Filter
-
-    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        return self.inner.init(belief, dims)
 
     # The states are those of the filter inside, which leaves out itself what is not taken.
     @jax.jit
@@ -110,20 +105,8 @@ class Scored(Filter):
         new, info = self.inner.update(state, sensor, y, aux)
         return new, info.noted(_RULE, log_density=density, components=seen.dof)
 
-    def reset(self, state: FilterState, belief: Belief) -> FilterState:
-        return self.inner.reset(state, belief)
-
-    def members(self, state: FilterState):
+    def members(self, state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
         return self.inner.members(state)
-
-    def report(
-        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
-    ) -> None:
-        def anew(filter_: Filter) -> FilterState:
-            assert again is not None
-            return again(replace(self, inner=filter_))
-
-        self.inner.report(start, final, None if again is None else anew, time)
 
 
 def scored(filter_: Filter) -> Filter:

@@ -21,6 +21,7 @@ from robins.filters.checks import sensor_names
 from robins.filters.composite.fusion import is_singular
 from robins.filters.kalman import (
     Again,
+    Composite,
     Filter,
     FilterState,
     Follow,
@@ -94,39 +95,6 @@ def local_dims(channels: Sequence[Channel], dims: Mapping[str, int]) -> list[dic
 
 
 # ------------------------------------------------------------------------------ filters of filters
-
-
-class Composite(Filter):
-    """A filter of filters: what rules report is asked of each by itself.
-
-    Attributes:
-        filters: those it is made of.
-        with_filters: ``filters -> Filter``, the same made of others.
-        parts: ``state -> states``, theirs in its own.
-    """
-
-    @property
-    def filters(self) -> tuple[Filter, ...]:
-        raise NotImplementedError
-
-    def with_filters(self, filters: tuple[Filter, ...]) -> Filter:
-        raise NotImplementedError
-
-    def parts(self, state: FilterState) -> tuple[FilterState, ...]:
-        raise NotImplementedError
-
-    def report(
-        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
-    ):
-        each = zip(self.filters, self.parts(start), self.parts(final), strict=True)
-        for i, (one, first, last) in enumerate(each):
-
-            def anew(other: Filter, i: int = i) -> FilterState:
-                assert again is not None
-                filters = (*self.filters[:i], other, *self.filters[i + 1 :])
-                return self.parts(again(self.with_filters(filters)))[i]
-
-            one.report(first, last, None if again is None else anew, time)
 
 
 class Joined(NamedTuple):
@@ -254,6 +222,10 @@ class JoinedFilter(Composite):
         locals_ = [m.belief for m in members[: len(self.channels)]]
         apart = self.apart(locals_, i) & (info.code == int(Code.DONE))
         return info._replace(code=jnp.where(apart, int(Code.APART), info.code))
+
+    @property
+    def reports(self) -> bool:
+        return True
 
     def report(
         self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None

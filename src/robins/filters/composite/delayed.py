@@ -11,18 +11,17 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo, is_failure
-from robins.filters.kalman import Again, Filter, FilterState, Prediction
+from robins.filters.kalman import Around, Filter, FilterState, Prediction
 from robins.filters.model import Data, Model, Motion, Sensor
 from robins.filters.trees import select
 from robins.filters.values import kind, value
@@ -90,14 +89,17 @@ class _Redone(NamedTuple):
 
 
 @value
-class Delayed(Filter):
+class Delayed(Around):
     """The filter of `delayed`."""
 
-    filter_: Filter
+    inner: Filter
     model: Model
     u: Data  # one input
     aux: dict[str, Data]  # one of each sensor
     depth: int = kind()
+
+    def parts(self, state: FilterState) -> tuple[FilterState, ...]:
+        return (_inner(state),)
 
     @property
     def size(self) -> int:
@@ -126,11 +128,11 @@ class Delayed(Filter):
         return _outer(inner, Delay(inner.memory, past, zero, zero, known))
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        return self.begin(self.filter_.init(belief, dims), _numbers(self.model))
+        return self.begin(self.inner.init(belief, dims), _numbers(self.model))
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
         # What was measured before the new belief is part of it, or meant to be forgotten.
-        return self.begin(self.filter_.reset(_inner(state), belief), state.memory.model)
+        return self.begin(self.inner.reset(_inner(state), belief), state.memory.model)
 
     # The filter itself knows whether its prediction was taken: what comes late can change that.
 
@@ -144,7 +146,7 @@ class Delayed(Filter):
         _check_same("an input u", u, _row(held.past.u, 0))
         inner, now = _inner(state), held.now + 1
         past = self.opened(held.past, now % self.size, inner, u)
-        inner, prediction = self.filter_.predict(inner, motion, u)
+        inner, prediction = self.inner.predict(inner, motion, u)
         reach = jnp.minimum(held.reach + 1, self.depth)
         known = Model(_numbers(motion), held.model.sensors)
         new = _outer(inner, Delay(inner.memory, past, now, reach, known))
@@ -175,7 +177,7 @@ class Delayed(Filter):
         value, age = y if isinstance(y, Late) else (y, jnp.zeros(()))
         place = self.placed(held, which, value, age)
         fresh = jax.tree_util.tree_map(lambda v: jnp.where(place.at_once, v, jnp.nan), value)
-        inner, info = self.filter_.update(_inner(state), sensor, fresh, aux)
+        inner, info = self.inner.update(_inner(state), sensor, fresh, aux)
         past = _entered(held.past, place, sensor.name, value, aux, info)
         redone = self.redone(past, place, known, inner, info)
         told = _told(past, place, redone)
@@ -231,11 +233,11 @@ class Delayed(Filter):
         j = (place.at + i) % self.size
         row = _row(past, j)
         before = jax.tree_util.tree_map(lambda a, x: a.at[j].set(x), before, inner)
-        moved, prediction = self.filter_.predict(inner, known.motion, row.u)
+        moved, prediction = self.inner.predict(inner, known.motion, row.u)
         inner = select(row.moved, moved, inner)
         taken = taken & (~row.moved | (prediction.code == int(Code.DONE)))
         for k, each in enumerate(known.sensors):
-            after, seen = self.filter_.update(inner, each, row.y[each.name], row.aux[each.name])
+            after, seen = self.inner.update(inner, each, row.y[each.name], row.aux[each.name])
             inner = select(row.asked[k], after, inner)
             gained = gained.at[j, k].set(jnp.where(row.asked[k], seen.log_likelihood, 0.0))
             told = jnp.isneginf(row.log_likelihood[k])  # when it was first asked
@@ -243,21 +245,6 @@ class Delayed(Filter):
             if k == place.which:
                 own = select(i == 0, seen, own)
         return _Redone(inner, before, gained, own, taken, failed)
-
-    @property
-    def reports(self) -> bool:
-        return self.filter_.reports
-
-    def report(
-        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
-    ) -> None:
-        """Ask the filter that is delayed, not its past."""
-
-        def anew(filter_: Filter) -> FilterState:
-            assert again is not None
-            return _inner(again(replace(self, filter_=filter_)))
-
-        self.filter_.report(_inner(start), _inner(final), None if again is None else anew, time)
 
 
 def delayed(

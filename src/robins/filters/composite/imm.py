@@ -173,6 +173,8 @@ def _stack(trees: Sequence[Any]) -> Any:
 
 Rows = ArrayLike | Sequence[Any]  # numbers, or rows of them
 
+WRONG = "imm.wrong"  # note of a bank: (names,) probability that each of `Filter.suspects` is wrong
+
 _ONE = 1e-9  # how far a sum of probabilities may be off
 
 
@@ -202,6 +204,11 @@ class Imm(Filter):
     log_change: Numbers  # (modes, modes)
     log_first: Numbers  # (modes,)
     likeliest: bool = kind()
+    wrong: tuple[tuple[str, tuple[int, ...]], ...] = kind()  # names, and the modes of each
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        return tuple(name for name, _ in self.wrong)
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
         own = set()
@@ -246,7 +253,10 @@ class Imm(Filter):
         after, seen, each = self.modes.every(lambda m, s: m.update(s, sensor, y, aux), states)
         log_prior, log_post, used = _judged(seen, log_prior)
         notes = {f"imm.{i}.{k}": v for i, own in enumerate(each) for k, v in own.items()}
-        notes["imm.probability"] = jnp.exp(log_post)
+        notes["imm.probability"] = probability = jnp.exp(log_post)
+        if self.wrong:
+            each = [jnp.sum(probability[np.asarray(modes)]) for _, modes in self.wrong]
+            notes[WRONG] = jnp.stack(each)
         info = self.told(seen, log_prior, log_post, used)._replace(notes=notes)
         # Where no mode has moved the mixture stands bit for bit.
         was, now = self.modes.beliefs(states), self.modes.beliefs(after)
@@ -292,6 +302,7 @@ def imm(
     transition: Rows,
     start: Rows | None = None,
     likeliest: bool = False,
+    wrong: Mapping[str, Sequence[int]] | None = None,
 ) -> Filter:
     """Interacting multiple model filter over any filters of the same state.
 
@@ -313,10 +324,14 @@ def imm(
         start: (modes,) probabilities before the first prediction; all equal where not given.
         likeliest: innovation, factor, NIS and what was used are those of the mode that is likeliest
             after the update. Beliefs and likelihoods are the same either way.
+        wrong: numbers of the modes in which something is wrong, by the name of an instrument or
+            "motion"; a mode may stand under several names. The probability of each name is noted as
+            ``imm.wrong`` (names,), and `Filter.suspects` has the names.
 
     Raises:
         ValueError: no modes, or probabilities that are negative, of a wrong shape or do not sum to
-            one. When a run begins: a mode brings a sensor that the model does not have.
+            one; `wrong` numbers a mode that is not there. When a run begins: a mode brings a sensor
+            that the model does not have.
     """
     all_ = modes if isinstance(modes, Family) else Several(tuple(map(_as_mode, modes)))
     count = all_.size
@@ -324,7 +339,11 @@ def imm(
     even = np.full(count, 1.0 / count)
     log_first = _log_probabilities("start", even if start is None else start, (count,))
     log_change = _log_probabilities("transition", transition, (count, count))
-    return Imm(all_, log_change, log_first, likeliest)
+    of = tuple((name, tuple(sorted(set(modes)))) for name, modes in (wrong or {}).items())
+    for name, numbers in of:
+        there = bool(numbers) and numbers[0] >= 0 and numbers[-1] < count
+        require(there, f"modes of '{name}' in wrong must be among 0 to {count - 1}", list(numbers))
+    return Imm(all_, log_change, log_first, likeliest, of)
 
 
 def _log_probabilities(name: str, given: Rows, shape: tuple[int, ...]) -> Numbers:

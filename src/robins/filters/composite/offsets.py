@@ -24,19 +24,18 @@ sensors is wrong, the offset is learnt, and what the records say of changes of x
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief
 from robins.filters.composite.bank import EVERY, transitions
-from robins.filters.kalman import Again, Filter, FilterState, Prediction
+from robins.filters.kalman import Around, Filter, FilterState, Prediction
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.values import Numbers, kind, value
 
@@ -155,16 +154,13 @@ def _wide_sensor(sensor: Sensor, names: Sequence[str], of: Supposed) -> Sensor:
 
 
 @value
-class Supposing(Filter):
+class Supposing(Around):
     """The filter of `supposing`."""
 
     inner: Filter
     of: Supposed
     scaled: Scaled
     names: tuple[str, ...] = kind()
-
-    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        return self.inner.init(belief, dims)
 
     @jax.jit
     def predict(self, state: FilterState, motion: Motion, u: Data = None):
@@ -177,21 +173,6 @@ class Supposing(Filter):
     @jax.jit
     def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None):
         return self.inner.update(state, _wide_sensor(sensor, self.names, self.of), y, aux)
-
-    def reset(self, state: FilterState, belief: Belief) -> FilterState:
-        return self.inner.reset(state, belief)
-
-    def members(self, state: FilterState):
-        return self.inner.members(state)
-
-    def report(
-        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
-    ):
-        def anew(inner: Filter) -> FilterState:
-            assert again is not None
-            return again(replace(self, inner=inner))
-
-        self.inner.report(start, final, None if again is None else anew, time)
 
 
 def supposing(filter_: Filter, names: Sequence[str], of: Supposed, scaled: Scaled) -> Filter:
@@ -217,11 +198,14 @@ def _narrow(wide: FilterState) -> FilterState:
 
 
 @value
-class Narrowed(Filter):
+class Narrowed(Around):
     """The filter of `narrowed`."""
 
     inner: Filter
     names: tuple[str, ...] = kind()
+
+    def parts(self, state: FilterState) -> tuple[FilterState, ...]:
+        return (state.memory,)
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
         if unknown := set(self.names) - set(dims):
@@ -248,15 +232,6 @@ class Narrowed(Filter):
         wide = state.memory.belief
         factor = linalg.tria(wide.factor[len(belief.factor) :])
         return _narrow(self.inner.reset(state.memory, _widened(belief, wide.mean.offset, factor)))
-
-    def report(
-        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
-    ):
-        def anew(inner: Filter) -> FilterState:
-            assert again is not None
-            return again(replace(self, inner=inner)).memory
-
-        self.inner.report(start.memory, final.memory, None if again is None else anew, time)
 
 
 def narrowed(filter_: Filter, names: Sequence[str]) -> Filter:
