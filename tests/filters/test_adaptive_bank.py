@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from robins.filters import Belief, Model, Motion, Sensor, adaptive, kalman, run
-from robins.filters.composite.adaptive import changes, excited, lasting
-from robins.filters.composite.bank import EVERY, transitions
+from robins.filters.composite.adaptive import changes, excited
+from robins.filters.composite.bank import EVERY, lasting, transitions
 from robins.filters.linearise import Transition
 from robins.filters.rules import huber
 
@@ -113,7 +113,12 @@ def test_it_follows_what_lasts_and_ignores_what_does_not():
     y[10] += 1e4
     error = {}
     for name, one in {"bank": adaptive(), "huber": kalman(rules=[huber(0.99)])}.items():
-        error[name] = np.abs(run(one, MODEL, START, y).mean[:, 0] - clean[:, 0])
+        found = run(one, MODEL, START, y)
+        error[name] = np.abs(found.mean[:, 0] - clean[:, 0])
+        if name == "bank":
+            assert one.suspects == ("motion",)
+            moved = found.steps.info["y"].notes["imm.wrong"][:, 0]
+            assert np.max(moved[:19]) < 0.5 < np.max(moved[20:26])
     assert error["bank"][10] < 5.0  # the wild record
     assert np.max(error["bank"][26:]) < 6.0  # four sigma of a record, of six times the noise
     assert np.max(error["huber"][26:]) > 4.0 * np.max(error["bank"][26:])
@@ -130,7 +135,7 @@ def test_a_part_has_its_own_noise():
 @pytest.mark.parametrize("off", [(), ("y",)], ids=["right", "off"])
 def test_a_bank_made_again_with_other_numbers_has_the_same_structure(off):
     def leaves_and_structure(scales, up, robust):
-        parts = [[0], slice(1, 3)]
+        parts = {"gyro": [0], "accelerometer": slice(1, 3)}
         return jax.tree_util.tree_flatten(adaptive(scales, robust, up, 0.1, parts, off=off))
 
     one, structure = leaves_and_structure((1.0, 8.0), 0.01, 0.99)
@@ -147,6 +152,8 @@ def test_a_bank_made_again_with_other_numbers_has_the_same_structure(off):
 def test_what_cannot_be_is_refused():
     with pytest.raises(ValueError, match="rise"):
         adaptive((1.0, 1.0))
+    with pytest.raises(ValueError, match="named"):
+        adaptive(parts={})
     with pytest.raises(ValueError, match="rise"):
         adaptive((0.0, 8.0))
     with pytest.raises(ValueError, match="chance to stay"):

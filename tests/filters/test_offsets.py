@@ -9,7 +9,8 @@ from scipy.stats import multivariate_normal
 from robins import linalg
 from robins.filters import Belief, Model, Motion, Sensor, adaptive, imm, kalman, run
 from robins.filters.composite import offsets
-from robins.filters.composite.adaptive import changes, lasting
+from robins.filters.composite.adaptive import changes
+from robins.filters.composite.bank import lasting
 from robins.filters.composite.offsets import narrowed, sensors_off, supposing, with_offsets
 from robins.filters.rules import huber
 from robins.manifold import Angle
@@ -101,12 +102,16 @@ def _linear(x, u):
 @pytest.mark.parametrize("linear", [None, _linear])
 def test_it_is_the_dense_recursion(linear):
     y = data(np.random.default_rng(2), off=1.0)
-    found = run(adaptive((1.0, 8.0), 1.0, off=(RATE,)), model(linear), START, y)
+    bank = adaptive((1.0, 8.0), 1.0, off=(RATE,))
+    found = run(bank, model(linear), START, y)
     mean, covariance, mu = dense(y, 8.0)
     np.testing.assert_allclose(found.mean, mean, rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(found.covariance, covariance, rtol=1e-7, atol=1e-10)
     noted = found.steps.info[BOTH].notes["imm.probability"]
     np.testing.assert_allclose(noted, mu, rtol=1e-6, atol=1e-11)
+    assert bank.suspects == ("motion", RATE)
+    wrong = np.stack([mu[:, 1], mu[:, 2] + mu[:, 3]], axis=1)
+    np.testing.assert_allclose(found.steps.info[BOTH].notes["imm.wrong"], wrong, rtol=1e-6)
     assert mu[25, 0] > 0.8  # all is right, then the offset is seen, and lasts
     assert np.all(mu[45:, 3] > 0.8)
 

@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+from robins.filters.composite.bank import stacked
 from robins.scenario import load
 from robins.sim.flexure import Flexure
 from robins.systems.finding import find_system
@@ -52,7 +53,7 @@ def test_alignment_is_told_of_no_structure_and_has_no_number_of_a_scenario():
 
 
 def test_attitude_matching_supposes_structures_and_no_louder_gyros():
-    rows = hypotheses()
+    rows = stacked(hypotheses())
     count = len(rows.sigma)
     swings = {(float(s), float(t)) for s, t in zip(rows.sigma, rows.time, strict=True)}
     assert count == 2 * len(swings) == 18  # with flutter and without
@@ -63,6 +64,9 @@ def test_attitude_matching_supposes_structures_and_no_louder_gyros():
     probability = np.exp(state.memory.log_probability)
     np.testing.assert_allclose(probability[np.asarray(rows.sigma) == 0.0].sum(), 0.5)
     np.testing.assert_allclose(probability.sum(), 1.0)
+    assert bank.suspects == (ATTITUDE, "flexure")
+    assert dict(bank.wrong)["flexure"] == tuple(np.flatnonzero(rows.sigma))
+    assert dict(bank.wrong)[ATTITUDE] == tuple(np.flatnonzero(rows.flutter))
 
 
 def test_a_bank_made_again_is_the_same_and_its_numbers_are_leaves():

@@ -42,8 +42,7 @@ def blank(problem: Problem | None) -> Statistics:
     """Statistics of no runs; without a problem such as can be joined, not asked."""
     if problem is None:
         return Statistics(())
-    p = problem
-    return Statistics(p.blocks, p.count_from, p.limits, p.count_to, p.norms, p.windows)
+    return Statistics.of(problem)
 
 
 def gather(store: Store, plan: Plan, problem: Problem | None = None) -> State:

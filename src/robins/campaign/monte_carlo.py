@@ -26,6 +26,7 @@ from robins.filters.values import as_data
 from robins.manifold import State, local
 from robins.program.liveness import bytes_of_jaxpr
 from robins.systems.study import Case, Contender, Problem
+from robins.systems.suspects import probabilities
 from robins.systems.tables import updates
 
 Blocks = tuple[tuple[str, int, int], ...]  # name, first and last of the reported components
@@ -106,6 +107,7 @@ def one_record(
         "dim": jnp.asarray(posterior.factor.shape[-1]),
         "mean": posterior.mean,
         "updates": info,
+        "wrong": probabilities(contender.filter, info),
         "outputs": dict(case.outputs),
         "readings": dict(case.y),
         "tally": tally,
@@ -204,7 +206,8 @@ def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, An
     Returns:
         NumPy records with a leading axis of ``count`` runs. Of the reported components error and
         sigma (E, r) and block_nees by block; of the state mean, nees (E,) and dim (); by sensor
-        updates, each an `Update`, and readings; by name the outputs; the tally of its steps.
+        updates, each an `Update`, and readings; by name the outputs; by suspect the probability
+        that it is wrong (E,); the tally of its steps.
 
     Raises:
         ValueError: there is no such contender.

@@ -17,6 +17,7 @@ from robins.filters import Code, Tally, doubts
 from robins.results import Outcome, Probability, Progress, array, keeping, silent, variable
 from robins.systems.judgement import RUNS, Metrics, Verdicts
 from robins.systems.study import Contender, Problem, StateBlock
+from robins.systems.suspects import sentences, tables, words
 from robins.systems.tables import block_array, innovation_tables
 
 
@@ -43,11 +44,7 @@ def simulate(
     `robins.results.rescued` to write.
     """
     names = list(problem.contenders)
-    p = problem
-    found = {
-        n: Statistics(p.blocks, p.count_from, p.limits, p.count_to, p.norms, p.windows)
-        for n in names
-    }
+    found = {name: Statistics.of(problem) for name in names}
     done, bound = 0, None
     by = machine_for(problem, runs, machine) if isinstance(machine, str) else machine
     chunk = chunk or by.width(runs)
@@ -93,6 +90,7 @@ def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray
         counts=_counts(found),
         notes=[
             *problem.notes,
+            *(sentence for name, s in found.items() for sentence in _finds(problem, name, s)),
             *(_undecided(c["id"], c["more_runs"]) for c in claims if c["verdict"] == "undecided"),
         ],
         warnings=[
@@ -101,6 +99,44 @@ def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray
             for sentence in _doubts(problem.contenders[name], s.tally)
         ],
     )
+
+
+def _finds(problem: Problem, name: str, s: Statistics) -> list[str]:
+    """Sentences on what a filter finds wrong, and since when."""
+    if s.runs == 1:
+        return sentences(name, problem.epoch_s, s.first_run.get("wrong", {}))
+    said, suspects = [], s.suspects
+    for suspect in suspects:
+        first = s.first_wrong(suspect)
+        if count := int(np.sum(first >= 0)):
+            since = np.median(problem.epoch_s[first[first >= 0]])
+            said.append(
+                f"{name} finds {words(suspect)} wrong in {count} of {s.runs} runs, "
+                f"first at {since:.1f} s in the median."
+            )
+    if suspects and not said:
+        listed = ", ".join(map(words, suspects))
+        return [f"{name} finds none of these wrong in any of {s.runs} runs: {listed}."]
+    return said
+
+
+def _scores(problem: Problem, s: Statistics) -> dict[str, Any]:
+    """By suspect or fault: the share of faults found, the time that took, wrong accusations."""
+    if not s.suspects or problem.faults is None:
+        return {}
+    out: dict[str, Any] = {}
+    real = [name for name, true in problem.faults.items() if np.any(true)]
+    for name in dict.fromkeys([*s.suspects, *real]):
+        if name in real:
+            delays = s.delays(name) if name in s.suspects else np.array([[-1]])
+            found = delays[delays >= 0]
+            out[f"{name}_fault_found_share"] = float(np.mean(delays >= 0))
+            if len(found):
+                step_s = float(np.median(np.diff(problem.epoch_s)))
+                out[f"{name}_fault_found_after_s"] = float(np.median(found)) * step_s
+        if name in s.suspects:
+            out[f"{name}_accused_wrongly_share"] = float(np.mean(s.accused(name)))
+    return out
 
 
 def _doubts(contender: Contender, tally: Tally) -> list[str]:
@@ -114,6 +150,7 @@ def _metrics(
     problem: Problem, name: str, s: Statistics, bound: np.ndarray | None
 ) -> dict[str, Any]:
     out = problem.metrics(s) | dict(problem.contenders[name].facts) | _chances(s)
+    out |= _scores(problem, s)
     return out if bound is None else out | _over_bound(problem, s, bound)
 
 
@@ -222,7 +259,7 @@ def campaign_solution(
         if o.is_error:
             rms = _stack(found, lambda s, name=o.name: s.output_rms(name))
             data |= block_array("rms", o, rms, f"RMS {words}", comment=o.text, runs=runs)
-    data |= _notes(found)
+    data |= _notes(found) | _wrong(problem, found)
     data |= problem.shown({name: s.first_run["mean"] for name, s in found.items()})
     seen = [s.first_run["updates"] for s in found.values()]
     return xr.Dataset(data | innovation_tables(seen, problem.sensors, problem.epoch_s))
@@ -241,6 +278,22 @@ def _scatter(b: StateBlock, found: dict[str, Statistics]) -> dict[str, Any]:
         | array("covariance", covariance, b.name, **whole)
         | array("percentile", lengths, b.name, axes=[f"{p} %" for p in PERCENTS], **shown)
     )
+
+
+def _wrong(problem: Problem, found: dict[str, Statistics]) -> dict[str, Any]:
+    """How likely each suspect is wrong, in the first run and over all, and when it truly is."""
+    data = tables("wrong", [s.first_run.get("wrong", {}) for s in found.values()])
+    if not data:
+        return {}
+    runs = next(iter(found.values())).runs
+    if runs > 1:
+        mean = [{name: s.wrong(name) for name in s.suspects} for s in found.values()]
+        data |= tables("mean_wrong", mean, runs=runs)
+    if problem.faults is not None:
+        none = np.zeros(len(problem.epoch_s), bool)
+        true = [problem.faults.get(str(name), none) for name in data["suspect"].values]
+        data |= array("truly_wrong", np.stack(true, axis=1).astype(np.int8))
+    return data
 
 
 def _notes(found: dict[str, Statistics]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ are plain arrays by name.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,7 +19,8 @@ from robins.campaign.histogram import counted, joined, percentiles
 from robins.filters import Tally
 from robins.filters.analysis.consistency import Verdict, grand_mean_nis
 from robins.filters.chi_square import chi2_band
-from robins.systems.study import Limit, Norm, StateBlock
+from robins.systems.study import Limit, Norm, StateBlock, View
+from robins.systems.suspects import HELD, edges
 
 
 @dataclass
@@ -44,6 +45,7 @@ class Statistics:
     count_to: int | None = None  # epoch after the last that counts
     norms: Sequence[Norm] = ()
     windows: Sequence[slice] = ()  # spans of epochs whose largest errors are kept
+    faults: Mapping[str, np.ndarray] | None = None  # as of a `View`
     runs: int = 0
     diverged: int = 0
     n: int = 0
@@ -51,6 +53,14 @@ class Statistics:
     sums: dict[str, Any] = field(default_factory=dict)
     each: dict[str, list[np.ndarray]] = field(default_factory=dict)
     bins: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, view: View) -> Statistics:
+        """Statistics of no runs yet, of what a problem wants."""
+        return cls(
+            *(view.blocks, view.count_from, view.limits, view.count_to, view.norms, view.windows),
+            view.faults,
+        )
 
     def add(self, record: dict[str, Any]) -> None:
         """Take in a chunk as `robins.campaign.record` gives it."""
@@ -78,6 +88,7 @@ class Statistics:
         self._scatter(error)
         self._lengths(error)
         self._within(error)
+        self._suspected(record.get("wrong", {}))
         self._each("lost", bad)
         self._each("rms", np.sqrt(np.mean(error[:, self.counted] ** 2, axis=1)))
         self._each("variance", np.mean(sigma[:, self.counted] ** 2, axis=1))
@@ -109,7 +120,8 @@ class Statistics:
     def blank(self) -> Statistics:
         """Of no runs yet, with the settings of these: for a chunk, to be merged."""
         return Statistics(
-            self.blocks, self.count_from, self.limits, self.count_to, self.norms, self.windows
+            *(self.blocks, self.count_from, self.limits, self.count_to, self.norms, self.windows),
+            self.faults,
         )
 
     def resampled(self, draws: np.ndarray) -> Iterator[Statistics]:
@@ -171,6 +183,23 @@ class Statistics:
             if self.windows:
                 worst = [np.max(whole[:, span], axis=1) for span in self.windows]
                 self._each(f"peaks of {norm.name}", np.stack(worst, axis=1))
+
+    def _suspected(self, wrong: Mapping[str, np.ndarray]) -> None:
+        """Mean probability, and by run when a suspect is first held for wrong and whether rightly.
+
+        A fault is a run of epochs; it is found if its suspect is held for wrong within it.
+        """
+        for name, chance in wrong.items():
+            held = chance > HELD
+            self._sum(f"wrong {name}", chance)
+            self._each(f"first wrong {name}", _first(held))
+            if self.faults is None:
+                continue
+            true = np.zeros(held.shape[1], bool) | self.faults.get(name, False)
+            right = np.flatnonzero(~true[self.counted]) + self.count_from
+            self._each(f"accused {name}", np.sum(held[:, right], axis=1) / max(len(right), 1))
+            delays = [_first(held[:, a:b]) for a, b in edges(true)]
+            self._each(f"delay {name}", np.transpose(delays).reshape(len(held), len(delays)))
 
     def _within(self, error: np.ndarray) -> None:
         for limit in self.limits:
@@ -303,6 +332,28 @@ class Statistics:
         return self._all(f"settled {limit}")
 
     @property
+    def suspects(self) -> list[str]:
+        """Names of what the filter may find wrong."""
+        names = [name for name in self.sums if name.startswith("wrong ")]
+        return [name.removeprefix("wrong ") for name in names]
+
+    def wrong(self, suspect: str) -> np.ndarray:
+        """(E,) mean probability that a suspect is wrong."""
+        return self.sums[f"wrong {suspect}"] / self.runs
+
+    def first_wrong(self, suspect: str) -> np.ndarray:
+        """(runs,) epoch at which it is first held for wrong; -1: never."""
+        return self._all(f"first wrong {suspect}")
+
+    def accused(self, suspect: str) -> np.ndarray:
+        """(runs,) share of the counted epochs without its fault at which it is held for wrong."""
+        return self._all(f"accused {suspect}")
+
+    def delays(self, suspect: str) -> np.ndarray:
+        """(runs, faults) epochs from the begin of a fault until it is held for wrong; -1: never."""
+        return self._all(f"delay {suspect}")
+
+    @property
     def tally(self) -> Tally:
         """How the steps went; leading axis of runs."""
         found: dict[str, dict[str, np.ndarray]] = {field: {} for field in Tally._fields}
@@ -365,6 +416,11 @@ THIN = 128  # epochs at which the scatter is kept: its memory does not grow with
 def thinned(epochs: int) -> np.ndarray:
     """Numbers of at most `THIN` epochs from the first to the last, evenly."""
     return np.unique(np.rint(np.linspace(0, epochs - 1, min(THIN, epochs))).astype(int))
+
+
+def _first(holds: np.ndarray) -> np.ndarray:
+    """(runs,) first epoch at which something holds (runs, E); -1 where it never does."""
+    return np.where(np.any(holds, axis=1), np.argmax(holds, axis=1), -1)
 
 
 def _by_name(tally: Tally) -> dict[str, Any]:

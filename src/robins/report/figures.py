@@ -21,6 +21,7 @@ from robins.report import (
 )
 from robins.report.lateness import lateness
 from robins.report.style import Picture
+from robins.report.suspects import suspects
 from robins.report.tuning import tuning
 from robins.results import find
 
@@ -66,6 +67,7 @@ FIGURES = (
     Figure(scatter.percentiles, "percentile", EACH),
     Figure(curves.within, "within", EACH),
     Figure(curves.worst_case, "note"),
+    Figure(suspects, "wrong mean_wrong truly_wrong"),
     Figure(curves.estimates, "estimate sigma", EACH, _tells_more),
     Figure(curves.values, "value sigma", EACH),
     Figure(curves.height, "track reference gnss"),

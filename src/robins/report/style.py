@@ -170,11 +170,11 @@ def decades(axes: Axes, low: float, top: float) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-def shade(axes: Axes, x: np.ndarray, mask: np.ndarray | None) -> None:
+def shade(axes: Axes, x: np.ndarray, mask: np.ndarray | None, tint: str = OUTAGE) -> None:
     """Shade where the mask holds."""
     if mask is None or not mask.any():
         return
     edges = np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))
     last = len(x) - 1
     for begin, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
-        axes.axvspan(x[begin], x[min(end, last)], color=OUTAGE, linewidth=0, zorder=0)
+        axes.axvspan(x[begin], x[min(end, last)], color=tint, linewidth=0, zorder=0)

@@ -118,6 +118,11 @@ ROLES = (
         attrs=("runs", "bins"),
     ),
     Role("within_{limit}", _FT, "runs within {of}; share of the `runs`", "1", ("runs",)),
+    Role("wrong", "filter time suspect", "probability that a suspect is wrong; of one run", "1"),
+    Role(
+        "mean_wrong", "filter time suspect", "mean probability of being wrong", "1", attrs=("runs",)
+    ),
+    Role("truly_wrong", "time suspect", "instruments, or motion, that are truly wrong", "1"),
     Role("bounds", "filter", "states bounds, not standard deviations; nonzero where it does", "1"),
     Role("note_{note}", _FT, "{of}, first run; what a rule noted", "1"),
     Role("bound_{block}", _TA, "covariance bound of {of}; one standard deviation"),

@@ -145,7 +145,7 @@ def angle_bursts(
     Raises:
         ValueError: a period or length that is not positive.
     """
-    active, number = _bursts(time_s, every_s, length_s, first_s)
+    active, number = bursts(time_s, every_s, length_s, first_s)
     size = _given.vector("size_rad", size_rad, 3)
     signs = jax.vmap(lambda k: jax.random.rademacher(jax.random.fold_in(key, k), (3,), float))
     return jnp.where(active[:, None], size[None] * signs(number), 0.0)
@@ -162,14 +162,14 @@ def field_bursts(
     Raises:
         ValueError: a period or length that is not positive.
     """
-    active, number = _bursts(time_s, every_s, length_s, first_s)
+    active, number = bursts(time_s, every_s, length_s, first_s)
     _given.number("size_rad", size_rad)
     drawn = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(key, k), (3,)))(number)
     length = jnp.sqrt(jnp.sum(drawn * drawn, 1, keepdims=True))
     return jnp.where(active[:, None], size_rad * drawn / length, 0.0)
 
 
-def _bursts(time_s, every_s, length_s, first_s) -> tuple[Array, Array]:
+def bursts(time_s, every_s, length_s, first_s) -> tuple[Array, Array]:
     """Whether each sample is in a burst, and the number of the last burst begun."""
     time = jnp.asarray(time_s, float)
     require(time.ndim == 1, "time_s must have shape (E,)", time.shape)

@@ -69,6 +69,11 @@ def outside(spans: Sequence[Span], time_s: np.ndarray) -> np.ndarray:
     return ~np.any([np.zeros(len(time_s), bool), *(span.holds(time_s) for span in spans)], axis=0)
 
 
+def during(spans: Sequence[Span | None], time_s: np.ndarray) -> np.ndarray:
+    """(N,) bool, true of the times (N,) that lie in one of some spans."""
+    return ~outside([span for span in spans if span is not None], time_s)
+
+
 def as_array(numbers: Any) -> Any:
     """Numbers of parameters as an array: NumPy's, which can be checked; JAX's if one is traced."""
     return (np if _given.known(numbers) else jnp).asarray(numbers, float)

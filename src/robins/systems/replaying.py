@@ -21,12 +21,14 @@ import xarray as xr
 from robins import rotation
 from robins.filters import Belief, Code, StepWarning, Tally, doubts, rts_smoother, run
 from robins.filters.analysis.consistency import grand_mean_nis
+from robins.filters.composite.imm import WRONG
 from robins.filters.run import Step
 from robins.filters.whiteness import joined
 from robins.ins.blocks import Blocks
 from robins.ins.increments import after_gap
 from robins.results import Outcome, Progress, silent, variable
 from robins.systems.study import Contender, SensorAxes, StateBlock
+from robins.systems.suspects import probabilities, sentences, tables
 from robins.systems.tables import (
     EULER,
     Update,
@@ -57,7 +59,7 @@ class Recorded(NamedTuple):
     contender: Callable[[str], Contender]  # by name; raises a ValueError where there is none
 
 
-PROBABILITY = "imm.probability"  # note of a bank: (modes,), kept of every step
+PROBABILITY = "imm.probability"  # note of a bank: (modes,), kept of every step as is `WRONG`
 
 PieceT = TypeVar("PieceT", bound=Piece)
 
@@ -73,6 +75,7 @@ class Answer(NamedTuple):
     log_likelihood: float
     tally: Tally  # how the steps went, of each piece
     bounds: bool  # its sigmas are bounds of an H-infinity filter
+    wrong: Mapping[str, Any] = {}  # (E,) probability by suspect
 
 
 class Reported(NamedTuple):
@@ -153,7 +156,7 @@ def kept(step: Step) -> tuple[Any, Any, dict[str, Update]]:
 
     Of a bank also how likely each mode is.
     """
-    return step.posterior.mean, step.posterior.sigma, updates(step, (PROBABILITY,))
+    return step.posterior.mean, step.posterior.sigma, updates(step, (PROBABILITY, WRONG))
 
 
 @jax.jit
@@ -207,21 +210,21 @@ def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answe
     mean, sigma, seen = of_steps
     likelihood, bounds = float(found.log_likelihood), contender.bounds
     tally = found.tally.looking(seen, case.y)
-    answer = Answer("", mean, sigma, seen, case.start, likelihood, tally, bounds)
+    wrong = probabilities(filter_, seen)
+    answer = Answer("", mean, sigma, seen, case.start, likelihood, tally, bounds, wrong)
     if not smoothed:
         return answer, answer
     belief = rts_smoother(found)
-    return answer, answer._replace(mean=belief.mean, sigma=belief.sigma, updates={})
+    return answer, answer._replace(mean=belief.mean, sigma=belief.sigma, updates={}, wrong={})
 
 
 def _joined(parts: Sequence[Answer]) -> Answer:
     if len(parts) == 1:
         return parts[0]
-    mean, sigma, seen = end_to_end([(a.mean, a.sigma, a.updates) for a in parts])
+    kept = "mean", "sigma", "updates", "wrong"
+    whole = end_to_end([{name: getattr(a, name) for name in kept} for a in parts])
     return parts[-1]._replace(
-        mean=mean,
-        sigma=sigma,
-        updates=seen,
+        **whole,
         log_likelihood=sum(a.log_likelihood for a in parts),
         tally=_tally_of(parts),
     )
@@ -292,7 +295,7 @@ def outcome(
         solution=xr.Dataset(_tables(epoch_s, answers, reported) | dict(variables), attrs=origin),
         metrics={name: metrics(answer) | _innovations(answer) for name, answer in answers.items()},
         counts=dict(counts),
-        notes=list(notes),
+        notes=[*notes, *(s for k, a in answers.items() for s in sentences(k, epoch_s, a.wrong))],
         warnings=[*doubtful, reported.causes] if doubtful else [],
     )
 
@@ -320,6 +323,7 @@ def _tables(
         euler = np.stack([np.asarray(of["euler"]) for of in found])
     data |= block_array("estimate", reported.euler, euler, "estimated roll, pitch, heading")
     seen = [answer.updates for answer in answers.values()]
+    data |= tables("wrong", [answer.wrong for answer in answers.values()])
     return data | innovation_tables(seen, reported.sensors, epoch_s)
 
 

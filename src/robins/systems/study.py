@@ -168,6 +168,8 @@ class View:
     windows: Sequence[slice] = ()  # spans of epochs whose largest errors are kept of each run
     notes: Sequence[str] = ()  # sentences for the reader of the report
     outputs: Sequence[Output] = ()  # of its cases
+    # (E,) bool by instrument, or "motion": when it is truly wrong; None where that is not known
+    faults: Mapping[str, np.ndarray] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

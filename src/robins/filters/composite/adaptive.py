@@ -27,7 +27,8 @@ named, and each has two modes more (`robins.filters.composite.offsets`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
@@ -36,8 +37,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
-from robins.filters.composite.bank import EVERY, transitions
-from robins.filters.composite.imm import Family, imm
+from robins.filters.composite.bank import EVERY, Row, bank, louder, transitions
 from robins.filters.composite.offsets import (
     Supposed,
     narrowed,
@@ -59,7 +59,8 @@ Part = Sequence[int] | slice
 """Tangent components whose process noise goes wrong together, such as all that one instrument
 drives."""
 
-ALL = slice(None)
+MOTION: Mapping[str, Part] = MappingProxyType({"motion": slice(None)})
+"""All of the process noise, under the name of what is then wrong."""
 
 
 @value
@@ -105,21 +106,10 @@ def changes(scales: Sequence[float | int], up: float = UP, back: float = BACK) -
     Raises:
         ValueError: they are no probabilities.
     """
-    s = np.asarray(scales, float)
-    chance = np.where(s[None] < s[:, None], back, up)
-    change = transitions(len(s), [(EVERY, EVERY, chance)])
+    change = transitions(len(scales), [(EVERY, EVERY, louder(scales, up, back))])
     good = 0.0 < up < 1.0 and 0.0 < back < 1.0 and bool(np.all(np.diag(change) > 0.0))
     require(good, "up and back of adaptive must leave a mode a chance to stay", (up, back))
     return change
-
-
-def lasting(change: np.ndarray) -> np.ndarray:
-    """(count,) probabilities that stay as they are under a change of each step."""
-    count = len(change)
-    A = np.vstack([change.T - np.eye(count), np.ones(count)])
-    found, *_ = np.linalg.lstsq(A, np.append(np.zeros(count), 1.0))
-    found = np.maximum(found, 0.0)
-    return found / found.sum()
 
 
 @value
@@ -144,7 +134,7 @@ def adaptive(
     robust: float = 0.99,
     up: float = UP,
     back: float = BACK,
-    parts: Sequence[Part] = (ALL,),
+    parts: Mapping[str, Part] = MOTION,
     linearise: Linearisation | None = None,
     form: Form = "sqrt",
     off: Sequence[str] = (),
@@ -160,7 +150,8 @@ def adaptive(
         robust: share of right records that keep their weight (`huber`).
         up: probability of a change to one louder scale in a step.
         back: of a change to one quieter scale.
-        parts: of the process noise; a mode makes one of them louder.
+        parts: of the process noise, by the name of the instrument that drives each; a mode makes
+            one of them louder, and holds that instrument for wrong.
         linearise: of each mode; by Taylor where not given.
         form: of the update, "sqrt" or "joseph".
         off: names of sensors whose records may be off for some time, one at a time. It costs a
@@ -175,16 +166,21 @@ def adaptive(
     s = np.asarray(scales, float)
     rising = s.ndim == 1 and len(s) > 0 and s[0] > 0.0 and bool(np.all(np.diff(s) > 0.0))
     require(rising, "scales of adaptive must rise, from above zero", scales)
-    # The quiet mode, then each louder scale of each part.
-    more = np.tile(s[1:], len(parts))
-    own = np.repeat(np.eye(len(parts)), len(s) - 1, axis=0)
-    gains = s[0] * np.ones((1 + len(more), len(parts)))
-    gains[1:] = np.where(own > 0.0, more[:, None], gains[1:])
+    named = isinstance(parts, Mapping) and len(parts) > 0
+    require(named, 'parts of adaptive must be named, as in {"gyros": [0, 1, 2]}', parts)
+    quiet, names = np.full(len(parts), s[0]), tuple(off)
+    own = zip(np.eye(len(parts)) > 0.0, parts, strict=True)
+    plain = [Row(quiet), *(Row(np.where(i, x, quiet), (name,)) for i, name in own for x in s[1:])]
+    change = changes([float(np.max(row.numbers)) for row in plain], up, back)
     way, weight = taylor() if linearise is None else linearise, huber(robust, patience=patience)
-    one, change = Adapted(way, weight, form, tuple(off)), changes([s[0], *more], up, back)
-    if not off:
-        return imm(Family(one, (excited(parts, gains), None)), change, lasting(change))
-    plain, change = len(gains), with_offsets(change, len(off))
-    gains = np.vstack([gains, np.repeat(gains[:1], len(change) - plain, axis=0)])
-    rows = excited(parts, gains), sensors_off(plain, len(off))
-    return narrowed(imm(Family(one, rows), change, lasting(change)), off)
+    make = Adapted(way, weight, form, names)
+
+    def loud(row: Row) -> Rule:
+        return excited(list(parts.values()), row.numbers)
+
+    if not names:
+        return bank(make, [row._replace(numbers=(loud(row), None)) for row in plain], change)
+    each = [*plain, *(Row(quiet, (name,)) for name in names for _ in ("begins", "lasts"))]
+    off_of = map(Supposed, *sensors_off(len(plain), len(names)))
+    rows = [Row((loud(row), of), row.wrong) for row, of in zip(each, off_of, strict=True)]
+    return narrowed(bank(make, rows, with_offsets(change, len(names))), names)

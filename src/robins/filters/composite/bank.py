@@ -1,32 +1,71 @@
-"""Banks of hypotheses: hypotheses are rows, and changes between them are edges."""
+"""Banks of hypotheses: each row is one, with what it holds for wrong; edges are changes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import ArrayLike
 
-Hypotheses = int | slice | np.ndarray
+from robins.filters.composite.imm import Family, Mode, imm
+from robins.filters.kalman import Filter
+from robins.filters.values import Numbers
+
+Hypotheses = int | slice | Sequence[int] | np.ndarray
 """One of a bank, or some."""
 
 EVERY = slice(None)
 
 
+class Row(NamedTuple):
+    """A hypothesis."""
+
+    numbers: Any  # of its mode, a pytree
+    wrong: tuple[str, ...] = ()  # names of instruments, or "motion", that are wrong where it holds
+
+
+def stacked(rows: Sequence[Row]) -> Any:
+    """The numbers of all rows, with a leading axis of hypotheses."""
+    return jax.tree_util.tree_map(lambda *x: np.stack(x), *(row.numbers for row in rows))
+
+
+def bank(
+    make: Callable[[Any], Filter | Mode],
+    rows: Sequence[Row],
+    change: Numbers,
+    start: ArrayLike | None = None,
+    likeliest: bool = False,
+) -> Filter:
+    """An interacting multiple model over hypotheses that differ in numbers.
+
+    Args:
+        make: makes a mode of the numbers of a row (`Family`).
+        rows: the hypotheses; the names in them are the `Filter.suspects`.
+        change: (rows, rows) probabilities of a change in one step, by `transitions`.
+        start: (rows,) probabilities at the start; by default those that last under `change`.
+        likeliest: as of `imm`.
+    """
+    names = dict.fromkeys(name for row in rows for name in row.wrong)
+    wrong = {name: [i for i, row in enumerate(rows) if name in row.wrong] for name in names}
+    first = lasting(np.asarray(change)) if start is None else start
+    return imm(Family(make, stacked(rows)), change, first, likeliest, wrong)
+
+
 def transitions(
     count: int,
-    edges: Sequence[tuple[Hypotheses, Hypotheses, ArrayLike | Sequence[float]]],
+    edges: Sequence[tuple[Hypotheses, Hypotheses, ArrayLike]],
     rest: Sequence[int] | np.ndarray | None = None,
 ) -> np.ndarray:
     """(count, count) probabilities of a change in one step, row i those from hypothesis i.
 
     Args:
-        count: of the hypotheses.
-        edges: from which, to which, and with what probability; of one pair the last holds.
-        rest: (count,) where each goes with what is left; where not given it stays as it is.
+        count: number of hypotheses.
+        edges: from, to, probability; of a pair named twice the last holds.
+        rest: (count,) where each goes with the probability that is left; by default it stays.
     """
-    at: Any = np.arange(count)
+    at = np.arange(count)
     left = at if rest is None else np.asarray(rest, int)
     p = np.zeros((count, count))
     for one, other, chance in edges:
@@ -34,3 +73,21 @@ def transitions(
     p[at, left] = 0.0
     p[at, left] = 1.0 - p.sum(axis=1)
     return p
+
+
+def louder(scales: Sequence[float | int], up: float, back: float) -> np.ndarray:
+    """Probabilities of a change between modes of these scales: up to none quieter, back to quieter.
+
+    The diagonal is left to `transitions`.
+    """
+    s = np.asarray(scales, float)
+    return np.where(s[None] < s[:, None], back, up)
+
+
+def lasting(change: np.ndarray) -> np.ndarray:
+    """(count,) stationary probabilities of `transitions`."""
+    count = len(change)
+    A = np.vstack([change.T - np.eye(count), np.ones(count)])
+    found, *_ = np.linalg.lstsq(A, np.append(np.zeros(count), 1.0))
+    found = np.maximum(found, 0.0)
+    return found / found.sum()

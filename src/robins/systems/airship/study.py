@@ -38,7 +38,7 @@ from robins.systems.study import Case, Contender, Instrument, Norm, Recipe, Stat
 LEVEL = np.diag([1e12] * 3 + [1.0] * 6)
 
 COMMON = 9  # states that all local filters have
-GYROS, ACCELEROMETERS = range(0, 3), range(3, 9)  # what each of them drives
+DRIVEN = {"gyros": range(0, 3), "accelerometers": range(3, 9)}  # components, by instrument
 BOTH = (WIND, WIND_OF_STAR)
 
 
@@ -95,7 +95,7 @@ def _product() -> Filter:
 
 def _adaptive() -> Filter:
     """As "product", but for a motion of which nobody knows when it is wrong."""
-    return filters.adaptive(parts=(GYROS, ACCELEROMETERS))
+    return filters.adaptive(parts=DRIVEN)
 
 
 class Candidate(NamedTuple):
@@ -208,6 +208,7 @@ def view(given: Airship, course: Course) -> View:
         count_to=last,
         norms=(Norm("horizontal", (6, 7)), Norm("velocity", (3, 4))),
         bound_of="product",
+        faults={"accelerometers": np.full(len(course.epoch_s), given.wind.unsensed > 0.0)},
     )
 
 

@@ -39,7 +39,6 @@ from robins.systems.ins_gnss.robust import (
     in_hindsight,
     navigation,
     robust,
-    stretches,
     supposed,
     weighed,
 )
@@ -49,6 +48,7 @@ from robins.systems.ins_gnss.study import SMOOTHERS, make_filter
 from robins.systems.parts import Block
 from robins.systems.replaying import PROBABILITY, Answer, Piece, Recorded, Reported
 from robins.systems.study import Case, Contender
+from robins.systems.suspects import spans
 from robins.systems.tables import place_arrays, track_arrays
 
 CAUSES = (
@@ -256,7 +256,7 @@ def _doubts(piece: Stretch, probability: np.ndarray, verdict: Verdict) -> list[s
     """Sentences on where positions were off, and on where that could not be told in time."""
     seen = np.isfinite(np.asarray(piece.world.y[model.POSITION].lat))
     said = []
-    if off := stretches(piece.epoch_s[seen], verdict.off[seen] > 0.5):
+    if off := spans(piece.epoch_s[seen], verdict.off[seen] > 0.5):
         shown = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in off[:6])
         more = "" if len(off) <= 6 else f" and {len(off) - 6} more"
         said.append(
@@ -264,7 +264,7 @@ def _doubts(piece: Stretch, probability: np.ndarray, verdict: Verdict) -> list[s
             f"{shown}{more}. They were not followed."
         )
     now = probability[:, HYPOTHESES.read > 0.0].sum(axis=1)
-    open_ = [(a, b) for a, b in stretches(piece.epoch_s, (now > 0.05) & (now < 0.95) & seen)]
+    open_ = [(a, b) for a, b in spans(piece.epoch_s, (now > 0.05) & (now < 0.95) & seen)]
     if long := [(a, b) for a, b in open_ if b - a >= UNSURE_S]:
         shown = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in long[:6])
         said.append(

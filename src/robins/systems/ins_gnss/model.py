@@ -45,6 +45,7 @@ POSITION, VELOCITY, STANDSTILL, STILL_RATE, ROAD = (
     "non_holonomic",
 )
 ODOMETER = "odometer"
+IMU = "imu"  # drives the motion; a bank may find it wrong
 SENSORS = {
     POSITION: SensorAxes("m", "NED", NED),
     VELOCITY: SensorAxes("m/s", "NED", NED),

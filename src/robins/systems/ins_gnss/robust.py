@@ -31,8 +31,8 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array
 
-from robins.filters import Belief, Family, Filter, Model, Motion, Rule, Sensor, imm, kalman, taylor
-from robins.filters.composite.bank import EVERY, transitions
+from robins.filters import Belief, Filter, Model, Motion, Rule, Sensor, kalman, taylor
+from robins.filters.composite.bank import EVERY, Row, bank, louder, stacked, transitions
 from robins.filters.composite.imm import Mode
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory
@@ -40,7 +40,7 @@ from robins.filters.rules import student_t
 from robins.filters.values import Numbers, as_data, value
 from robins.ins.state import InsState
 from robins.linalg import block_diagonal
-from robins.systems.ins_gnss.model import POSITION, VELOCITY, Velocity
+from robins.systems.ins_gnss.model import IMU, POSITION, VELOCITY, Velocity
 from robins.systems.parts import Block, moved_by
 from robins.systems.study import Case
 
@@ -78,13 +78,18 @@ RIGHT, LASTS = slice(COUNT), slice(COUNT, 2 * COUNT)
 BEGINS, ENDS, STRAYED = range(2 * COUNT, 2 * COUNT + 3)
 """Where the modes stand in the bank."""
 
-_ROWS = [(s, float(off), float(off), 0.0, 0.0) for off in (0, 1) for s in SCALES] + [
-    (SCALES[1], 1.0, 0.0, 1.0, 0.0),
-    (SCALES[1], 0.0, 0.0, 0.0, 0.0),
-    (SCALES[1], 0.0, 0.0, 0.0, 1.0),
+_IMU, _POSITION = (IMU,), (POSITION,)  # what is wrong
+_ROWS = [
+    Row(Hypothesis(s, off, off, 0.0, 0.0), _POSITION * int(off) + _IMU * (s > 1.0))
+    for off in (0.0, 1.0)
+    for s in SCALES
+] + [
+    Row(Hypothesis(SCALES[1], 1.0, 0.0, 1.0, 0.0), _POSITION),
+    Row(Hypothesis(SCALES[1], 0.0, 0.0, 0.0, 0.0)),
+    Row(Hypothesis(SCALES[1], 0.0, 0.0, 0.0, 1.0), _IMU),
 ]
-HYPOTHESES = Hypothesis(*np.array(_ROWS).T)
-AS_TOLD = Hypothesis(*np.array(_ROWS[0]))
+HYPOTHESES = stacked(_ROWS)
+AS_TOLD = Hypothesis(*np.array(_ROWS[0].numbers))
 
 
 def changes(step_s: float, patience_s: float) -> np.ndarray:
@@ -96,9 +101,7 @@ def changes(step_s: float, patience_s: float) -> np.ndarray:
     """
     step_s = min(step_s, 0.5 * patience_s)
     begin, over = (-math.expm1(-step_s / length) for length in (SELDOM_S, patience_s))
-    scale = np.array(SCALES)
-    chance = np.where(scale[None] > scale[:, None], RISE, FALL)
-    edges: list[Any] = [(same, same, chance) for same in (RIGHT, LASTS)]
+    edges: list[Any] = [(same, same, louder(SCALES, RISE, FALL)) for same in (RIGHT, LASTS)]
     edges += [(EVERY, BEGINS, begin)]
     for off in (LASTS, BEGINS):
         edges += [(off, ENDS, over), (off, STRAYED, over / LATER)]
@@ -235,12 +238,6 @@ def in_hindsight(probability: np.ndarray, change: np.ndarray) -> Verdict:
     return Verdict(off, np.exp(known @ np.log(HYPOTHESES.scale)), known[:, STRAYED])
 
 
-def stretches(time_s: np.ndarray, which: np.ndarray) -> list[tuple[float, float]]:
-    """First and last time of each run of steps for which something holds."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(int)))
-    return [(float(time_s[a]), float(time_s[b - 1])) for a, b in edges.reshape(-1, 2)]
-
-
 # ----------------------------------------------------------------------------------- the filters
 
 
@@ -294,5 +291,5 @@ def robust(model: Model, step_s: float, patience_s: float) -> Filter:
     start = np.zeros(len(_ROWS))
     start[RIGHT] = 1.0 / COUNT
     # a position that may be off by `OFF_M` is seldom expected, and would hide what is
-    family = Family(Partial(_mode, model, tails()), HYPOTHESES)
-    return imm(family, changes(step_s, patience_s), start, likeliest=True)
+    make = Partial(_mode, model, tails())
+    return bank(make, _ROWS, changes(step_s, patience_s), start, likeliest=True)

@@ -15,7 +15,7 @@ from robins.errors import require_known
 from robins.filters import Filter, adaptive, cubature, kalman, taylor, unscented
 from robins.filters.rules import gate
 from robins.results import array
-from robins.systems.ins_gnss.model import SENSORS, ins_gnss_model, state_blocks
+from robins.systems.ins_gnss.model import IMU, SENSORS, ins_gnss_model, state_blocks
 from robins.systems.ins_gnss.parameters import Drive, Imu
 from robins.systems.ins_gnss.world import Course, as_believed, belief_of, lay_out, simulate
 from robins.systems.judgement import consistency, consistency_claims
@@ -55,7 +55,7 @@ def make_filter(name: str, gate_probability: float = 0.0) -> Filter:
         ValueError: there is no filter of this name.
     """
     if name == ADAPTIVE:
-        return adaptive()
+        return adaptive(parts={IMU: slice(None)})
     require_known("filter", name, FILTERS, "this system, where each may end in +rts")
     return FILTERS[name]((gate(gate_probability),) if gate_probability > 0.0 else ())
 
@@ -101,6 +101,7 @@ def view(drive: Drive, course: Course) -> View:
         context=xr.Dataset(context),
         shown=lambda means: track_arrays(mean.position for mean in means.values()),
         count_from=int(np.searchsorted(epoch_s, drive.settle)),
+        faults={},  # the errors of the sensors are drawn from what filters believe
     )
 
 

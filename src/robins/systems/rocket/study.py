@@ -40,6 +40,7 @@ from robins.systems.rocket.world import (
     Course,
     World,
     body_of,
+    faults,
     instruments,
     lay_out,
     simulate,
@@ -96,9 +97,14 @@ def sensors_of(
     return aboard([i for i in instruments(given) if i.name in names], given, course)
 
 
-def bank(*off: str) -> Filter:
-    """A bank with the sigma points of the studies, in which these sensors may be off."""
-    return filters.adaptive(linearise=_POINTS, off=off)
+def bank(driver: str, *off: str) -> Filter:
+    """A bank with the sigma points of the studies.
+
+    Args:
+        driver: of the motion, "motion" where none of the instruments drives it.
+        off: sensors that may be off.
+    """
+    return filters.adaptive(linearise=_POINTS, parts={driver: slice(None)}, off=off)
 
 
 # ------------------------------------------------------------------------------- magnetic attitude
@@ -149,7 +155,7 @@ def angle_filter(given: MagneticAttitude, chosen: AngleFilter) -> Filter:
     if chosen.adapts:
         # Of two that read the angles an integrated gyro is off, sooner or later: it only adds up.
         adds_up = given.gyro_reads == "attitude"
-        return bank(GYRO) if adds_up else bank(GYRO, MAGNETIC)
+        return bank("motion", GYRO, *(() if adds_up else (MAGNETIC,)))
     if chosen.sharing is None:
         return own(*chosen.sensors)
     channels = [filters.channel((sensor,), own(sensor)) for sensor in chosen.sensors]
@@ -241,7 +247,7 @@ FIELD_FILTERS: dict[str, FieldFilter] = {
     "gate": FieldFilter(ukf(patient())),
     "discriminator": FieldFilter(discriminates="huber"),
     "discriminator-gate": FieldFilter(discriminates="gate"),
-    "adaptive": FieldFilter(bank(FIELD), scaled=True),
+    "adaptive": FieldFilter(bank(GYRO, FIELD), scaled=True),
     "strong-tracking": FieldFilter(ukf(fading())),
     "strong-tracking-projected": FieldFilter(ukf(fading("projected"))),
     "gate-scale-factor": FieldFilter(ukf(patient()), scaled=True),
@@ -315,6 +321,7 @@ def _view(given: Flight, course: Course, **own: Any) -> View:
         windows=course.bursts,
         sensors={i.name: i.axes for i in instruments(given)},
         notes=notes,
+        faults=faults(given, course, FIELD if isinstance(given, FieldVector) else MAGNETIC),
         **own,
     )
 

@@ -24,6 +24,7 @@ from robins.sim.free_body import FreeBody, coning_start, free_body
 from robins.sim.gyro import MemsErrors, MemsGyro, delta_angles, integrate_angles
 from robins.sim.magnetometer import (
     angle_bursts,
+    bursts,
     field_bursts,
     observe_field,
     observe_magnetic_attitude,
@@ -114,6 +115,16 @@ def _disturbed(given: Flight, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarra
         after = np.maximum(time_s - begin - burst.length, 0.0)
         since = np.where(time_s >= begin - 1e-9, after, since)
     return begun, since
+
+
+def faults(given: Flight, course: Course, name: str) -> dict[str, np.ndarray]:
+    """When the magnetometer, of this name, is disturbed; whether filters believe a wrong motion."""
+    burst, time = given.magnetometer.disturbance, course.time_s
+    disturbed = np.zeros(len(time), bool)
+    if burst is not None:
+        disturbed = np.asarray(bursts(time, burst.every, burst.length)[0])
+    believed = isinstance(given, MagneticAttitude) and given.believed.error != 0.0
+    return {name: disturbed, "motion": np.full(len(time), believed)}
 
 
 def body_of(given: Flight) -> FreeBody:

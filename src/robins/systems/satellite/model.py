@@ -180,7 +180,7 @@ def start(q_ib: Array, attitude_rad: Any, bias_rad_s: Any, additive: bool = Fals
 def make_filter(build: Build) -> Filter:
     """The filter of a build; those that differ in their gains share it, for a gain is data."""
     if build == "adaptive":
-        return adaptive()
+        return adaptive(parts={"gyro": slice(None)})
     if build == "redesigned":  # imported here: other filters need no designs
         from robins.systems.satellite.stepwise import redesigned
 

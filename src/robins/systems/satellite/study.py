@@ -22,6 +22,7 @@ from robins.filters.rules import with_gains
 from robins.filters.synthesis import MissingExtra
 from robins.results import array
 from robins.systems.judgement import ratio_claims
+from robins.systems.parts import during
 from robins.systems.satellite import design, model, stepwise
 from robins.systems.satellite.design import GainSpec, SensorNoise
 from robins.systems.satellite.model import ARCSEC, Build, make_filter
@@ -235,6 +236,22 @@ CLAIMS = ratio_claims(_RATIOS, _TEXTS)
 """Every claim that a scenario may state."""
 
 
+def faults(given: AttitudeLoop, course: Course) -> dict[str, np.ndarray]:
+    """When gyro and star sensor are other than the filters believe.
+
+    Noise, drift as believed and false stars are no faults.
+    """
+    g, star, believed = given.gyro, given.star, given.believed.drift
+    true = model.equivalent_walk(g.rate_walk, g.markov, g.markov_time)
+    drifts = believed is not None and not math.isclose(believed, true, rel_tol=0.1)
+    gyro = drifts or g.scale_factor > 0.0 or g.misalignment > 0.0
+    spans = [fault for fault in star.faults if fault.kind != "sign"]
+    return {
+        "gyro": np.full(len(course.time_s), gyro),
+        STAR: during(spans, course.time_s) | (star.low_frequency > 0.0),
+    }
+
+
 def view(given: AttitudeLoop, course: Course) -> View:
     """What is reported: attitude, gyro bias, where the craft points, what its wheels hold."""
     counted = int(np.searchsorted(course.time_s, given.counted_from + 1e-9))
@@ -256,6 +273,7 @@ def view(given: AttitudeLoop, course: Course) -> View:
         ),
         norms=(Norm("attitude", (0, 1, 2)),),
         windows=(slice(counted, len(course.time_s)),),
+        faults=faults(given, course),
     )
 
 

@@ -23,8 +23,8 @@ from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
 
 from robins import units
-from robins.filters import Family, Filter, Motion, imm, kalman
-from robins.filters.composite.bank import EVERY, transitions
+from robins.filters import Filter, Motion, kalman
+from robins.filters.composite.bank import EVERY, Row, bank, transitions
 from robins.filters.composite.imm import Mode
 from robins.filters.rule import Rule
 from robins.filters.rules import huber
@@ -49,10 +49,14 @@ class Supposed(NamedTuple):
     flutter: ArrayLike  # of the noise of the records
 
 
-def hypotheses() -> Supposed:
-    """(18,) of each: every swing with every flutter."""
+def hypotheses() -> list[Row]:
+    """18 structures: every swing with every flutter; wrong is what no structure of none has."""
     swings = [(0.0, 1.0), *((s * _ARCMIN, t) for s in _SIGMAS for t in _TIMES_S)]
-    return Supposed(*np.array([(*swing, f) for swing in swings for f in _FLUTTERS]).T)
+    return [
+        Row(Supposed(*swing, f), ("flexure",) * (swing[0] > 0.0) + (am.ATTITUDE,) * (f > 0.0))
+        for swing in swings
+        for f in _FLUTTERS
+    ]
 
 
 def _with(F: Array, swing: Array) -> Array:
@@ -97,7 +101,7 @@ def blind(system: am.LinearSystem, noise_rad: float, period_s: float) -> Filter:
         period_s: of the records.
     """
     rows = hypotheses()
-    stiff = np.asarray(rows.sigma) == 0.0
+    stiff = np.array([row.numbers.sigma == 0.0 for row in rows])
     start = np.where(stiff, 0.5 / np.sum(stiff), 0.5 / np.sum(~stiff))
-    change = transitions(len(start), [(EVERY, EVERY, _OTHER)])
-    return imm(Family(supposed(system, noise_rad, period_s), rows), change, start)
+    change = transitions(len(rows), [(EVERY, EVERY, _OTHER)])
+    return bank(supposed(system, noise_rad, period_s), rows, change, start)

@@ -201,7 +201,7 @@ def _existing(step: Step):
 
 def view(given: AttitudeMatching, course: Course) -> View:
     """What is reported of every filter."""
-    roll = am.roll_rad(given.manoeuvre, course.epoch_s)
+    roll, count = am.roll_rad(given.manoeuvre, course.epoch_s), len(course.epoch_s)
     return View(
         epoch_s=course.epoch_s,
         blocks=(
@@ -211,6 +211,10 @@ def view(given: AttitudeMatching, course: Course) -> View:
         ),
         sensors={am.ATTITUDE: SensorAxes("rad", "ENU", ENU)},
         metrics=metrics_of,
+        faults={
+            "flexure": np.full(count, any(given.flexure.sigma) or any(given.flexure.bending)),
+            am.ATTITUDE: np.full(count, given.flexure.flutter > 0.0),
+        },
         context=xr.Dataset(
             array("context", roll, "roll", unit="rad")
             | array("context", course.load[course.at], "load_factor", unit="1")

@@ -31,7 +31,8 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
 
-from robins.filters import Family, Filter, imm, kalman, taylor, unscented
+from robins.filters import Filter, kalman, taylor, unscented
+from robins.filters.composite.bank import Row, bank
 from robins.filters.linearise import Transition
 from robins.filters.rule import Memory, Rule
 from robins.filters.rules import huber
@@ -87,15 +88,16 @@ def supposing(hypothesis: Hypothesis, stiff: ArrayLike) -> Rule:
     return Supposing(own, number("stiff is one or zero", stiff))
 
 
+GYROS, FLEXURE = ("gyros",), ("flexure",)  # what is wrong in a mode
 # Changes in one step of the filter, tenths of a second: from the row's hypothesis to the column's.
-_STIFF_MODES = (QUIET, NOISY, DRIFTING)
+_STIFF_MODES = ((QUIET, ()), (NOISY, GYROS), (DRIFTING, GYROS))
 _STIFF_CHANGES = (
     (1.0 - 1.5e-4, 1e-4, 5e-5),
     (5e-4, 1.0 - 1.5e-3, 1e-3),
     (5e-3, 2e-2, 1.0 - 2.5e-2),
 )
 _STIFF_START = (0.98, 0.01, 0.01)
-_FLEXING_MODES = (QUIET, KICKED, NOISY, DRIFTING)
+_FLEXING_MODES = ((QUIET, ()), (KICKED, FLEXURE), (NOISY, GYROS), (DRIFTING, GYROS))
 _FLEXING_CHANGES = (
     (1.0 - 5.15e-3, 5e-3, 1e-4, 5e-5),
     (0.5, 0.5 - 2e-4, 1e-4, 1e-4),
@@ -124,11 +126,10 @@ def _mode(weight: Rule, row: tuple[Hypothesis, Array]) -> Filter:
 
 def seven() -> Filter:
     """The bank of hypotheses, for a product model with flexure states."""
-    modes = (*_STIFF_MODES, *_FLEXING_MODES)
-    stiff = np.repeat([1.0, 0.0], [len(_STIFF_MODES), len(_FLEXING_MODES)])
-    numbers = Hypothesis(*np.array(modes).T), stiff
+    halves = (1.0, _STIFF_MODES), (0.0, _FLEXING_MODES)
+    rows = [Row((one, stiff), wrong) for stiff, modes in halves for one, wrong in modes]
     start = 0.5 * np.array([*_STIFF_START, *_FLEXING_START])
-    return imm(Family(Partial(_mode, huber(_WEIGHED)), numbers), changes(), start)
+    return bank(Partial(_mode, huber(_WEIGHED)), rows, changes(), start)
 
 
 # ----------------------------------------------------------------------------------- by name

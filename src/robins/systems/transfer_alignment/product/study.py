@@ -29,7 +29,7 @@ from robins.systems.judgement import (
     rms_by_axis,
     rms_by_component,
 )
-from robins.systems.parts import FRD, NED, Block, refuse_unsettled
+from robins.systems.parts import FRD, NED, Block, during, refuse_unsettled
 from robins.systems.study import Case, Contender, Limit, Recipe, StateBlock, Study, View
 from robins.systems.tables import place_arrays, track_arrays
 from robins.systems.transfer_alignment.product import model as pm
@@ -241,6 +241,22 @@ def tracks(means: Mapping[str, pm.ProductState]) -> dict[str, Any]:
     return track_arrays((mean.ins.position for mean in means.values()), "{} of the slave")
 
 
+def faults(given: PairParameters, epoch_s: np.ndarray) -> dict[str, np.ndarray]:
+    """When the gyros of the slave, the flexure or the mounting is other than its noise says."""
+    d = given.disturbance
+    louder = d.gyro_noise_factor > 1.0
+    gyros = during([d.gyro_noise_window] if louder else [], epoch_s)
+    if d.drift_step_time is not None and any(d.drift_step):
+        gyros |= epoch_s >= d.drift_step_time
+    heavy = any(given.flexure.sigma) and given.flexure.tail_dof is not None
+    askew = any(given.mounting.error)
+    return {
+        "gyros": gyros,
+        "flexure": np.full(len(epoch_s), heavy),
+        "mounting": np.full(len(epoch_s), askew),
+    }
+
+
 def _view(given: Product, course: Course) -> View:
     refuse_unsettled("settle", given.settle, float(course.epoch_s[-1]))
     path = course.path.position
@@ -252,6 +268,7 @@ def _view(given: Product, course: Course) -> View:
         metrics=product_metrics,
         context=xr.Dataset(place_arrays("reference", (path.lat, path.lon, path.alt), "true {}")),
         shown=tracks,
+        faults=faults(given, course.epoch_s),
         count_from=int(np.searchsorted(course.epoch_s, given.settle)),
         limits=(Limit(FIVE_ARCMIN, "attitude", units.parse("5 arcmin", "angle")),),
         notes=("The pair is simulated; --master and --slave align a recorded one.",),

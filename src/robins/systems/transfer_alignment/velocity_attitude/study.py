@@ -58,7 +58,7 @@ from robins.systems.transfer_alignment.product.parameters import (
     Structure,
 )
 from robins.systems.transfer_alignment.product.study import SENSORS as PRODUCT_SENSORS
-from robins.systems.transfer_alignment.product.study import product_contender
+from robins.systems.transfer_alignment.product.study import faults, product_contender
 from robins.systems.transfer_alignment.velocity_attitude import model as va
 
 ARCMIN = units.parse("1 arcmin", "angle")
@@ -311,6 +311,7 @@ def view(given: VelocityAttitude, course: Course) -> View:
     roll, _, heading = (np.asarray(a) for a in to_euler(jnp.asarray(path.q_nb.wxyz)))
     return View(
         epoch_s=epoch_s,
+        faults=faults(given, epoch_s),
         blocks=(
             StateBlock("attitude", slice(0, 3), "rad", "arcmin", "ENU", ENU),
             StateBlock("velocity", slice(3, 5), "m/s", "m/s", "ENU", ENU[:2]),

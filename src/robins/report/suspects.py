@@ -1,0 +1,41 @@
+"""Probability that each instrument, or the motion, is wrong, as a bank of hypotheses states it."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from matplotlib.patches import Patch
+
+from robins.report import series, style
+from robins.report.style import Picture
+
+
+@style.styled
+def suspects(solution: xr.Dataset) -> Picture | None:
+    """Probability by suspect over time; None if no filter states one."""
+    first, mean = (series.get(solution, role) for role in ("wrong", "mean_wrong"))
+    true = series.one(solution, "truly_wrong")
+    assert first is not None
+    names = [name.replace("_", " ") for name in first.axes]
+    filters = series.filters(solution)
+    stating = [i for i in range(len(filters)) if np.isfinite(first.values[i]).any()]
+    if not stating:
+        return None
+    figure, stack, clock = series.stacked(solution, first.x, names, "")
+    for k, axes in enumerate(stack):
+        if true is not None:
+            style.shade(axes, first.x / clock.seconds, np.asarray(true)[:, k] != 0, style.BAND)
+        for i in stating:
+            look = style.look(i) if mean is None else style.look(i, linewidth=0.5)
+            clock.plot(axes, first.x, first.values[i, :, k], **look)
+            if mean is not None:
+                clock.plot(axes, mean.x, mean.values[i, :, k], **style.look(i))
+        axes.set(ylim=(-0.03, 1.03))
+    keys = [style.filter_keys(filters)[i] for i in stating]
+    if true is not None and np.any(true):
+        keys.append(Patch(color=style.BAND, label="truly wrong"))
+    style.legend(figure, [*keys, *([style.outage_key()] if series.outage(solution) else [])])
+    caption = "Probability that it is wrong, as the hypotheses of the filter state it at each step."
+    if mean is not None:
+        caption += f" Mean over {mean.attrs['runs']} runs; thin: the first run."
+    return Picture("wrong", "What the filter finds wrong", caption, figure)

@@ -1,0 +1,95 @@
+"""The instruments, or the motion, that a bank of hypotheses finds wrong: since when, how likely."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from robins.filters import Filter
+from robins.filters.composite.imm import WRONG
+from robins.results import array
+
+HELD = 0.5  # probability above which a suspect is held for wrong
+_SHOWN = 4  # spans in a sentence
+
+Wrong = Mapping[str, Any]
+"""Probability that each suspect is wrong, by its name; leading axis E epochs."""
+
+
+def probabilities(filter_: Filter, updates: Mapping[str, Any]) -> dict[str, Any]:
+    """Probability of each suspect of a filter after its last update of each step.
+
+    Args:
+        filter_: with `Filter.suspects`.
+        updates: by sensor, each with the ``notes`` of its updates; leading axes as you like.
+    """
+    notes = [update.notes for update in updates.values()][-1:]
+    return {
+        name: jnp.asarray(noted[WRONG])[..., i]
+        for noted in notes
+        for i, name in enumerate(filter_.suspects)
+    }
+
+
+def spans(time_s: np.ndarray, which: np.ndarray) -> list[tuple[float, float]]:
+    """First and last time of each run of epochs at which something holds.
+
+    Args:
+        time_s: (E,).
+        which: (E,) bool.
+    """
+    return [(float(time_s[a]), float(time_s[b - 1])) for a, b in edges(which)]
+
+
+def edges(which: np.ndarray) -> list[tuple[int, int]]:
+    """First epoch, and the one after the last, of each run of epochs at which something holds."""
+    change = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(int)))
+    return [(int(a), int(b)) for a, b in change.reshape(-1, 2)]
+
+
+def tables(role: str, found: Sequence[Wrong], **attrs: Any) -> dict[str, Any]:
+    """An array of probabilities (filter, time, suspect); nothing where no filter has a suspect.
+
+    Args:
+        role: "wrong" or "mean_wrong".
+        found: by filter, in their order; NaN where a filter does not have a suspect.
+        attrs: as of `robins.results.array`.
+    """
+    names = list(dict.fromkeys(name for of in found for name in of))
+    if not names:
+        return {}
+    blank = np.full(np.shape(next(iter(of[names[0]] for of in found if names[0] in of))), np.nan)
+    rows = [[np.asarray(of.get(name, blank), float) for name in names] for of in found]
+    return array(role, np.moveaxis(np.array(rows), 1, 2), axes=names, **attrs)
+
+
+def sentences(name: str, time_s: np.ndarray, wrong: Wrong) -> list[str]:
+    """Sentences on what a filter finds wrong in one run; none for a filter without suspects.
+
+    Args:
+        name: of the filter.
+        time_s: (E,).
+        wrong: its probabilities; NaN between the pieces of a log.
+    """
+    said = []
+    for suspect, chance in wrong.items():
+        chance = np.nan_to_num(np.asarray(chance, float))
+        if found := spans(time_s, chance > HELD):
+            longest = sorted(sorted(found, key=lambda one: one[0] - one[1])[:_SHOWN])
+            shown = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in longest)
+            more = f" and {len(found) - _SHOWN} shorter times" if len(found) > _SHOWN else ""
+            said.append(
+                f"{name} finds {words(suspect)} wrong: {shown}{more}; "
+                f"probability up to {np.max(chance):.2f}."
+            )
+    if wrong and not said:
+        return [f"{name} finds none of these wrong: {', '.join(map(words, wrong))}."]
+    return said
+
+
+def words(suspect: str) -> str:
+    """A suspect in a sentence."""
+    return suspect.replace("_", " ")
