@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from robins.campaign.monte_carlo import solved, worlds
 from robins.filters import Belief, Code, Filter, Model, StepInfo
+from robins.filters.composite.imm import WRONG
 from robins.filters.run import nothing
 from robins.filters.trees import select
 from robins.manifold import State
@@ -34,6 +35,7 @@ class Used(NamedTuple):
     innovation: Array
     sigma: Array | np.ndarray
     used: Array
+    wrong: Array | tuple[()] = ()  # of a bank, the probability that each suspect is wrong
 
 
 class BoardRun(NamedTuple):
@@ -109,7 +111,8 @@ def entry_functions(filter_: Filter, model: Model, names: Mapping[str, Any]) -> 
 
 
 def _told(info: StepInfo) -> Used:
-    return Used(info.code, info.nis, info.dof, info.innovation, info.sigma, info.used)
+    wrong = info.notes.get(WRONG, ())
+    return Used(info.code, info.nis, info.dof, info.innovation, info.sigma, info.used, wrong)
 
 
 def reset_function(filter_: Filter, start: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -63,7 +63,11 @@ def components(axes: list[Axis | None]) -> list[str]:
 
 
 def field_notes(
-    problem: Problem, axes: list[Axis | None], state: State, given: Mapping[str, Any]
+    problem: Problem,
+    axes: list[Axis | None],
+    state: State,
+    given: Mapping[str, Any],
+    suspects: Sequence[str] = (),
 ) -> dict[tuple[str, str], str]:
     """Units and axes by struct and field: of the means in a state, of readings and innovations.
 
@@ -90,6 +94,10 @@ def field_notes(
             notes[f"{name}_result", "innovation"] = _read(sensor, 0, len(sensor.axes))
             deviation = f"{sensor.units}: its standard deviation; NaN where not used"
             notes[f"{name}_result", "sigma"] = deviation
+            if suspects:
+                notes[f"{name}_result", "wrong"] = (
+                    f"probability of being wrong: {', '.join(suspects)}"
+                )
     return {**notes, **problem.fields}
 
 

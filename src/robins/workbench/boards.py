@@ -212,7 +212,7 @@ def _library(
     entries = [_entry(n, p) for n, p in zip([*functions, RESET], programs, strict=True)]
     reported = reported_rows(contender.reported, run.case)[0]
     axes = tangent_axes(problem, reported, len(belief.factor))
-    notes = field_notes(problem, axes, run.start, first)
+    notes = field_notes(problem, axes, run.start, first, contender.filter.suspects)
     library = Library(asked.library, entries, run.start, (), notes, precision)
     c = library.source()
     identity = hashlib.sha256((library.header() + c).encode()).hexdigest()

@@ -139,7 +139,7 @@ class LiveInsGnss(Live):
         self._back_s = longest_delay_s + 2.0 * self._reach_s + back
         asked = contender(p, self._usual.fix_s, filter)
         self._on = partial(OnlineFilter, asked.filter, asked.model, machine=machine)
-        self._case = asked.case
+        self._case, self._suspects = asked.case, asked.filter.suspects
         self._C_bs = axes_of(p.imu.orientation) if any(p.imu.orientation) else None
         self._patience = max(3, round(_PATIENCE_S * rate_hz))
         self.start_over()
@@ -440,11 +440,13 @@ class LiveInsGnss(Live):
         end_s = float(rows[-1, 0])
         u = self._block(end_s, rows, at, self._width + 8)
         found = self._online.look(predicted, u)
-        return self._told(end_s, np.asarray(found), mark)._replace(time_ns=time_ns)
+        wrong = {} if self.epoch is None else self.epoch.wrong
+        told = self._told(end_s, np.asarray(found), mark)
+        return told._replace(time_ns=time_ns, wrong=wrong)
 
     def _told(self, time_s: float, x: np.ndarray, flags: Flag) -> Navigation:
         time_ns = round(time_s * 1e9) + (self._origin_ns or 0)
-        return answer_of(time_ns, x, flags)
+        return answer_of(time_ns, x, flags, self._suspects)
 
     def _compile(self) -> None:
         """Have all compiled by a standstill that is thrown away."""

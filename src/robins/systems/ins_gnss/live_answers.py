@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from robins.filters.composite.imm import WRONG
 from robins.filters.run import Step
 from robins.systems.ins_gnss.robust import navigation
 from robins.systems.parts import Block
 from robins.systems.streaming import Flag
+
+_WIDTH = 19  # of the vector: attitude, velocity, place and nine sigmas
 
 
 class Navigation(NamedTuple):
@@ -25,6 +29,8 @@ class Navigation(NamedTuple):
     alt_m: float
     sigma: np.ndarray  # (9,) attitude [rad], velocity [m/s], position [m], each NED
     flags: Flag
+    # probability that each suspect of a bank is wrong, after the last fix or standstill
+    wrong: Mapping[str, float] = {}
 
 
 def predicted(filter_: Any, model: Any, state: Any, u: Block) -> jax.Array:
@@ -40,11 +46,15 @@ def _vector(belief: Any) -> jax.Array:
 
 
 def kept(step: Step) -> jax.Array:
-    """The same after what was measured."""
-    return _vector(step.posterior)
+    """The same after what was measured, and what a bank finds wrong."""
+    last = [info.notes[WRONG] for info in step.info.values() if WRONG in info.notes][-1:]
+    return jnp.concatenate([_vector(step.posterior), *last])
 
 
-def answer_of(time_ns: int, x: np.ndarray, flags: Flag) -> Navigation:
-    """The answer that such a vector is."""
+def answer_of(
+    time_ns: int, x: np.ndarray, flags: Flag, suspects: tuple[str, ...] = ()
+) -> Navigation:
+    """The answer that such a vector is, of a filter with these suspects."""
     lat, lon, alt = x[7:10].tolist()
-    return Navigation(time_ns, x[:4], x[4:7], lat, lon, alt, x[10:], flags)
+    wrong = dict(zip(suspects, x[_WIDTH:].tolist(), strict=False))
+    return Navigation(time_ns, x[:4], x[4:7], lat, lon, alt, x[10:_WIDTH], flags, wrong)
