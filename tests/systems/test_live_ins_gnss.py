@@ -33,7 +33,7 @@ def log():
 
 
 def epochs_of_replay(dataset, parameters, name):
-    """Stamps [ns] and vectors (q, v, lat, lon, alt, sigmas) at the epochs of a causal replay."""
+    """Stamps [ns] and vectors (as `vector`) at the epochs of a causal replay."""
     log = on_one_clock(in_body_axes(dataset, parameters.imu.orientation), parameters)
     pieces, _ = replaying.prepared(
         log.time_s,
@@ -46,14 +46,16 @@ def epochs_of_replay(dataset, parameters, name):
     x = navigation(answer.mean)
     place = x.position
     rows = [x.q_nb.wxyz, x.v_n, np.stack([place.lat, place.lon, place.alt], axis=1)]
-    vectors = np.concatenate([*map(np.asarray, rows), np.asarray(answer.sigma)[:, :9]], axis=1)
+    rows += [np.asarray(answer.sigma)[:, :9], *(p[:, None] for p in answer.wrong.values())]
+    vectors = np.concatenate(list(map(np.asarray, rows)), axis=1)
     seconds = replaying.epochs_of(pieces)
     return np.round(seconds * 1e9).astype(np.int64) + int(dataset.imu.time_ns[0]), vectors
 
 
 def vector(n):
     """The numbers of an answer."""
-    return np.concatenate([n.q_nb, n.v_n, [n.lat_rad, n.lon_rad, n.alt_m], n.sigma])
+    wrong = list(n.wrong.values())
+    return np.concatenate([n.q_nb, n.v_n, [n.lat_rad, n.lon_rad, n.alt_m], n.sigma, wrong])
 
 
 def events(dataset, late_s, skipped=()):
@@ -95,7 +97,7 @@ def compare(at, stamps, vectors, shortest):
     found = [(at[int(t)], row) for t, row in zip(stamps, vectors, strict=True) if int(t) in at]
     assert len(found) >= shortest
     live, of = (np.array(side) for side in zip(*found, strict=True))
-    scale = np.concatenate([np.ones(7), [6.4e6, 6.4e6, 1.0], np.ones(9)])
+    scale = np.concatenate([np.ones(7), [6.4e6, 6.4e6, 1.0], np.ones(live.shape[1] - 10)])
     np.testing.assert_allclose((live - of) * scale, 0.0, atol=2e-9)
 
 
