@@ -122,7 +122,7 @@ def faults(given: Flight, course: Course, name: str) -> dict[str, np.ndarray]:
     burst, time = given.magnetometer.disturbance, course.time_s
     disturbed = np.zeros(len(time), bool)
     if burst is not None:
-        disturbed = np.asarray(bursts(time, burst.every, burst.length)[0])
+        disturbed = np.asarray(bursts(time, burst.every, burst.length, None)[0])
     believed = isinstance(given, MagneticAttitude) and given.believed.error != 0.0
     return {name: disturbed, "motion": np.full(len(time), believed)}
 
