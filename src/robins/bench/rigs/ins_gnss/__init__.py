@@ -20,10 +20,12 @@ from robins.bench.wire.fields import Field, f64, message, size
 from robins.bench.wire.schema import Wire
 from robins.scenario import Quantity, default
 
-__all__ = ["FLAGS", "RIG", "WIRE"]
+__all__ = ["FLAGS", "RIG", "SUSPECTS", "WIRE"]
 
 FLAGS = ("starting", "refused", "rest", "saturated", "disturbed", "doubtful", "behind")
 """Bits of `state.flags`, from the lowest: `robins.systems.streaming.Flag`."""
+SUSPECTS = "imu", "gnss_position"
+"""Instruments in `wrong`, as `robins.systems.ins_gnss.model` names them."""
 _SPEED, _FAR = 1e5, 1e9  # m/s, m: far beyond any vehicle
 _TIME = Field("time", "u64", 1, "ns", "of the clock that samples and fixes share")
 _PLACE = (
@@ -37,6 +39,7 @@ _NAVIGATED = (
     f64("v_n", 3, "m/s", "north, east, down", _SPEED, True),
     *_PLACE,
     size("sigma", 9, "rad, m/s, m", "stated of attitude, velocity, position, each NED", _FAR),
+    size("wrong", len(SUSPECTS), "1", f"probability that it is: {', '.join(SUSPECTS)}", 1.001),
 )
 
 WIRE = Wire(

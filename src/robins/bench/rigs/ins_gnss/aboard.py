@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from robins.bench.rig import Aboard, RigError
+from robins.bench.rigs.ins_gnss import SUSPECTS
 from robins.bench.rigs.ins_gnss.navigating import Kit
 from robins.ins.blocks import reach_of_rate, usual_width
 from robins.ins.increments import Increments
@@ -78,7 +79,7 @@ def aboard(flight: Any) -> Aboard:
         fields=_FIELDS,
     )
     wide = not hasattr(chosen.case(world).start.mean, "q_nb")
-    told = _given_h(given, kit.rates_hz, world, "ins_" if wide else "")
+    told = _given_h(given, kit.rates_hz, world, "ins_" if wide else "", chosen.filter.suspects)
     here = resources.files("robins.bench.rigs.ins_gnss")
     files = {name: (here / name).read_text("utf-8") for name in _FILES}
     return Aboard(problem, "filter", {**files, "navigation_given.h": told})
@@ -103,8 +104,16 @@ def _begun(world: Case, width: int) -> Case:
     return first._replace(start=world.start, u=Block(Increments(*padded), first.u.noise_scale))
 
 
-def _given_h(given: Replay, rates_hz: tuple[float, float], world: Case, mean: str) -> str:
+def _given_h(
+    given: Replay,
+    rates_hz: tuple[float, float],
+    world: Case,
+    mean: str,
+    suspects: tuple[str, ...],
+) -> str:
     """`navigation_given.h`: what the part is told, and room for what it keeps."""
+    where = {name: f"(result).wrong[{i}]" for i, name in enumerate(suspects)}
+    wrong = [where.get(name, "NAN") for name in SUSPECTS]
     g, aids, longest_s = given.gnss, given.aids, given.update.longest_block
     sample_s, fix_s = (1.0 / rate for rate in rates_hz)
     window_s = fix_s if g.velocity_window is None else g.velocity_window
@@ -140,6 +149,8 @@ def _given_h(given: Replay, rates_hz: tuple[float, float], world: Case, mean: st
         "VELOCITIES": int(model.VELOCITY in world.y),
         "REST": int(model.STANDSTILL in world.y),
         "MEAN(field)": f"mean_{mean}##field",
+        # of the result of an update, in the order of the wire
+        "TELL_WRONG(result, to)": ", ".join(f"(to)[{k}] = {x}" for k, x in enumerate(wrong)),
     }
     axes = axes_of(given.imu.orientation).tolist()
     rows = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in axes)

@@ -17,7 +17,7 @@ from robins.bench.parts.station import Inputs, Part
 from robins.bench.recording.topics import JSON, Topic, as_json, nav_sat_fix
 from robins.bench.recording.topics import imu as imu_of_ros
 from robins.bench.rig import Judged, RigError, Timing, View
-from robins.bench.rigs.ins_gnss import FLAGS
+from robins.bench.rigs.ins_gnss import FLAGS, SUSPECTS
 from robins.bench.run.numbers import figures_of, latest
 from robins.bench.run.telemetry import Flown
 from robins.dataset import Dataset
@@ -37,6 +37,7 @@ from robins.systems.ins_gnss.log import antenna_of, distances, fix_arrays
 from robins.systems.ins_gnss.parameters import Drive, Gnss, Replay
 from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock, with_lever_arm
 from robins.systems.ins_gnss.world import drive_dataset, motion_of
+from robins.systems.suspects import sentences, tables
 from robins.systems.tables import attitude_array, block_array, track_arrays
 
 _SHARED = ("system", "title", "imu", "start", "aids", "update", "outages", "log")
@@ -222,7 +223,9 @@ def navigation(kit: Kit) -> Part:
 
 def _told(n: Navigation) -> dict[str, Any]:
     place = {"lat": n.lat_rad, "lon": n.lon_rad, "alt": n.alt_m}
-    return {"time": n.time_ns, "q_nb": n.q_nb, "v_n": n.v_n, **place, "sigma": n.sigma}
+    wrong = np.array([n.wrong.get(name, np.nan) for name in SUSPECTS])
+    state = {"time": n.time_ns, "q_nb": n.q_nb, "v_n": n.v_n, **place}
+    return {**state, "sigma": n.sigma, "wrong": wrong}
 
 
 def topics(kit: Kit) -> tuple[Topic, ...]:
@@ -270,7 +273,11 @@ def judge(flight: Any, ran: Any) -> Judged:
         f"steps_{name}": int(np.sum(flown["state.flags"] >> k & 1))
         for k, name in enumerate(FLAGS[:2])
     }
-    return Judged(metrics, counts, arrays=arrays, lines=figures_of(metrics))
+    wrong = {name: x for name, x in zip(SUSPECTS, flown["state.wrong"].T, strict=True)}
+    wrong = {name: x for name, x in wrong.items() if np.any(np.isfinite(x))}
+    arrays |= tables("wrong", [wrong])
+    said = sentences("navigation", flown.time_s, wrong)
+    return Judged(metrics, counts, arrays=arrays, lines=[*figures_of(metrics), *said])
 
 
 def _nav(flown: Flown, message: str, rows: Any = slice(None)) -> Nav:
@@ -319,6 +326,9 @@ def view() -> View:
         for axis in ("north", "east", "down")
     ]
     drawn = [*(Signal(f"q {c}", "1", "attitude", "attitude", "navigated") for c in "wxyz"), *three]
+    drawn += [
+        Signal(name.replace("_", " "), "1", "probability of being wrong") for name in SUSPECTS
+    ]
     faults = (
         ("gnss: 30 m to the north", {"kind": "shifted"}),
         ("gnss: no satellites", {"kind": "blind"}),
@@ -327,13 +337,13 @@ def view() -> View:
     )
 
     def sample(flown: Flown, kit: Kit, since: int, step: int) -> list[float]:
-        names = ("q_nb", "v_n", "sigma", "lat", "lon", "alt")
-        q, v, sigma, *place = (latest(flown[f"state.{name}"], since, step) for name in names)
+        names = ("q_nb", "v_n", "sigma", "wrong", "lat", "lon", "alt")
+        q, v, sigma, wrong, *place = (latest(flown[f"state.{name}"], since, step) for name in names)
         known = np.flatnonzero(np.isfinite(flown["state.lat"][: step + 1]))
         first = known[0] if len(known) else step
-        begin = [flown[f"state.{name}"][first] for name in names[3:]]
+        begin = [flown[f"state.{name}"][first] for name in names[4:]]
         to_m = np.array([1.0, np.cos(begin[0]), 0.0]) * 6.378137e6 - np.array([0.0, 0.0, 1.0])
-        return [*q, *v, *((np.array(place) - begin) * to_m), *sigma[6:]]
+        return [*q, *v, *((np.array(place) - begin) * to_m), *sigma[6:], *wrong]
 
     offered = tuple({"label": label, "fault": fault} for label, fault in faults)
     return View(lambda given: drawn, sample, offered=offered)

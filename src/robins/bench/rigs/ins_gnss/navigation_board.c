@@ -13,7 +13,7 @@
 
 enum { STARTING = 1, REFUSED = 2 }; /* of the state */
 
-typedef struct { double time_s, wanted_s; int number; filter_state state; } epoch; /* see the part */
+typedef struct { double time_s, wanted_s; int number; filter_state state; double wrong[2]; } epoch; /* see the part */
 
 static robins_sample sample; /* what came, and the ends of its steps */
 static robins_fix fix;
@@ -31,7 +31,7 @@ static int says_state, says_epoch;
 
 static void forget_all(void) { samples = count = heard = kept = 0, calmest = INFINITY; }
 
-static void tell(const filter_state *x, int64_t time_ns, robins_epoch *to) {
+static void tell(const filter_state *x, const double *wrong, int64_t time_ns, robins_epoch *to) {
   to->time = (uint64_t)time_ns;
   memcpy(to->q_nb, x->MEAN(q_nb_wxyz), sizeof to->q_nb);
   memcpy(to->v_n, x->MEAN(v_n), sizeof to->v_n);
@@ -41,6 +41,7 @@ static void tell(const filter_state *x, int64_t time_ns, robins_epoch *to) {
     for (int j = 0; j <= i; j++) sum += x->factor[i][j] * x->factor[i][j];
     to->sigma[i] = sqrt(sum);
   }
+  memcpy(to->wrong, wrong, sizeof to->wrong);
 }
 
 static void drop(int old) {
@@ -69,6 +70,7 @@ static void step(double to_s, double wanted_s, int number) {
   }
   rate_about(to_s, about.omega_b);
   filter_update_gnss_position(&now->state, &place, &about, &seen);
+  TELL_WRONG(seen, now->wrong);
 #if VELOCITIES
   filter_update_gnss_velocity_reading velocity;
   filter_update_gnss_velocity_about fresh;
@@ -79,6 +81,7 @@ static void step(double to_s, double wanted_s, int number) {
   memcpy(fresh.omega_b, about.omega_b, sizeof fresh.omega_b);
   gained_before(to_s, some ? WINDOW_S : 0.0, fresh.gained_b, &fresh.age_s);
   filter_update_gnss_velocity(&now->state, &velocity, &fresh, &felt);
+  TELL_WRONG(felt, now->wrong);
 #endif
 #if REST
   filter_update_zero_velocity_reading stands;
@@ -95,8 +98,9 @@ static void step(double to_s, double wanted_s, int number) {
   }
   filter_update_zero_velocity(&now->state, &stands, &stood);
   filter_update_zero_rate(&now->state, &turns, &turned);
+  TELL_WRONG(turned, now->wrong);
 #endif
-  if (waiting < TOLD) tell(&now->state, llrint(to_s * 1e9) + origin_ns, &told[waiting++]);
+  if (waiting < TOLD) tell(&now->state, now->wrong, llrint(to_s * 1e9) + origin_ns, &told[waiting++]);
   int old = 0, gone = 0; /* one epoch before the longest delay is where a fix is counted from */
   while (past[old].time_s < to_s - DELAY_S) old++;
   if (old > 1) memmove(past, past + old - 1, sizeof *past * (size_t)(kept -= old - 1));
@@ -114,6 +118,7 @@ static void seek(void) {
   const row *fix = find_start(&past[0].state);
   if (!fix) return;
   past[0].time_s = past[0].wanted_s = fix->time_s, past[0].number = 0, kept = 1;
+  past[0].wrong[0] = past[0].wrong[1] = NAN;
 }
 
 /* Takes all steps that can be taken. */
@@ -242,7 +247,7 @@ static void compute(uint64_t time_ns) {
     if (kept) {
       ahead = past[kept - 1].state;
       predict(&ahead, past[kept - 1].time_s, steps[count].end_s, count + 1, 0);
-      tell(&ahead, (int64_t)stamp, &now);
+      tell(&ahead, past[kept - 1].wrong, (int64_t)stamp, &now);
     }
     memcpy(&state, &now, sizeof now);
     state.flags = (uint8_t)flags;
