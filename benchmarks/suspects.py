@@ -62,7 +62,7 @@ def _row(name: str, one: str, true: np.ndarray | None, found: dict[str, Any]) ->
         str(count),
         "" if share is None else "cannot name it" if accused is None else f"{100 * share:.0f} %",
         "" if after is None else f"{after:.3g} s",
-        "" if accused is None or (true is not None and np.all(true)) else f"{100 * accused:.2g} %",
+        "" if accused is None or (true is not None and np.all(true)) else f"{100 * accused:.1f} %",
     ]
     return "| " + " | ".join(cells) + " |"
 

@@ -37,7 +37,7 @@ from robins.systems.ins_gnss.log import antenna_of, distances, fix_arrays
 from robins.systems.ins_gnss.parameters import Drive, Gnss, Replay
 from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock, with_lever_arm
 from robins.systems.ins_gnss.world import drive_dataset, motion_of
-from robins.systems.suspects import sentences, tables
+from robins.systems.suspects import sentences, tables, words
 from robins.systems.tables import attitude_array, block_array, track_arrays
 
 _SHARED = ("system", "title", "imu", "start", "aids", "update", "outages", "log")
@@ -273,8 +273,8 @@ def judge(flight: Any, ran: Any) -> Judged:
         f"steps_{name}": int(np.sum(flown["state.flags"] >> k & 1))
         for k, name in enumerate(FLAGS[:2])
     }
-    wrong = {name: x for name, x in zip(SUSPECTS, flown["state.wrong"].T, strict=True)}
-    wrong = {name: x for name, x in wrong.items() if np.any(np.isfinite(x))}
+    each = zip(SUSPECTS, flown["state.wrong"].T, strict=True)
+    wrong = {name: x for name, x in each if np.any(np.isfinite(x))}
     arrays |= tables("wrong", [wrong])
     said = sentences("navigation", flown.time_s, wrong)
     return Judged(metrics, counts, arrays=arrays, lines=[*figures_of(metrics), *said])
@@ -326,9 +326,7 @@ def view() -> View:
         for axis in ("north", "east", "down")
     ]
     drawn = [*(Signal(f"q {c}", "1", "attitude", "attitude", "navigated") for c in "wxyz"), *three]
-    drawn += [
-        Signal(name.replace("_", " "), "1", "probability of being wrong") for name in SUSPECTS
-    ]
+    drawn += [Signal(words(name), "1", "probability of being wrong") for name in SUSPECTS]
     faults = (
         ("gnss: 30 m to the north", {"kind": "shifted"}),
         ("gnss: no satellites", {"kind": "blind"}),
