@@ -321,7 +321,7 @@ def _view(given: Flight, course: Course, **own: Any) -> View:
         windows=course.bursts,
         sensors={i.name: i.axes for i in instruments(given)},
         notes=notes,
-        faults=faults(given, course, FIELD if isinstance(given, FieldVector) else MAGNETIC),
+        faults=faults(given, course.time_s, FIELD if isinstance(given, FieldVector) else MAGNETIC),
         **own,
     )
 

@@ -117,14 +117,14 @@ def _disturbed(given: Flight, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return begun, since
 
 
-def faults(given: Flight, course: Course, name: str) -> dict[str, np.ndarray]:
+def faults(given: Flight, time_s: np.ndarray, name: str) -> dict[str, np.ndarray]:
     """When the magnetometer, of this name, is disturbed; whether filters believe a wrong motion."""
-    burst, time = given.magnetometer.disturbance, course.time_s
-    disturbed = np.zeros(len(time), bool)
+    burst = given.magnetometer.disturbance
+    disturbed = np.zeros(len(time_s), bool)
     if burst is not None:
-        disturbed = np.asarray(bursts(time, burst.every, burst.length, None)[0])
+        disturbed = np.asarray(bursts(time_s, burst.every, burst.length, None)[0])
     believed = isinstance(given, MagneticAttitude) and given.believed.error != 0.0
-    return {name: disturbed, "motion": np.full(len(time), believed)}
+    return {name: disturbed, "motion": np.full(len(time_s), believed)}
 
 
 def body_of(given: Flight) -> FreeBody:

@@ -236,7 +236,7 @@ CLAIMS = ratio_claims(_RATIOS, _TEXTS)
 """Every claim that a scenario may state."""
 
 
-def faults(given: AttitudeLoop, course: Course) -> dict[str, np.ndarray]:
+def faults(given: AttitudeLoop, time_s: np.ndarray) -> dict[str, np.ndarray]:
     """When gyro and star sensor are other than the filters believe.
 
     Noise, drift as believed and false stars are no faults.
@@ -247,8 +247,8 @@ def faults(given: AttitudeLoop, course: Course) -> dict[str, np.ndarray]:
     gyro = drifts or g.scale_factor > 0.0 or g.misalignment > 0.0
     spans = [fault for fault in star.faults if fault.kind != "sign"]
     return {
-        "gyro": np.full(len(course.time_s), gyro),
-        STAR: during(spans, course.time_s) | (star.low_frequency > 0.0),
+        "gyro": np.full(len(time_s), gyro),
+        STAR: during(spans, time_s) | (star.low_frequency > 0.0),
     }
 
 
@@ -273,7 +273,7 @@ def view(given: AttitudeLoop, course: Course) -> View:
         ),
         norms=(Norm("attitude", (0, 1, 2)),),
         windows=(slice(counted, len(course.time_s)),),
-        faults=faults(given, course),
+        faults=faults(given, course.time_s),
     )
 
 
