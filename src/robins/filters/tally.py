@@ -173,11 +173,11 @@ def _off(sensor: str, ratio: float, dof: int, cautious: bool) -> list[str]:
     ]
 
 
-def warn_not_taken(tally: Tally, stacklevel: int = 3) -> None:
-    """Warn of steps that were not taken.
+def warn_not_taken(tally: Tally) -> None:
+    """Warn of steps that were not taken, at the caller of a run.
 
     Warns:
         StepWarning: there are such steps; the message counts them by outcome.
     """
     if said := not_taken(tally):
-        warnings.warn("; ".join(said), StepWarning, stacklevel=stacklevel)
+        warnings.warn("; ".join(said), StepWarning, stacklevel=4)
