@@ -62,6 +62,12 @@ def matrix(
     return numbers
 
 
+def square(what: str, given: Matrix) -> np.ndarray:
+    """Square matrix of finite floats; errors as of `matrix`."""
+    numbers = matrix(what, given)
+    return matrix(what, numbers, *2 * numbers.shape[:1])
+
+
 def positive(what: str, given: ArrayLike, of_infinity: str) -> None:
     """Refuse all but a positive number; infinity is one.
 
