@@ -80,17 +80,8 @@ def gamma_min(
     the filter exists, then bisected. It grows with the horizon and with outages; for a linear model
     it depends on the data only by the missing measurements.
 
-    Args:
-        model: the motion and the sensors.
-        start: initial belief.
-        y: measurements as `run` takes them.
-        weight: L as `h_infinity` takes it.
-        u: inputs as `run` takes them.
-        aux: further inputs of sensors as `run` takes them.
-        linearise: `taylor` by default.
-        rtol: relative excess of the result, for which the filter exists.
-        estimate: as `h_infinity` takes it.
-        count_missing: as `h_infinity` takes it.
+    Arguments are those of `run` and of `h_infinity`, but for rtol, the largest relative excess of
+    the result; the filter exists for the result itself.
 
     Raises:
         ValueError: the Kalman filter itself cannot take every step, or rtol is below 1e-12.
@@ -160,8 +151,7 @@ def error_operator(
         (T r, p + T (q + k)), k summed over the channels.
     """
     T, n, q = G.shape
-    widths = [q, *(c.W.shape[2] for c in channels)]
-    width = sum(widths)
+    width = q + sum(c.W.shape[2] for c in channels)
     E = np.zeros((n, S0.shape[1] + T * width))
     E[:, : S0.shape[1]] = S0
     out = np.zeros((T, weight.shape[1], E.shape[1]))
@@ -205,25 +195,16 @@ def worst_case_gain(
 
     The 2-norm of the matrix that stacks the recursion of the error with the gains of the run. The
     model is linearised about the means of the run, so a nonlinear one has this gain to small
-    disturbances.
-
-    Args:
-        model: the model of the run.
-        start: its initial belief.
-        solution: a run that kept its steps.
-        weight: L, as `h_infinity` takes it.
-        u: the inputs of the run.
-        aux: the further inputs of its sensors.
-        estimate: error that counts: "a-posteriori", after the measurements of a step, or "a-priori"
-            and "predictor", before them.
-        count_missing: count also steps without a used measurement.
+    disturbances. Arguments are those of the run, its solution with all steps, and those of
+    `h_infinity`: "a-posteriori" counts the error after the measurements of a step, "a-priori" and
+    "predictor" the error before them.
 
     Raises:
         ValueError: the run did not keep its steps.
     """
     steps = solution.steps
-    if not hasattr(steps, "prediction"):
-        raise ValueError("worst_case_gain needs a run that kept its steps: leave `keep` alone")
+    kept = hasattr(steps, "prediction")
+    require(kept, "worst_case_gain needs a run that kept its steps: leave `keep` alone")
     S0, F, G, channels, L = _linearised(model, start, steps, weight, u, dict(aux or {}))
     counts = np.ones(len(F), bool) if count_missing else np.asarray(_used(steps.info))
     L = np.where(counts[:, None, None], L, 0.0)
@@ -345,14 +326,8 @@ def steady_h_infinity(
 
     The stabilising solution of the Riccati equation of F' and [H' L'] with weights R and -gamma^2 I
     (Hassibi, Sayed & Kailath 1999, ch. 4), checked against existence and against the recursion.
-
-    Args:
-        F: (n, n) transition.
-        Q: (n, n) process noise covariance.
-        H: (m, n).
-        R: (m, m) measurement noise covariance.
-        weight: (q, n) L.
-        gamma: bound; inf gives the Kalman filter.
+    Arguments are those of `steady_kalman`, the weight L (q, n) and the bound gamma; inf gives the
+    Kalman filter.
 
     Raises:
         TypeError: a matrix is not of real numbers.
