@@ -10,7 +10,7 @@ from jaxtyping import ArrayLike
 
 from robins.errors import require
 
-Matrix = ArrayLike | Sequence[ArrayLike | Sequence[ArrayLike]]  # an array, or rows of numbers
+Matrix = ArrayLike | Sequence[object]  # given by a user: an array or rows of numbers, unchecked
 
 
 def one_of(what: str, given: str, known: object) -> None:
