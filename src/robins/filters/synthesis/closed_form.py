@@ -82,11 +82,8 @@ def isotropic(plant: Plant) -> Isotropic:
     n = len(plant.A)
     size = float(np.linalg.norm(plant.A, ord=2))
     require(size != 0.0, "no closed form: A is zero")
-    spread = plant.Bw @ plant.Bw.T
-    noise = plant.Dw @ plant.Dw.T
-    sw2, ss2 = np.trace(spread) / n, np.trace(noise) / len(noise)
-    each = plant.L.T @ plant.L
-    eye = np.eye(n)
+    spread, noise, each = plant.Bw @ plant.Bw.T, plant.Dw @ plant.Dw.T, plant.L.T @ plant.L
+    sw2, ss2, eye = np.trace(spread) / n, np.trace(noise) / len(noise), np.eye(n)
     demands = (
         (_same(plant.A @ plant.A.T / size**2, eye), "A is no multiple of an orthogonal matrix"),
         (plant.C.shape == (n, n) and _same(plant.C, eye), "C is not the identity"),
@@ -110,11 +107,7 @@ def isotropic(plant: Plant) -> Isotropic:
 
 
 def closed_form(plant: Plant, gamma: Number) -> Design:
-    """Gain k U that meets gamma with the least H2 norm.
-
-    Args:
-        plant: A a multiple of an orthogonal matrix, C the identity, noises isotropic and apart.
-        gamma: bound on the H-infinity norm; inf is the Kalman filter.
+    """Gain k U that meets gamma with the least H2 norm; the Kalman filter if gamma is inf.
 
     Raises:
         Unreachable: gamma is below the least of this form, which the message names.

@@ -52,14 +52,9 @@ class Design(NamedTuple):
 
 
 def certify(plant: Plant, K: Matrix, *, method: str, **fields: Any) -> Design:
-    """Design of an observer gain, if its true norms keep the bounds.
+    """Design of an observer gain K (n, m), if its true norms keep the bounds.
 
-    Args:
-        plant: as it was designed for.
-        K: (n, m) gain.
-        method: as in `Design`.
-        fields: ``gamma``, ``bound``, ``lambda_``, ``status`` and ``seconds`` of `Design`, all
-            optional.
+    `fields` are ``gamma``, ``bound``, ``lambda_``, ``status`` and ``seconds`` of `Design`.
 
     Raises:
         NotCertified: the error does not decay, H2 > bound (1 + 1e-3), Hinf > gamma (1 + 1e-6), or
@@ -73,9 +68,6 @@ def certify_full(plant: Plant, filter_: FullOrder, *, method: str, **fields: Any
     """Design of a full-order filter x^(k+1) = Ah x^ + Bh y, z^ = Gh x^, as `certify`.
 
     Its error depends on the state of the plant, which must therefore be stable.
-
-    Raises:
-        NotCertified: as `certify`.
     """
     Ah, Bh, Gh = (np.array(matrix, float) for matrix in filter_)
     zero = np.zeros((len(plant.A), len(Ah)))
@@ -106,24 +98,16 @@ def _certified(
         norms.peak_gain(error.A, error.Bn, error.L),
         norms.spectral_radius(error.A), float(lambda_), status, float(seconds),
     )  # fmt: skip
-    promises = (
-        (design.radius < 1.0, f"its error does not decay, spectral radius {design.radius:.9g}"),
-        (
-            not design.h2 > design.bound * (1.0 + BOUND),
-            f"true H2 norm {design.h2:.6g} above the promised {design.bound:.6g}",
-        ),
-        (
-            not design.hinf > design.gamma * (1.0 + GAMMA),
-            f"true H-infinity norm {design.hinf:.9g} above gamma {design.gamma:.9g}",
-        ),
-        (
-            not abs(design.hinf - design.hinf_sweep) > _AGREE * design.hinf,
-            f"H-infinity norm {design.hinf:.9g} by levels but {design.hinf_sweep:.9g} by a sweep "
-            "of the frequency",
-        ),
-    )
-    for kept, why in promises:
-        if not kept:
-            by = f" (the solver said {status!r})" if status else ""
-            raise NotCertified(f"{method}: the answer is not certified: {why}{by}")
-    return design
+    h2, hinf, sweep = design.h2, design.hinf, design.hinf_sweep
+    if not design.radius < 1.0:
+        why = f"its error does not decay, spectral radius {design.radius:.9g}"
+    elif h2 > design.bound * (1.0 + BOUND):
+        why = f"true H2 norm {h2:.6g} above the promised {design.bound:.6g}"
+    elif hinf > design.gamma * (1.0 + GAMMA):
+        why = f"true H-infinity norm {hinf:.9g} above gamma {design.gamma:.9g}"
+    elif abs(hinf - sweep) > _AGREE * hinf:
+        why = f"H-infinity norm {hinf:.9g} by levels but {sweep:.9g} by a sweep of the frequency"
+    else:
+        return design
+    by = f" (the solver said {status!r})" if status else ""
+    raise NotCertified(f"{method}: the answer is not certified: {why}{by}")

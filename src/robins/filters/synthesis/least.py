@@ -72,9 +72,6 @@ def least_gamma(plant: Plant) -> LeastGamma:
 
     It needs no solver. The proof holds to the rounding of the plant's numbers.
 
-    Args:
-        plant: what is filtered.
-
     Raises:
         ValueError: the plant has no steady Kalman filter.
         NotCertified: the norms of the Kalman filter cannot be computed.

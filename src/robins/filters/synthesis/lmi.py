@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -39,9 +40,12 @@ from robins.filters.synthesis.programs import Answer, Form, solve
 from robins.filters.synthesis.riccati import check_gamma
 from robins.filters.synthesis.scaling import Scales, balanced
 
+ObserverForm = Literal["common", "slack"]
+Reading = Callable[[Answer, Scales], np.ndarray | FullOrder]  # a gain or filter, in plant units
 
-def attempt(
-    plant: Plant, form: Form, aim: Aim, gamma: Number, certified: Callable[[Answer, Scales], Design]
+
+def _attempt(
+    plant: Plant, form: Form, aim: Aim, gamma: float, method: str, readings: Sequence[Reading]
 ) -> Design:
     """First certified design: scale, solve, check the true norms, else try other scales.
 
@@ -49,38 +53,41 @@ def attempt(
     optimal one may be wrong by orders of magnitude where numbers are badly scaled, and infeasible
     problems have half a dozen statuses.
 
-    Args:
-        plant: in its own units.
-        form: of the inequalities.
-        aim: "h2" or "mixed".
-        gamma: bound on the H-infinity norm; inf with "h2".
-        certified: makes the design of an answer in scaled units.
-
     Raises:
         Unreachable: gamma is below the proved least one (`robins.filters.synthesis.least`).
         NotCertified: no answer passed; the message states each status and the failed test.
     """
+    began = time.perf_counter()
     failures: list[str] = []
     ones = Scales(np.ones(len(plant.A)), np.ones(len(plant.C)), 1.0, 1.0, 1.0)
-    plain = ones if np.isinf(gamma) else ones._replace(n=1.0 / float(gamma))
+    plain = ones if np.isinf(gamma) else ones._replace(n=1.0 / gamma)
     for scales in (balanced(plant, gamma), plain):
         answer = solve(scales.plant(plant), form, aim)
         if not answer.unknowns:
             failures.append(f"the solver said {answer.status!r} and gave no answer")
             continue
-        try:
-            return certified(answer, scales)
-        except NotCertified as error:
-            failures.append(str(error))
-    failed = f"no design by the {form} form of the LMI; " + "; then ".join(failures)
+        failed: list[str] = []
+        for read in readings:
+            found = read(answer, scales)
+            try:
+                return (certify_full if isinstance(found, tuple) else certify)(
+                    plant,
+                    found,
+                    method=method,
+                    gamma=gamma,
+                    bound=_bound(answer, scales),
+                    status=answer.status,
+                    seconds=time.perf_counter() - began,
+                )
+            except NotCertified as error:
+                failed.append(str(error))
+        failures.append("; in the limit of R -> 0: ".join(failed))
+    why = f"no design by the {form} form of the LMI; " + "; then ".join(failures)
     if aim == "mixed":
         least = least_gamma(plant)
         least.refuse(gamma)
-        failed += f". No proof that gamma is out of reach: a gain has {least.reached:.6g}"
-    raise NotCertified(failed)
-
-
-ObserverForm = Literal["common", "slack"]
+        why += f". No proof that gamma is out of reach: a gain has {least.reached:.6g}"
+    raise NotCertified(why)
 
 
 def _aim(gamma: Number) -> Aim:
@@ -108,20 +115,7 @@ def observer(plant: Plant, gamma: Number, form: ObserverForm = "common") -> Desi
     """
     check_gamma(gamma)
     one_of("form", form, ObserverForm)
-    began = time.perf_counter()
-
-    def certified(answer: Answer, scales: Scales) -> Design:
-        return certify(
-            plant,
-            gain_of(answer, scales),
-            method=f"lmi-{form}",
-            gamma=gamma,
-            bound=_bound(answer, scales),
-            status=answer.status,
-            seconds=time.perf_counter() - began,
-        )
-
-    return attempt(plant, form, _aim(gamma), float(gamma), certified)
+    return _attempt(plant, form, _aim(gamma), float(gamma), f"lmi-{form}", (gain_of,))
 
 
 def gain_of(answer: Answer, scales: Scales) -> np.ndarray:
@@ -140,16 +134,10 @@ def retuned(plant: Plant, gamma: Number, form: ObserverForm = "slack") -> Design
 
     LMIs are conservative: the true norm of the answer lies below its gamma, at the cost of H2. A
     search for gamma' recovers that in some ten solves. If the Kalman filter meets gamma, the result
-    is that filter. Arguments are those of `observer`.
+    is that filter. Arguments and errors are those of `observer`.
 
     Returns:
         The best design found that meets gamma. Its `bound` is valid; `status` states gamma'.
-
-    Raises:
-        Unreachable: as `observer`.
-        NotCertified: a solve of the search had no answer that passed.
-        MissingExtra: as `observer`.
-        ValueError: as `observer`.
     """
     check_gamma(gamma)
     one_of("form", form, ObserverForm)
@@ -232,13 +220,7 @@ class EveryStep:
         )
 
     def __call__(self, plant: Plant) -> np.ndarray:
-        """Gain K (n, m), certified for this plant if it were constant.
-
-        Raises:
-            Unreachable: as `observer`.
-            NotCertified: as `observer`.
-            MissingExtra: as `observer`.
-        """
+        """Gain K (n, m), certified for this plant if it were constant; errors of `observer`."""
         sizes = (len(plant.A), len(plant.C))
         if self._scales is None or sizes != (len(self._scales.x), len(self._scales.y)):
             self._scales = balanced(plant, self.gamma)
@@ -274,39 +256,12 @@ def full(plant: Plant, gamma: Number) -> Design:
     The optimal R is at the edge of its cone, R -> 0, where solvers stop with some R of 1e-9 of
     either sign. R - P stays regular, so (8) is well defined, but need not be a filter. If the true
     norms of plant and filter refute (8), the limit is taken: S = -(P A + Q C), U = L.
-
-    Args:
-        plant: plant of the filter, spectral radius of A below one.
-        gamma: bound on the H-infinity norm.
-
-    Raises:
-        ValueError: the spectral radius of A is one or more, or gamma is not a positive number.
-        Unreachable: as `observer`.
-        NotCertified: as `observer`.
-        MissingExtra: as `observer`.
+    Arguments and errors are those of `observer`; the spectral radius of A must be below one.
     """
     check_gamma(gamma)
     refuse_unstable(plant)
-    began = time.perf_counter()
-
-    def certified(answer: Answer, scales: Scales) -> Design:
-        failed: list[str] = []
-        for made in (_of_variables, _in_the_limit):
-            try:
-                return certify_full(
-                    plant,
-                    _unscaled(made(answer, scales.plant(plant)), scales),
-                    method="full-order",
-                    gamma=gamma,
-                    bound=_bound(answer, scales),
-                    status=answer.status,
-                    seconds=time.perf_counter() - began,
-                )
-            except NotCertified as error:
-                failed.append(str(error))
-        raise NotCertified("; in the limit of R -> 0: ".join(failed))
-
-    return attempt(plant, "full", "mixed", float(gamma), certified)
+    readings = (_of_variables, partial(_in_the_limit, plant))
+    return _attempt(plant, "full", "mixed", float(gamma), "full-order", readings)
 
 
 def refuse_unstable(plant: Plant) -> None:
@@ -319,19 +274,14 @@ def refuse_unstable(plant: Plant) -> None:
         )
 
 
-def _of_variables(answer: Answer, plant: Plant) -> FullOrder:
+def _of_variables(answer: Answer, scales: Scales) -> FullOrder:
     """(8)."""
     R, P, S, Q, U = (answer.unknowns[name] for name in "RPSQU")
-    return np.linalg.solve(R - P, S), np.linalg.solve(R - P, Q), U
+    return scales.full_order(np.linalg.solve(R - P, S), np.linalg.solve(R - P, Q), U)
 
 
-def _in_the_limit(answer: Answer, plant: Plant) -> FullOrder:
+def _in_the_limit(plant: Plant, answer: Answer, scales: Scales) -> FullOrder:
     """(8) for R = 0, where (7) is the observer's inequality."""
+    scaled = scales.plant(plant)
     Bh = -np.linalg.solve(answer.unknowns["P"], answer.unknowns["Q"])
-    return plant.A - Bh @ plant.C, Bh, plant.L
-
-
-def _unscaled(filter_: FullOrder, scales: Scales) -> FullOrder:
-    Ah, Bh, Gh = filter_
-    x = scales.x
-    return Ah * x[:, None] / x, Bh * x[:, None] / scales.y, Gh / x * scales.z
+    return scales.full_order(scaled.A - Bh @ scaled.C, Bh, scaled.L)

@@ -26,7 +26,7 @@ _SQUARINGS = 64  # of A: a radius of 1 - eps needs 58
 
 
 def _system(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None) -> System:
-    """Matrices of a system, D zero by default.
+    """Matrices (n, n), (n, q), (r, n), (r, q) of a system, D zero by default.
 
     Raises:
         TypeError: one is not of real numbers.
@@ -85,15 +85,8 @@ def hinf_norm(
     level that is not reached is the answer. The search starts from the highest of some responses,
     below |D| + 2 sum(s) of the Hankel singular values s.
 
-    Args:
-        A: (n, n).
-        B: (n, q).
-        C: (r, n).
-        D: (r, q), zero by default.
-        rtol: relative distance of the answer from a response.
-
     Returns:
-        The norm, from above; inf unless A is stable.
+        The norm, from above and within rtol of a response; inf unless A is stable.
     """
     A, B, C, D = _system(A, B, C, D)
     if spectral_radius(A) >= 1.0:
@@ -186,17 +179,7 @@ def peak_gain(
     """Greatest gain found by a sweep of the frequency: never more than the H-infinity norm.
 
     The circle is sampled evenly, more densely about the angle of each eigenvalue, and then
-    repeatedly about the highest peaks.
-
-    Args:
-        A: (n, n).
-        B: (n, q).
-        C: (r, n).
-        D: (r, q), zero by default.
-        points: even samples of the half circle.
-
-    Returns:
-        The gain; inf unless A is stable.
+    repeatedly about the highest peaks; `points` is the number of even samples of the half circle.
     """
     A, B, C, D = _system(A, B, C, D)
     values = np.linalg.eigvals(A)

@@ -27,13 +27,13 @@ _UNSEEN = 1e-9  # least singular value of the scaled Popov-Belevitch-Hautus matr
 class Plant(NamedTuple):
     """Matrices of a plant, float64; made by `plant` or `current_form`, which check them."""
 
-    A: np.ndarray  # (n, n)
-    Bw: np.ndarray  # (n, p) noise
-    Bn: np.ndarray  # (n, q) modelling error
-    C: np.ndarray  # (m, n)
-    Dw: np.ndarray  # (m, p)
-    Dn: np.ndarray  # (m, q)
-    L: np.ndarray  # (r, n) rows whose error counts
+    A: np.ndarray  # (n, n) transition
+    Bw: np.ndarray  # (n, p) process noise
+    Bn: np.ndarray  # (n, q) modelling error of the motion
+    C: np.ndarray  # (m, n) measurement
+    Dw: np.ndarray  # (m, p) measurement noise
+    Dn: np.ndarray  # (m, q) modelling error of the measurement
+    L: np.ndarray  # (r, n) rows to estimate
 
 
 class ErrorSystem(NamedTuple):
@@ -56,14 +56,7 @@ def plant(
 ) -> Plant:
     """Plant whose gain K predicts: x^(k+1) = A x^ + K (y - C x^).
 
-    Args:
-        A: (n, n) transition.
-        Bw: (n, p) process noise.
-        Bn: (n, q) modelling error of the motion.
-        C: (m, n) measurement.
-        Dw: (m, p) measurement noise; zero by default.
-        Dn: (m, q) modelling error of the measurement; zero by default.
-        L: (r, n) rows to estimate; the whole state by default.
+    Arguments are the blocks of `Plant`; Dw and Dn are zero by default, L the whole state.
 
     Raises:
         TypeError: a block is not made of real numbers.

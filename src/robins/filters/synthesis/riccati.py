@@ -38,11 +38,7 @@ def kalman_gain(plant: Plant) -> np.ndarray:
 
 
 def kalman_design(plant: Plant) -> Design:
-    """Design of the steady Kalman filter.
-
-    Raises:
-        ValueError: as `kalman_gain`.
-    """
+    """Design of the steady Kalman filter; errors are those of `kalman_gain`."""
     began = time.perf_counter()
     K = kalman_gain(plant)
     seconds = time.perf_counter() - began
@@ -66,11 +62,7 @@ def riccati(plant: Plant, gamma: norms.Number) -> Design:
     the error is gamma. Run with its own covariance it is the ordinary Kalman filter with
     Q + lambda Bn Bn' (`channel_inflation`), start and outages included. If n drives measured states
     it is as good as any gain; if n drives a state that is not measured a better one can exist, and
-    gamma can be out of reach.
-
-    Args:
-        plant: what is filtered.
-        gamma: bound on the H-infinity norm; inf is the Kalman filter.
+    gamma can be out of reach. With gamma = inf it is the Kalman filter.
 
     Raises:
         Unreachable: no lambda meets gamma; the message names the least gamma that one can.
@@ -84,11 +76,7 @@ def riccati(plant: Plant, gamma: norms.Number) -> Design:
 
 
 def least_riccati_gamma(plant: Plant) -> float:
-    """Least H-infinity norm of the Kalman gains for noise [w, sqrt(lambda) n], over all lambda.
-
-    Raises:
-        ValueError: as `kalman_gain`.
-    """
+    """Least H-infinity norm of the `inflated_gain` over all lambda."""
     return _least(plant)[-1]
 
 
@@ -171,8 +159,7 @@ def _grid(plant: Plant, K: np.ndarray) -> np.ndarray:
     S = plant.C @ P @ plant.C.T + plant.Dw @ plant.Dw.T
     noise = np.concatenate([np.diagonal(P), np.diagonal(S)])[:, None]
     error = np.vstack([plant.Bn, plant.Dn]) ** 2
-    seen = (noise > 0.0) & (error > 0.0)
-    share = np.where(seen, error / np.where(noise > 0.0, noise, 1.0), 0.0)
+    share = np.divide(error, noise, out=np.zeros_like(error), where=noise > 0.0)
     largest = float(np.max(share, initial=0.0))
     return 10.0**_DECADES / (largest or 1.0)
 
@@ -231,6 +218,7 @@ def _update(system: norms.System, P: np.ndarray) -> np.ndarray:
 
 
 def _sizes(rows: np.ndarray) -> np.ndarray:
+    """Norms of rows; one for a row of zeros."""
     size = np.linalg.norm(rows, axis=1)
     return np.where(size > 1e-150, size, 1.0)
 

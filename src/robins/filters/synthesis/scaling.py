@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from robins.filters.synthesis.design import FullOrder
 from robins.filters.synthesis.norms import Number
 from robins.filters.synthesis.plant import Plant
 
@@ -47,6 +48,11 @@ class Scales(NamedTuple):
     def gain(self, K: np.ndarray) -> np.ndarray:
         """Gain (n, m) in units of the plant."""
         return self.x[:, None] * K / self.y
+
+    def full_order(self, Ah: np.ndarray, Bh: np.ndarray, Gh: np.ndarray) -> FullOrder:
+        """Full-order filter in units of the plant."""
+        x = self.x
+        return Ah * x[:, None] / x, Bh * x[:, None] / self.y, Gh / x * self.z
 
     def h2(self, value: float) -> float:
         """H2 norm in units of the plant."""
