@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from robins import linalg, manifold
+from robins.errors import require
 from robins.filters.checks import finite_numbers
 from robins.filters.values import Numbers
 from robins.manifold import State
@@ -40,10 +41,9 @@ class Belief(NamedTuple):
         mean = jax.tree_util.tree_map(
             lambda leaf: jnp.asarray(finite_numbers("initial mean", leaf)), mean
         )
-        factor = linalg.factor(covariance, "initial covariance")
-        n = manifold.dim(mean)
-        if factor.shape != (n, n):
-            raise ValueError(f"initial covariance is {factor.shape}, the state needs ({n}, {n})")
+        factor, n = linalg.factor(covariance, "initial covariance"), manifold.dim(mean)
+        fits = factor.shape == (n, n)
+        require(fits, f"initial covariance is {factor.shape}, the state needs ({n}, {n})")
         return cls(mean, factor)
 
     @property

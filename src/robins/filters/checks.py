@@ -50,11 +50,10 @@ def matrix(
         raise ValueError(f"{what} is no matrix: its rows differ in length") from error
     if numbers.dtype.kind not in "iuf":
         raise TypeError(f"{what} holds {numbers.dtype}, real numbers are wanted")
-    if numbers.ndim != 2:
-        raise ValueError(f"{what} has shape {numbers.shape}, a matrix (rows of numbers) is wanted")
-    n, m = numbers.shape
-    wanted = (n if rows is None else rows, m if columns is None else columns)
-    require(numbers.shape == wanted, f"{what} is {numbers.shape}, must be {wanted}")
+    shape = numbers.shape
+    require(len(shape) == 2, f"{what} has shape {shape}, a matrix (rows of numbers) is wanted")
+    wanted = (shape[0] if rows is None else rows, shape[1] if columns is None else columns)
+    require(shape == wanted, f"{what} is {shape}, must be {wanted}")
     numbers = numbers.astype(float)
     if not np.isfinite(numbers).all():
         row, column = np.argwhere(~np.isfinite(numbers))[0]

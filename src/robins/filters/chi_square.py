@@ -21,14 +21,9 @@ def chi_square(probability: ArrayLike, dof: ArrayLike) -> np.ndarray:
 
 
 def limits(probability: ArrayLike, each: int = 1) -> np.ndarray:
-    """Quantiles by the number of components, for a rule to keep.
+    """(..., MOST + 1) quantiles for 0 to `MOST` components of ``each`` degrees of freedom.
 
-    Args:
-        probability: one, or a batch of them.
-        each: degrees of freedom of a component.
-
-    Returns:
-        (..., MOST + 1) for 0 to `MOST` components; infinity for none.
+    Infinity for no component; the leading axes are those of the probability.
     """
     dof = np.arange(each, each * MOST + 1, each)
     p = np.asarray(probability, float)[..., None]
@@ -47,10 +42,9 @@ def within(table: ArrayLike, residual: Array) -> Array:
 
 
 def chi2_band(dof: ArrayLike, count: int = 1, level: float = 0.95) -> np.ndarray:
-    """Two-sided band of the mean of ``count`` independent chi-square(dof) numbers.
+    """(..., 2) two-sided band of the mean of ``count`` independent chi-square(dof) numbers.
 
-    Returns:
-        (..., 2) lower and upper bound; divide by dof for a normalised statistic.
+    Divide by dof for a normalised statistic.
     """
     total = np.asarray(dof, dtype=float) * count
     tail = (1.0 - level) / 2.0

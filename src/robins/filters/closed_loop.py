@@ -142,12 +142,9 @@ def run_closed(
         time_s: (T,) time of each step [s], which errors then name.
 
     Raises:
-        Exception: as in `robins.filters.run`.
+        Exception: as in `robins.filters.run`, which also states the warnings.
         ValueError: ``due`` or a reading names no sensor of the model, or ``due`` is not as long as
             the rows.
-
-    Warns:
-        StepWarning: as in `robins.filters.run`.
     """
     steps = {jnp.shape(x)[0] for x in jax.tree_util.tree_leaves((loop.rows, loop.due))}
     require(len(steps) == 1, "rows and due of a loop must have one length", sorted(steps))

@@ -100,10 +100,7 @@ class ByJax:
 
 
 class ByProgram:
-    """A state in a memory, stepped by functions that the memory compiles for it.
-
-    The numbers of the filter and the model are folded into the programs.
-    """
+    """A state in a memory, which folds the numbers of filter and model into its programs."""
 
     is_numpy = True
 
@@ -152,13 +149,7 @@ class ByProgram:
 def on(
     machine: Machine | str, filter_: Filter, model: Model, state: FilterState
 ) -> ByJax | ByProgram:
-    """Place a state on a machine.
-
-    Args:
-        machine: "jax", "c", or a function that makes a memory.
-        filter_: the filter to step.
-        model: the motion and the sensors.
-        state: initial state.
+    """Place a state on a machine: "jax", "c", or a function that makes a memory.
 
     Raises:
         ValueError: there is no machine of this name.

@@ -58,9 +58,8 @@ class OnlineFilter:
         Raises:
             ValueError: there is no such machine.
             robins.program.BuildError: there is no C compiler.
-            robins.program.ProgramError: the state holds numbers that C cannot represent. An
-                operation without equivalent in C is refused by the call that needs it, with the
-                line of the model or the rule.
+            robins.program.ProgramError: the state holds numbers that C cannot represent; a call
+                raises it for an operation that C lacks, with the line of the model or the rule.
         """
         self.filter, self.model = filter_, model
         state = settled(filter_.init(start, model.dims) if isinstance(start, Belief) else start)
@@ -143,11 +142,7 @@ class OnlineFilter:
         """Sentences on reasons to doubt the last 400 updates of each sensor.
 
         Updates by `step` count where it keeps the whole `Step`. The probability of a false alarm is
-        that of one call.
-
-        Args:
-            bounds: as in `robins.filters.doubts`.
-            assumed: as in `robins.filters.doubts`.
+        that of one call. Arguments are those of `robins.filters.doubts`.
         """
         tally = Tally.blank(tuple(self._last))
         info, readings = {}, {}
@@ -163,10 +158,8 @@ class OnlineFilter:
     def look(self, question: Callable[..., T], *args: Data) -> T:
         """Return ``question(filter, model, state, *args)``, compiled; the state stays.
 
-        Args:
-            question: a pure function, the same object at every call, such as one that predicts to
-                another time than that of the next step.
-            args: pytrees of numbers.
+        The question is a pure function, the same object at every call, such as one that predicts to
+        another time than that of the next step.
         """
         return self._machine.look(question, *args)
 

@@ -67,10 +67,9 @@ def _by_sensor(model: Model, data: Data) -> dict[str, State]:
     if data is None:
         return {}
     if not isinstance(data, Mapping):
-        if len(model.sensors) != 1:
-            raise ValueError(
-                f"this model has {sorted(model.dims)}: give measurements as a dict by sensor name"
-            )
+        names = sorted(model.dims)
+        one = len(model.sensors) == 1
+        require(one, f"this model has {names}: give measurements as a dict by sensor name")
         data = {model.sensors[0].name: data}
     check_names(model, data)
     return {name: as_measurement(name, values) for name, values in data.items()}
@@ -89,11 +88,11 @@ def _check_lengths(y: Mapping[str, Data], u: Data, aux: Mapping[str, Data]) -> N
     lengths: dict[str, int] = {}
     for name, data in named.items():
         for leaf in jax.tree_util.tree_leaves(data):
-            if jnp.ndim(leaf) == 0:
-                raise ValueError(f"{name} holds a single number: a leading axis of time is wanted")
+            timed = jnp.ndim(leaf) > 0
+            require(timed, f"{name} holds a single number: a leading axis of time is wanted")
             lengths[name] = jnp.shape(leaf)[0]
-            if lengths[name] != next(iter(lengths.values())):
-                raise ValueError(f"measurements and inputs must have one length, got {lengths}")
+            same = len(set(lengths.values())) == 1
+            require(same, "measurements and inputs must have one length", lengths)
     require(u is not None or y, "nothing to run over: neither a measurement nor an input")
 
 
@@ -159,9 +158,9 @@ def run(
     Args:
         filter_: from `kalman` and its kin.
         model: the motion and the sensors.
-        start: belief before the first prediction, or the state a run ended with, to go on.
+        start: belief before the first prediction, or the final state of another run.
         y: measurements, (T, m) for a model of one sensor, else a dict by sensor name; NaN is
-            missing, per component. The motion comes first: row 0 is measured one step after start.
+            missing, per component. Row 0 is measured one step after start.
         u: input of the motion at each step, a pytree of arrays with leading axis T.
         aux: further inputs of sensors, by sensor name, leading axis T.
         keep: part of each `Step` to keep; long campaigns keep little.

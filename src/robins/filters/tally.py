@@ -43,28 +43,21 @@ class Tally(NamedTuple):
     @classmethod
     def blank(cls, sensors: Collection[str]) -> Tally:
         """Tally of no step."""
-        none = jnp.zeros(len(Code), int)
-        return cls(
-            none,
-            dict.fromkeys(sensors, none),
-            dict.fromkeys(sensors, jnp.zeros(())),
-            dict.fromkeys(sensors, jnp.zeros((), int)),
-        )
+        zeros = (jnp.zeros(len(Code), int), jnp.zeros(()), jnp.zeros((), int))
+        return cls(zeros[0], *(dict.fromkeys(sensors, zero) for zero in zeros))
 
     def and_step(self, prediction: Numbers, info: Mapping[str, StepInfo]) -> Tally:
         """Add a step: the code of its prediction, and its updates by sensor."""
         judged = {k: (i.dof > 0) & (i.code != int(Code.REFUSED)) for k, i in info.items()}
-        return Tally(
-            self.predictions + _one(prediction),
-            self.updates | {k: self.updates[k] + _one(i.code) for k, i in info.items()},
-            # A contradiction has an infinite NIS, but may use no component.
-            self.nis
-            | {
-                k: self.nis[k] + jnp.where(judged[k] | jnp.isinf(i.nis), i.nis, 0.0)
-                for k, i in info.items()
-            },
-            self.dof | {k: self.dof[k] + jnp.where(judged[k], i.dof, 0) for k, i in info.items()},
-        )
+        predictions = self.predictions + _one(prediction)
+        updates = {k: self.updates[k] + _one(i.code) for k, i in info.items()}
+        # A contradiction has an infinite NIS, but may use no component.
+        nis = {
+            k: self.nis[k] + jnp.where(judged[k] | jnp.isinf(i.nis), i.nis, 0.0)
+            for k, i in info.items()
+        }
+        dof = {k: self.dof[k] + jnp.where(judged[k], i.dof, 0) for k, i in info.items()}
+        return Tally(predictions, self.updates | updates, self.nis | nis, self.dof | dof)
 
     def looking(
         self, info: Mapping[str, tuple], readings: Mapping[str, State] | None = None
@@ -96,15 +89,14 @@ def _one(code: Numbers) -> Numbers:
 
 def not_taken(tally: Tally) -> list[str]:
     """Sentences on steps that were not taken and on contradictions."""
-    said = []
     counts = tally.counts()
     total = sum(counts.values())
-    for code, number in counts.items():
-        if code is not Code.DONE:
-            said.append(
-                f"{number} of {total} predictions are {code.name}: {SENTENCES[code]}. The belief "
-                "stays behind by these steps"
-            )
+    said = [
+        f"{number} of {total} predictions are {code.name}: {SENTENCES[code]}. The belief stays "
+        "behind by these steps"
+        for code, number in counts.items()
+        if code is not Code.DONE
+    ]
     for sensor in tally.updates:
         counts = tally.counts(sensor)
         total = sum(counts.values())

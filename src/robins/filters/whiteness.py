@@ -57,8 +57,7 @@ def looked(
             repeated readings.
     """
     e, sigma = np.asarray(innovation, float), np.asarray(sigma, float)
-    m = e.shape[-1]
-    out = np.zeros((*e.shape[:-2], m, 11))
+    out = np.zeros((*e.shape[:-2], e.shape[-1], 11))
     there = np.any(np.isfinite(e), axis=(*range(e.ndim - 2), -1))
     e, sigma = e[..., there, :], sigma[..., there, :]
     nis, dof = (np.asarray(x, float)[..., there] for x in (nis, dof))
@@ -71,19 +70,20 @@ def looked(
     product = w[..., 1:, :] * before
     late = slice(3 * w.shape[-2] // 4, None)
     used = np.isfinite(nis) & (dof > 0)
-    for column, value in (
-        (_COUNT, np.sum(product != 0.0, axis=-2)),
-        (_PRODUCT, np.sum(product, axis=-2)),
-        (_SQUARE, np.sum(product**2, axis=-2)),
-        (_SEEN, np.sum(w != 0.0, axis=-2)),
-        (_ABOVE, np.sum(w > 0.0, axis=-2)),
-        (_LATE, np.sum(w[..., late, :] != 0.0, axis=-2)),
-        (_LATE_ABOVE, np.sum(w[..., late, :] > 0.0, axis=-2)),
-        (_FAR, np.sum(np.abs(w[..., late, :]) >= CLIPPED, axis=-2)),
-        (_NIS, np.sum(np.where(used, nis, 0.0)[..., late], axis=-1)[..., None]),
-        (_DOF, np.sum(np.where(used, dof, 0.0)[..., late], axis=-1)[..., None]),
+    end = w[..., late, :]
+    for column, terms in (
+        (_COUNT, product != 0.0),
+        (_PRODUCT, product),
+        (_SQUARE, product**2),
+        (_SEEN, w != 0.0),
+        (_ABOVE, w > 0.0),
+        (_LATE, end != 0.0),
+        (_LATE_ABOVE, end > 0.0),
+        (_FAR, np.abs(end) >= CLIPPED),
     ):
-        out[..., column] = value
+        out[..., column] = np.sum(terms, axis=-2)
+    for column, terms in ((_NIS, nis), (_DOF, dof)):
+        out[..., column] = np.sum(np.where(used, terms, 0.0)[..., late], axis=-1)[..., None]
     if readings is not None:
         out[..., _REPEATS] = _repeats(readings, there, e, sigma)
     return out
@@ -163,13 +163,12 @@ def suspicions(looks: Mapping[str, ArrayLike], assumed: Collection[str] = ()) ->
     level = FALSE_ALARM / max(TESTS * components, 1)
     found = []
     for sensor, table in tables.items():
-        rows = table.reshape(-1, *table.shape[-2:])
         lasting = sensor in assumed
         tests = [_repeating, partial(_late, lasting=lasting)]
         if not lasting:
             tests += [_far, _following, _one_sided]
         for test in tests:
-            found += _sentence(sensor, rows, test, level)
+            found += _sentence(sensor, table.reshape(-1, *table.shape[-2:]), test, level)
     return found
 
 
@@ -181,11 +180,8 @@ def _sentence(sensor: str, rows: np.ndarray, test: Test, level: float) -> list[s
     """Sentence of one test of one sensor, on its strongest component and run."""
     found = []
     for table in rows:
-        by_component = [
-            (strength, index, words)
-            for index, row in enumerate(table)
-            for strength, words in test(row, level)
-        ]
+        judged = ((i, one) for i, row in enumerate(table) for one in test(row, level))
+        by_component = [(strength, index, words) for index, (strength, words) in judged]
         if by_component:
             found.append(max(by_component))
     # a few of very many runs fail by chance

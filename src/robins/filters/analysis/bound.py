@@ -153,11 +153,8 @@ def covariance_bound(
 ) -> Bound:
     """Covariance bound along a true trajectory; may be batched by `jax.vmap`.
 
-    Arguments are those of `linearised`, the factor of ``start`` being the prior, and of
+    Arguments and errors are those of `linearised`, the factor of ``start`` being the prior, and of
     `bound_along`.
-
-    Raises:
-        ValueError: lengths differ, or a component that is known does not exist.
     """
     return bound_along(linearised(model, start, truth, y, u, aux), start.factor, use, known)
 

@@ -57,12 +57,7 @@ def grand_mean_nis(nis: np.ndarray, dof: np.ndarray, level: float = 0.95) -> Ver
 
     Innovations of a consistent filter are white, so their sum over time is chi-square too; this is
     the sharpest single test of R and Q. Steps without measurement (dof = 0) do not count; an
-    infinite NIS, that of a contradiction, does.
-
-    Args:
-        nis: any shape.
-        dof: the same shape, degrees of freedom used.
-        level: of the two-sided band.
+    infinite NIS, that of a contradiction, does. `level` is of the two-sided band.
 
     Raises:
         ValueError: the shapes differ, or the level is not between 0 and 1.
@@ -109,13 +104,9 @@ def anees(values: np.ndarray, n: int, level: float = 0.95) -> tuple[np.ndarray, 
 
 
 def whitened_innovations(info: StepInfo) -> Float[Array, "t m"]:
-    """Innovations in units of their predicted spread, uncorrelated if the filter is right.
+    """(T, m) innovations of a sensor in units of their predicted spread; NaN where not used.
 
-    Args:
-        info: of one sensor over a run (leading axis T).
-
-    Returns:
-        (T, m), NaN where not used.
+    They are uncorrelated if the filter is consistent.
     """
 
     def one(residual, factor, used):

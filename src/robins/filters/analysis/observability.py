@@ -52,14 +52,11 @@ def observability(
 ) -> Array:
     """Factors L of (I + W)^-1 after every step of a run; may be batched by `jax.vmap`.
 
-    Arguments are those of `robins.filters.analysis.bound.linearised`, the standard deviations of
-    ``start`` being the units, and of `observability_along`.
+    Arguments and errors are those of `robins.filters.analysis.bound.linearised`, the standard
+    deviations of ``start`` being the units, and of `observability_along`.
 
     Returns:
         (E, n, n); `bits`, `gramian` and `spectrum` read it.
-
-    Raises:
-        ValueError: lengths differ, or a window is shorter than a step.
     """
     line = linearised(model, start, truth, y, u, aux)
     return observability_along(line, start.sigma, use, window)
@@ -124,7 +121,7 @@ def spectrum(L: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
 
     Raises:
         TypeError: L is not of real numbers.
-        ValueError: L is not square, or not finite, as after an overflow: give windows then.
+        ValueError: L is not square, or not finite, as after an overflow.
     """
     vectors, left, _ = np.linalg.svd(square("L", L))
     with np.errstate(divide="ignore"):

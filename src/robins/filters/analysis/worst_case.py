@@ -38,13 +38,8 @@ from robins.manifold import State
 def existence_margin(belief: Belief, weight: Weight, gamma: Number) -> Float[Array, ""]:
     """Least eigenvalue of ``P^-1 - gamma^-2 L'L``: positive where an H-infinity filter exists.
 
-    Args:
-        belief: after the measurement; batch with `jax.vmap`.
-        weight: L as `h_infinity` takes it.
-        gamma: bound; inf for the least eigenvalue of the information.
-
-    Returns:
-        In units of P^-1; NaN where P is singular.
+    In units of P^-1, of the belief after the measurement; NaN where P is singular. Batch with
+    `jax.vmap`. `weight` is L as `h_infinity` takes it.
 
     Raises:
         TypeError: gamma is not one real number.
@@ -89,7 +84,7 @@ def gamma_min(
     require(rtol >= 1e-12, "rtol must be 1e-12 or more, for numbers have no more digits", rtol)
     of = partial(h_infinity, weight=weight, estimate=estimate, count_missing=count_missing)
 
-    def bounds(step):
+    def bounds(step: Step) -> Array:
         last = [info.notes["h_infinity.bound"] for info in step.info.values()][-1:]
         counts = count_missing | _used(step.info)
         return jnp.where(counts, jnp.max(jnp.array(last), initial=0.0), 0.0)
@@ -139,7 +134,7 @@ def error_operator(
 
     Args:
         S0: (n, p) factor of the initial covariance.
-        F: (T, n, n) transitions into each step.
+        F: (T, n, n) transitions.
         G: (T, n, q) factors of the process noise.
         channels: sensors in the order in which they update.
         weight: (T, r, n) rows L of each step; zero rows do not count.
@@ -293,14 +288,9 @@ def _matrices(
 def steady_kalman(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> SteadyHInfinity:
     """Steady gain and covariances of the Kalman filter of a time-invariant system.
 
-    For x' = F x + w, y = H x + v, by the discrete algebraic Riccati equation (DARE), accurate to
-    the last digits also with very different units (`robins.filters.synthesis.kalman_gain`).
-
-    Args:
-        F: (n, n) transition.
-        Q: (n, n) process noise covariance.
-        H: (m, n).
-        R: (m, m) measurement noise covariance.
+    For x' = F x + w, y = H x + v with noise covariances Q and R, by the discrete algebraic Riccati
+    equation (DARE), accurate to the last digits also with very different units
+    (`robins.filters.synthesis.kalman_gain`).
 
     Raises:
         TypeError: a matrix is not of real numbers.
