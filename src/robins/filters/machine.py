@@ -28,7 +28,7 @@ Codes = tuple[Numbers, dict[str, Numbers]]  # of a step: of its prediction, and 
 class Memory(Protocol):
     """Memory of a state that compiles functions of it, such as `robins.program.Memory`."""
 
-    state: FilterState
+    state: Data
 
     def step(
         self, name: Hashable, function: Callable[..., tuple[FilterState, T]], *args: Data

@@ -44,7 +44,8 @@ class Tally(NamedTuple):
     def blank(cls, sensors: Collection[str]) -> Tally:
         """Tally of no step."""
         zeros = (jnp.zeros(len(Code), int), jnp.zeros(()), jnp.zeros((), int))
-        return cls(zeros[0], *(dict.fromkeys(sensors, zero) for zero in zeros))
+        updates, nis, dof = (dict.fromkeys(sensors, zero) for zero in zeros)
+        return cls(zeros[0], updates, nis, dof)
 
     def and_step(self, prediction: Numbers, info: Mapping[str, StepInfo]) -> Tally:
         """Add a step: the code of its prediction, and its updates by sensor."""

@@ -147,11 +147,11 @@ def unobservable(values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return basis / np.linalg.norm(basis, axis=0)
 
 
-def worded(vector: np.ndarray, names: Sequence[str], most: int = 4) -> str:
+def worded(vector: np.ndarray, names: Sequence[str]) -> str:
     """Composition of a direction: "82 % heading against 17 % gyro bias z".
 
     The shares are squares of the components, in units of the prior; "with" joins states of one
-    sign, "against" of opposite ones. States of less than 1 % are left out.
+    sign, "against" of opposite ones. At most four states are named, none of less than 1 %.
 
     Raises:
         ValueError: it has not a number for each name, or is no direction: zero, or not finite.
@@ -161,7 +161,7 @@ def worded(vector: np.ndarray, names: Sequence[str], most: int = 4) -> str:
     require(fits, f"a vector of shape {shape} has not a number for each of {len(names)} names")
     length = float(np.linalg.norm(vector))
     require(0.0 < length < np.inf, "no direction: the length of the vector is", length)
-    order = np.argsort(-np.round(np.abs(vector), 9), kind="stable")[:most]  # ties keep their order
+    order = np.argsort(-np.round(np.abs(vector), 9), kind="stable")[:4]  # ties keep their order
     text = ""
     for i in order:
         share = 100.0 * vector[i] ** 2 / float(np.sum(vector**2))

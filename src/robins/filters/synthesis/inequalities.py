@@ -8,7 +8,7 @@ those of an observer.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -102,10 +102,10 @@ def _gain(cp: ModuleType, plant: Blocks, corner: Expr, X: Expr, G: Expr, Y: Expr
     )
 
 
-def _symmetric(cp: ModuleType, *rows: list[Expr]) -> Expr:
+def _symmetric(cp: ModuleType, *rows: Sequence[Any]) -> Expr:
     """Block matrix by the blocks on and above its diagonal; 0 stands for a zero block."""
     size = [row[0].shape[0] for row in rows]
-    whole = [[None] * len(rows) for _ in rows]
+    whole: list[list[Any]] = [[None] * len(rows) for _ in rows]
     for i, row in enumerate(rows):
         for j, block in enumerate(row, start=i):
             entry = np.zeros((size[i], size[j])) if isinstance(block, int) else block

@@ -17,7 +17,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import scipy.optimize
@@ -69,16 +69,12 @@ def _attempt(
         failed: list[str] = []
         for read in readings:
             found = read(answer, scales)
+            fields: dict[str, Any] = {"bound": _bound(answer, scales), "status": answer.status}
+            fields |= {"gamma": gamma, "seconds": time.perf_counter() - began}
             try:
-                return (certify_full if isinstance(found, tuple) else certify)(
-                    plant,
-                    found,
-                    method=method,
-                    gamma=gamma,
-                    bound=_bound(answer, scales),
-                    status=answer.status,
-                    seconds=time.perf_counter() - began,
-                )
+                if isinstance(found, tuple):
+                    return certify_full(plant, found, method=method, **fields)
+                return certify(plant, found, method=method, **fields)
             except NotCertified as error:
                 failed.append(str(error))
         failures.append("; in the limit of R -> 0: ".join(failed))

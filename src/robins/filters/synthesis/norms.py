@@ -20,7 +20,9 @@ Number = float | int  # an int is no float at run time
 System = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # A, B, C, D
 
 _CIRCLE = 1e-6  # largest distance of an eigenvalue from the unit circle that may be a crossing
+_RTOL = 1e-11  # of the H-infinity norm by levels
 _STARTS = 65  # even samples of the half circle that begin a search
+_POINTS = 200  # even samples of the half circle in a sweep
 _LARGEST = 1e70  # whose fourth power is a number
 _SQUARINGS = 64  # of A: a radius of 1 - eps needs 58
 
@@ -74,9 +76,7 @@ def h2_norm(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = 
     return float(np.sqrt(max(float(power), 0.0) + direct))
 
 
-def hinf_norm(
-    A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = None, rtol: Number = 1e-11
-) -> float:
+def hinf_norm(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = None) -> float:
     """Greatest singular value of C (zI - A)^-1 B + D on the unit circle, by level tests.
 
     A level is reached where the symplectic pencil of the level has an eigenvalue on the circle
@@ -86,7 +86,7 @@ def hinf_norm(
     below |D| + 2 sum(s) of the Hankel singular values s.
 
     Returns:
-        The norm, from above and within rtol of a response; inf unless A is stable.
+        The norm, from above and within 1e-11 of a response; inf unless A is stable.
     """
     A, B, C, D = _system(A, B, C, D)
     if spectral_radius(A) >= 1.0:
@@ -94,7 +94,7 @@ def hinf_norm(
     levels = Levels.of(A, B, C, D)
     lower = levels.lower
     while lower > 0.0 and lower < levels.upper:
-        above = lower * (1.0 + rtol)
+        above = lower * (1.0 + _RTOL)
         if (highest := levels.highest(above)) < above:
             return above
         lower = highest
@@ -173,13 +173,11 @@ def meets(A: np.ndarray, B: np.ndarray, C: np.ndarray, gamma: Number) -> bool:
     return bool(np.isinf(gamma)) or not Levels.of(A, B, C).reached(gamma)
 
 
-def peak_gain(
-    A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = None, points: int = 200
-) -> float:
+def peak_gain(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = None) -> float:
     """Greatest gain found by a sweep of the frequency: never more than the H-infinity norm.
 
     The circle is sampled evenly, more densely about the angle of each eigenvalue, and then
-    repeatedly about the highest peaks; `points` is the number of even samples of the half circle.
+    repeatedly about the highest peaks.
     """
     A, B, C, D = _system(A, B, C, D)
     values = np.linalg.eigvals(A)
@@ -188,7 +186,7 @@ def peak_gain(
     widths = np.maximum(1.0 - np.abs(values), 1e-15)[:, None] * np.logspace(-1.5, 2.0, 15)
     angles = np.angle(values)[:, None]
     about = np.concatenate([angles, angles - widths, angles + widths], axis=1).ravel()
-    angle = np.concatenate([np.linspace(0.0, np.pi, points), np.abs(about)])
+    angle = np.concatenate([np.linspace(0.0, np.pi, _POINTS), np.abs(about)])
     angle = np.unique(angle[angle <= np.pi])
 
     def gains(angle: np.ndarray) -> np.ndarray:

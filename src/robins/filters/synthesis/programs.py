@@ -80,7 +80,7 @@ def solve(plant: Plant, form: Form, aim: Aim) -> Answer:
         status = str(program.problem.status)
         if any(value is None or not np.isfinite(value).all() for value in found.values()):
             return Answer(status, np.nan, {})
-        return Answer(status, float(program.problem.value), found)
+        return Answer(status, float(program.problem.value), found)  # type: ignore[arg-type]
 
 
 @lru_cache(maxsize=64)
