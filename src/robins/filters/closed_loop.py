@@ -131,18 +131,10 @@ def run_closed(
     """Run a filter in a loop: for each step the world reacts to the belief, then the filter
     predicts with the reading's input and updates with each sensor.
 
-    With the readings as its data, `run` gives the same estimates, to rounding.
-
-    Args:
-        filter_: from `kalman` and its kin.
-        model: the motion and the sensors.
-        start: belief before the first step, or a state of the filter.
-        loop: the world.
-        keep: part of each step to keep.
-        time_s: (T,) time of each step [s], which errors then name.
+    With the readings as its data, `run` gives the same estimates, to rounding. The arguments but
+    for the loop, errors and warnings are also those of `run`.
 
     Raises:
-        Exception: as in `robins.filters.run`, which also states the warnings.
         ValueError: ``due`` or a reading names no sensor of the model, or ``due`` is not as long as
             the rows.
     """

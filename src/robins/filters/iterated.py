@@ -71,8 +71,8 @@ def iterated(linearise: Linearisation | None = None, iterations: int = 4) -> Lin
     """Linearisation of a measurement about its own update.
 
     With Taylor this is the iterated extended Kalman filter, Gauss-Newton on the posterior density
-    (Bell & Cathey 1993, eq. 12), whose fixed point is the most probable state. In the tangent space
-    of the prior mean m, with g(e) = h(retract(m, e)) and H_i its slope at e_i,
+    (Bell & Cathey 1993, eq. 12), with the most probable state as fixed point. In the tangent space
+    of the prior mean m, with g(e) = h(retract(m, e)) and H_i its Jacobian at e_i,
 
         e_i+1 = K_i (y - g(e_i) + H_i e_i),        K_i = P H_i' (H_i P H_i' + R)^-1
 

@@ -100,7 +100,7 @@ class ByJax:
 
 
 class ByProgram:
-    """A state in a memory, which folds the numbers of filter and model into its programs."""
+    """`ByJax` with a memory, which folds the numbers of filter and model into its programs."""
 
     is_numpy = True
 
@@ -111,7 +111,6 @@ class ByProgram:
 
     @property
     def state(self) -> FilterState:
-        """The filter's state; may be assigned."""
         return self._memory.state
 
     @state.setter
@@ -119,16 +118,12 @@ class ByProgram:
         self._memory.state = state
 
     def predict(self, u: Data) -> Prediction:
-        """Move on by one step."""
-
         def predicted(state: FilterState, u: Data) -> tuple[FilterState, Prediction]:
             return self._filter.predict(state, self._model.motion, u)
 
         return self._memory.step("predict", predicted, u)
 
     def update(self, name: str, y: Data, aux: Data) -> StepInfo:
-        """Use a measurement of a sensor."""
-
         def updated(state: FilterState, y: Data, aux: Data) -> tuple[FilterState, StepInfo]:
             return self._filter.update(state, self._model.sensor(name), y, aux)
 
@@ -137,12 +132,10 @@ class ByProgram:
     def step(
         self, u: Data, y: Mapping[str, Data], aux: Mapping[str, Data], keep: Callable[[Step], T]
     ) -> tuple[T, Codes]:
-        """Take a whole step; return the part that is kept, and the codes."""
         stepped = partial(_stepped, self._filter, self._model, keep=keep)
         return self._memory.step(("step", keep), stepped, u, y, aux)
 
     def look(self, question: Callable[..., T], *args: Data) -> T:
-        """Return ``question(filter, model, state, *args)``."""
         return self._memory.look(question, partial(question, self._filter, self._model), *args)
 
 

@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 from jax.tree_util import tree_map
 
+from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.machine import Machine, on, settled
@@ -114,23 +115,17 @@ class OnlineFilter:
         return kept
 
     def update(self, y: Data, sensor: str | None = None, aux: Data = None) -> StepInfo:
-        """Use a measurement.
-
-        Args:
-            y: the measurement; NaN is missing, per component.
-            sensor: name of the sensor; optional where the model has one.
-            aux: further inputs of the sensor.
+        """Use a measurement of a sensor, optional where the model has one; NaN is missing.
 
         Raises:
             KeyError: the model has no sensor of this name.
             TypeError: the measurement is not of real numbers.
-            ValueError: no name was given and the model has several sensors, or the measurement has
-                the wrong shape.
+            ValueError: the name is missing, or the measurement has the wrong shape.
         """
         if sensor is None:
-            if len(self.model.sensors) != 1:
-                raise ValueError(f"name one of the sensors {sorted(self.model.dims)}")
-            sensor = self.model.sensors[0].name
+            names = sorted(self.model.dims)
+            require(len(names) == 1, f"name one of the sensors {names}")
+            (sensor,) = names
         self.model.sensor(sensor)
         numbers = (as_real if self._machine.is_numpy else as_measurement)(sensor, y)
         info = self._machine.update(sensor, numbers, aux)

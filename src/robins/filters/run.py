@@ -151,9 +151,8 @@ def run(
 ) -> Solution:
     """Run a filter over measurements: for each step k predict, then update with row k of y.
 
-    One compiled scan: batch with `jax.vmap` over any of the data, differentiate with `jax.grad`.
-    Runs share a compiled program if only numbers differ: functions of the user and `keep` must be
-    the same objects, data of the same shapes.
+    One compiled scan, for `jax.vmap` over any of the data and for `jax.grad`. Runs share a compiled
+    program if functions of the user and `keep` are the same objects, and shapes are equal.
 
     Args:
         filter_: from `kalman` and its kin.
@@ -167,15 +166,13 @@ def run(
         time_s: (T,) time of each step [s], which errors then name.
 
     Raises:
-        Exception: report of the filter (`Filter.report`); not in transformed or compiled code,
-            where only the codes of the steps state it.
+        Exception: report of the filter (`Filter.report`); in transformed code see the codes.
         TypeError: a measurement is not a real number.
-        ValueError: lengths differ, a measurement names no sensor of the model or is not of the
-            shape that its sensor reads.
+        ValueError: lengths differ, or a measurement names no sensor or has another shape than it.
 
     Warns:
         StepWarning: steps were not taken, or measurements contradict what is known exactly; in
-            transformed code only `Solution.tally` counts them.
+            transformed code see `Solution.tally`.
     """
     measurements = _by_sensor(model, y)
     extra = dict(aux or {})

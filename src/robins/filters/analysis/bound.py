@@ -83,8 +83,8 @@ def linearised(
 ) -> Linearised:
     """Linearise a model about a true trajectory.
 
-    The transition of step k is taken at the true state before it and with its input, for the first
-    step at the mean of the start; the sensors at ``truth[k]``.
+    The transition of step k is taken at the true state before it, of the first step at the mean of
+    the start; the sensors at ``truth[k]``.
 
     Args:
         model: the motion and the sensors.

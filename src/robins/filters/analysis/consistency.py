@@ -75,7 +75,7 @@ def grand_mean_nis(nis: np.ndarray, dof: np.ndarray, level: float = 0.95) -> Ver
 
 
 def anees(values: np.ndarray, n: int, level: float = 0.95) -> tuple[np.ndarray, np.ndarray, float]:
-    """Average NEES over runs at each epoch, normalised by n.
+    """Average NEES over runs at each epoch, normalised by the state dimension n.
 
     Args:
         values: (runs, T) NEES.
@@ -83,11 +83,10 @@ def anees(values: np.ndarray, n: int, level: float = 0.95) -> tuple[np.ndarray, 
         level: of the two-sided band.
 
     Returns:
-        (T,) average NEES over n, its band (2,), and the share of epochs inside the band.
+        (T,) averages, their band (2,), and the share of epochs inside the band.
 
     Raises:
-        ValueError: the values are not (runs, T), there is none, n is below one, or the level is not
-            between 0 and 1.
+        ValueError: the values are not (runs, T), there is none, or n or the level is out of range.
     """
     values = np.asarray(values, dtype=float)
     require(
@@ -125,8 +124,8 @@ def whiteness(series: np.ndarray, lags: int = 20, level: float = 0.95) -> Verdic
         level: of the one-sided bound.
 
     Raises:
-        ValueError: it is not one row of numbers, has fewer than three times as many samples as
-            lags or all of them the same, there is no lag, or the level is not between 0 and 1.
+        ValueError: it is not (T,), has fewer than three samples a lag or equal ones, or the lags or
+            the level is out of range.
     """
     x = np.asarray(series, dtype=float)
     require(x.ndim == 1, "whiteness takes one series, (T,)", x.shape)

@@ -43,8 +43,7 @@ def existence_margin(belief: Belief, weight: Weight, gamma: Number) -> Float[Arr
 
     Raises:
         TypeError: gamma is not one real number.
-        ValueError: it is not positive (unchecked in compiled code), or L has the wrong number of
-            columns.
+        ValueError: it is not positive, outside of compiled code, or L has not n columns.
     """
     if not isinstance(gamma, Tracer):
         positive("gamma", gamma, "the Kalman filter")
@@ -130,20 +129,16 @@ def error_operator(
     weight: np.ndarray,
     gain_on: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Matrix from initial error and noises, each of unit weight, to the errors L e of a run.
+    """Matrix (T r, p + T (q + k)) from initial error and noises of unit weight to the errors L e.
 
     Args:
         S0: (n, p) factor of the initial covariance.
         F: (T, n, n) transitions.
         G: (T, n, q) factors of the process noise.
-        channels: sensors in the order in which they update.
+        channels: sensors in the order in which they update; k sums their noises.
         weight: (T, r, n) rows L of each step; zero rows do not count.
         gain_on: (T, n, n) counts the error *before* the measurement, and multiplies the correction
-            by the measurements from which the filter predicts. By default the error after the
-            measurement counts.
-
-    Returns:
-        (T r, p + T (q + k)), k summed over the channels.
+            from which the filter predicts. By default the error after the measurement counts.
     """
     T, n, q = G.shape
     width = q + sum(c.W.shape[2] for c in channels)
@@ -239,16 +234,12 @@ def _linearised(
     return np.asarray(start.factor), np.asarray(F), np.asarray(G), channels, L
 
 
-def _unit(mean: State) -> Belief:
-    """Belief of unit covariance, so that a spread is the Jacobian."""
-    return Belief(mean, jnp.eye(manifold.dim(mean)))
-
-
 @jax.jit
 @partial(jax.vmap, in_axes=(None, 0, 0))
 def _motion_along(motion: Motion, mean: State, u: Data) -> tuple[Array, Array]:
     """Transitions and noise factors at the means before the steps."""
-    t = taylor().transition(_unit(mean), motion, u)
+    unit = jnp.eye(manifold.dim(mean))  # so that a spread is the Jacobian
+    t = taylor().transition(Belief(mean, unit), motion, u)
     return t.spread, t.noise
 
 
@@ -259,7 +250,7 @@ def _sensor_along(
 ) -> tuple[Array, Array, State]:
     """Jacobians and noise factors of a sensor, and the means after its updates."""
     z = sensor.read(mean, aux) if sensor.linear is None else sensor.linear(mean, aux)[0]
-    o = taylor().observation(_unit(mean), sensor, z, aux)
+    o = taylor().observation(Belief(mean, jnp.eye(manifold.dim(mean))), sensor, z, aux)
     residual = jnp.where(info.used, info.innovation, 0.0)
     return o.spread, o.noise, manifold.retract(mean, info.gain @ residual)
 

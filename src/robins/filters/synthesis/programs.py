@@ -53,12 +53,10 @@ class Program(NamedTuple):
 
 
 def solve(plant: Plant, form: Form, aim: Aim) -> Answer:
-    """Solve a design's program for one plant, whose numbers should be of order one.
+    """Solve a design program: "common" is (9) and (10), "slack" their slack form, "full" (6), (7).
 
-    Args:
-        plant: scaled such that the gain from n to z may be 1 (`robins.filters.synthesis.scaling`).
-        form: "common" for (9) and (10), "slack" for their slack form, "full" for (6) and (7).
-        aim: least Trace(H), with or without the channel of n.
+    Numbers of the plant should be of order one, and the gain from n to z at most 1
+    (`robins.filters.synthesis.scaling`).
 
     Raises:
         MissingExtra: cvxpy or Clarabel is not installed.

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from robins.errors import require
 from robins.filters.synthesis import lmi
 from robins.filters.synthesis.closed_form import closed_form, isotropic
 from robins.filters.synthesis.design import Design, NotCertified, Unreachable
@@ -67,12 +68,9 @@ def trade_off(
 ) -> TradeOff:
     """Design by every method for every gamma; the answer includes failures.
 
-    Args:
-        plant: plant of the filter.
-        gammas: bounds on the H-infinity norm; by default six, from nine tenths of the Kalman
-            filter's own down to the least, or a tenth of the Kalman filter's.
-        methods: some of `METHODS`.
-        progress: called with the number done, the total and the name of the next.
+    By default there are six gammas, from nine tenths of the Kalman filter's own norm down to the
+    least, or a tenth of the Kalman filter's. `progress` gets the number done, the total and the
+    name of the next.
 
     Raises:
         Unreachable: all gammas are below the proved least one.
@@ -81,10 +79,10 @@ def trade_off(
     """
     for gamma in () if gammas is None else gammas:
         check_gamma(gamma)
-        if not np.isfinite(gamma):
-            raise ValueError("gamma must be finite here; without a bound it is the Kalman filter")
-    if unknown := [name for name in methods if name not in METHODS]:
-        raise ValueError(f"no method {unknown[0]!r}; there are {', '.join(METHODS)}")
+        finite = np.isfinite(gamma)
+        require(finite, "gamma must be finite here; without a bound it is the Kalman filter")
+    for name in methods:
+        require(name in METHODS, f"no method {name!r}; there are {', '.join(METHODS)}")
     notify = progress or (lambda done, total, what: None)
     notify(0, 1, "least gamma")
     kalman = kalman_design(plant)
