@@ -51,10 +51,10 @@ class Iterated(Linearisation):
     ) -> Observation:
         """Observation from the prior, linearised about retract(m, S t) over S M."""
         mean, S = _carried(prior, t)
-        seen = self.way.observation(Belief(mean, S @ M), sensor, y, aux)
-        spread = linalg.solve_lower_transposed(M, seen.spread.T).T
-        residual = jnp.where(seen.present, seen.residual + spread @ t, 0.0)
-        return seen._replace(prior=prior, residual=residual, spread=spread)
+        o = self.way.observation(Belief(mean, S @ M), sensor, y, aux)
+        spread = linalg.solve_lower_transposed(M, o.spread.T).T
+        residual = jnp.where(o.present, o.residual + spread @ t, 0.0)
+        return o._replace(prior=prior, residual=residual, spread=spread)
 
 
 def _updated(o: Observation, by_slope: bool) -> tuple[Array, Array]:

@@ -92,7 +92,7 @@ def not_taken(tally: Tally) -> list[str]:
     """Sentences on steps that were not taken and on contradictions."""
     counts = tally.counts()
     total = sum(counts.values())
-    said = [
+    found = [
         f"{number} of {total} predictions are {code.name}: {SENTENCES[code]}. The belief stays "
         "behind by these steps"
         for code, number in counts.items()
@@ -101,12 +101,12 @@ def not_taken(tally: Tally) -> list[str]:
     for sensor in tally.updates:
         counts = tally.counts(sensor)
         total = sum(counts.values())
-        said += [
+        found += [
             f"{number} of {total} updates with '{sensor}' are {code.name}: {SENTENCES[code]}"
             for code, number in counts.items()
             if code in FAILURES
         ]
-    return said
+    return found
 
 
 def doubts(tally: Tally, bounds: bool = False, assumed: Collection[str] = ()) -> list[str]:
@@ -126,27 +126,27 @@ def doubts(tally: Tally, bounds: bool = False, assumed: Collection[str] = ()) ->
         assumed: sensors with cautious noise: neither a small NIS nor the side and order of
             innovations are tested.
     """
-    said = not_taken(tally)
+    found = not_taken(tally)
     for sensor in tally.updates:
         counts = tally.counts(sensor)
         refused = counts.get(Code.REFUSED, 0)
         measured = sum(counts.values()) - counts.get(Code.MISSING, 0)
         if measured >= FEWEST and refused > REFUSED_SHARE * measured:
-            said.append(
+            found.append(
                 f"{refused} of {measured} measurements of '{sensor}' were refused: look at the "
                 "noise of the sensor and of the motion, and at the initial state"
             )
         apart = counts.get(Code.APART, 0)
         if measured >= FEWEST and apart > APART_SHARE * measured:
-            said.append(
+            found.append(
                 f"the local filter of '{sensor}' and another one differed by more than 5 standard "
                 f"deviations at {apart} of {measured} measurements: a sensor of one of them may "
                 "have an error that the model leaves out"
             )
         nis, dof = float(np.sum(tally.nis[sensor])), int(np.sum(tally.dof[sensor]))
         if not bounds and dof >= FEWEST:
-            said += _off(sensor, nis / dof, dof, sensor in assumed)
-    return said + suspicions(tally.looks, assumed)
+            found += _off(sensor, nis / dof, dof, sensor in assumed)
+    return found + suspicions(tally.looks, assumed)
 
 
 def _off(sensor: str, ratio: float, dof: int, cautious: bool) -> list[str]:
@@ -172,5 +172,5 @@ def warn_not_taken(tally: Tally) -> None:
     Warns:
         StepWarning: there are such steps; the message counts them by outcome.
     """
-    if said := not_taken(tally):
-        warnings.warn("; ".join(said), StepWarning, stacklevel=4)
+    if found := not_taken(tally):
+        warnings.warn("; ".join(found), StepWarning, stacklevel=4)

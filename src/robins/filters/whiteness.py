@@ -210,16 +210,16 @@ def _following(row: np.ndarray, level: float) -> Findings:
 
 
 def _one_sided(row: np.ndarray, level: float) -> Findings:
-    for seen, above, when in (
+    for count, above, when in (
         (row[_SEEN], row[_ABOVE], "of all"),
         (row[_LATE], row[_LATE_ABOVE], "of the last quarter"),
     ):
-        most = max(above, seen - above)
-        if seen >= FEWEST and most > max(_binomial(seen, level / 2.0), ONE_SIDE * seen):
-            z = (2.0 * most - seen) / np.sqrt(seen)
+        most = max(above, count - above)
+        if count >= FEWEST and most > max(_binomial(count, level / 2.0), ONE_SIDE * count):
+            z = (2.0 * most - count) / np.sqrt(count)
             yield (
                 z,
-                f"has {most:.0f} {when} its {seen:.0f} innovations on one side, by {z:.1f} "
+                f"has {most:.0f} {when} its {count:.0f} innovations on one side, by {z:.1f} "
                 "sigma more than chance: the sensor or the motion may have an error that the "
                 "model leaves out; look at its bias, its units and its axes",
             )

@@ -64,6 +64,11 @@ class Sight(NamedTuple):
             size=self.size + jnp.abs(self.H) @ belief.sigma,
         )
 
+    def updated_factor(self, factor: Array, use: Array) -> Array:
+        """Factor of the error after one step of it."""
+        o = self.seen_with(factor, use)
+        return updated(o.prior, o, "sqrt")[0].factor
+
 
 class Linearised(NamedTuple):
     """Model along a trajectory, leading axis E."""
@@ -186,8 +191,7 @@ def bound_along(
         S = predicted
         for i, sight in enumerate(row.sights):
             if sight is not None:
-                seen = sight.seen_with(S, use[i])
-                S = updated(seen.prior, seen, "sqrt")[0].factor
+                S = sight.updated_factor(S, use[i])
         return S, Bound(predicted, S)
 
     return jax.lax.scan(step, _conditioned(factor, known), line)[1]
@@ -200,5 +204,4 @@ def _conditioned(factor: Array, known: tuple[int, ...]) -> Array:
     rows = jnp.eye(factor.shape[0])[np.array(known)]
     m = len(known)
     exact = Sight(rows, jnp.zeros((m, 0)), jnp.ones(m, bool), jnp.zeros(m))
-    seen = exact.seen_with(factor, jnp.ones((), bool))
-    return updated(seen.prior, seen, "sqrt")[0].factor
+    return exact.updated_factor(factor, jnp.ones((), bool))

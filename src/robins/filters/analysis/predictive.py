@@ -65,7 +65,7 @@ def scale(m: int) -> float:
     return float(optimize.root_scalar(excess, bracket=(0.9, 1.01), xtol=1e-12).root)
 
 
-def log_density(seen: Normalised) -> Float[Array, ""]:
+def log_density(innovation: Normalised) -> Float[Array, ""]:
     """Log density of an innovation z of dimension m with covariance S.
 
     A normal density, contaminated by a share e of outliers of k times the size (Tukey 1960):
@@ -75,12 +75,12 @@ def log_density(seen: Normalised) -> Float[Array, ""]:
     A normal density would let one outlier outweigh all else; leaving outliers out would reward
     their number. `scale` gives c_m, with which the true S scores best where z is normal.
     """
-    m = seen.dof.astype(float)
-    c = jnp.asarray([scale(n) for n in range(len(seen.used) + 1)])[seen.dof]
-    nis = seen.nis / c**2
+    m = innovation.dof.astype(float)
+    c = jnp.asarray([scale(n) for n in range(len(innovation.used) + 1)])[innovation.dof]
+    nis = innovation.nis / c**2
     normal = math.log1p(-OUTLIERS) - 0.5 * nis
     wide = math.log(OUTLIERS) - m * math.log(WIDER) - 0.5 * nis / WIDER**2
-    spread = linalg.log_diagonal(seen.factor, seen.used) + m * jnp.log(c)
+    spread = linalg.log_diagonal(innovation.factor, innovation.used) + m * jnp.log(c)
     return jnp.logaddexp(normal, wide) - spread - 0.5 * m * math.log(2.0 * math.pi)
 
 
@@ -100,11 +100,11 @@ class Scored(Filter):
 
     @jax.jit
     def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None):
-        seen = normalised(taylor().observation(state.belief, sensor, y, aux))
-        there = seen.dof > 0
-        density = jnp.where(there, jnp.where(state.current, log_density(seen), -jnp.inf), 0.0)
+        innovation = normalised(taylor().observation(state.belief, sensor, y, aux))
+        there = innovation.dof > 0
+        density = jnp.where(there, jnp.where(state.current, log_density(innovation), -jnp.inf), 0.0)
         new, info = self.inner.update(state, sensor, y, aux)
-        return new, info.noted(_RULE, log_density=density, components=seen.dof)
+        return new, info.noted(_RULE, log_density=density, components=innovation.dof)
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
         return self.inner.reset(state, belief)

@@ -47,11 +47,11 @@ def existence_margin(belief: Belief, weight: Weight, gamma: Number) -> Float[Arr
     """
     if not isinstance(gamma, Tracer):
         positive("gamma", gamma, "the Kalman filter")
-    whose = "existence_margin"
-    L = rows_of(as_weight(weight, whose), belief.mean, whose) / jnp.asarray(gamma, float)
+    name = "existence_margin"
+    L = rows_of(as_weight(weight, name), belief.mean, name) / jnp.asarray(gamma, float)
     n = belief.factor.shape[0]
     if L.shape[1] != n:
-        raise ValueError(f"{whose}: weight has {L.shape[1]} columns, the state has {n} components")
+        raise ValueError(f"{name}: weight has {L.shape[1]} columns, the state has {n} components")
     root = linalg.solve_lower(belief.factor, jnp.eye(n))
     return linalg.eigenvalue_bounds(root.T @ root - L.T @ L)[0]
 
@@ -228,9 +228,9 @@ def _linearised(
         info = steps.info[sensor.name]
         H, W, mean = _sensor_along(sensor, mean, info, aux.get(sensor.name))
         channels.append(Channel(np.asarray(info.gain), np.asarray(H), np.asarray(W)))
-    whose = "worst_case_gain"
-    rows = as_weight(weight, whose)
-    L = np.asarray(jax.vmap(lambda mean: rows_of(rows, mean, whose))(steps.posterior.mean))
+    name = "worst_case_gain"
+    rows = as_weight(weight, name)
+    L = np.asarray(jax.vmap(lambda mean: rows_of(rows, mean, name))(steps.posterior.mean))
     return np.asarray(start.factor), np.asarray(F), np.asarray(G), channels, L
 
 

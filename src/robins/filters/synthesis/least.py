@@ -127,8 +127,8 @@ def _play(plant: Plant, gamma: float, noise: float = 0.0) -> tuple[np.ndarray, i
         if share.max(initial=0.0) >= 1.0:
             return K, step
         played = S @ axes.T / np.sqrt(1.0 - share**2)
-        seen, moved = np.hstack([plant.C @ played, D]), np.hstack([plant.A @ played, B])
-        left, size, axes = np.linalg.svd(seen)
+        measured, moved = np.hstack([plant.C @ played, D]), np.hstack([plant.A @ played, B])
+        left, size, axes = np.linalg.svd(measured)
         rank = int(np.sum(size > _UNSEEN * size.max(initial=0.0)))
         K = moved @ axes[:rank].T / size[:rank] @ left[:, :rank].T
         before, S = S, _square(moved @ axes[rank:].T)

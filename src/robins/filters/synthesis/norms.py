@@ -23,7 +23,7 @@ _CIRCLE = 1e-6  # largest distance of an eigenvalue from the unit circle that ma
 _RTOL = 1e-11  # of the H-infinity norm by levels
 _STARTS = 65  # even samples of the half circle that begin a search
 _POINTS = 200  # even samples of the half circle in a sweep
-_LARGEST = 1e70  # whose fourth power is a number
+_LARGEST = 1e70  # number with a finite fourth power
 _SQUARINGS = 64  # of A: a radius of 1 - eps needs 58
 
 
@@ -52,8 +52,8 @@ def spectral_radius(A: np.ndarray) -> float:
 def gramian(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """Covariance P = A P A' + B B' of the state under unit white noise (A must be stable).
 
-    By doubling (Smith 1968): P(2k) = P(k) + A^k P(k) A^k'. Only what is positive semidefinite is
-    added, so that the result is as accurate in a state with small numbers as in one with large.
+    By doubling (Smith 1968): P(2k) = P(k) + A^k P(k) A^k'. Only positive semidefinite terms are
+    added, so that states with small and with large numbers are equally accurate.
     """
     power, P = A, B @ B.T
     for squaring in range(_SQUARINGS):
