@@ -129,27 +129,29 @@ def _least(plant: Plant) -> tuple[np.ndarray, float, float]:
         e = error_system(plant, K)
         return max(norms.hinf_norm(e.A, e.Bn, e.L), norms.peak_gain(e.A, e.Bn, e.L))
 
-    gains = [_gain(plant, 0.0)]
-    grid = [0.0, *_grid(plant, gains[0])]
-    for value in grid[1:]:
-        gains.append(_gain(plant, float(value), gains[-1]))
-    reached, end = [norm(K) for K in gains], grid[-1]
-    while reached[-1] < (1.0 - _FALLS) * reached[-2] and grid[-1] < _FARTHEST * end:
-        grid.append(_FARTHER * grid[-1])
-        gains.append(_gain(plant, grid[-1], gains[-1]))
-        reached.append(norm(gains[-1]))
-    best = int(np.argmin(reached))
-    found = gains[best], grid[best], reached[best]
-    if 1 < best < len(grid) - 1:
-        ends = np.log(grid[best - 1]), np.log(grid[best + 1])
+    def at(lambda_: float, near: np.ndarray | None) -> tuple[np.ndarray, float, float]:
+        K = _gain(plant, lambda_, near)
+        return K, lambda_, norm(K)
+
+    found = [at(0.0, None)]
+    for value in _grid(plant, found[0][0]):
+        found.append(at(float(value), found[-1][0]))
+    end = found[-1][1]
+    while found[-1][2] < (1.0 - _FALLS) * found[-2][2] and found[-1][1] < _FARTHEST * end:
+        found.append(at(_FARTHER * found[-1][1], found[-1][0]))
+    best = int(np.argmin([least for _, _, least in found]))
+    K, _, least = found[best]
+    if 1 < best < len(found) - 1:
         fine = scipy.optimize.minimize_scalar(
-            lambda exponent: norm(_gain(plant, float(np.exp(exponent)), gains[best])),
-            bounds=ends, method="bounded", options={"xatol": 1e-9},
-        )  # fmt: skip
-        K = _gain(plant, lambda_ := float(np.exp(fine.x)), gains[best])
-        if (lowest := norm(K)) < reached[best]:
-            found = K, lambda_, lowest
-    return found
+            lambda exponent: at(float(np.exp(exponent)), K)[2],
+            bounds=(np.log(found[best - 1][1]), np.log(found[best + 1][1])),
+            method="bounded",
+            options={"xatol": 1e-9},
+        )
+        finer = at(float(np.exp(fine.x)), K)
+        if finer[2] < least:
+            return finer
+    return found[best]
 
 
 def _grid(plant: Plant, K: np.ndarray) -> np.ndarray:
