@@ -44,13 +44,11 @@ class Memory(Protocol):
 Machine = Callable[[FilterState, Hashable], Memory]  # of a state, and the content of the functions
 
 
-@jax.jit
-def _predict(filter_, motion, state, u):
+def _predicted(filter_, motion, state, u):
     return filter_.predict(state, motion, u)
 
 
-@jax.jit
-def _update(filter_, sensor, state, y, aux):
+def _updated(filter_, sensor, state, y, aux):
     return filter_.update(state, sensor, y, aux)
 
 
@@ -59,12 +57,13 @@ def _stepped(filter_, model, state, u, y, aux, keep):
     return state, (keep(step), (step.prediction.code, {k: i.code for k, i in step.info.items()}))
 
 
-_step = jax.jit(_stepped, static_argnames=("keep",))
-
-
-@partial(jax.jit, static_argnames=("question",))
-def _look(filter_, model, state, args, question):
+def _answer(filter_, model, state, args, question):
     return question(filter_, model, state, *args)
+
+
+_predict, _update = jax.jit(_predicted), jax.jit(_updated)
+_step = jax.jit(_stepped, static_argnames=("keep",))
+_look = jax.jit(_answer, static_argnames=("question",))
 
 
 class ByJax:
@@ -118,15 +117,11 @@ class ByProgram:
         self._memory.state = state
 
     def predict(self, u: Data) -> Prediction:
-        def predicted(state: FilterState, u: Data) -> tuple[FilterState, Prediction]:
-            return self._filter.predict(state, self._model.motion, u)
-
+        predicted = partial(_predicted, self._filter, self._model.motion)
         return self._memory.step("predict", predicted, u)
 
     def update(self, name: str, y: Data, aux: Data) -> StepInfo:
-        def updated(state: FilterState, y: Data, aux: Data) -> tuple[FilterState, StepInfo]:
-            return self._filter.update(state, self._model.sensor(name), y, aux)
-
+        updated = partial(_updated, self._filter, self._model.sensor(name))
         return self._memory.step(("update", name), updated, y, aux)
 
     def step(

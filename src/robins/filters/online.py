@@ -46,7 +46,7 @@ class OnlineFilter:
         start: Belief | FilterState,
         machine: Machine | str = "jax",
     ):
-        """Begin at a belief, or go on from a state.
+        """Begin at a belief, or continue from a state.
 
         Args:
             filter_: from `kalman` and its kin.
@@ -100,12 +100,8 @@ class OnlineFilter:
     ) -> Data:
         """Take a whole step in one compiled call: predict, then update with each sensor in y.
 
-        Args:
-            y: measurements by sensor name, NaN where missing, of the same shapes at every call;
-                unlike those of `update` they are not checked.
-            u: input of the motion.
-            aux: further inputs of sensors, by sensor name.
-            keep: part of the `Step` to return, as in `run`.
+        Measurements have the same shapes at every call, with NaN where missing; unlike those of
+        `update` they are not checked. `keep` is the part of the `Step` to return, as in `run`.
         """
         kept, (moved, used) = self._machine.step(u, dict(y), dict(aux or {}), keep)
         self._count(moved, *used.values())

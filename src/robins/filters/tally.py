@@ -65,10 +65,8 @@ class Tally(NamedTuple):
     ) -> Tally:
         """Add sums of innovations and readings over the steps, for `doubts`; not in `jit`.
 
-        Args:
-            info: by sensor a `StepInfo` of all steps, or a tuple with its innovation, sigma, nis
-                and dof.
-            readings: by sensor, as the run took them.
+        Both are by sensor: a `StepInfo` of all steps, or a tuple with its innovation, sigma, nis
+        and dof; the readings as the run took them.
         """
         given = readings or {}
         looks = {}
@@ -167,10 +165,6 @@ def _off(sensor: str, ratio: float, dof: int, cautious: bool) -> list[str]:
 
 
 def warn_not_taken(tally: Tally) -> None:
-    """Warn of steps that were not taken, at the caller of a run.
-
-    Warns:
-        StepWarning: there are such steps; the message counts them by outcome.
-    """
+    """Warn with a `StepWarning` of steps that were not taken, at the caller of a run."""
     if found := not_taken(tally):
         warnings.warn("; ".join(found), StepWarning, stacklevel=4)

@@ -145,9 +145,6 @@ def joined(looks: Sequence[np.ndarray]) -> np.ndarray:
     return table
 
 
-# ------------------------------------------------------------------------------- sums to sentences
-
-
 def suspicions(looks: Mapping[str, ArrayLike], assumed: Collection[str] = ()) -> list[str]:
     """Sentences on sequences that a consistent filter would not show.
 

@@ -89,15 +89,8 @@ def linearised(
     """Linearise a model about a true trajectory.
 
     The transition of step k is taken at the true state before it, of the first step at the mean of
-    the start; the sensors at ``truth[k]``.
-
-    Args:
-        model: the motion and the sensors.
-        start: belief before the first step.
-        truth: true states at the measurements, leading axis E.
-        y: measurements by sensor name, leading axis E; only NaN matters.
-        u: inputs of the motion, leading axis E.
-        aux: further inputs of sensors, by sensor name, leading axis E.
+    the start; the sensors at ``truth[k]``. Arguments are those of `run`, with leading axis E, and
+    the true states at the measurements; of y, by sensor name, only NaN matters.
 
     Raises:
         ValueError: lengths differ.
@@ -113,7 +106,7 @@ def linearised(
     )
     way, unit = taylor(), jnp.eye(manifold.dim(start.mean))
 
-    def at(row: tuple[State, State, Data, dict[str, Data], dict[str, Data]]) -> Linearised:
+    def at(row) -> Linearised:
         before, now, u, y, aux = row
         moved = way.transition(Belief(before, unit), model.motion, u)
         sights = []

@@ -110,9 +110,6 @@ def _used(info: Mapping[str, StepInfo]) -> Array:
     return jnp.any(jnp.stack(some), axis=0) if some else jnp.array(False)
 
 
-# ------------------------------------------------------------------------------- worst-case gain
-
-
 class Channel(NamedTuple):
     """Sensor over a run: e becomes (I - K H) e - K W v at each step, v of unit variance."""
 
@@ -253,9 +250,6 @@ def _sensor_along(
     o = taylor().observation(Belief(mean, jnp.eye(manifold.dim(mean))), sensor, z, aux)
     residual = jnp.where(info.used, info.innovation, 0.0)
     return o.spread, o.noise, manifold.retract(mean, info.gain @ residual)
-
-
-# -------------------------------------------------------------------------------------- steady
 
 
 class SteadyHInfinity(NamedTuple):

@@ -101,9 +101,7 @@ def current_form(
     Arguments are those of `plant`, from one measurement to the next, and Dv (m, v), the factor of
     the measurement noise, independent of w.
 
-    Raises:
-        TypeError: as `plant`.
-        ValueError: as `plant`.
+    Errors are those of `plant`.
     """
     given = plant(A, Bw, Bn, C, None, Dn, L)
     Dv = matrix("Dv", Dv)

@@ -66,9 +66,7 @@ class Scales(NamedTuple):
 def balanced(plant: Plant, gamma: Number = np.inf) -> Scales:
     """Scales under which states, measurements, noise and output are of order one.
 
-    Args:
-        plant: in any units.
-        gamma: bound on the gain from n to z that becomes 1; inf scales n itself to order one.
+    gamma is the bound on the gain from n to z that becomes 1; inf scales n itself to order one.
     """
     x, y, w, n, z = np.ones(len(plant.A)), np.ones(len(plant.C)), 1.0, 1.0, 1.0
     for _ in range(_SWEEPS):
