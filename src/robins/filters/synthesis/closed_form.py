@@ -28,7 +28,7 @@ _SAME = 1e-9  # relative difference of equal numbers
 
 
 class Isotropic(NamedTuple):
-    """A plant of this kind."""
+    """Parameters of a plant of this kind."""
 
     rho: float  # size of A
     U: np.ndarray  # (n, n) orthogonal

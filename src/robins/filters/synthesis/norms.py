@@ -130,10 +130,6 @@ class Levels(NamedTuple):
         lower = max(direct, float(np.max(_gains(*blocks, np.exp(1j * angle))))) * (1.0 - 1e-9)
         return cls(*blocks, lower, (direct + 2.0 * float(np.sum(hankel))) * (1.0 + 1e-9))
 
-    def reached(self, gain: Number) -> bool:
-        """True if some singular value of the frequency response is as large as this gain."""
-        return gain <= self.lower or (gain <= self.upper and self.highest(gain) >= gain)
-
     def highest(self, gain: Number) -> float:
         """Highest response at z = 1, -1, where singular values cross this level, and between.
 
@@ -170,7 +166,10 @@ def meets(A: np.ndarray, B: np.ndarray, C: np.ndarray, gamma: Number) -> bool:
     """True if a system is stable and its H-infinity norm is below gamma."""
     if spectral_radius(A) >= 1.0:
         return False
-    return bool(np.isinf(gamma)) or not Levels.of(A, B, C).reached(gamma)
+    if np.isinf(gamma):
+        return True
+    levels = Levels.of(A, B, C)
+    return gamma > levels.lower and (gamma > levels.upper or levels.highest(gamma) < gamma)
 
 
 def peak_gain(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = None) -> float:

@@ -27,7 +27,6 @@ _DESIGNERS: dict[str, Callable[[Plant, float], Design]] = {
     "full-order": lmi.full,
 }
 METHODS = tuple(_DESIGNERS)
-_PLAIN = ("riccati", "closed-form")  # need no solver
 _POINTS = 6  # of a default range
 _DEEPEST = 0.1  # least gamma of a default range over the Kalman filter's own norm
 
@@ -117,7 +116,7 @@ def _why_not(plant: Plant, name: str) -> str:
     try:
         if name == "closed-form":
             isotropic(plant)
-        elif name not in _PLAIN:
+        elif name != "riccati":
             packages()
         if name == "full-order":
             lmi.refuse_unstable(plant)
