@@ -28,6 +28,8 @@ from robins.filters.model import Data, Model
 from robins.filters.observation import Observation, as_measurement
 from robins.manifold import State
 
+Use = ArrayLike | Sequence[bool]  # (S,) bool, sensors of a model that are used
+
 
 class Bound(NamedTuple):
     """Lower-triangular factors of the bound, leading axis E steps."""
@@ -146,7 +148,7 @@ def covariance_bound(
     y: Mapping[str, Data],
     u: Data = None,
     aux: Mapping[str, Data] | None = None,
-    use: ArrayLike | None = None,
+    use: Use | None = None,
     known: Sequence[int] = (),
 ) -> Bound:
     """Covariance bound along a true trajectory; may be batched by `jax.vmap`.
@@ -158,7 +160,7 @@ def covariance_bound(
 
 
 def bound_along(
-    line: Linearised, factor: Array, use: ArrayLike | None = None, known: Sequence[int] = ()
+    line: Linearised, factor: Array, use: Use | None = None, known: Sequence[int] = ()
 ) -> Bound:
     """Covariance bound of a linearised model; one scan.
 

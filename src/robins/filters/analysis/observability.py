@@ -29,7 +29,7 @@ from jaxtyping import Array, ArrayLike
 
 from robins import linalg
 from robins.errors import require
-from robins.filters.analysis.bound import Linearised, linearised
+from robins.filters.analysis.bound import Linearised, Use, linearised
 from robins.filters.belief import Belief
 from robins.filters.checks import square
 from robins.filters.model import Data, Model
@@ -47,7 +47,7 @@ def observability(
     y: Mapping[str, Data],
     u: Data = None,
     aux: Mapping[str, Data] | None = None,
-    use: ArrayLike | None = None,
+    use: Use | None = None,
     window: int | None = None,
 ) -> Array:
     """Factors L of (I + W)^-1 after every step of a run; may be batched by `jax.vmap`.
@@ -63,7 +63,7 @@ def observability(
 
 
 def observability_along(
-    line: Linearised, sigma: Array, use: ArrayLike | None = None, window: int | None = None
+    line: Linearised, sigma: Array, use: Use | None = None, window: int | None = None
 ) -> Array:
     """Factors L of (I + W)^-1 along a linearised model; one scan.
 
