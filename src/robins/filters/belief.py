@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from robins import linalg, manifold
+from robins.errors import require
 from robins.filters.checks import finite_numbers
 from robins.filters.values import Numbers
 from robins.manifold import State
 
-# Of a user. Where types are checked an int is no float; a batch and a stand-in of JAX are arrays.
+# A number given by a user: an int is no float at run time, and tracers and batches are arrays.
 Number = float | int | Numbers
 
 
@@ -31,20 +32,18 @@ class Belief(NamedTuple):
 
     @classmethod
     def of(cls, mean: State, covariance: ArrayLike) -> Belief:
-        """From a mean and a covariance (positive semidefinite; looked at, so not inside `jit`).
+        """Belief of a mean and a positive semidefinite covariance, checked, so not inside `jit`.
 
         Raises:
             TypeError: the mean holds something that is not a real number.
-            ValueError: the mean is not finite, the covariance is not one, or its size is not the
-                state's.
+            ValueError: the mean is not finite, the covariance is not one, or has the wrong size.
         """
         mean = jax.tree_util.tree_map(
             lambda leaf: jnp.asarray(finite_numbers("initial mean", leaf)), mean
         )
-        factor = linalg.factor(covariance, "initial covariance")
-        n = manifold.dim(mean)
-        if factor.shape != (n, n):
-            raise ValueError(f"initial covariance is {factor.shape}, the state needs ({n}, {n})")
+        factor, n = linalg.factor(covariance, "initial covariance"), manifold.dim(mean)
+        fits = factor.shape == (n, n)
+        require(fits, f"initial covariance is {factor.shape}, the state needs ({n}, {n})")
         return cls(mean, factor)
 
     @property
@@ -59,7 +58,7 @@ class Belief(NamedTuple):
 
 
 class Code(IntEnum):
-    """How a step went; `SENTENCES` says what that means and what to do."""
+    """Outcome of a step; `SENTENCES` states its meaning and remedy."""
 
     DONE = 0
     MISSING = 1
@@ -74,7 +73,7 @@ class Code(IntEnum):
     APART = 10
 
 
-# A prediction or an update was not taken, or a rule could not do what it is for.
+# A step was not taken, or a rule could not do its task.
 FAILURES = (
     Code.INDEFINITE,
     Code.NOT_FINITE,
@@ -125,13 +124,15 @@ SENTENCES: dict[Code, str] = {
 }
 
 
-def with_notes(known: Mapping[str, Any], rule: str, notes: dict[str, Any]) -> dict[str, Any]:
-    """Notes with those of a rule, each as ``rule.name``; a ``_`` at the end of a name is cut."""
-    return {**known} | {f"{rule}.{name.rstrip('_')}": value for name, value in notes.items()}
+def with_notes(
+    known: Mapping[str, Numbers], rule: str, notes: Mapping[str, Numbers]
+) -> dict[str, Numbers]:
+    """Notes extended by those of a rule as ``rule.name``, without a ``_`` at the end of a name."""
+    return dict(known) | {f"{rule}.{name.rstrip('_')}": value for name, value in notes.items()}
 
 
 class StepInfo(NamedTuple):
-    """Innovation, gain and outcome of an update. m is the measurement's tangent dimension."""
+    """Innovation, gain and outcome of an update; m is the tangent dimension."""
 
     innovation: Array  # (m,) y minus its prediction; NaN where missing
     expected: Array  # (m,) standard deviation of it, before a robust rule weighs it
@@ -143,17 +144,16 @@ class StepInfo(NamedTuple):
     dof: Array  # number of components used
     log_likelihood: Float[Array, ""]
     code: Array  # a `Code`
-    notes: dict[str, Any]  # what the rules add, by their names
+    notes: dict[str, Numbers]  # added by rules, each as ``rule.name``
 
-    def noted(self, rule: str, **notes: Any) -> StepInfo:
-        """With notes of a rule (`with_notes`)."""
+    def noted(self, rule: str, **notes: Numbers) -> StepInfo:
+        """A copy with notes of a rule (`with_notes`)."""
         return self._replace(notes=with_notes(self.notes, rule, notes))
 
     def contradicted_where(self, wrong: Array) -> StepInfo:
-        """The information of an update after which a rule could not do what it is for.
+        """A copy with code `Code.CONTRADICTED` and likelihood zero where a rule failed.
 
-        Its code is `Code.CONTRADICTED` there, which the tally of a run counts, and the likelihood
-        zero. A rule whose notes report a failure passes it through this method.
+        A rule that notes a failure also reports it here, so that the tally of a run counts it.
         """
         return self._replace(
             nis=jnp.where(wrong, jnp.inf, self.nis),
@@ -164,5 +164,5 @@ class StepInfo(NamedTuple):
     @property
     def sigma(self) -> Array | np.ndarray:
         """(..., m) ``expected``; NaN where a component was not used."""
-        where: Any = np.where if isinstance(self.used, np.ndarray) else jnp.where
-        return where(self.used, self.expected, jnp.nan)
+        xp = np if isinstance(self.used, np.ndarray) else jnp
+        return xp.where(self.used, self.expected, jnp.nan)

@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
+from jaxtyping import ArrayLike
 
 from robins.errors import require
 
+Matrix = ArrayLike | Sequence[object]  # given by a user: an array or rows of numbers, unchecked
 
-def one_of(what: str, given: Any, known: Any) -> None:
-    """Refuse a name that is none of those of a `Literal` or a sequence.
+
+def one_of(what: str, given: str, known: object) -> None:
+    """Refuse a name that is not in a `Literal` or a sequence.
 
     Raises:
         ValueError: ``what must be 'a', 'b' or 'c', got 'd'``.
     """
-    names = get_args(known) or tuple(known)
+    names = get_args(known) or tuple(known)  # type: ignore[arg-type]
     *most, last = map(repr, names)
     require(given in names, f"{what} must be {', '.join(most)} or {last}", repr(given))
 
 
 def sensor_names(what: str, given: str | Sequence[str]) -> tuple[str, ...]:
-    """A name, or several.
+    """Tuple of one name or several.
 
     Raises:
         ValueError: there is none.
@@ -33,13 +36,13 @@ def sensor_names(what: str, given: str | Sequence[str]) -> tuple[str, ...]:
 
 
 def matrix(
-    what: str, given: Any, rows: int | None = None, columns: int | None = None
+    what: str, given: object, rows: int | None = None, columns: int | None = None
 ) -> np.ndarray:
-    """A matrix of finite floats, with so many rows and columns where these are given.
+    """Matrix of finite floats, of the shape that is given.
 
     Raises:
         TypeError: it is not of real numbers.
-        ValueError: it is no matrix, of another shape or not finite; the message names the place.
+        ValueError: it is no matrix, of another shape or not finite; the message names the entry.
     """
     try:
         numbers = np.asarray(given)
@@ -47,11 +50,10 @@ def matrix(
         raise ValueError(f"{what} is no matrix: its rows differ in length") from error
     if numbers.dtype.kind not in "iuf":
         raise TypeError(f"{what} holds {numbers.dtype}, real numbers are wanted")
-    if numbers.ndim != 2:
-        raise ValueError(f"{what} has shape {numbers.shape}, a matrix (rows of numbers) is wanted")
-    n, m = numbers.shape
-    wanted = (n if rows is None else rows, m if columns is None else columns)
-    require(numbers.shape == wanted, f"{what} is {numbers.shape}, must be {wanted}")
+    shape = numbers.shape
+    require(len(shape) == 2, f"{what} has shape {shape}, a matrix (rows of numbers) is wanted")
+    wanted = (shape[0] if rows is None else rows, shape[1] if columns is None else columns)
+    require(shape == wanted, f"{what} is {shape}, must be {wanted}")
     numbers = numbers.astype(float)
     if not np.isfinite(numbers).all():
         row, column = np.argwhere(~np.isfinite(numbers))[0]
@@ -59,8 +61,14 @@ def matrix(
     return numbers
 
 
-def positive(what: str, given: Any, of_infinity: str) -> None:
-    """Refuse what is no positive number; infinity is one.
+def square(what: str, given: object) -> np.ndarray:
+    """Square matrix of finite floats; errors as of `matrix`."""
+    numbers = matrix(what, given)
+    return matrix(what, numbers, *2 * numbers.shape[:1])
+
+
+def positive(what: str, given: object, of_infinity: str) -> None:
+    """Refuse all but a positive number; infinity is one.
 
     Raises:
         TypeError: it is not one real number.
@@ -72,8 +80,8 @@ def positive(what: str, given: Any, of_infinity: str) -> None:
     require(number > 0.0, f"{what} must be positive, or inf for {of_infinity}; got {given}")
 
 
-def finite_numbers(what: str, given: Any) -> np.ndarray:
-    """An array of floats from real and finite numbers.
+def finite_numbers(what: str, given: object) -> np.ndarray:
+    """Array of floats from real and finite numbers.
 
     Raises:
         TypeError: they are not real numbers.

@@ -1,4 +1,4 @@
-"""Linearise again where the measurement says the state is: iterated filters."""
+"""Iterated filters: linearisation about the updated state."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Iterated(Linearisation):
         first = self.way.observation(prior, sensor, y, aux)
         if self.iterations == 1:
             return first
-        by_slope = first.excess.shape[1] == 0  # how uncertain the state is does not matter
+        by_slope = first.excess.shape[1] == 0  # Taylor, which does not depend on the covariance
 
         def look(t, M):
             return self.look(prior, sensor, y, aux, t, M)
@@ -49,16 +49,16 @@ class Iterated(Linearisation):
     def look(
         self, prior: Belief, sensor: Sensor, y: Data, aux: Data, t: Array, M: Array
     ) -> Observation:
-        """The measurement about retract(m, S t), regressed over S M, as the prior sees it."""
+        """Observation from the prior, linearised about retract(m, S t) over S M."""
         mean, S = _carried(prior, t)
-        seen = self.way.observation(Belief(mean, S @ M), sensor, y, aux)
-        spread = linalg.solve_lower_transposed(M, seen.spread.T).T
-        residual = jnp.where(seen.present, seen.residual + spread @ t, 0.0)
-        return seen._replace(prior=prior, residual=residual, spread=spread)
+        o = self.way.observation(Belief(mean, S @ M), sensor, y, aux)
+        spread = linalg.solve_lower_transposed(M, o.spread.T).T
+        residual = jnp.where(o.present, o.residual + spread @ t, 0.0)
+        return o._replace(prior=prior, residual=residual, spread=spread)
 
 
 def _updated(o: Observation, by_slope: bool) -> tuple[Array, Array]:
-    """The posterior in units of the prior: the state moves by S t, its factor is S M."""
+    """Posterior in units of the prior: the state moves by S t, its factor is S M."""
     unit = jnp.eye(o.prior.factor.shape[0])
     spread, excess, noise, deficit, used = left_out(o)
     S_y, cross, M = linalg.block_factor(spread, (excess, noise), unit, deficit)
@@ -68,45 +68,43 @@ def _updated(o: Observation, by_slope: bool) -> tuple[Array, Array]:
 
 
 def iterated(linearise: Linearisation | None = None, iterations: int = 4) -> Linearisation:
-    """A linearisation that looks again: the measurement is linearised about its own update.
+    """Linearisation of a measurement about its own update.
 
     With Taylor this is the iterated extended Kalman filter, Gauss-Newton on the posterior density
-    (Bell & Cathey 1993, eq. 12), whose fixed point is the most probable state. In the tangent space
-    of the prior mean m, with g(e) = h(retract(m, e)) and H_i its slope at e_i,
+    (Bell & Cathey 1993, eq. 12), with the most probable state as fixed point. In the tangent space
+    of the prior mean m, with g(e) = h(retract(m, e)) and H_i its Jacobian at e_i,
 
         e_i+1 = K_i (y - g(e_i) + H_i e_i),        K_i = P H_i' (H_i P H_i' + R)^-1
 
-    With sigma points it is iterated posterior linearisation: the regression is done over
-    the last posterior, mean and covariance (García-Fernández, Svensson, Morelande & Särkkä 2015,
-    sec. III). Where a measurement leaves less than 1e-6 of a prior deviation, differences of points
-    would be rounding: their spread is then the prior's, about the new mean (Sibley, Sukhatme &
-    Matthies 2006).
+    With sigma points it is iterated posterior linearisation: the regression is over the last
+    posterior, mean and covariance (García-Fernández, Svensson, Morelande & Särkkä 2015, sec. III).
+    Where a measurement leaves less than 1e-6 of a prior deviation, differences of points would be
+    rounding: their spread is then the prior's, about the new mean (Sibley, Sukhatme & Matthies
+    2006).
 
-    The update gets the last linearisation with the *effective* residual y - g(e) + H e: that is
-    what rules judge and what `StepInfo.innovation` holds. What rules do to noise and components
-    bears on the last step only: where to linearise is decided with the sensor's own noise.
-    Gauss-Newton is not damped, so on a measurement that is far off it need not converge.
+    Rules and `StepInfo.innovation` get the *effective* residual y - g(e) + H e of the last
+    linearisation; the earlier ones use the sensor's own noise and all components. Gauss-Newton is
+    not damped, so for a distant measurement it need not converge.
 
     Args:
-        linearise: how to linearise each time; `taylor` by default.
-        iterations: how often a measurement is linearised; 1 is the filter without iteration.
+        linearise: each linearisation; `taylor` by default.
+        iterations: number of linearisations; 1 is the filter without iteration.
 
     Raises:
-        ValueError: iterations is not positive, or the way to linearise uses its points again.
+        ValueError: iterations is not positive, or `linearise` uses its points again.
     """
     require(iterations >= 1, "iterated: iterations must be at least 1", iterations)
     way = taylor() if linearise is None else linearise
-    if way.reuse is not None:
-        raise ValueError(
-            "iterated: points that were predicted cannot be drawn about another mean; "
-            "use unscented(redraw=True)"
-        )
-
+    require(
+        way.reuse is None,
+        "iterated: points that were predicted cannot be drawn about another mean; "
+        "use unscented(redraw=True)",
+    )
     return Iterated(way, iterations)
 
 
 def _carried(prior: Belief, t: Array) -> tuple[State, Array]:
-    """The state retract(m, S t), and S seen from its tangent space."""
+    """State retract(m, S t), and S in its tangent space."""
     S = prior.factor
     mean = manifold.retract(prior.mean, S @ t)
     if not any(manifold.is_element(leaf) for leaf in manifold.leaves(prior.mean)):

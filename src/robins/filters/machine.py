@@ -1,15 +1,14 @@
-"""On what machine a filter is stepped: the functions of a step, compiled by JAX or as programs.
+"""Machines: a state of a filter, stepped by functions compiled by JAX or as programs.
 
-A machine keeps a state and steps it by the filter's own functions. `ByJax` calls them compiled by
-JAX. `ByProgram` hands them, each under a name, to a memory that compiles them for this one state:
-in C it is that of `robins.program`, which knows no filter.
+`ByProgram` passes the functions of the filter, each under a name, to a memory that compiles them
+for this one state: in C it is that of `robins.program`, which knows no filter.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
 from functools import partial
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,47 +18,38 @@ from robins.filters.checks import one_of
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Data, Model
 from robins.filters.run import Step, filter_step
-from robins.filters.values import content, on_device
+from robins.filters.values import Numbers, content, on_device
 
+T = TypeVar("T")
 Name = Literal["jax", "c"]
-Codes = tuple[Any, dict[str, Any]]  # of a step: of its prediction, and by sensor
+Codes = tuple[Numbers, dict[str, Numbers]]  # of a step: of its prediction, and by sensor
 
 
 class Memory(Protocol):
-    """What keeps a state and compiles functions of it; `robins.program.Memory` is one."""
+    """Memory of a state that compiles functions of it, such as `robins.program.Memory`."""
 
-    state: Any
+    state: Data
 
-    def step(self, name: Hashable, function: Callable[..., Any], *args: Any) -> Any:
-        """Step the state by ``(state, *args) -> (state, result)``; gives the result."""
+    def step(
+        self, name: Hashable, function: Callable[..., tuple[FilterState, T]], *args: Data
+    ) -> T:
+        """Step the state by ``(state, *args) -> (state, result)``; return the result."""
         ...
 
-    def look(self, name: Hashable, function: Callable[..., Any], *args: Any) -> Any:
-        """What ``(state, *args) -> result`` gives; the state stays."""
+    def look(self, name: Hashable, function: Callable[..., T], *args: Data) -> T:
+        """Return the result of ``(state, *args) -> result``; the state stays."""
         ...
 
 
-Machine = Callable[[Any, Hashable], Memory]  # of a state, and of what the functions hold
+Machine = Callable[[FilterState, Hashable], Memory]  # of a state, and the content of the functions
 
 
-@jax.jit
-def _predict(filter_, motion, state, u):
+def _predicted(filter_, motion, state, u):
     return filter_.predict(state, motion, u)
 
 
-@jax.jit
-def _update(filter_, sensor, state, y, aux):
+def _updated(filter_, sensor, state, y, aux):
     return filter_.update(state, sensor, y, aux)
-
-
-@partial(jax.jit, static_argnames=("keep",))
-def _step(filter_, model, state, u, y, aux, keep):
-    return _stepped(filter_, model, state, u, y, aux, keep)
-
-
-@partial(jax.jit, static_argnames=("question",))
-def _look(filter_, model, state, args, question):
-    return question(filter_, model, state, *args)
 
 
 def _stepped(filter_, model, state, u, y, aux, keep):
@@ -67,61 +57,59 @@ def _stepped(filter_, model, state, u, y, aux, keep):
     return state, (keep(step), (step.prediction.code, {k: i.code for k, i in step.info.items()}))
 
 
-class ByJax:
-    """A state, stepped by functions that JAX compiles.
+def _answer(filter_, model, state, args, question):
+    return question(filter_, model, state, *args)
 
-    Attributes:
-        state: what they step.
-    """
+
+_predict, _update = jax.jit(_predicted), jax.jit(_updated)
+_step = jax.jit(_stepped, static_argnames=("keep",))
+_look = jax.jit(_answer, static_argnames=("question",))
+
+
+class ByJax:
+    """A state, stepped by functions that JAX compiles."""
 
     is_numpy = False
 
     def __init__(self, filter_: Filter, model: Model, state: FilterState):
-        """Take a filter and a model, whose numbers are handed to the device once."""
+        """Take a filter and a model, whose numbers go to the device once."""
         self._filter, self._model = on_device((filter_, model))
         self.state = state
 
     def predict(self, u: Data) -> Prediction:
         """Move on by one step."""
-        self.state, told = _predict(self._filter, self._model.motion, self.state, u)
-        return told
+        self.state, prediction = _predict(self._filter, self._model.motion, self.state, u)
+        return prediction
 
     def update(self, name: str, y: Data, aux: Data) -> StepInfo:
         """Use a measurement of a sensor."""
-        self.state, told = _update(self._filter, self._model.sensor(name), self.state, y, aux)
-        return told
+        self.state, info = _update(self._filter, self._model.sensor(name), self.state, y, aux)
+        return info
 
     def step(
-        self, u: Data, y: Mapping[str, Any], aux: Mapping[str, Any], keep: Callable[[Step], Any]
-    ) -> tuple[Any, Codes]:
-        """A whole step: what is kept of it, and its codes."""
-        self.state, told = _step(self._filter, self._model, self.state, u, y, aux, keep)
-        return told[0], jax.device_get(told[1])
+        self, u: Data, y: Mapping[str, Data], aux: Mapping[str, Data], keep: Callable[[Step], T]
+    ) -> tuple[T, Codes]:
+        """Take a whole step; return the part that is kept, and the codes."""
+        self.state, (kept, codes) = _step(self._filter, self._model, self.state, u, y, aux, keep)
+        return kept, jax.device_get(codes)
 
-    def look(self, question: Callable[..., Any], *args: Any) -> Any:
-        """What ``question(filter, model, state, *args)`` gives."""
+    def look(self, question: Callable[..., T], *args: Data) -> T:
+        """Return ``question(filter, model, state, *args)``."""
         return _look(self._filter, self._model, self.state, args, question)
 
 
 class ByProgram:
-    """A state in a memory, stepped by functions that the memory compiles for it.
-
-    Here the numbers of a filter and of a model are known, and folded into the programs.
-    """
+    """`ByJax` with a memory, which folds the numbers of filter and model into its programs."""
 
     is_numpy = True
 
     def __init__(self, filter_: Filter, model: Model, state: FilterState, machine: Machine):
-        """Of a filter, a model and a state, in the memory that a machine gives."""
+        """Take a filter, a model and a state into the memory that a machine makes."""
         self._filter, self._model = filter_, model
         self._memory = machine(state, content(filter_, model))
-        self._sensors = {
-            s.name: (("update", s.name), partial(_used, filter_, s)) for s in model.sensors
-        }
 
     @property
     def state(self) -> FilterState:
-        """What they step; to be assigned too."""
         return self._memory.state
 
     @state.setter
@@ -129,45 +117,27 @@ class ByProgram:
         self._memory.state = state
 
     def predict(self, u: Data) -> Prediction:
-        """Move on by one step."""
-        return self._memory.step("predict", self._predicted, u)
-
-    def _predicted(self, state: FilterState, u: Data) -> tuple[FilterState, Prediction]:
-        return self._filter.predict(state, self._model.motion, u)
+        predicted = partial(_predicted, self._filter, self._model.motion)
+        return self._memory.step("predict", predicted, u)
 
     def update(self, name: str, y: Data, aux: Data) -> StepInfo:
-        """Use a measurement of a sensor."""
-        return self._memory.step(*self._sensors[name], y, aux)
+        updated = partial(_updated, self._filter, self._model.sensor(name))
+        return self._memory.step(("update", name), updated, y, aux)
 
     def step(
-        self, u: Data, y: Mapping[str, Any], aux: Mapping[str, Any], keep: Callable[[Step], Any]
-    ) -> tuple[Any, Codes]:
-        """A whole step: what is kept of it, and its codes."""
-
-        def stepped(state: FilterState, u: Data, y: Data, aux: Data) -> Any:
-            return _stepped(self._filter, self._model, state, u, y, aux, keep)
-
+        self, u: Data, y: Mapping[str, Data], aux: Mapping[str, Data], keep: Callable[[Step], T]
+    ) -> tuple[T, Codes]:
+        stepped = partial(_stepped, self._filter, self._model, keep=keep)
         return self._memory.step(("step", keep), stepped, u, y, aux)
 
-    def look(self, question: Callable[..., Any], *args: Any) -> Any:
-        """What ``question(filter, model, state, *args)`` gives."""
+    def look(self, question: Callable[..., T], *args: Data) -> T:
         return self._memory.look(question, partial(question, self._filter, self._model), *args)
-
-
-def _used(filter_, sensor, state, y, aux):
-    return filter_.update(state, sensor, y, aux)
 
 
 def on(
     machine: Machine | str, filter_: Filter, model: Model, state: FilterState
 ) -> ByJax | ByProgram:
-    """A state on a machine.
-
-    Args:
-        machine: "jax", "c", or what makes a memory.
-        filter_: what is stepped,
-        model: with what.
-        state: to begin with.
+    """Place a state on a machine: "jax", "c", or a function that makes a memory.
 
     Raises:
         ValueError: there is no machine of this name.
@@ -186,7 +156,7 @@ def on(
 
 
 def settled(state: FilterState) -> FilterState:
-    """With types of their own: a weak one would have all compiled again after the first step."""
+    """State without weak types, which would compile everything again after the first step."""
     if not any(getattr(x, "weak_type", False) for x in jax.tree_util.tree_leaves(state)):
         return state
     return jax.tree_util.tree_map(lambda x: jnp.asarray(x, jnp.asarray(x).dtype), state)

@@ -1,14 +1,15 @@
-"""The same filter, one sample at a time, for benches and live programs."""
+"""A filter stepped one sample at a time, for benches and live programs."""
 
 from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from jax.tree_util import tree_map
 
+from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.machine import Machine, on, settled
@@ -16,8 +17,10 @@ from robins.filters.model import Data, Model
 from robins.filters.observation import as_measurement, as_real
 from robins.filters.run import Step, everything
 from robins.filters.tally import Tally, doubts
+from robins.filters.values import Numbers
 from robins.manifold import State
 
+T = TypeVar("T")
 WINDOW = 400  # last updates of each sensor that are judged
 
 _DONE = int(Code.DONE)
@@ -27,13 +30,13 @@ _NAMES = {int(code): code.name for code in Code}
 class OnlineFilter:
     """A filter with a current state; `predict` and `update` are those of a run, compiled.
 
-    Gives the numbers of `robins.filters.run` to rounding. In C a call takes some ten microseconds
-    where JAX takes a hundred; what it tells are then arrays of NumPy.
+    It equals `robins.filters.run` to rounding. In C a call takes some ten microseconds where JAX
+    takes a hundred, and returns arrays of NumPy.
 
     Attributes:
-        filter: what it steps, and
-        model: with what.
-        counts: outcomes so far, by `Code` name: of updates, and of predictions not taken.
+        filter: the filter.
+        model: its motion and sensors.
+        counts: outcomes by `Code` name: of updates, and of predictions not taken.
     """
 
     def __init__(
@@ -43,30 +46,29 @@ class OnlineFilter:
         start: Belief | FilterState,
         machine: Machine | str = "jax",
     ):
-        """Begin at a belief, or go on from a state.
+        """Begin at a belief, or continue from a state.
 
         Args:
             filter_: from `kalman` and its kin.
             model: the motion and the sensors.
             start: initial belief or saved state.
             machine: "jax", or "c" for compiled programs of scalars, which need a C compiler. The
-                first call of each kind is traced and compiled, for seconds; the compiler's work is
-                kept on disk. Or what makes a `robins.filters.machine.Memory` of a state.
+                first call of each kind takes seconds to compile; programs are kept on disk. Or a
+                function that makes a `robins.filters.machine.Memory` of a state.
 
         Raises:
             ValueError: there is no such machine.
             robins.program.BuildError: there is no C compiler.
-            robins.program.ProgramError: the state holds numbers that have no place in C. What a
-                function does that has no place there is told by the call that needs it, with the
-                line of the model or the rule.
+            robins.program.ProgramError: the state holds numbers that C cannot represent; a call
+                raises it for an operation that C lacks, with the line of the model or the rule.
         """
         self.filter, self.model = filter_, model
         state = settled(filter_.init(start, model.dims) if isinstance(start, Belief) else start)
         self._machine = on(machine, self.filter, self.model, state)
         self._reports = filter_.reports
-        self._start = self._held()
+        self._start = self._copied(self.state)
         self.counts: Counter[str] = Counter()
-        self._last: dict[str, deque[tuple[StepInfo, Any]]] = {}
+        self._last: dict[str, deque[tuple[StepInfo, State]]] = {}
 
     @property
     def state(self) -> FilterState:
@@ -76,11 +78,11 @@ class OnlineFilter:
     @state.setter
     def state(self, state: FilterState) -> None:
         self._machine.state = state
-        self._start = self._held()
+        self._start = self._copied(self.state)
 
     @property
     def belief(self) -> Belief:
-        """What is believed now."""
+        """The current belief."""
         return self.state.belief
 
     def predict(self, u: Data = None) -> Prediction:
@@ -91,19 +93,15 @@ class OnlineFilter:
 
     def step(
         self,
-        y: Mapping[str, Any],
+        y: Mapping[str, Data],
         u: Data = None,
-        aux: Mapping[str, Any] | None = None,
-        keep: Callable[[Step], Any] = everything,
-    ) -> Any:
-        """A whole step in one compiled call: predict, then update with each sensor in y.
+        aux: Mapping[str, Data] | None = None,
+        keep: Callable[[Step], Data] = everything,
+    ) -> Data:
+        """Take a whole step in one compiled call: predict, then update with each sensor in y.
 
-        Args:
-            y: measurements by sensor name, NaN where missing, of the same shapes at every call;
-                they are not checked as those of `update` are.
-            u: input of the motion.
-            aux: what sensors need besides the state, by sensor name.
-            keep: what to give back of the `Step`, as in `run`.
+        Measurements have the same shapes at every call, with NaN where missing; unlike those of
+        `update` they are not checked. `keep` is the part of the `Step` to return, as in `run`.
         """
         kept, (moved, used) = self._machine.step(u, dict(y), dict(aux or {}), keep)
         self._count(moved, *used.values())
@@ -113,23 +111,17 @@ class OnlineFilter:
         return kept
 
     def update(self, y: Data, sensor: str | None = None, aux: Data = None) -> StepInfo:
-        """Use a measurement; NaN is missing, per component.
-
-        Args:
-            y: the measurement.
-            sensor: its sensor's name; may be left out where the model has one sensor.
-            aux: what the sensor needs besides the state.
+        """Use a measurement of a sensor, optional where the model has one; NaN is missing.
 
         Raises:
             KeyError: the model has no sensor of this name.
             TypeError: the measurement is not of real numbers.
-            ValueError: no name was given and the model has several sensors, or the measurement is
-                not of the shape that the sensor reads.
+            ValueError: the name is missing, or the measurement has the wrong shape.
         """
         if sensor is None:
-            if len(self.model.sensors) != 1:
-                raise ValueError(f"name one of the sensors {sorted(self.model.dims)}")
-            sensor = self.model.sensors[0].name
+            names = sorted(self.model.dims)
+            require(len(names) == 1, f"name one of the sensors {names}")
+            (sensor,) = names
         self.model.sensor(sensor)
         numbers = (as_real if self._machine.is_numpy else as_measurement)(sensor, y)
         info = self._machine.update(sensor, numbers, aux)
@@ -138,14 +130,10 @@ class OnlineFilter:
         return info
 
     def doubts(self, bounds: bool = False, assumed: Collection[str] = ()) -> list[str]:
-        """Sentences on why to doubt the last 400 updates of each sensor, as those on a run.
+        """Sentences on reasons to doubt the last 400 updates of each sensor.
 
-        Updates by `step` are among them where it keeps the whole `Step`. The probability of a false
-        alarm is that of one call.
-
-        Args:
-            bounds: as in `robins.filters.doubts`.
-            assumed: likewise.
+        Updates by `step` count where it keeps the whole `Step`. The probability of a false alarm is
+        that of one call. Arguments are those of `robins.filters.doubts`.
         """
         tally = Tally.blank(tuple(self._last))
         info, readings = {}, {}
@@ -158,30 +146,26 @@ class OnlineFilter:
             tally.dof[sensor] = np.sum(np.where(judged, dof, 0))
         return doubts(tally.looking(info, readings), bounds, assumed)
 
-    def look(self, question: Callable[..., Any], *args: Any) -> Any:
-        """What ``question(filter, model, state, *args)`` gives, compiled; the state stays.
+    def look(self, question: Callable[..., T], *args: Data) -> T:
+        """Return ``question(filter, model, state, *args)``, compiled; the state stays.
 
-        Args:
-            question: a pure function, the same object at every call, such as one that predicts to
-                another time than that of the next step.
-            args: pytrees of numbers.
+        The question is a pure function, the same object at every call, such as one that predicts to
+        another time than that of the next step.
         """
         return self._machine.look(question, *args)
 
     def _remember(self, sensor: str, info: StepInfo, y: State) -> None:
-        """Keep an update for `doubts`; what C computes next must not change it."""
-        kept = (info._replace(gain=(), notes={}), y)
-        if self._machine.is_numpy:
-            kept = tree_map(np.array, kept)
+        """Keep an update for `doubts`."""
+        kept = self._copied((info._replace(gain=(), notes={}), y))
         self._last.setdefault(sensor, deque(maxlen=WINDOW)).append(kept)
 
-    def _held(self) -> FilterState:
-        """The state of now for later: what C computes next must not change it."""
-        return tree_map(np.array, self.state) if self._machine.is_numpy else self.state
+    def _copied(self, tree: T) -> T:
+        """The same numbers, which the next call in C does not overwrite."""
+        return tree_map(np.array, tree) if self._machine.is_numpy else tree
 
-    def _count(self, moved: Any, *used: Any) -> None:
+    def _count(self, moved: Numbers | int, *used: Numbers) -> None:
         """Count a prediction that was not taken, and updates; let the filter report."""
-        # whole numbers of Python: to compare one of NumPy with a `Code` takes as long as a step
+        # integers of Python: to compare one of NumPy with a `Code` takes as long as a step
         if (code := int(moved)) != _DONE:
             self.counts[_NAMES[code]] += 1
         for one in used:

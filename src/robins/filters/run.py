@@ -1,22 +1,23 @@
-"""The one driver: a whole run is one scan, a batch of runs one `vmap` of it."""
+"""Driver of filters: a whole run is one scan, a batch of runs one `vmap` of it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo
-from robins.filters.kalman import Filter, FilterState, Prediction
+from robins.filters.kalman import Again, Filter, FilterState, Prediction
 from robins.filters.model import Data, Model
 from robins.filters.observation import as_measurement
 from robins.filters.tally import Tally, warn_not_taken
+from robins.filters.values import is_known
+from robins.manifold import State
 
 
 class Step(NamedTuple):
@@ -30,13 +31,13 @@ class Step(NamedTuple):
 class Solution(NamedTuple):
     """A run: every field has a leading axis of T steps."""
 
-    steps: Any  # what `keep` chose of each Step; by default the Step itself
+    steps: Data  # result of `keep` for each Step; by default the Step itself
     final: FilterState  # after the last step, to go on from
     log_likelihood: Float[Array, ""]
-    tally: Tally  # how the steps went, whatever was kept of them
+    tally: Tally  # outcomes of all steps, whatever was kept
 
     @property
-    def mean(self):
+    def mean(self) -> State:
         """Filtered means."""
         return self.steps.posterior.mean
 
@@ -61,50 +62,44 @@ def nothing(step: Step) -> tuple[()]:
     return ()
 
 
-def is_traced(tree: Any) -> bool:
-    """Whether numbers are stand-ins of a transformation, so that nothing can be asked of them."""
-    return any(isinstance(x, Tracer) for x in jax.tree_util.tree_leaves(tree))
-
-
-def _by_sensor(model: Model, data: Any) -> dict[str, Any]:
-    """Measurements by sensor name; a bare array means the only sensor there is."""
+def _by_sensor(model: Model, data: Data) -> dict[str, State]:
+    """Measurements by sensor name; a bare array means the only sensor."""
     if data is None:
         return {}
     if not isinstance(data, Mapping):
-        if len(model.sensors) != 1:
-            raise ValueError(
-                f"this model has {sorted(model.dims)}: give measurements as a dict by sensor name"
-            )
+        names = sorted(model.dims)
+        one = len(model.sensors) == 1
+        require(one, f"this model has {names}: give measurements as a dict by sensor name")
         data = {model.sensors[0].name: data}
     check_names(model, data)
     return {name: as_measurement(name, values) for name, values in data.items()}
 
 
-def check_names(model: Model, data: Mapping[str, Any]) -> None:
+def check_names(model: Model, data: Mapping[str, Data]) -> None:
     """Refuse data of sensors that the model does not have."""
     unknown = set(data) - set(model.dims)
     require(not unknown, f"no sensor {sorted(unknown)}; this model has {sorted(model.dims)}")
 
 
-def _check_lengths(y: Mapping[str, Any], u: Data, aux: Mapping[str, Any]) -> None:
-    """All that runs along must have one length in time."""
+def _check_lengths(y: Mapping[str, Data], u: Data, aux: Mapping[str, Data]) -> None:
+    """Refuse data of different lengths in time."""
     named = {"u": u, **{f"y['{k}']": v for k, v in y.items()}}
     named |= {f"aux['{k}']": v for k, v in aux.items()}
     lengths: dict[str, int] = {}
     for name, data in named.items():
         for leaf in jax.tree_util.tree_leaves(data):
-            if jnp.ndim(leaf) == 0:
-                raise ValueError(f"{name} holds a single number: a leading axis of time is wanted")
+            timed = jnp.ndim(leaf) > 0
+            require(timed, f"{name} holds a single number: a leading axis of time is wanted")
             lengths[name] = jnp.shape(leaf)[0]
-            if lengths[name] != next(iter(lengths.values())):
-                raise ValueError(f"measurements and inputs must have one length, got {lengths}")
+            same = len(set(lengths.values())) == 1
+            require(same, "measurements and inputs must have one length", lengths)
     require(u is not None or y, "nothing to run over: neither a measurement nor an input")
 
 
 def filter_step(
-    filter_: Filter, model: Model, state: FilterState, u: Data, y: Mapping[str, Any], aux: Data
+    filter_: Filter, model: Model, state: FilterState, u: Data, y: Mapping[str, Data], aux: Data
 ) -> tuple[FilterState, Step]:
-    """Predict over one step, then update with each sensor that has a measurement in y."""
+    """Predict over one step, then update with each sensor in y."""
     state, prediction = filter_.predict(state, model.motion, u)
     info = {}
     for sensor in model.sensors:
@@ -129,43 +124,55 @@ def _scan(filter_, model, state, u, y, aux, keep):
     return Solution(steps, state, total, tally)
 
 
+def report_run(
+    filter_: Filter,
+    start: FilterState,
+    final: FilterState,
+    tally: Tally,
+    again: Again,
+    time_s: ArrayLike | None,
+) -> None:
+    """Raise the report of a filter on a run and warn of its tally, unless they are traced."""
+    if is_known(final):
+        filter_.report(start, final, again, time_s)
+    if is_known(tally):
+        warn_not_taken(tally)
+
+
 def run(
     filter_: Filter,
     model: Model,
     start: Belief | FilterState,
     y: Data,
     u: Data = None,
-    aux: Mapping[str, Any] | None = None,
-    keep: Callable[[Step], Any] = everything,
+    aux: Mapping[str, Data] | None = None,
+    keep: Callable[[Step], Data] = everything,
     time_s: ArrayLike | None = None,
 ) -> Solution:
-    """Run a filter over measurements: for each step predict, then update with row k of y.
+    """Run a filter over measurements: for each step k predict, then update with row k of y.
 
-    One compiled scan: batch with `jax.vmap` over any of the data, differentiate with `jax.grad`.
-    Filters and models of other numbers, with a user's functions and `keep` that are the same
-    objects, and data of the same shapes, share what was compiled.
+    One compiled scan, for `jax.vmap` over any of the data and for `jax.grad`. Runs share a compiled
+    program if functions of the user and `keep` are the same objects, and shapes are equal.
 
     Args:
         filter_: from `kalman` and its kin.
         model: the motion and the sensors.
-        start: belief before the first prediction, or the state a run ended with, to go on.
+        start: belief before the first prediction, or the final state of another run.
         y: measurements, (T, m) for a model of one sensor, else a dict by sensor name; NaN is
-            missing, per component. The motion comes first: row 0 is measured one step after start.
+            missing, per component. Row 0 is measured one step after start.
         u: input of the motion at each step, a pytree of arrays with leading axis T.
-        aux: what sensors need besides the state, by sensor name, leading axis T.
-        keep: what to keep of each `Step`; long campaigns keep little.
+        aux: further inputs of sensors, by sensor name, leading axis T.
+        keep: part of each `Step` to keep; long campaigns keep little.
         time_s: (T,) time of each step [s], which errors then name.
 
     Raises:
-        Exception: what the filter has to report of the run (`Filter.report`). In transformed or
-            compiled code nothing can be raised: the codes of the steps say it.
+        Exception: report of the filter (`Filter.report`); in transformed code see the codes.
         TypeError: a measurement is not a real number.
-        ValueError: lengths differ, a measurement names no sensor of the model or is not of the
-            shape that its sensor reads.
+        ValueError: lengths differ, or a measurement names no sensor or has another shape than it.
 
     Warns:
-        StepWarning: steps were not taken, or measurements contradict what is known exactly; outside
-            of transformations. `Solution.tally` counts them also there.
+        StepWarning: steps were not taken, or measurements contradict what is known exactly; in
+            transformed code see `Solution.tally`.
     """
     measurements = _by_sensor(model, y)
     extra = dict(aux or {})
@@ -175,15 +182,12 @@ def run(
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
     state, u, extra = as_arrays(state), as_arrays(u), as_arrays(extra)
     solution = _scan(filter_, model, state, u, measurements, extra, keep)
-    if not is_traced(solution.final):
 
-        def again(other: Filter) -> FilterState:
-            return _scan(other, model, state, u, measurements, extra, nothing).final
+    def again(other: Filter) -> FilterState:
+        return _scan(other, model, state, u, measurements, extra, nothing).final
 
-        filter_.report(state, solution.final, again, time_s)
-    if not is_traced(solution.tally):
-        warn_not_taken(solution.tally)
-        if keep is everything:
-            tally = solution.tally.looking(solution.steps.info, measurements)
-            solution = solution._replace(tally=tally)
+    report_run(filter_, state, solution.final, solution.tally, again, time_s)
+    if keep is everything and is_known(solution.tally):
+        tally = solution.tally.looking(solution.steps.info, measurements)
+        solution = solution._replace(tally=tally)
     return solution

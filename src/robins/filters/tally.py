@@ -4,28 +4,26 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Collection, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from robins.filters.belief import FAILURES, SENTENCES, Code, StepInfo
 from robins.filters.chi_square import chi2_band
+from robins.filters.values import Numbers
 from robins.filters.whiteness import looked, suspicions
 from robins.manifold import State
 
-# A gate against outliers refuses a few measurements in a hundred. One that refuses more than this
-# share takes the model for right and the sensor for wrong.
-REFUSED_SHARE = 1.0 / 3.0
-APART_SHARE = 0.1  # of measurements whose local filter differs from another, worth a word
+REFUSED_SHARE = 1.0 / 3.0  # of refused measurements that is reported: a sound gate refuses few
+APART_SHARE = 0.1  # of measurements with diverging local filters that is reported
 FEWEST = 20  # measurements, or degrees of freedom, below which no share and no mean is judged
 
-# Mean NIS per degree of freedom that is worth a word: standard deviations half of what they should
+# Mean NIS per degree of freedom that is reported: standard deviations half of what they should
 # be, or four times. Robust filters are cautious by design, so that side is wider.
 NIS_HIGH, NIS_LOW = 4.0, 1.0 / 16.0
-CORRELATED = 10  # innovations of a wrong model are alike for a while: so many count as one
+CORRELATED = 10  # innovations of a wrong model are correlated: so many count as one
 LEVEL = 0.999
 
 
@@ -34,133 +32,123 @@ class StepWarning(UserWarning):
 
 
 class Tally(NamedTuple):
-    """Outcomes of a run's steps, counted; leading axes, of several runs, are summed."""
+    """Counts of the outcomes of a run's steps; leading axes, of several runs, are summed."""
 
-    predictions: Any  # (codes,) number of predictions by `Code`
-    updates: dict[str, Any]  # (codes,) number of updates by `Code`, by sensor
-    nis: dict[str, Any]  # () sum of the normalised innovations squared, by sensor
-    dof: dict[str, Any]  # () sum of their degrees of freedom, by sensor
-    looks: Mapping[str, Any] = {}  # sums of `whiteness.looked` by sensor, where steps were kept
+    predictions: Numbers  # (codes,) number of predictions by `Code`
+    updates: dict[str, Numbers]  # (codes,) number of updates by `Code`, by sensor
+    nis: dict[str, Numbers]  # () sum of the normalised innovations squared, by sensor
+    dof: dict[str, Numbers]  # () sum of their degrees of freedom, by sensor
+    looks: Mapping[str, np.ndarray] = {}  # `whiteness.looked` by sensor, where steps were kept
 
     @classmethod
-    def blank(cls, sensors: Mapping[str, Any] | tuple[str, ...]) -> Tally:
-        """Nothing counted yet."""
-        none = jnp.zeros(len(Code), int)
-        return cls(
-            none,
-            dict.fromkeys(sensors, none),
-            dict.fromkeys(sensors, jnp.zeros(())),
-            dict.fromkeys(sensors, jnp.zeros((), int)),
-        )
+    def blank(cls, sensors: Collection[str]) -> Tally:
+        """Tally of no step."""
+        zeros = (jnp.zeros(len(Code), int), jnp.zeros(()), jnp.zeros((), int))
+        updates, nis, dof = (dict.fromkeys(sensors, zero) for zero in zeros)
+        return cls(zeros[0], updates, nis, dof)
 
-    def and_step(self, prediction: Any, info: Mapping[str, StepInfo]) -> Tally:
-        """With one more step: the code of its prediction, and its updates by sensor."""
+    def and_step(self, prediction: Numbers, info: Mapping[str, StepInfo]) -> Tally:
+        """Add a step: the code of its prediction, and its updates by sensor."""
         judged = {k: (i.dof > 0) & (i.code != int(Code.REFUSED)) for k, i in info.items()}
-        return Tally(
-            self.predictions + _one(prediction),
-            self.updates | {k: self.updates[k] + _one(i.code) for k, i in info.items()},
-            # An infinite NIS is that of a contradiction, which may leave nothing to be used.
-            self.nis
-            | {
-                k: self.nis[k] + jnp.where(judged[k] | jnp.isinf(i.nis), i.nis, 0.0)
-                for k, i in info.items()
-            },
-            self.dof | {k: self.dof[k] + jnp.where(judged[k], i.dof, 0) for k, i in info.items()},
-        )
+        predictions = self.predictions + _one(prediction)
+        updates = {k: self.updates[k] + _one(i.code) for k, i in info.items()}
+        # A contradiction has an infinite NIS, but may use no component.
+        nis = {
+            k: self.nis[k] + jnp.where(judged[k] | jnp.isinf(i.nis), i.nis, 0.0)
+            for k, i in info.items()
+        }
+        dof = {k: self.dof[k] + jnp.where(judged[k], i.dof, 0) for k, i in info.items()}
+        return Tally(predictions, self.updates | updates, self.nis | nis, self.dof | dof)
 
     def looking(
         self, info: Mapping[str, tuple], readings: Mapping[str, State] | None = None
     ) -> Tally:
         """Add sums of innovations and readings over the steps, for `doubts`; not in `jit`.
 
-        Args:
-            info: by sensor a `StepInfo` of all steps, or what has its innovation, sigma, nis, dof.
-            readings: by sensor, as the run took them.
+        Both are by sensor: a `StepInfo` of all steps, or a tuple with its innovation, sigma, nis
+        and dof; the readings as the run took them.
         """
         given = readings or {}
-        fields = ("innovation", "sigma", "nis", "dof")
-        # in NumPy, where no operation is a program
-        steps = {k: jax.tree_util.tree_map(np.asarray, i) for k, i in info.items()}
-        seen = {k: {field: getattr(i, field) for field in fields} for k, i in steps.items()}
-        return self._replace(looks={k: looked(**x, readings=given.get(k)) for k, x in seen.items()})
+        looks = {}
+        for name, one in info.items():
+            i = jax.tree_util.tree_map(np.asarray, one)  # NumPy compiles no programs
+            looks[name] = looked(i.innovation, i.sigma, i.nis, i.dof, given.get(name))
+        return self._replace(looks=looks)
 
     def counts(self, sensor: str | None = None) -> dict[Code, int]:
-        """How often each code occurred: in predictions, or in the updates of a sensor."""
+        """Count the occurrences of each code in predictions, or in the updates of a sensor."""
         numbers = np.asarray(self.predictions if sensor is None else self.updates[sensor])
         total = numbers.reshape(-1, len(Code)).sum(axis=0)
         return {Code(i): int(number) for i, number in enumerate(total) if number}
 
 
-def _one(code: Array) -> Array:
+def _one(code: Numbers) -> Numbers:
     return (jnp.arange(len(Code)) == code).astype(int)
 
 
 def not_taken(tally: Tally) -> list[str]:
     """Sentences on steps that were not taken and on contradictions."""
-    said = []
     counts = tally.counts()
     total = sum(counts.values())
-    for code, number in counts.items():
-        if code is not Code.DONE:
-            said.append(
-                f"{number} of {total} predictions are {code.name}: {SENTENCES[code]}. The belief "
-                "stays behind by these steps"
-            )
+    found = [
+        f"{number} of {total} predictions are {code.name}: {SENTENCES[code]}. The belief stays "
+        "behind by these steps"
+        for code, number in counts.items()
+        if code is not Code.DONE
+    ]
     for sensor in tally.updates:
         counts = tally.counts(sensor)
         total = sum(counts.values())
-        said += [
+        found += [
             f"{number} of {total} updates with '{sensor}' are {code.name}: {SENTENCES[code]}"
             for code, number in counts.items()
             if code in FAILURES
         ]
-    return said
+    return found
 
 
 def doubts(tally: Tally, bounds: bool = False, assumed: Collection[str] = ()) -> list[str]:
-    """Sentences on why a reader should doubt the results of a filter; none if there is no reason.
+    """Sentences on reasons to doubt the results of a filter.
 
-    They name steps that were not taken, and contradictions; sensors more than a third of whose
-    measurements the filter refused; sensors at more than a tenth of whose measurements the local
-    filters of a joined one were more than 5 standard deviations apart; and sensors whose mean NIS
-    per degree of freedom is above 4 (standard deviations half of what they should be) or below 1/16
-    (four times) and outside the 99.9 % band of chi-square with a tenth of the degrees of freedom:
-    innovations of a wrong model are correlated. Of runs whose steps were looked at
-    (`Tally.looking`, which `run` does where it keeps whole steps) also what
-    `whiteness.suspicions` finds in the sequence.
+    They name steps that were not taken, and contradictions; sensors with more than a third of the
+    measurements refused; sensors with more than a tenth of the measurements where the local filters
+    of a joined one were more than 5 standard deviations apart; and sensors with a mean NIS per
+    degree of freedom above 4 or below 1/16 and outside the 99.9 % band of chi-square with a tenth
+    of the degrees of freedom. A run that keeps whole steps (`Tally.looking`) is also tested by
+    `whiteness.suspicions`.
 
     Args:
         tally: of a run (`Solution.tally`), or of several with leading axes.
         bounds: the filter states bounds, not standard deviations (an H-infinity filter), so the
             mean NIS of the run is not tested.
-        assumed: sensors whose noise is a guess on the cautious side: a small NIS says nothing, nor
-            does the side and order of innovations.
+        assumed: sensors with cautious noise: neither a small NIS nor the side and order of
+            innovations are tested.
     """
-    said = not_taken(tally)
+    found = not_taken(tally)
     for sensor in tally.updates:
         counts = tally.counts(sensor)
         refused = counts.get(Code.REFUSED, 0)
         measured = sum(counts.values()) - counts.get(Code.MISSING, 0)
         if measured >= FEWEST and refused > REFUSED_SHARE * measured:
-            said.append(
+            found.append(
                 f"{refused} of {measured} measurements of '{sensor}' were refused: look at the "
                 "noise of the sensor and of the motion, and at the initial state"
             )
         apart = counts.get(Code.APART, 0)
         if measured >= FEWEST and apart > APART_SHARE * measured:
-            said.append(
+            found.append(
                 f"the local filter of '{sensor}' and another one differed by more than 5 standard "
                 f"deviations at {apart} of {measured} measurements: a sensor of one of them may "
                 "have an error that the model leaves out"
             )
         nis, dof = float(np.sum(tally.nis[sensor])), int(np.sum(tally.dof[sensor]))
         if not bounds and dof >= FEWEST:
-            said += _off(sensor, nis / dof, dof, sensor in assumed)
-    return said + suspicions(tally.looks, assumed)
+            found += _off(sensor, nis / dof, dof, sensor in assumed)
+    return found + suspicions(tally.looks, assumed)
 
 
 def _off(sensor: str, ratio: float, dof: int, cautious: bool) -> list[str]:
-    """A sentence where a mean NIS per degree of freedom is far from one."""
+    """Sentence on a mean NIS per degree of freedom that is far from one."""
     count = max(dof // CORRELATED, 1)
     low, high = chi2_band(count, 1, LEVEL) / count
     if (cautious or min(low, NIS_LOW) <= ratio) and ratio <= max(high, NIS_HIGH):
@@ -176,11 +164,7 @@ def _off(sensor: str, ratio: float, dof: int, cautious: bool) -> list[str]:
     ]
 
 
-def warn_not_taken(tally: Tally, stacklevel: int = 3) -> None:
-    """Warn of steps that were not taken.
-
-    Warns:
-        StepWarning: there are such steps; the message counts them by outcome.
-    """
-    if said := not_taken(tally):
-        warnings.warn("; ".join(said), StepWarning, stacklevel=stacklevel)
+def warn_not_taken(tally: Tally) -> None:
+    """Warn with a `StepWarning` of steps that were not taken, at the caller of a run."""
+    if found := not_taken(tally):
+        warnings.warn("; ".join(found), StepWarning, stacklevel=4)

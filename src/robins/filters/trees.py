@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
+
+from robins.filters.model import Data
+
+T = TypeVar("T")
 
 
-def finite(tree: Any) -> Array:
-    """Whether all its floating-point numbers are finite; true where it has none."""
+def finite(tree: Data) -> Array:
+    """() bool: all floating-point numbers are finite; true where there are none."""
     leaves = [jnp.asarray(x) for x in jax.tree_util.tree_leaves(tree)]
     found = [jnp.all(jnp.isfinite(x)) for x in leaves if jnp.issubdtype(x.dtype, jnp.inexact)]
     return jnp.all(jnp.stack(found)) if found else jnp.ones((), bool)
 
 
-def equal(a: Any, b: Any) -> Array:
-    """Whether two pytrees hold the same numbers."""
+def equal(a: Data, b: Data) -> Array:
+    """() bool: two pytrees hold the same numbers."""
     pairs = zip(jax.tree_util.tree_leaves(a), jax.tree_util.tree_leaves(b), strict=True)
     return jnp.all(jnp.stack([jnp.all(x == y) for x, y in pairs]))
 
 
-def select(condition: Any, new: Any, old: Any) -> Any:
+def select(condition: ArrayLike, new: T, old: T) -> T:
     """``new`` where the condition holds, else ``old``, leaf by leaf."""
     return jax.tree_util.tree_map(lambda a, b: jnp.where(condition, a, b), new, old)

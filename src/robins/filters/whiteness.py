@@ -1,17 +1,17 @@
-"""Sequences of innovations and readings: what a sound filter does not show, and how sure that is.
+"""Tests of sequences of innovations and readings.
 
-The innovations of a filter that is right are independent of all before them, lie on either side of
-zero alike, and are as large late as they were early; a sensor that is alive does not repeat itself.
-Each test compares one of these with a quantile of a stated probability, and with a size below
-which a deviation is of no consequence: in a long log every model is wrong by many of its sigmas.
+The innovations of a consistent filter are independent of all before them, lie on either side of
+zero alike, and are as large late as they were early; a working sensor does not repeat itself.
+Each test compares one of these with a quantile of a stated probability, and with a least size of
+deviation: in a long log every model is wrong by many of its sigmas.
 
-The innovations are those before a robust rule weighs them: a weight changes the sigma, not the
-side. All is NumPy on arrays that a run has kept, with any leading axes of runs.
+The innovations are those before a robust rule weighs them. All is NumPy on arrays that a run has
+kept, with any leading axes of runs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -22,20 +22,20 @@ from scipy.special import bdtrik, ndtr, ndtri
 from robins.filters.chi_square import chi_square
 from robins.manifold import State
 
-FALSE_ALARM = 1e-5  # probability that a sound run is doubted, over all its sensors and tests
-BY_CHANCE = 1e-3  # probability that chance alone doubts as many runs as a sentence counts
+FALSE_ALARM = 1e-5  # probability of a finding on a consistent run, over all sensors and tests
+BY_CHANCE = 1e-3  # probability that as many runs have a finding by chance
 TESTS = 5  # of a component: following, the side in all, the side late, size and share far late
 FEWEST = 20  # innovations below which nothing is judged
 BEFORE = 10  # innovations whose sum is compared with the next
-CLIPPED = 3.0  # sigmas: an outlier counts as one of these
-FOLLOWING = 0.2  # correlation with those before that is worth a word
-ONE_SIDE = 0.6  # share on one side that is worth a word: a bias of a quarter of a sigma
-FAR_SHARE = 1.0 / 3.0  # innovations of the last quarter beyond `CLIPPED` that are worth a word
-LATE_NIS = 2.0  # mean NIS per degree of freedom in the last quarter that is worth a word
+CLIPPED = 3.0  # sigmas at which an innovation is clipped
+FOLLOWING = 0.2  # least correlation with those before that is reported
+ONE_SIDE = 0.6  # least share on one side that is reported: a bias of a quarter of a sigma
+FAR_SHARE = 1.0 / 3.0  # least share of the last quarter beyond `CLIPPED` that is reported
+LATE_NIS = 2.0  # least mean NIS per degree of freedom in the last quarter that is reported
 REPEATS = 10  # equal readings in a row of a stuck sensor
-COARSE = 0.1  # resolution over sigma of the innovation from which a reading may repeat itself
+COARSE = 0.1  # resolution over sigma of the innovation above which readings may repeat
 
-# Sums of a component, last axis of `looked`: those of pieces of one log may be added.
+# Columns of `looked`: the sums of several pieces of one log may be added.
 _COUNT, _PRODUCT, _SQUARE, _SEEN, _ABOVE, _LATE, _LATE_ABOVE, _FAR, _NIS, _DOF, _REPEATS = range(11)
 
 
@@ -46,19 +46,18 @@ def looked(
     dof: ArrayLike,
     readings: State = None,
 ) -> np.ndarray:
-    """Sums that `suspicions` judges: (..., m, 11), of a sensor's updates over the steps of a run.
+    """Sums (..., m, 11) over the updates of a sensor in a run, for `suspicions`.
 
     Args:
         innovation: (..., T, m), NaN where missing.
         sigma: (..., T, m), NaN where not used.
         nis: (..., T).
         dof: (..., T).
-        readings: (..., T) pytree of what the sensor gave, as a run takes it; not given, repeated
-            readings are not looked for.
+        readings: (..., T) pytree of measurements as a run takes it; None skips the test of
+            repeated readings.
     """
     e, sigma = np.asarray(innovation, float), np.asarray(sigma, float)
-    m = e.shape[-1]
-    out = np.zeros((*e.shape[:-2], m, 11))
+    out = np.zeros((*e.shape[:-2], e.shape[-1], 11))
     there = np.any(np.isfinite(e), axis=(*range(e.ndim - 2), -1))
     e, sigma = e[..., there, :], sigma[..., there, :]
     nis, dof = (np.asarray(x, float)[..., there] for x in (nis, dof))
@@ -71,19 +70,20 @@ def looked(
     product = w[..., 1:, :] * before
     late = slice(3 * w.shape[-2] // 4, None)
     used = np.isfinite(nis) & (dof > 0)
-    for column, value in (
-        (_COUNT, np.sum(product != 0.0, axis=-2)),
-        (_PRODUCT, np.sum(product, axis=-2)),
-        (_SQUARE, np.sum(product**2, axis=-2)),
-        (_SEEN, np.sum(w != 0.0, axis=-2)),
-        (_ABOVE, np.sum(w > 0.0, axis=-2)),
-        (_LATE, np.sum(w[..., late, :] != 0.0, axis=-2)),
-        (_LATE_ABOVE, np.sum(w[..., late, :] > 0.0, axis=-2)),
-        (_FAR, np.sum(np.abs(w[..., late, :]) >= CLIPPED, axis=-2)),
-        (_NIS, np.sum(np.where(used, nis, 0.0)[..., late], axis=-1)[..., None]),
-        (_DOF, np.sum(np.where(used, dof, 0.0)[..., late], axis=-1)[..., None]),
+    end = w[..., late, :]
+    for column, terms in (
+        (_COUNT, product != 0.0),
+        (_PRODUCT, product),
+        (_SQUARE, product**2),
+        (_SEEN, w != 0.0),
+        (_ABOVE, w > 0.0),
+        (_LATE, end != 0.0),
+        (_LATE_ABOVE, end > 0.0),
+        (_FAR, np.abs(end) >= CLIPPED),
     ):
-        out[..., column] = value
+        out[..., column] = np.sum(terms, axis=-2)
+    for column, terms in ((_NIS, nis), (_DOF, dof)):
+        out[..., column] = np.sum(np.where(used, terms, 0.0)[..., late], axis=-1)[..., None]
     if readings is not None:
         out[..., _REPEATS] = _repeats(readings, there, e, sigma)
     return out
@@ -92,7 +92,7 @@ def looked(
 def _standard(e: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """Innovations over their sigmas, clipped; zero where missing.
 
-    One that was refused has no sigma, and takes that of the run: it counts all the same.
+    A refused innovation has no sigma and takes the mean one of the run.
     """
     blank = np.isnan(sigma)
     if np.any(blank):
@@ -106,10 +106,10 @@ def _standard(e: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 
 
 def _repeats(readings: State, there: np.ndarray, e: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Most equal readings in a row of each component; zero where the rule exempts it.
+    """Most equal readings in a row of each component; zero where repetition is legitimate.
 
-    A reading that is one number throughout is a pseudo-measurement such as zero velocity, and a
-    resolution above a tenth of the innovation's sigma lets a sensor at rest repeat itself.
+    A constant reading is a pseudo-measurement such as zero velocity, and a sensor at rest repeats
+    itself if its resolution is above a tenth of the innovation's sigma.
     """
     lead, m = e.shape[:-2], e.shape[-1]
     flat = [np.asarray(leaf, float) for leaf in tree_leaves(readings)]
@@ -139,56 +139,49 @@ def _longest(y: np.ndarray, sigma: float) -> int:
 
 
 def joined(looks: Sequence[np.ndarray]) -> np.ndarray:
-    """Sums over several pieces of one log."""
+    """Sums over all pieces of one log."""
     table = np.sum(looks, axis=0)
     table[..., _REPEATS] = np.max([look[..., _REPEATS] for look in looks], axis=0)
     return table
 
 
-# ------------------------------------------------------------------------------- sums to sentences
-
-
 def suspicions(looks: Mapping[str, ArrayLike], assumed: Collection[str] = ()) -> list[str]:
-    """Sentences on sequences that a sound filter would not show; none if there is no reason.
+    """Sentences on sequences that a consistent filter would not show.
 
     Args:
-        looks: by sensor what `looked` gives; with leading axes each run is judged by itself, and a
-            sentence counts those of which it holds.
-        assumed: sensors whose errors last by design, so that only the size of the innovations and
-            repeated readings count: their noise is a guess on the cautious side, or the gain is
-            held or leaves states out, as those of `constant_gain` and `consider`.
+        looks: sums of `looked` by sensor; with leading axes each run is judged by itself, and a
+            sentence counts the runs for which it holds.
+        assumed: sensors with correlated errors by design, so that only the size of the innovations
+            and repeated readings count: their noise is a cautious guess, or the gain is held or
+            leaves states out (`constant_gain`, `consider`).
     """
     tables = {name: np.asarray(table, float) for name, table in looks.items()}
     components = sum(table.shape[-2] for table in tables.values())
     level = FALSE_ALARM / max(TESTS * components, 1)
     found = []
     for sensor, table in tables.items():
-        rows = table.reshape(-1, *table.shape[-2:])
         lasting = sensor in assumed
         tests = [_repeating, partial(_late, lasting=lasting)]
         if not lasting:
             tests += [_far, _following, _one_sided]
         for test in tests:
-            found += _told(sensor, rows, test, level)
+            found += _sentence(sensor, table.reshape(-1, *table.shape[-2:]), test, level)
     return found
 
 
-Finding = tuple[float, str]  # how strong, and the words after the sensor's name
-Test = Callable[[np.ndarray, float], list[Finding]]
+Findings = Iterator[tuple[float, str]]  # strength, and the words after the sensor's name
+Test = Callable[[np.ndarray, float], Findings]
 
 
-def _told(sensor: str, rows: np.ndarray, test: Test, level: float) -> list[str]:
-    """The sentence of one test of one sensor, by its strongest component and run."""
+def _sentence(sensor: str, rows: np.ndarray, test: Test, level: float) -> list[str]:
+    """Sentence of one test of one sensor, on its strongest component and run."""
     found = []
     for table in rows:
-        by_component = [
-            (strength, index, words)
-            for index, row in enumerate(table)
-            for strength, words in test(row, level)
-        ]
+        judged = ((i, one) for i, row in enumerate(table) for one in test(row, level))
+        by_component = [(strength, index, words) for index, (strength, words) in judged]
         if by_component:
             found.append(max(by_component))
-    # chance doubts a few of very many
+    # a few of very many runs fail by chance
     if len(found) <= _binomial(len(rows), BY_CHANCE, FALSE_ALARM):
         return []
     _, index, words = max(found)
@@ -197,88 +190,72 @@ def _told(sensor: str, rows: np.ndarray, test: Test, level: float) -> list[str]:
     return [f"{among}'{sensor}'{where} {words}"]
 
 
-def _following(row: np.ndarray, level: float) -> list[Finding]:
+def _binomial(count: float | int, level: float, share: float = 0.5) -> float:
+    """Upper quantile of the number of hits in ``count`` draws of probability ``share``."""
+    return max(float(np.ceil(bdtrik(1.0 - level, count, share))), 0.0)
+
+
+def _following(row: np.ndarray, level: float) -> Findings:
     count, z = row[_COUNT], row[_PRODUCT] / np.sqrt(max(row[_SQUARE], 1e-300))
-    if count < FEWEST or z < max(-ndtri(level), FOLLOWING * np.sqrt(count)):
-        return []
-    return [
-        (
+    if count >= FEWEST and not z < max(-ndtri(level), FOLLOWING * np.sqrt(count)):
+        yield (
             z,
             f"has innovations that follow the {BEFORE} before them, by {z:.1f} sigma more than "
             "chance: the filter may trust its motion too much, or the errors of the sensor may "
             "last; compare a run with more process noise, or estimate that error",
         )
-    ]
 
 
-def _one_sided(row: np.ndarray, level: float) -> list[Finding]:
-    found = []
-    for seen, above, when in (
+def _one_sided(row: np.ndarray, level: float) -> Findings:
+    for count, above, when in (
         (row[_SEEN], row[_ABOVE], "of all"),
         (row[_LATE], row[_LATE_ABOVE], "of the last quarter"),
     ):
-        if seen < FEWEST:
-            continue
-        most = max(above, seen - above)
-        z = (2.0 * most - seen) / np.sqrt(seen)
-        if most > max(_binomial(seen, level / 2.0), ONE_SIDE * seen):
-            found.append(
-                (
-                    z,
-                    f"has {most:.0f} {when} its {seen:.0f} innovations on one side, by {z:.1f} "
-                    "sigma more than chance: the sensor or the motion may have an error that the "
-                    "model leaves out; look at its bias, its units and its axes",
-                )
+        most = max(above, count - above)
+        if count >= FEWEST and most > max(_binomial(count, level / 2.0), ONE_SIDE * count):
+            z = (2.0 * most - count) / np.sqrt(count)
+            yield (
+                z,
+                f"has {most:.0f} {when} its {count:.0f} innovations on one side, by {z:.1f} "
+                "sigma more than chance: the sensor or the motion may have an error that the "
+                "model leaves out; look at its bias, its units and its axes",
             )
-    return found
 
 
-def _binomial(count: float | int, level: float, share: float = 0.5) -> float:
-    """Number that so many draws, each a hit by this share, exceed with at most this probability."""
-    return max(float(np.ceil(bdtrik(1.0 - level, count, share))), 0.0)
-
-
-def _late(row: np.ndarray, level: float, lasting: bool) -> list[Finding]:
+def _late(row: np.ndarray, level: float, lasting: bool) -> Findings:
     nis, dof = row[_NIS], row[_DOF]
+    if dof < FEWEST:
+        return
     # errors that last make all innovations of a run large or small together: they count as one
     free = 1.0 if lasting else dof
-    if dof < FEWEST or nis < dof * max(LATE_NIS, float(chi_square(1.0 - level, free)) / free):
-        return []
-    z = (nis - dof) / np.sqrt(2.0 * dof)
-    return [
-        (
+    if not nis < dof * max(LATE_NIS, float(chi_square(1.0 - level, free)) / free):
+        z = (nis - dof) / np.sqrt(2.0 * dof)
+        yield (
             z,
             f"has innovations in the last quarter of mean NIS per degree of freedom "
             f"{nis / dof:.3g}, {z:.1f} sigma above one: the filter may have lost its way, or its "
             "standard deviations are too small; look at the time when the NIS begins to rise",
         )
-    ]
 
 
-def _far(row: np.ndarray, level: float) -> list[Finding]:
+def _far(row: np.ndarray, level: float) -> Findings:
     count, far = row[_LATE], row[_FAR]
     chance = _binomial(count, level, 2.0 * float(ndtr(-CLIPPED)))
     if count < FEWEST or far <= max(FAR_SHARE * count, chance):
-        return []
-    return [
-        (
-            far / count,
-            f"has {far:.0f} of the last {count:.0f} innovations beyond {CLIPPED:.0f} sigma, before "
-            "a rule gives them a weight: the filter may have lost its way, or the sensor may be "
-            "wrong; look at the time when that begins",
-        )
-    ]
+        return
+    yield (
+        far / count,
+        f"has {far:.0f} of the last {count:.0f} innovations beyond {CLIPPED:.0f} sigma, before "
+        "a rule gives them a weight: the filter may have lost its way, or the sensor may be "
+        "wrong; look at the time when that begins",
+    )
 
 
-def _repeating(row: np.ndarray, level: float) -> list[Finding]:
-    most = row[_REPEATS]
-    if most < REPEATS:
-        return []
-    return [
-        (
+def _repeating(row: np.ndarray, level: float) -> Findings:
+    if (most := row[_REPEATS]) >= REPEATS:
+        yield (
             most,
             f"gave the same reading {most:.0f} times in a row, though its resolution is finer than "
             "its noise: it may be stuck, or its last reading may be repeated by what records it; "
             "look at its readings there, and use each once",
         )
-    ]

@@ -1,4 +1,4 @@
-"""How good a filter is and can be: consistency, covariance bound, observability, worst case."""
+"""Accuracy of filters: consistency, covariance bound, observability, worst case."""
 
 from robins.filters.analysis.bound import (
     Bound,

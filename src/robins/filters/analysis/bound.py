@@ -1,33 +1,34 @@
-"""The covariance bound: how well given sensors can do at best, without any data.
+"""Covariance bound: the best accuracy that given sensors allow, without any data.
 
-The recursion of the Kalman filter's covariance with the model linearised about the *true* states.
-For Gaussian noise of the stated size it is the posterior Cramer-Rao bound along that trajectory
-(Tichavsky, Muravchik & Nehorai 1998, eq. 34; Van Trees & Bell 2007, part I): no estimator that is
-given the same model has smaller mean square errors. For a linear model the Kalman filter attains
-it.
+The recursion of the Kalman filter's covariance with the model, its noise included, linearised about
+the *true* states. For Gaussian noise it is the posterior Cramer-Rao bound along that trajectory
+(Tichavsky, Muravchik & Nehorai 1998, eq. 34; Van Trees & Bell 2007, part I): no estimator with the
+same model has smaller mean square errors. For a linear model the Kalman filter attains it.
 
-What was measured never enters, only which components were there. Where process noise depends on the
-state it is that at the true state.
+Of the measurements only the presence of components matters.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from robins import linalg, manifold
+from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.kalman import updated
 from robins.filters.linearise import taylor
 from robins.filters.model import Data, Model
 from robins.filters.observation import Observation, as_measurement
 from robins.manifold import State
+
+Use = ArrayLike | Sequence[bool]  # (S,) bool, sensors of a model that are used
 
 
 class Bound(NamedTuple):
@@ -41,15 +42,15 @@ class Bound(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """A sensor along a trajectory, leading axis E."""
+    """Sensor along a trajectory, leading axis E."""
 
     H: Array  # (E, m, n)
     noise: Array  # (E, m, k) factor, R = noise noise'
     present: Array  # (E, m) bool, the component was measured
-    size: Array  # (E, m) of the numbers that the reading was made of
+    size: Array  # (E, m) magnitude of the terms of the reading
 
     def seen_with(self, factor: Array, use: Array) -> Observation:
-        """One step of it (no axis E) as it is seen from an error with this factor."""
+        """Observation of one step (no axis E) from an error with this factor."""
         n = factor.shape[0]
         belief = Belief(jnp.zeros(n), factor)
         m = self.H.shape[0]
@@ -65,54 +66,49 @@ class Sight(NamedTuple):
             size=self.size + jnp.abs(self.H) @ belief.sigma,
         )
 
+    def updated_factor(self, factor: Array, use: Array) -> Array:
+        """Factor of the error after one step of it."""
+        o = self.seen_with(factor, use)
+        return updated(o.prior, o, "sqrt")[0].factor
+
 
 class Linearised(NamedTuple):
-    """A model along a trajectory, leading axis E."""
+    """Model along a trajectory, leading axis E."""
 
     F: Array  # (E, n, n) transition into each step
     noise: Array  # (E, n, q) factor, Q = noise noise'
-    sights: tuple[Sight | None, ...]  # of the model's sensors; None for what has no measurements
+    sights: tuple[Sight | None, ...]  # by sensor of the model; None without measurements
 
 
 def linearised(
     model: Model,
     start: Belief,
     truth: State,
-    y: Mapping[str, Any],
+    y: Mapping[str, Data],
     u: Data = None,
-    aux: Mapping[str, Any] | None = None,
+    aux: Mapping[str, Data] | None = None,
 ) -> Linearised:
     """Linearise a model about a true trajectory.
 
-    The transition of step k is taken at the true state before it and with its input, for the first
-    step at the mean of the start; the sensors at ``truth[k]``.
-
-    Args:
-        model: the motion and the sensors.
-        start: belief before the first step.
-        truth: true states at the measurements, leading axis E.
-        y: by sensor name, leading axis E. Only what is NaN matters.
-        u: inputs of the motion, leading axis E.
-        aux: what sensors need besides the state, by sensor name, leading axis E.
+    The transition of step k is taken at the true state before it, of the first step at the mean of
+    the start; the sensors at ``truth[k]``. Arguments are those of `run`, with leading axis E, and
+    the true states at the measurements; of y, by sensor name, only NaN matters.
 
     Raises:
         ValueError: lengths differ.
     """
     as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
     truth, mean, u, aux = map(as_arrays, (truth, start.mean, u, dict(aux or {})))
-    before = jax.tree_util.tree_map(
-        lambda first, rest: jnp.concatenate([first[None].astype(float), rest[:-1]]), mean, truth
-    )
+    before = delayed_by_one(mean, truth)
     measured = {name: as_measurement(name, values) for name, values in y.items()}
     rows = (before, truth, u, measured, aux)
     lengths = {jnp.shape(leaf)[0] for leaf in jax.tree_util.tree_leaves(rows)}
-    if len(lengths) > 1:
-        raise ValueError(
-            f"truth, inputs and measurements must have one length, got {sorted(lengths)}"
-        )
+    require(
+        len(lengths) <= 1, "truth, inputs and measurements must have one length", sorted(lengths)
+    )
     way, unit = taylor(), jnp.eye(manifold.dim(start.mean))
 
-    def at(row: Any) -> Linearised:
+    def at(row) -> Linearised:
         before, now, u, y, aux = row
         moved = way.transition(Belief(before, unit), model.motion, u)
         sights = []
@@ -128,11 +124,18 @@ def linearised(
     return jax.lax.map(at, rows)
 
 
+def delayed_by_one(first: State, states: State) -> State:
+    """States before each step, leading axis: the first one, then all but the last."""
+    return jax.tree_util.tree_map(
+        lambda a, b: jnp.concatenate([jnp.asarray(a, float)[None], b[:-1]]), first, states
+    )
+
+
 def used_sensors(model: Model, without: Sequence[str] = ()) -> np.ndarray:
-    """(S,) which sensors of a model are used when some are left out.
+    """(S,) bool: sensors of a model but some.
 
     Raises:
-        KeyError: the model has no such sensor; the message lists those there are.
+        KeyError: the model has no such sensor; the message lists its sensors.
     """
     left_out = {model.sensor(name).name for name in without}
     return np.array([s.name not in left_out for s in model.sensors], dtype=bool)
@@ -142,38 +145,35 @@ def covariance_bound(
     model: Model,
     start: Belief,
     truth: State,
-    y: Mapping[str, Any],
+    y: Mapping[str, Data],
     u: Data = None,
-    aux: Mapping[str, Any] | None = None,
-    use: Any = None,
+    aux: Mapping[str, Data] | None = None,
+    use: Use | None = None,
     known: Sequence[int] = (),
 ) -> Bound:
-    """Covariance that no filter can beat, along a true trajectory; ready for `jax.vmap`.
+    """Covariance bound along a true trajectory; may be batched by `jax.vmap`.
 
-    Arguments are those of `linearised`, the factor of ``start`` being the prior, and of
+    Arguments and errors are those of `linearised`, the factor of ``start`` being the prior, and of
     `bound_along`.
-
-    Raises:
-        ValueError: lengths differ, or a component that is known does not exist.
     """
     return bound_along(linearised(model, start, truth, y, u, aux), start.factor, use, known)
 
 
 def bound_along(
-    line: Linearised, factor: Array, use: Any = None, known: Sequence[int] = ()
+    line: Linearised, factor: Array, use: Use | None = None, known: Sequence[int] = ()
 ) -> Bound:
-    """The same of a model that has been linearised; one scan.
+    """Covariance bound of a linearised model; one scan.
 
     Args:
         line: from `linearised`.
         factor: (n, n) of the prior covariance.
-        use: (S,) bool, which sensors of the model to use, in its order, as `used_sensors` makes it;
-            it is data, so a batch of subsets is one `jax.vmap`. All by default.
-        known: numbers of the tangent components that are known exactly, before every prediction and
+        use: (S,) bool, sensors of the model to use, as `used_sensors` makes it; all by default. It
+            is data, so a batch of subsets is one `jax.vmap`.
+        known: indices of the tangent components that are known exactly, before every prediction and
             every measurement.
 
     Raises:
-        ValueError: a component that is known does not exist.
+        ValueError: a known component does not exist.
     """
     n = factor.shape[0]
     known = tuple(int(i) for i in known)
@@ -182,23 +182,21 @@ def bound_along(
     use = jnp.ones(len(line.sights), bool) if use is None else jnp.asarray(use, bool)
 
     def step(S: Array, row: Linearised):
-        predicted = _given(linalg.tria(row.F @ S, row.noise), known)
+        predicted = _conditioned(linalg.tria(row.F @ S, row.noise), known)
         S = predicted
         for i, sight in enumerate(row.sights):
             if sight is not None:
-                seen = sight.seen_with(S, use[i])
-                S = updated(seen.prior, seen, "sqrt")[0].factor
+                S = sight.updated_factor(S, use[i])
         return S, Bound(predicted, S)
 
-    return jax.lax.scan(step, _given(factor, known), line)[1]
+    return jax.lax.scan(step, _conditioned(factor, known), line)[1]
 
 
-def _given(factor: Array, known: tuple[int, ...]) -> Array:
-    """Factor of what is left once some components of the error are known exactly."""
+def _conditioned(factor: Array, known: tuple[int, ...]) -> Array:
+    """Factor of the covariance given some components of the error."""
     if not known:
         return factor
     rows = jnp.eye(factor.shape[0])[np.array(known)]
     m = len(known)
     exact = Sight(rows, jnp.zeros((m, 0)), jnp.ones(m, bool), jnp.zeros(m))
-    seen = exact.seen_with(factor, jnp.ones((), bool))
-    return updated(seen.prior, seen, "sqrt")[0].factor
+    return exact.updated_factor(factor, jnp.ones((), bool))

@@ -24,22 +24,19 @@ from robins.manifold import State
 def nees(belief: Belief, truth: State) -> Float[Array, ""]:
     """Normalised estimation error squared of one belief; batch with `jax.vmap`.
 
-    Directions in which nothing is uncertain (a known constant) do not count, whatever their error.
+    Directions without uncertainty (a known constant) do not count.
     """
     return normalised_sq(manifold.local(belief.mean, truth), belief.factor)
 
 
 def normalised_sq(error: Float[Array, "r"], factor: Float[Array, "r n"]) -> Float[Array, ""]:
-    """Error e' (S S')^-1 e of some components, from the rows of the factor that are theirs.
-
-    Directions without uncertainty do not count.
-    """
+    """Squared error e' (S S')^-1 e of some components, S being their rows of the factor."""
     solid, _ = linalg.guard(factor)
     return jnp.sum(linalg.solve_lower(solid, error[:, None]) ** 2)
 
 
 class Verdict(NamedTuple):
-    """A statistic beside the band it should be in."""
+    """A statistic and the band of its values under a consistent filter."""
 
     value: float
     low: float
@@ -47,7 +44,7 @@ class Verdict(NamedTuple):
 
     @property
     def inside(self) -> bool:
-        """Whether the value is in its band."""
+        """True if the value is in its band."""
         return bool(self.low <= self.value <= self.high)
 
 
@@ -58,17 +55,9 @@ def _require_level(level: float) -> None:
 def grand_mean_nis(nis: np.ndarray, dof: np.ndarray, level: float = 0.95) -> Verdict:
     """Mean of all innovations squared per degree of freedom, over runs and time.
 
-    Innovations of a right filter are white, so their sum over time is chi-square too; this is the
-    sharpest single test of R and Q. Steps with nothing measured (dof = 0) do not count; an infinite
-    NIS, that of a contradiction, does.
-
-    Args:
-        nis: any shape.
-        dof: the same shape, degrees of freedom used.
-        level: of the two-sided band.
-
-    Returns:
-        A verdict about a value that should be near one.
+    Innovations of a consistent filter are white, so their sum over time is chi-square too; this is
+    the sharpest single test of R and Q. Steps without measurement (dof = 0) do not count; an
+    infinite NIS, that of a contradiction, does. `level` is of the two-sided band.
 
     Raises:
         ValueError: the shapes differ, or the level is not between 0 and 1.
@@ -79,14 +68,14 @@ def grand_mean_nis(nis: np.ndarray, dof: np.ndarray, level: float = 0.95) -> Ver
     require(nis.shape == dof.shape, f"nis is of shape {nis.shape}, dof of {dof.shape}: they differ")
     total = float(np.sum(dof))
     if total == 0.0:
-        return Verdict(float("nan"), float("nan"), float("nan"))
+        return Verdict(np.nan, np.nan, np.nan)
     low, high = chi2_band(total, 1, level) / total
     counts = (dof > 0) | np.isinf(nis)
     return Verdict(float(np.sum(nis[counts]) / total), float(low), float(high))
 
 
 def anees(values: np.ndarray, n: int, level: float = 0.95) -> tuple[np.ndarray, np.ndarray, float]:
-    """Average NEES over runs at each epoch, normalised by n.
+    """Average NEES over runs at each epoch, normalised by the state dimension n.
 
     Args:
         values: (runs, T) NEES.
@@ -94,11 +83,10 @@ def anees(values: np.ndarray, n: int, level: float = 0.95) -> tuple[np.ndarray, 
         level: of the two-sided band.
 
     Returns:
-        (T,) average NEES over n, its band (2,), and the share of epochs inside the band.
+        (T,) averages, their band (2,), and the share of epochs inside the band.
 
     Raises:
-        ValueError: the values are not those of runs and epochs, there is none, n is below one, or
-            the level is not between 0 and 1.
+        ValueError: the values are not (runs, T), there is none, or n or the level is out of range.
     """
     values = np.asarray(values, dtype=float)
     require(
@@ -115,13 +103,9 @@ def anees(values: np.ndarray, n: int, level: float = 0.95) -> tuple[np.ndarray, 
 
 
 def whitened_innovations(info: StepInfo) -> Float[Array, "t m"]:
-    """Innovations in units of their predicted spread, uncorrelated if the filter is right.
+    """(T, m) innovations of a sensor in units of their predicted spread; NaN where not used.
 
-    Args:
-        info: of one sensor over a run (leading axis T).
-
-    Returns:
-        (T, m), NaN where not used.
+    They are uncorrelated if the filter is consistent.
     """
 
     def one(residual, factor, used):
@@ -132,16 +116,16 @@ def whitened_innovations(info: StepInfo) -> Float[Array, "t m"]:
 
 
 def whiteness(series: np.ndarray, lags: int = 20, level: float = 0.95) -> Verdict:
-    """Ljung-Box test that a series has no memory (Ljung & Box 1978).
+    """Ljung-Box test for autocorrelation of a series (Ljung & Box 1978).
 
     Args:
         series: (T,) whitened innovations of one component; NaN steps are left out of the products.
-        lags: number of autocorrelations looked at.
+        lags: number of autocorrelations.
         level: of the one-sided bound.
 
     Raises:
-        ValueError: it is not one row of numbers, has fewer than three times as many samples as
-            lags or all of them the same, there is no lag, or the level is not between 0 and 1.
+        ValueError: it is not (T,), has fewer than three samples a lag or equal ones, or the lags or
+            the level is out of range.
     """
     x = np.asarray(series, dtype=float)
     require(x.ndim == 1, "whiteness takes one series, (T,)", x.shape)
@@ -151,7 +135,7 @@ def whiteness(series: np.ndarray, lags: int = 20, level: float = 0.95) -> Verdic
     count = int(np.sum(here))
     require(not count < 3 * lags, f"whiteness over {lags} lags wants {3 * lags} samples", count)
     require(np.ptp(x[here]) != 0.0, "whiteness of a series that never changes")
-    x = x / np.max(np.abs(x[here]))  # so that no square is beyond the largest number
+    x = x / np.max(np.abs(x[here]))  # so that no square overflows
     x = np.where(here, x - np.mean(x[here]), 0.0)
     power = np.sum(x**2) / count
     total = 0.0

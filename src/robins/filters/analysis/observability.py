@@ -1,45 +1,42 @@
 r"""Observability: the information of a window's measurements about the state at its beginning.
 
-The observability Gramian of the linearised system, in units that make it comparable between states
-and between sensors (Ham & Brown 1983; Chen 1999, ch. 6),
+The observability Gramian of the linearised system, in comparable units of states and sensors
+(Ham & Brown 1983; Chen 1999, ch. 6),
 
     W_k = sum_{j <= k} D Phi_j' H_j' R_j^-1 H_j Phi_j D,
 
 with D the standard deviations of the prior and Phi_j the transition from the beginning to step j.
-An eigenvalue of W says how many times as much is measured of a direction as was known of it before:
-below one the prior knows more.
+An eigenvalue of W is the information measured of a direction over that of the prior.
 
-The Gramian itself is never summed up: Phi may grow without bound, and small eigenvalues would drown
-in the rounding of large ones. The recursion carries two factors, of the error e_0 at the beginning
-and e_k now, given the measurements so far and no process noise,
+The Gramian itself is never summed up: Phi may grow without bound, and small eigenvalues would be
+lost in the rounding of large ones. The recursion carries two factors, of the error e_0 at the
+beginning and e_k now, given the measurements so far and no process noise,
 
     e_0 = D L_k z,  e_k = M_k z,  z ~ N(0, I),  L_k L_k' = (I + W_k)^-1.
 
-A measurement multiplies both by the factor T of what it leaves of z, one QR each time, so what is
-seen cannot grow.
+A measurement multiplies both by the factor T of the remaining covariance of z, one QR each time.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from robins import linalg
 from robins.errors import require
-from robins.filters.analysis.bound import Linearised, linearised
+from robins.filters.analysis.bound import Linearised, Use, linearised
 from robins.filters.belief import Belief
-from robins.filters.checks import matrix
+from robins.filters.checks import square
 from robins.filters.model import Data, Model
 from robins.filters.observation import left_out
 from robins.manifold import State
 
-# An eigenvalue below this counts for nothing: the prior knows the direction a million times better.
+# An eigenvalue below this is unobservable: the prior has a million times the information.
 NOTHING = 1e-6
 
 
@@ -47,39 +44,35 @@ def observability(
     model: Model,
     start: Belief,
     truth: State,
-    y: Mapping[str, Any],
+    y: Mapping[str, Data],
     u: Data = None,
-    aux: Mapping[str, Any] | None = None,
-    use: Any = None,
+    aux: Mapping[str, Data] | None = None,
+    use: Use | None = None,
     window: int | None = None,
 ) -> Array:
-    """Factors L of (I + W)^-1 after every step of a run; ready for `jax.vmap`.
+    """Factors L of (I + W)^-1 after every step of a run; may be batched by `jax.vmap`.
 
-    Arguments are those of `robins.filters.analysis.bound.linearised`, the standard deviations of
-    ``start`` being the units, and of `observability_along`.
+    Arguments and errors are those of `robins.filters.analysis.bound.linearised`, the standard
+    deviations of ``start`` being the units, and of `observability_along`.
 
     Returns:
         (E, n, n); `bits`, `gramian` and `spectrum` read it.
-
-    Raises:
-        ValueError: lengths differ, or a window is shorter than a step.
     """
     line = linearised(model, start, truth, y, u, aux)
     return observability_along(line, start.sigma, use, window)
 
 
 def observability_along(
-    line: Linearised, sigma: Array, use: Any = None, window: int | None = None
+    line: Linearised, sigma: Array, use: Use | None = None, window: int | None = None
 ) -> Array:
-    """The same of a model that has been linearised; one scan.
+    """Factors L of (I + W)^-1 along a linearised model; one scan.
 
     Args:
         line: from `robins.filters.analysis.bound.linearised`.
         sigma: (n,) units of the states, their prior standard deviations.
-        use: (S,) bool, which sensors of the model to use, in its order; all by default.
-        window: number of steps after which to begin anew, each window with the same units. By
-            default the whole run is one window. A direction that grows and is never seen overflows
-            after 700 of its time constants: give windows then.
+        use: (S,) bool, sensors of the model to use; all by default.
+        window: steps of a window, each with the same units; by default the whole run. An unstable
+            direction that is not observed overflows after 700 of its time constants without one.
 
     Raises:
         ValueError: a window is shorter than a step.
@@ -104,41 +97,40 @@ def observability_along(
     return jax.lax.scan(step, (unit, D), (fresh, line))[1]
 
 
-def bits(L: Any) -> np.ndarray:
-    """(..., n) information gained of each state [bit]: one bit halves its standard deviation.
+def bits(L: ArrayLike) -> np.ndarray:
+    """(..., n) mutual information of each state and the measurements [bit].
 
-    The mutual information between a state at the beginning and the measurements; inf where it was
-    measured exactly.
+    One bit halves the standard deviation; inf where the state was measured exactly.
     """
     left = np.sqrt(np.sum(np.asarray(L) ** 2, axis=-1))
     with np.errstate(divide="ignore"):
         return np.maximum(-np.log2(left), 0.0)
 
 
-def gramian(L: Any) -> np.ndarray:
-    """(n, n) the Gramian W in units of the prior; not finite after an exact measurement."""
+def gramian(L: ArrayLike) -> np.ndarray:
+    """(n, n) Gramian W in units of the prior; not finite after an exact measurement."""
     values, vectors = spectrum(L)
     return (vectors * values) @ vectors.T
 
 
-def spectrum(L: Any) -> tuple[np.ndarray, np.ndarray]:
+def spectrum(L: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """(n,) eigenvalues of W, least first, and (n, n) their unit vectors as columns.
 
-    Values below `NOTHING` belong to directions that are not seen at all; as their vectors are any
-    mixture of these, `unobservable` sorts them out.
+    Vectors of values below `NOTHING` are any mixture of the unobservable directions; `unobservable`
+    separates them.
 
     Raises:
         TypeError: L is not of real numbers.
-        ValueError: L is not square, or not finite, as after an overflow: give windows then.
+        ValueError: L is not square, or not finite, as after an overflow.
     """
-    vectors, left, _ = np.linalg.svd(matrix("L", L, None, len(np.atleast_1d(L))))
+    vectors, left, _ = np.linalg.svd(square("L", L))
     with np.errstate(divide="ignore"):
         values = np.maximum((1.0 - left) * (1.0 + left) / left**2, 0.0)
     return values, vectors
 
 
 def unobservable(values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """(n, d) a basis of what is not seen at all, each vector of as few states as may be.
+    """(n, d) sparse basis of the unobservable directions.
 
     Gauss-Jordan on the eigenvectors below `NOTHING`: each keeps one state that no other has.
     """
@@ -155,22 +147,21 @@ def unobservable(values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return basis / np.linalg.norm(basis, axis=0)
 
 
-def worded(vector: np.ndarray, names: Sequence[str], most: int = 4) -> str:
-    """A direction by the states that make it up: "82 % heading against 17 % gyro bias z".
+def worded(vector: np.ndarray, names: Sequence[str]) -> str:
+    """Composition of a direction: "82 % heading against 17 % gyro bias z".
 
     The shares are squares of the components, in units of the prior; "with" joins states of one
-    sign, "against" of opposite ones. States that have less than 1 % are left out.
+    sign, "against" of opposite ones. At most four states are named, none of less than 1 %.
 
     Raises:
         ValueError: it has not a number for each name, or is no direction: zero, or not finite.
     """
-    require(
-        np.shape(vector) == (len(names),),
-        f"a vector of shape {np.shape(vector)} has not a number for each of {len(names)} names",
-    )
+    shape = np.shape(vector)
+    fits = shape == (len(names),)
+    require(fits, f"a vector of shape {shape} has not a number for each of {len(names)} names")
     length = float(np.linalg.norm(vector))
     require(0.0 < length < np.inf, "no direction: the length of the vector is", length)
-    order = np.argsort(-np.round(np.abs(vector), 9), kind="stable")[:most]  # ties keep their order
+    order = np.argsort(-np.round(np.abs(vector), 9), kind="stable")[:4]  # ties keep their order
     text = ""
     for i in order:
         share = 100.0 * vector[i] ** 2 / float(np.sum(vector**2))

@@ -1,7 +1,7 @@
-"""How well a filter predicts its measurements: the log density of each, before it is used.
+"""Predictive score of a filter: the log density of each measurement, before it is used.
 
-The density is that of the belief alone, whatever rules then refuse or weigh, so that it can be
-compared between filters of any kind, and no filter looks better for refusing more.
+The density is that of the belief alone, before rules refuse or weigh, so that filters of any kind
+can be compared, and refusing more is no advantage.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from robins.filters.observation import Normalised, normalised
 from robins.filters.run import Step
 from robins.filters.values import value
 
-OUTLIERS = 0.02  # share of measurements whose errors are `WIDER` times as large
+OUTLIERS = 0.02  # share of measurements with errors `WIDER` times as large
 WIDER = 10.0
 _RULE = "predicted"
 
 
 class Predicted(NamedTuple):
-    """Of a step, or of several with leading axes."""
+    """Score of a step, or of several with leading axes."""
 
     log_density: Float[Array, "..."]  # of all its measurements
-    components: Array  # how many
+    components: Array  # their number
 
 
 @cache
 def scale(m: int) -> float:
-    """Factor c_m of `log_density`, by quadrature: without it 0.987 of a right sigma scores best.
+    """Factor c_m of `log_density`, by quadrature: without it 0.987 of the true sigma scores best.
 
     For z normal with covariance S the expected score over S vanishes at S where q = z' S^-1 z / c^2
-    has E[w(q) q] = m; w is 1 for the normal part, 1 / k^2 for the outliers, each by the probability
-    that z is of it (the consistency factor of an M-estimate of scale: Huber & Ronchetti 2009,
-    sec. 5.2 and 8.4). By symmetry that holds for all directions of S at once.
+    has E[w(q) q] = m; w is the mean of 1 for the normal part and 1 / k^2 for the outliers (the
+    consistency factor of an M-estimate of scale: Huber & Ronchetti 2009, sec. 5.2 and 8.4). By
+    symmetry that holds for all directions of S at once.
     """
 
     def excess(c: float) -> float:
@@ -58,68 +58,64 @@ def scale(m: int) -> float:
         parts = [integrate.quad(weighted, *span)[0] for span in itertools.pairwise(spans)]
         return sum(parts) - m
 
-    # without a component there is nothing to scale; beyond 16 it is one to 1e-9
-    if not 0 < m <= 16:
+    if not 0 < m <= 16:  # beyond 16 it is one to 1e-9
         return 1.0
     return float(optimize.root_scalar(excess, bracket=(0.9, 1.01), xtol=1e-12).root)
 
 
-def log_density(seen: Normalised) -> Float[Array, ""]:
+def log_density(innovation: Normalised) -> Float[Array, ""]:
     """Log density of an innovation z of dimension m with covariance S.
 
     A normal density, contaminated by a share e of outliers of k times the size (Tukey 1960):
 
         p(z) = (1 - e) N(z; 0, c_m^2 S) + e N(z; 0, k^2 c_m^2 S)
 
-    A plain normal density would let one outlier outweigh all else; leaving outliers out would pay
-    for every measurement that is called one. `scale` gives c_m, with which the right S scores best
-    where z is normal.
+    A normal density would let one outlier outweigh all else; leaving outliers out would reward
+    their number. `scale` gives c_m, with which the true S scores best where z is normal.
     """
-    m = seen.dof.astype(float)
-    c = jnp.asarray([scale(n) for n in range(len(seen.used) + 1)])[seen.dof]
-    nis = seen.nis / c**2
+    m = innovation.dof.astype(float)
+    c = jnp.asarray([scale(n) for n in range(len(innovation.used) + 1)])[innovation.dof]
+    nis = innovation.nis / c**2
     normal = math.log1p(-OUTLIERS) - 0.5 * nis
     wide = math.log(OUTLIERS) - m * math.log(WIDER) - 0.5 * nis / WIDER**2
-    spread = linalg.log_diagonal(seen.factor, seen.used) + m * jnp.log(c)
+    spread = linalg.log_diagonal(innovation.factor, innovation.used) + m * jnp.log(c)
     return jnp.logaddexp(normal, wide) - spread - 0.5 * m * math.log(2.0 * math.pi)
 
 
 @value
 class Scored(Around):
-    """The filter of `scored`: that inside, with the log density of each measurement noted."""
+    """The filter of `scored`."""
 
     inner: Filter
 
-    # The states are those of the filter inside, which leaves out itself what is not taken.
+    # `Filter` wraps both for steps that are not taken; here the inner filter does so itself.
     @jax.jit
     def predict(self, state: FilterState, motion: Motion, u: Data = None):
-        """Predict by the filter inside."""
         return self.inner.predict(state, motion, u)
 
     @jax.jit
     def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None):
-        """Update by the filter inside, and note the score."""
-        seen = normalised(taylor().observation(state.belief, sensor, y, aux))
-        there = seen.dof > 0
-        density = jnp.where(there, jnp.where(state.current, log_density(seen), -jnp.inf), 0.0)
+        innovation = normalised(taylor().observation(state.belief, sensor, y, aux))
+        there = innovation.dof > 0
+        density = jnp.where(there, jnp.where(state.current, log_density(innovation), -jnp.inf), 0.0)
         new, info = self.inner.update(state, sensor, y, aux)
-        return new, info.noted(_RULE, log_density=density, components=seen.dof)
+        return new, info.noted(_RULE, log_density=density, components=innovation.dof)
 
     def members(self, state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
         return self.inner.members(state)
 
 
 def scored(filter_: Filter) -> Filter:
-    """The same filter, whose updates note how well the measurement was predicted.
+    """The same filter, whose updates note the score of the measurement, for `predicted`.
 
-    Measurements are linearised about the mean of the belief (first-order Taylor). What is found is
-    read by `predicted`; after a prediction that was not taken it is -inf.
+    Measurements are linearised about the mean of the belief (first-order Taylor). After a
+    prediction that was not taken the score is -inf.
     """
     return Scored(filter_)
 
 
 def predicted(step: Step) -> Predicted:
-    """What `scored` noted of a step, for ``run(..., keep=predicted)``."""
+    """Score of a step by a filter of `scored`, for ``run(..., keep=predicted)``."""
     notes = [info.notes for info in step.info.values()]
     density = sum((n[f"{_RULE}.log_density"] for n in notes), jnp.zeros(()))
     return Predicted(density, sum((n[f"{_RULE}.components"] for n in notes), jnp.zeros((), int)))

@@ -1,18 +1,18 @@
-"""The worst case: what gamma a run allows, and how far disturbances can take its error.
+"""Worst-case gain of a filter over a run, and the least gamma of an H-infinity filter.
 
-The worst-case gain of a filter over a run is
+The worst-case gain is
 
     sup of sqrt( sum_k |L e_k|^2 / (|x0 - x0_hat|^2_{P0^-1} + sum |w_k|^2_{Q^-1} + |v_k|^2_{R^-1}) )
 
 over all initial errors and noises, e_k being the error of the estimate. An H-infinity filter keeps
-it below its gamma. `worst_case_gain` finds it from the gains alone, by no Riccati equation.
+it below its gamma. `worst_case_gain` computes it from the gains alone, without a Riccati equation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,42 +23,35 @@ from jaxtyping import Array, ArrayLike, Float
 
 from robins import linalg, manifold
 from robins.errors import require
-from robins.filters.belief import Belief, StepInfo
-from robins.filters.checks import matrix, positive
+from robins.filters.analysis.bound import delayed_by_one
+from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.checks import matrix, positive, square
 from robins.filters.kalman import kalman
 from robins.filters.linearise import Linearisation, taylor
 from robins.filters.model import Data, Model, Motion, Sensor
-from robins.filters.rules._inflation import as_weight, rows_of
+from robins.filters.rules._inflation import Weight, as_weight, rows_of
 from robins.filters.rules.h_infinity import Estimate, h_infinity, least_gamma
-from robins.filters.run import Solution, run
+from robins.filters.run import Solution, Step, run
 from robins.manifold import State
 
 
-def existence_margin(belief: Belief, weight: Any, gamma: Any) -> Float[Array, ""]:
+def existence_margin(belief: Belief, weight: Weight, gamma: Number) -> Float[Array, ""]:
     """Least eigenvalue of ``P^-1 - gamma^-2 L'L``: positive where an H-infinity filter exists.
 
-    Args:
-        belief: after the measurement; batch with `jax.vmap`.
-        weight: L as `h_infinity` takes it.
-        gamma: bound; inf leaves the least eigenvalue of the information.
-
-    Returns:
-        In units of P^-1; NaN where P is singular.
+    In units of P^-1, of the belief after the measurement; NaN where P is singular. Batch with
+    `jax.vmap`. `weight` is L as `h_infinity` takes it.
 
     Raises:
         TypeError: gamma is not one real number.
-        ValueError: it is not positive (not seen in compiled code), or L has not as many columns as
-            the state has components.
+        ValueError: it is not positive, outside of compiled code, or L has not n columns.
     """
     if not isinstance(gamma, Tracer):
         positive("gamma", gamma, "the Kalman filter")
-    whose = "existence_margin"
-    L = rows_of(as_weight(weight, whose), belief.mean, whose) / jnp.asarray(gamma, float)
+    name = "existence_margin"
+    L = rows_of(as_weight(weight, name), belief.mean, name) / jnp.asarray(gamma, float)
     n = belief.factor.shape[0]
-    require(
-        L.shape[1] == n,
-        f"{whose}: weight has {L.shape[1]} columns, the state has {n} components",
-    )
+    if L.shape[1] != n:
+        raise ValueError(f"{name}: weight has {L.shape[1]} columns, the state has {n} components")
     root = linalg.solve_lower(belief.factor, jnp.eye(n))
     return linalg.eigenvalue_bounds(root.T @ root - L.T @ L)[0]
 
@@ -67,9 +60,9 @@ def gamma_min(
     model: Model,
     start: Belief,
     y: Data,
-    weight: Any,
+    weight: Weight,
     u: Data = None,
-    aux: Mapping[str, Any] | None = None,
+    aux: Mapping[str, Data] | None = None,
     linearise: Linearisation | None = None,
     rtol: float = 1e-4,
     estimate: Estimate = "a-posteriori",
@@ -78,20 +71,11 @@ def gamma_min(
     """Least gamma for which the H-infinity filter exists over a whole run.
 
     The largest local bound of the Kalman filter is a lower bound; from there gamma is doubled until
-    the filter exists, then bisected. It grows with the horizon and with outages, and does not
-    depend on the data where the model is linear, but for what is missing.
+    the filter exists, then bisected. It grows with the horizon and with outages; for a linear model
+    it depends on the data only by the missing measurements.
 
-    Args:
-        model: the motion and the sensors.
-        start: initial belief.
-        y: measurements as `run` takes them.
-        weight: L as `h_infinity` takes it.
-        u: inputs as `run` takes them.
-        aux: what sensors need, as `run` takes it.
-        linearise: `taylor` by default.
-        rtol: by how much the result may be too large; it exists itself.
-        estimate: whose error is bounded, as `h_infinity` takes it.
-        count_missing: as `h_infinity` takes it.
+    Arguments are those of `run` and of `h_infinity`, but for rtol, the largest relative excess of
+    the result; the filter exists for the result itself.
 
     Raises:
         ValueError: the Kalman filter itself cannot take every step, or rtol is below 1e-12.
@@ -99,7 +83,7 @@ def gamma_min(
     require(rtol >= 1e-12, "rtol must be 1e-12 or more, for numbers have no more digits", rtol)
     of = partial(h_infinity, weight=weight, estimate=estimate, count_missing=count_missing)
 
-    def bounds(step):
+    def bounds(step: Step) -> Array:
         last = [info.notes["h_infinity.bound"] for info in step.info.values()][-1:]
         counts = count_missing | _used(step.info)
         return jnp.where(counts, jnp.max(jnp.array(last), initial=0.0), 0.0)
@@ -121,16 +105,13 @@ def gamma_min(
 
 
 def _used(info: Mapping[str, StepInfo]) -> Array:
-    """Whether any sensor used anything, for each step."""
+    """(T,) bool: some sensor used a component in the step."""
     some = [jnp.any(one.used, axis=-1) for one in info.values()]
     return jnp.any(jnp.stack(some), axis=0) if some else jnp.array(False)
 
 
-# ------------------------------------------------------------------------------- worst-case gain
-
-
 class Channel(NamedTuple):
-    """A sensor over a run: e becomes (I - K H) e - K W v at each step, v of unit variance."""
+    """Sensor over a run: e becomes (I - K H) e - K W v at each step, v of unit variance."""
 
     K: np.ndarray  # (T, n, m) gain, zero columns where nothing was used
     H: np.ndarray  # (T, m, n)
@@ -145,24 +126,19 @@ def error_operator(
     weight: np.ndarray,
     gain_on: np.ndarray | None = None,
 ) -> np.ndarray:
-    """The matrix from initial error and noises, each of unit weight, to the errors L e of a run.
+    """Matrix (T r, p + T (q + k)) from initial error and noises of unit weight to the errors L e.
 
     Args:
         S0: (n, p) factor of the initial covariance.
-        F: (T, n, n) transitions into each step.
+        F: (T, n, n) transitions.
         G: (T, n, q) factors of the process noise.
-        channels: sensors in the order in which they update.
+        channels: sensors in the order in which they update; k sums their noises.
         weight: (T, r, n) rows L of each step; zero rows do not count.
-        gain_on: (T, n, n), for the error *before* the measurement, which is then the one counted:
-            the movement by the measurements, times this, is what the filter predicts from.
-            By default the error after the measurement is counted.
-
-    Returns:
-        (T r, p + T (q + k)), k summed over the channels.
+        gain_on: (T, n, n) counts the error *before* the measurement, and multiplies the correction
+            from which the filter predicts. By default the error after the measurement counts.
     """
     T, n, q = G.shape
-    widths = [q, *(c.W.shape[2] for c in channels)]
-    width = sum(widths)
+    width = q + sum(c.W.shape[2] for c in channels)
     E = np.zeros((n, S0.shape[1] + T * width))
     E[:, : S0.shape[1]] = S0
     out = np.zeros((T, weight.shape[1], E.shape[1]))
@@ -196,35 +172,26 @@ def worst_case_gain(
     model: Model,
     start: Belief,
     solution: Solution,
-    weight: Any,
+    weight: Weight,
     u: Data = None,
-    aux: Mapping[str, Any] | None = None,
+    aux: Mapping[str, Data] | None = None,
     estimate: Estimate = "a-posteriori",
     count_missing: bool = False,
 ) -> float:
-    """How far the worst initial error and noises of unit energy can take the error L e of a run.
+    """Worst-case gain from initial error and noises to the error L e of a run.
 
-    The closed-loop recursion of the error, with the gains that the run used, is stacked into one
-    matrix; its 2-norm is the answer (module docstring). The model is linearised about the means of
-    the run, so this is the gain to small disturbances where the model is not linear.
-
-    Args:
-        model: the one that was run.
-        start: the belief it began with.
-        solution: a run that kept its steps.
-        weight: L, as `h_infinity` takes it.
-        u: the inputs of the run.
-        aux: what its sensors were given.
-        estimate: which error counts: "a-posteriori", the one after the measurements of a step, or
-            "a-priori" and "predictor", the one before them.
-        count_missing: whether steps count in which nothing was used.
+    The 2-norm of the matrix that stacks the recursion of the error with the gains of the run. The
+    model is linearised about the means of the run, so a nonlinear one has this gain to small
+    disturbances. Arguments are those of the run, its solution with all steps, and those of
+    `h_infinity`: "a-posteriori" counts the error after the measurements of a step, "a-priori" and
+    "predictor" the error before them.
 
     Raises:
         ValueError: the run did not keep its steps.
     """
     steps = solution.steps
-    if not hasattr(steps, "prediction"):
-        raise ValueError("worst_case_gain needs a run that kept its steps: leave `keep` alone")
+    kept = hasattr(steps, "prediction")
+    require(kept, "worst_case_gain needs a run that kept its steps: leave `keep` alone")
     S0, F, G, channels, L = _linearised(model, start, steps, weight, u, dict(aux or {}))
     counts = np.ones(len(F), bool) if count_missing else np.asarray(_used(steps.info))
     L = np.where(counts[:, None, None], L, 0.0)
@@ -241,18 +208,15 @@ def worst_case_gain(
     return spectral_norm(error_operator(S0, F, G, channels, L, gain_on))
 
 
-def _linearised(model: Model, start: Belief, steps: Any, weight: Any, u: Data, aux: dict[str, Any]):
-    """Everything the recursion of the error needs, along a run."""
+def _linearised(
+    model: Model, start: Belief, steps: Step, weight: Weight, u: Data, aux: Mapping[str, Data]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Channel], np.ndarray]:
+    """S0, F, G, channels and L of `error_operator` along a run."""
     prediction = steps.prediction
     if prediction.origin is not None:
         before = prediction.origin.mean
     else:
-        before = jax.tree_util.tree_map(
-            lambda a, b: jnp.concatenate([jnp.asarray(a, float)[None], b[:-1]]),
-            start.mean,
-            steps.posterior.mean,
-        )
-
+        before = delayed_by_one(start.mean, steps.posterior.mean)
     F, G = _motion_along(model.motion, before, u)
     mean, channels = prediction.belief.mean, []
     for sensor in model.sensors:
@@ -261,22 +225,18 @@ def _linearised(model: Model, start: Belief, steps: Any, weight: Any, u: Data, a
         info = steps.info[sensor.name]
         H, W, mean = _sensor_along(sensor, mean, info, aux.get(sensor.name))
         channels.append(Channel(np.asarray(info.gain), np.asarray(H), np.asarray(W)))
-    whose = "worst_case_gain"
-    rows = as_weight(weight, whose)
-    L = np.asarray(jax.vmap(lambda mean: rows_of(rows, mean, whose))(steps.posterior.mean))
+    name = "worst_case_gain"
+    rows = as_weight(weight, name)
+    L = np.asarray(jax.vmap(lambda mean: rows_of(rows, mean, name))(steps.posterior.mean))
     return np.asarray(start.factor), np.asarray(F), np.asarray(G), channels, L
-
-
-def _unit(mean: State) -> Belief:
-    """About a mean, so that a spread is the Jacobian."""
-    return Belief(mean, jnp.eye(manifold.dim(mean)))
 
 
 @jax.jit
 @partial(jax.vmap, in_axes=(None, 0, 0))
 def _motion_along(motion: Motion, mean: State, u: Data) -> tuple[Array, Array]:
-    """Transitions and noise factors at the means before them."""
-    t = taylor().transition(_unit(mean), motion, u)
+    """Transitions and noise factors at the means before the steps."""
+    unit = jnp.eye(manifold.dim(mean))  # so that a spread is the Jacobian
+    t = taylor().transition(Belief(mean, unit), motion, u)
     return t.spread, t.noise
 
 
@@ -285,14 +245,11 @@ def _motion_along(motion: Motion, mean: State, u: Data) -> tuple[Array, Array]:
 def _sensor_along(
     sensor: Sensor, mean: State, info: StepInfo, aux: Data
 ) -> tuple[Array, Array, State]:
-    """Slopes and noise factors of a sensor, and the means that its updates led to."""
+    """Jacobians and noise factors of a sensor, and the means after its updates."""
     z = sensor.read(mean, aux) if sensor.linear is None else sensor.linear(mean, aux)[0]
-    o = taylor().observation(_unit(mean), sensor, z, aux)
+    o = taylor().observation(Belief(mean, jnp.eye(manifold.dim(mean))), sensor, z, aux)
     residual = jnp.where(info.used, info.innovation, 0.0)
     return o.spread, o.noise, manifold.retract(mean, info.gain @ residual)
-
-
-# -------------------------------------------------------------------------------------- steady
 
 
 class SteadyHInfinity(NamedTuple):
@@ -307,32 +264,25 @@ class SteadyHInfinity(NamedTuple):
 def _matrices(
     F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The matrices of a system that does not change, of shapes that fit."""
-    F = matrix("F", F)
-    n = len(F)
-    F, Q, H = matrix("F", F, n, n), matrix("Q", Q, n, n), matrix("H", H, None, n)
+    """Matrices of a time-invariant system, checked for their shapes."""
+    F = square("F", F)
+    Q, H = matrix("Q", Q, *F.shape), matrix("H", H, None, len(F))
     return F, Q, H, matrix("R", R, len(H), len(H))
 
 
 def steady_kalman(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> SteadyHInfinity:
-    """Steady gain and covariances of the Kalman filter of a system that does not change.
+    """Steady gain and covariances of the Kalman filter of a time-invariant system.
 
-    Of x' = F x + w, y = H x + v, from the discrete algebraic Riccati equation (DARE), polished to
-    the last digits (`robins.filters.synthesis.kalman_gain`, which takes a `Plant`). Variances of
-    very different units do not drown each other.
-
-    Args:
-        F: (n, n) transition.
-        Q: (n, n) process noise covariance.
-        H: (m, n).
-        R: (m, m) measurement noise covariance.
+    For x' = F x + w, y = H x + v with noise covariances Q and R, by the discrete algebraic Riccati
+    equation (DARE), accurate to the last digits also with very different units
+    (`robins.filters.synthesis.kalman_gain`).
 
     Raises:
         TypeError: a matrix is not of real numbers.
         ValueError: a matrix is of another shape, not finite, or no covariance where it must be one,
             or there is no steady state, with the reason.
     """
-    # Imported here: a filter that runs needs no design.
+    # Imported here to keep designs out of the imports of filters.
     from robins.filters.synthesis import current_form, kalman_gain
     from robins.filters.synthesis.norms import gramian
 
@@ -347,23 +297,16 @@ def steady_kalman(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> Ste
 def steady_h_infinity(
     F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, weight: ArrayLike, gamma: float | int
 ) -> SteadyHInfinity:
-    """What `h_infinity` converges to on a system that does not change.
+    """Steady state of `h_infinity` on a time-invariant system.
 
     The stabilising solution of the Riccati equation of F' and [H' L'] with weights R and -gamma^2 I
     (Hassibi, Sayed & Kailath 1999, ch. 4), checked against existence and against the recursion.
-
-    Args:
-        F: (n, n) transition.
-        Q: (n, n) process noise covariance.
-        H: (m, n).
-        R: (m, m) measurement noise covariance.
-        weight: (q, n) L.
-        gamma: bound; inf gives the Kalman filter.
+    Arguments are those of `steady_kalman`, the weight L (q, n) and the bound gamma; inf gives the
+    Kalman filter.
 
     Raises:
         TypeError: a matrix is not of real numbers.
-        ValueError: gamma is not positive, a matrix is of another shape, not finite, or no
-            covariance where it must be one, or no such filter exists.
+        ValueError: as `steady_kalman`, or gamma is not positive.
     """
     F, Q, H, R = _matrices(F, Q, H, R)
     L = matrix("weight", weight, None, len(F))

@@ -1,4 +1,4 @@
-"""The design of a plant whose error is one number: a scaled rotation, measured whole.
+"""Closed-form design for a scaled rotation with a measured state.
 
 With A = rho U, U orthogonal, C = I, noise of variance sw^2 in every state and ss^2 in every
 measurement, a gain K = k U leaves the error e(k+1) = f U e + ..., f = rho - k, and
@@ -7,8 +7,8 @@ measurement, a gain K = k U leaves the error e(k+1) = f U e + ..., f = rho - k, 
 
 b the greatest singular value of Bn and l that of L, whose rows must be orthogonal and of one
 length. (The second is reached where Bn drives an invariant direction of U at full strength, as the
-angular rate does in a quaternion; else it is a bound.) No norm of a matrix, no equation to iterate:
-the attitude quaternion of a turning body is of this kind, at every instant anew, with rho = 1.
+angular rate does in a quaternion; else it is a bound.) The attitude quaternion of a turning body is
+of this kind at every instant, with rho = 1.
 """
 
 from __future__ import annotations
@@ -24,13 +24,11 @@ from robins.filters.synthesis.norms import Number
 from robins.filters.synthesis.plant import Plant
 from robins.filters.synthesis.riccati import check_gamma
 
-METHOD = "closed-form"
-
-_SAME = 1e-9  # relative; what differs by less counts as equal
+_SAME = 1e-9  # relative difference of equal numbers
 
 
 class Isotropic(NamedTuple):
-    """A plant of this kind."""
+    """Parameters of a plant of this kind."""
 
     rho: float  # size of A
     U: np.ndarray  # (n, n) orthogonal
@@ -45,7 +43,7 @@ class Isotropic(NamedTuple):
         sw2, ss2 = self.sw**2, self.ss**2
         half = 0.5 * (sw2 - ss2 * (1.0 - self.rho**2))
         root = np.hypot(half, self.sw * self.ss)
-        # The form of the positive root that subtracts nothing.
+        # The positive root without cancellation.
         p = half + root if half > 0.0 else (sw2 * ss2 / (root - half) if root > half else 0.0)
         return float(self.rho * p / (p + ss2)) if p + ss2 > 0.0 else self.rho
 
@@ -71,24 +69,21 @@ class Isotropic(NamedTuple):
         return float(self.size * np.sqrt((self.sw**2 + k**2 * self.ss**2) / (1.0 - f**2)))
 
     def hinf(self, k: Number) -> float:
-        """H-infinity norm of the gain k, or a bound: see the module."""
+        """H-infinity norm of the gain k, or a bound of it (module docstring)."""
         return float(self.weight * self.b / (1.0 - abs(self.rho - k)))
 
 
 def isotropic(plant: Plant) -> Isotropic:
-    """See that a plant is of this kind.
+    """Parameters of a plant of this kind.
 
     Raises:
-        ValueError: it is not; the message says which block.
+        ValueError: it is of another kind; the message names the block.
     """
     n = len(plant.A)
     size = float(np.linalg.norm(plant.A, ord=2))
     require(size != 0.0, "no closed form: A is zero")
-    spread = plant.Bw @ plant.Bw.T
-    noise = plant.Dw @ plant.Dw.T
-    sw2, ss2 = np.trace(spread) / n, np.trace(noise) / len(noise)
-    each = plant.L.T @ plant.L
-    eye = np.eye(n)
+    spread, noise, each = plant.Bw @ plant.Bw.T, plant.Dw @ plant.Dw.T, plant.L.T @ plant.L
+    sw2, ss2, eye = np.trace(spread) / n, np.trace(noise) / len(noise), np.eye(n)
     demands = (
         (_same(plant.A @ plant.A.T / size**2, eye), "A is no multiple of an orthogonal matrix"),
         (plant.C.shape == (n, n) and _same(plant.C, eye), "C is not the identity"),
@@ -112,15 +107,11 @@ def isotropic(plant: Plant) -> Isotropic:
 
 
 def closed_form(plant: Plant, gamma: Number) -> Design:
-    """The gain k U that meets gamma with the least H2 norm, certified as every other.
-
-    Args:
-        plant: A a multiple of an orthogonal matrix, C the identity, noises isotropic and apart.
-        gamma: bound on the H-infinity norm; inf is the Kalman filter.
+    """Gain k U that meets gamma with the least H2 norm; the Kalman filter if gamma is inf.
 
     Raises:
         Unreachable: gamma is below the least of this form, which the message names.
-        ValueError: the plant is not of this kind, or gamma is not positive.
+        ValueError: the plant is of another kind, or gamma is not positive.
     """
     check_gamma(gamma)
     began = time.perf_counter()
@@ -128,7 +119,7 @@ def closed_form(plant: Plant, gamma: Number) -> Design:
     k = scalar.gain(gamma)
     seconds = time.perf_counter() - began
     return certify(
-        plant, k * scalar.U, method=METHOD, gamma=gamma, bound=scalar.h2(k), seconds=seconds
+        plant, k * scalar.U, method="closed-form", gamma=gamma, bound=scalar.h2(k), seconds=seconds
     )
 
 

@@ -7,12 +7,14 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from robins.errors import RobinsError
+from robins.filters.checks import Matrix
 from robins.filters.synthesis import norms
 from robins.filters.synthesis.plant import ErrorSystem, Plant, error_system
 
-_BOUND = 1e-3  # by how much, relatively, a solver's bound may lie below the true H2 norm
-_GAMMA = 1e-6  # by how much the true H-infinity norm may exceed gamma
-_AGREE = 1e-6  # and differ from the sweep
+BOUND = 1e-3  # largest relative excess of the true H2 norm over a solver's bound
+GAMMA = 1e-6  # and of the true H-infinity norm over gamma
+_AGREE = 1e-6  # largest relative difference of the two computations of that norm
+FullOrder = tuple[np.ndarray, np.ndarray, np.ndarray]  # Ah (n, n), Bh (n, m), Gh (r, n)
 
 
 class NotCertified(RobinsError, ValueError):
@@ -20,10 +22,10 @@ class NotCertified(RobinsError, ValueError):
 
 
 class Unreachable(RobinsError, ValueError):
-    """No filter of the form asked for meets gamma; the message names the least one can have.
+    """No filter of the form meets gamma; the message names the least that one can have.
 
     Attributes:
-        least: that gamma, nan where it is not known.
+        least: that gamma; nan if unknown.
     """
 
     def __init__(self, message: str, least: norms.Number = np.nan):
@@ -32,59 +34,40 @@ class Unreachable(RobinsError, ValueError):
 
 
 class Design(NamedTuple):
-    """A filter with constant gains.
+    """Filter with constant gains; norms are those of the error z - z^, in units of the plant."""
 
-    Norms are those of the error z - z^, in the units of the plant.
-    """
-
-    method: str  # how it was found
-    gamma: float  # bound on the H-infinity norm that was asked for; inf for none
+    method: str
+    gamma: float  # requested bound on the H-infinity norm; inf for none
     gain: np.ndarray  # (n, m) K of the observer; Bh of a full-order filter
     order: Literal["observer", "full"]
-    filter: tuple[np.ndarray, np.ndarray, np.ndarray] | None  # (Ah, Bh, Gh) where order is "full"
-    bound: float  # what the solver promised for the H2 norm; nan where it promised nothing
+    filter: FullOrder | None  # where order is "full"
+    bound: float  # the solver's bound on the H2 norm; nan for none
     h2: float  # true, by the Gramian
     hinf: float  # true, by tests of levels (`hinf_norm`)
     hinf_sweep: float  # the same, by a sweep of the frequency
     radius: float  # spectral radius of the error, or of plant and full-order filter together
-    lambda_: float  # by how much n was made noise; nan where no Riccati equation was solved
-    status: str  # the solver's own words
-    seconds: float  # time the design took; nan where it was not measured
+    lambda_: float  # variance of n taken as noise; nan where no Riccati equation was solved
+    status: str  # of the solver
+    seconds: float  # time of the design; nan where it was not measured
 
 
-def certify(plant: Plant, K: Any, *, method: str, **told: Any) -> Design:
-    """The design of an observer gain, if its true norms are what was asked and promised.
+def certify(plant: Plant, K: Matrix, *, method: str, **fields: Any) -> Design:
+    """Design of an observer gain K (n, m), if its true norms keep the bounds.
 
-    Args:
-        plant: what it was designed for.
-        K: (n, m) gain.
-        method: as in `Design`.
-        told: ``gamma``, ``bound``, ``lambda_``, ``status`` and ``seconds``, as in `Design`, of
-            those that there are.
+    `fields` are ``gamma``, ``bound``, ``lambda_``, ``status`` and ``seconds`` of `Design`.
 
     Raises:
         NotCertified: the error does not decay, H2 > bound (1 + 1e-3), Hinf > gamma (1 + 1e-6), or
             the two computations of Hinf differ by more than 1e-6.
         ValueError: K is not (n, m) or not finite.
     """
-    return _certified(error_system(plant, K), np.array(K, float), None, method, **told)
+    return _certified(error_system(plant, K), np.array(K, float), None, method, **fields)
 
 
-def certify_full(
-    plant: Plant, filter_: tuple[Any, Any, Any], *, method: str, **told: Any
-) -> Design:
-    """The same for a full-order filter x^(k+1) = Ah x^ + Bh y, z^ = Gh x^.
+def certify_full(plant: Plant, filter_: FullOrder, *, method: str, **fields: Any) -> Design:
+    """Design of a full-order filter x^(k+1) = Ah x^ + Bh y, z^ = Gh x^, as `certify`.
 
-    Its error depends on the state of the plant, which must therefore decay by itself.
-
-    Args:
-        plant: what it was designed for.
-        filter_: Ah (n, n), Bh (n, m), Gh (r, n).
-        method: as in `Design`.
-        told: as `certify` takes it.
-
-    Raises:
-        NotCertified: as `certify`.
+    Its error depends on the state of the plant, which must therefore be stable.
     """
     Ah, Bh, Gh = (np.array(matrix, float) for matrix in filter_)
     zero = np.zeros((len(plant.A), len(Ah)))
@@ -94,13 +77,13 @@ def certify_full(
         np.vstack([plant.Bn, Bh @ plant.Dn]),
         np.hstack([plant.L, -Gh]),
     )
-    return _certified(error, Bh, (Ah, Bh, Gh), method, **told)
+    return _certified(error, Bh, (Ah, Bh, Gh), method, **fields)
 
 
 def _certified(
     error: ErrorSystem,
     gain: np.ndarray,
-    filter_: tuple[np.ndarray, np.ndarray, np.ndarray] | None,
+    filter_: FullOrder | None,
     method: str,
     gamma: norms.Number = np.inf,
     bound: norms.Number = np.nan,
@@ -108,7 +91,6 @@ def _certified(
     status: str = "",
     seconds: norms.Number = np.nan,
 ) -> Design:
-    """The design, if no promise is broken; else the error names which."""
     design = Design(
         method, float(gamma), gain, "full" if filter_ else "observer", filter_, float(bound),
         norms.h2_norm(error.A, error.Bw, error.L),
@@ -116,24 +98,16 @@ def _certified(
         norms.peak_gain(error.A, error.Bn, error.L),
         norms.spectral_radius(error.A), float(lambda_), status, float(seconds),
     )  # fmt: skip
-    said = f" (the solver said {status!r})" if status else ""
-    promises = (
-        (design.radius < 1.0, f"its error does not decay, spectral radius {design.radius:.9g}"),
-        (
-            not design.h2 > design.bound * (1.0 + _BOUND),
-            f"true H2 norm {design.h2:.6g} above the promised {design.bound:.6g}",
-        ),
-        (
-            not design.hinf > design.gamma * (1.0 + _GAMMA),
-            f"true H-infinity norm {design.hinf:.9g} above gamma {design.gamma:.9g}",
-        ),
-        (
-            not abs(design.hinf - design.hinf_sweep) > _AGREE * design.hinf,
-            f"H-infinity norm {design.hinf:.9g} by levels but {design.hinf_sweep:.9g} by a sweep "
-            "of the frequency",
-        ),
-    )
-    for kept, why in promises:
-        if not kept:
-            raise NotCertified(f"{method}: the answer is not certified: {why}{said}")
-    return design
+    h2, hinf, sweep = design.h2, design.hinf, design.hinf_sweep
+    if not design.radius < 1.0:
+        why = f"its error does not decay, spectral radius {design.radius:.9g}"
+    elif h2 > design.bound * (1.0 + BOUND):
+        why = f"true H2 norm {h2:.6g} above the promised {design.bound:.6g}"
+    elif hinf > design.gamma * (1.0 + GAMMA):
+        why = f"true H-infinity norm {hinf:.9g} above gamma {design.gamma:.9g}"
+    elif abs(hinf - sweep) > _AGREE * hinf:
+        why = f"H-infinity norm {hinf:.9g} by levels but {sweep:.9g} by a sweep of the frequency"
+    else:
+        return design
+    by = f" (the solver said {status!r})" if status else ""
+    raise NotCertified(f"{method}: the answer is not certified: {why}{by}")

@@ -1,25 +1,34 @@
 """The linear matrix inequalities of filter designs, in the symbols of their equations.
 
-For a channel of white noise w and one of a modelling error n, as docs/filters/mixed.md numbers
-them. A function takes the module `cvxpy` (an optional package), the
-plant's matrices by name and what the inequalities are wanted for, and returns the unknowns by
-symbol and the matrices that must be positive semidefinite. Gains K are those of an observer.
+For a channel of white noise w and one of a modelling error n, numbered as in docs/filters/mixed.md.
+A function takes the module `cvxpy`, which is optional, the plant's matrices by name and the aim; it
+returns the unknowns by symbol and the matrices that must be positive semidefinite. Gains K are
+those of an observer.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+
+from robins.filters.synthesis.plant import Plant
+
+if TYPE_CHECKING:
+    from cvxpy import Expression as Expr
+else:
+    Expr = Any
 
 Aim = Literal["h2", "mixed"]
 """Least Trace(H) for w alone, or with a gain of at most 1 from n."""
 
-Inequalities = tuple[dict[str, Any], list[Any]]
+Blocks = Mapping[str, Expr]
+Inequalities = tuple[dict[str, Expr], list[Expr]]
 
 
-def common(cp: Any, plant: dict[str, Any], aim: Aim) -> Inequalities:
+def common(cp: ModuleType, plant: Blocks, aim: Aim) -> Inequalities:
     """(9) and (10): one Lyapunov matrix X for both channels; K = X^-1 Y."""
     X = cp.Variable(plant["A"].shape, symmetric=True, name="X")
     Y = cp.Variable(plant["C"].T.shape, name="Y")
@@ -28,8 +37,8 @@ def common(cp: Any, plant: dict[str, Any], aim: Aim) -> Inequalities:
     return {"X": X, "Y": Y, "H": H}, [_noise(cp, plant, H, X, X, Y), error]
 
 
-def slack(cp: Any, plant: dict[str, Any], aim: Aim) -> Inequalities:
-    """The same with a Lyapunov matrix for each channel, X2 and Xi, joined by G; K = G^-1 Y."""
+def slack(cp: ModuleType, plant: Blocks, aim: Aim) -> Inequalities:
+    """(9) and (10) with a Lyapunov matrix a channel, X2 and Xi, joined by G; K = G^-1 Y."""
     A = plant["A"]
     G = cp.Variable(A.shape, name="G")
     Y = cp.Variable(plant["C"].T.shape, name="Y")
@@ -42,12 +51,9 @@ def slack(cp: Any, plant: dict[str, Any], aim: Aim) -> Inequalities:
     return unknowns, matrices
 
 
-def full(cp: Any, plant: dict[str, Any], aim: Aim) -> Inequalities:
-    """(6) and (7): a filter with matrices of its own, which (8) makes of R, P, S, Q and U.
-
-    It has no H2 form of its own: the aim is always "mixed".
-    """
-    A, Bw, Bn, C, Dw, Dn, L = (plant[name] for name in ("A", "Bw", "Bn", "C", "Dw", "Dn", "L"))
+def full(cp: ModuleType, plant: Blocks, aim: Aim) -> Inequalities:
+    """(6) and (7): the full-order filter by R, P, S, Q and U of (8); the aim is always "mixed"."""
+    A, Bw, Bn, C, Dw, Dn, L = (plant[name] for name in Plant._fields)
     R, P = (cp.Variable(A.shape, symmetric=True, name=name) for name in "RP")
     S, Q = cp.Variable(A.shape, name="S"), cp.Variable(C.T.shape, name="Q")
     U, H, moved = cp.Variable(L.shape, name="U"), _trace_matrix(cp, plant), P @ A + Q @ C
@@ -64,18 +70,18 @@ def full(cp: Any, plant: dict[str, Any], aim: Aim) -> Inequalities:
     return {"R": R, "P": P, "S": S, "Q": Q, "U": U, "H": H}, [noise, error]
 
 
-def _trace_matrix(cp: Any, plant: dict[str, Any]) -> Any:
+def _trace_matrix(cp: ModuleType, plant: Blocks) -> Expr:
     """H, whose trace bounds the squared H2 norm."""
     p = plant["Bw"].shape[1]
     return cp.Variable((p, p), symmetric=True, name="H")
 
 
-def _noise(cp: Any, plant: dict[str, Any], H: Any, corner: Any, X: Any, Y: Any) -> Any:
+def _noise(cp: ModuleType, plant: Blocks, H: Expr, corner: Expr, X: Expr, Y: Expr) -> Expr:
     """(9)."""
     return _symmetric(cp, [H, (X @ plant["Bw"] - Y @ plant["Dw"]).T], [corner])
 
 
-def _energy(cp: Any, plant: dict[str, Any], corner: Any, X: Any, G: Any, Y: Any) -> Any:
+def _energy(cp: ModuleType, plant: Blocks, corner: Expr, X: Expr, G: Expr, Y: Expr) -> Expr:
     """(10) without the row and the column of n."""
     L = plant["L"]
     return _symmetric(
@@ -83,7 +89,7 @@ def _energy(cp: Any, plant: dict[str, Any], corner: Any, X: Any, G: Any, Y: Any)
     )
 
 
-def _gain(cp: Any, plant: dict[str, Any], corner: Any, X: Any, G: Any, Y: Any) -> Any:
+def _gain(cp: ModuleType, plant: Blocks, corner: Expr, X: Expr, G: Expr, Y: Expr) -> Expr:
     """(10)."""
     L, Bn = plant["L"], plant["Bn"]
     error, disturbed = G @ plant["A"] - Y @ plant["C"], G @ Bn - Y @ plant["Dn"]
@@ -96,8 +102,8 @@ def _gain(cp: Any, plant: dict[str, Any], corner: Any, X: Any, G: Any, Y: Any) -
     )
 
 
-def _symmetric(cp: Any, *rows: Sequence[Any]) -> Any:
-    """A matrix of blocks from those on and above its diagonal; 0 stands for a zero block."""
+def _symmetric(cp: ModuleType, *rows: Sequence[Any]) -> Expr:
+    """Block matrix by the blocks on and above its diagonal; 0 stands for a zero block."""
     size = [row[0].shape[0] for row in rows]
     whole: list[list[Any]] = [[None] * len(rows) for _ in rows]
     for i, row in enumerate(rows):

@@ -1,4 +1,4 @@
-"""The least gain from n to the error of any filter, and a gain that reaches it.
+"""Least gain from n to the error of any filter, and an observer gain that reaches it.
 
 Both come from the Riccati recursion of the game in which n is played against the estimate (Hassibi,
 Sayed & Kailath, *Indefinite-Quadratic Estimation and Control*, SIAM 1999, ch. 4), from P = 0:
@@ -7,11 +7,11 @@ Sayed & Kailath, *Indefinite-Quadratic Estimation and Control*, SIAM 1999, ch. 4
     P <- (A - K C) P~ (A - K C)' + (Bn - K Dn)(Bn - K Dn)',  K = (A P~ C' + Bn Dn') R^-1,
     R = C P~ C' + Dn Dn'.
 
-e' P^-1 e is the least energy, less what the error has already cost, with which n makes the error e
-while y shows nothing. So if L P L' reaches g^2 at some step, no causal filter, linear or not, has a
-gain below g: that is the proof. If it never does, the K of some step may be a gain that has less,
-and its true norms decide. Factors of P are propagated, P = S S', and nothing is subtracted. A plant
-whose modes grow without being driven by n may have a greater least gain than is proved.
+e' P^-1 e is the least energy, net of the past cost of the error, with which n makes the error e
+while y is zero. So if L P L' reaches g^2 at some step, no causal filter, linear or not, has a gain
+below g: that is the proof. If it never does, the K of some step may have less, and its true norms
+decide. Factors of P are propagated, P = S S', and nothing is subtracted. A plant with unstable
+modes that n does not drive may have a greater least gain than is proved.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ from robins.filters.synthesis.riccati import kalman_design
 from robins.filters.synthesis.scaling import balanced
 
 _STEPS = 1000  # of a proof at most
-_TRIAL = 200  # of the recursion that only looks for a gain
+_TRIAL = 200  # of a search for a gain at most
 _SETTLED = 1e-13  # relative growth of P in a step at which the recursion ends
-_NOTHING = 1e-6  # of the unit of gamma: no longer told from zero
-_RTOL = 1e-7  # to which the gamma that is refuted is found
+_NOTHING = 1e-6  # of the unit of gamma: indistinguishable from zero
+_RTOL = 1e-7  # of the refuted gamma
 _REACHED = 1e-5  # relative distance to it at which a gain is good enough
-_ROUGHLY = 1e-3  # to which others are
-_NOISES = (0.0, *(10.0**k for k in range(-9, 0, 2)))  # share of w added to n, that gains are stable
-_UNSEEN = 1e-14  # relative singular value below which y shows nothing
+_ROUGHLY = 1e-3  # tolerance of gamma in a search for a gain
+_NOISES = (0.0, *(10.0**k for k in range(-9, 0, 2)))  # share of w added to n for stable gains
+_UNSEEN = 1e-14  # relative singular value of y that counts as zero
 
 
 class LeastGamma(NamedTuple):
-    """Between what two numbers the least gamma lies, and why."""
+    """Bounds of the least gamma, with their proofs."""
 
     proved: float  # no causal filter has less than this
-    step: int  # of the recursion that proves it; 0 where nothing is proved
-    reached: float  # the H-infinity norm of `design`; 0 where it is next to nothing
+    step: int  # of the recursion that proves it; 0 without a proof
+    reached: float  # the H-infinity norm of `design`; 0 where it is negligible
     design: Design  # certified
 
     def refuse(self, gamma: Number) -> None:
-        """Raise Unreachable if it is proved that no filter meets gamma."""
+        """Raise `Unreachable` for a gamma below the proved bound."""
         if gamma < self.proved:
             raise Unreachable(
                 f"gamma {gamma:.6g} is below the least that any gain can have, {self.proved:.6g} "
@@ -56,24 +56,21 @@ class LeastGamma(NamedTuple):
             )
 
     def with_(self, design: Design) -> LeastGamma:
-        """The same, knowing of one more certified design."""
+        """Bounds with one more certified design."""
         if design.hinf >= self.reached:
             return self
         return self._replace(reached=design.hinf, design=design)
 
     @property
     def exact(self) -> bool:
-        """Whether the two numbers are one, to three digits."""
+        """True if both bounds agree to three digits."""
         return self.reached <= self.proved * (1.0 + 1e-3)
 
 
 def least_gamma(plant: Plant) -> LeastGamma:
-    """The least H-infinity norm that any gain reaches, proved from below and reached from above.
+    """Least H-infinity norm of any gain, proved from below and reached from above.
 
-    No solver is asked. The proof is good to the rounding of the plant's numbers.
-
-    Args:
-        plant: what is filtered.
+    It needs no solver. The proof holds to the rounding of the plant's numbers.
 
     Raises:
         ValueError: the plant has no steady Kalman filter.
@@ -103,10 +100,7 @@ def least_gamma(plant: Plant) -> LeastGamma:
 
 
 def _edge(plant: Plant, low: float, high: float, noise: float = 0.0) -> tuple[float, float, int]:
-    """The greatest gamma at which the game is seen to end, the least at which not, and the step.
-
-    The first is 0 where it does not end at `low`.
-    """
+    """Greatest gamma (or 0) at which the game ends, least at which it does not, and the step."""
     step = _play(plant, low, noise)[1] if low < high else 0
     if not step:
         return 0.0, low, 0
@@ -121,7 +115,7 @@ def _edge(plant: Plant, low: float, high: float, noise: float = 0.0) -> tuple[fl
 
 
 def _play(plant: Plant, gamma: float, noise: float = 0.0) -> tuple[np.ndarray, int]:
-    """The last gain of the recursion, and the step at which L P L' reached gamma^2, or 0."""
+    """Last gain of the recursion, and the step at which L P L' reached gamma^2, or 0."""
     B = np.hstack([plant.Bn, noise * plant.Bw])
     D = np.hstack([plant.Dn, noise * plant.Dw])
     n = len(plant.A)
@@ -133,8 +127,8 @@ def _play(plant: Plant, gamma: float, noise: float = 0.0) -> tuple[np.ndarray, i
         if share.max(initial=0.0) >= 1.0:
             return K, step
         played = S @ axes.T / np.sqrt(1.0 - share**2)
-        seen, moved = np.hstack([plant.C @ played, D]), np.hstack([plant.A @ played, B])
-        left, size, axes = np.linalg.svd(seen)
+        measured, moved = np.hstack([plant.C @ played, D]), np.hstack([plant.A @ played, B])
+        left, size, axes = np.linalg.svd(measured)
         rank = int(np.sum(size > _UNSEEN * size.max(initial=0.0)))
         K = moved @ axes[:rank].T / size[:rank] @ left[:, :rank].T
         before, S = S, _square(moved @ axes[rank:].T)
@@ -145,7 +139,7 @@ def _play(plant: Plant, gamma: float, noise: float = 0.0) -> tuple[np.ndarray, i
 
 
 def _square(S: np.ndarray) -> np.ndarray:
-    """A square factor of S S'."""
+    """Square factor of S S'."""
     n = len(S)
     square = np.zeros((n, n))
     lower = np.asarray(np.linalg.qr(S.T, mode="r")).T

@@ -1,9 +1,9 @@
 """Norms of a discrete-time system x(k+1) = A x + B u, z = C x + D u, and its spectral radius.
 
 The H2 norm is the root mean square of z for white u of unit covariance, the H-infinity norm the
-greatest energy gain from u to z. The latter is computed twice, in ways that err differently:
-`hinf_norm` asks an eigenvalue problem whether a singular value of the frequency response crosses a
-level, `peak_gain` sweeps the frequency. All are inf for a system that is not stable.
+greatest energy gain from u to z. The latter is computed in two independent ways: `hinf_norm` finds
+crossings of a level by the singular values of the frequency response from an eigenvalue problem,
+`peak_gain` sweeps the frequency. All are inf for an unstable system.
 """
 
 from __future__ import annotations
@@ -14,28 +14,28 @@ import numpy as np
 import scipy.linalg
 
 from robins.errors import require
-from robins.filters.checks import matrix
+from robins.filters.checks import matrix, square
 
-Number = float | int  # where types are checked an int is no float
+Number = float | int  # an int is no float at run time
+System = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # A, B, C, D
 
-_CIRCLE = 1e-6  # eigenvalues as near to the unit circle are looked at
+_CIRCLE = 1e-6  # largest distance of an eigenvalue from the unit circle that may be a crossing
+_RTOL = 1e-11  # of the H-infinity norm by levels
 _STARTS = 65  # even samples of the half circle that begin a search
-_LARGEST = 1e70  # whose fourth power is a number
+_POINTS = 200  # even samples of the half circle in a sweep
+_LARGEST = 1e70  # number with a finite fourth power
 _SQUARINGS = 64  # of A: a radius of 1 - eps needs 58
 
 
-def _system(
-    A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The matrices of a system, D zero by default.
+def _system(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None) -> System:
+    """Matrices (n, n), (n, q), (r, n), (r, q) of a system, D zero by default.
 
     Raises:
         TypeError: one is not of real numbers.
-        ValueError: one has another shape than the others ask for, is not finite or beyond 1e70.
+        ValueError: one does not fit the shapes of the others, is not finite or beyond 1e70.
     """
-    A = matrix("A", A)
-    n = len(A)
-    A, B, C = matrix("A", A, n, n), matrix("B", B, n), matrix("C", C, None, n)
+    A = square("A", A)
+    B, C = matrix("B", B, len(A)), matrix("C", C, None, len(A))
     shape = len(C), B.shape[1]
     D = np.zeros(shape) if D is None else matrix("D", D, *shape)
     for name, block in (("A", A), ("B", B), ("C", C), ("D", D)):
@@ -46,16 +46,14 @@ def _system(
 
 def spectral_radius(A: np.ndarray) -> float:
     """Greatest modulus of an eigenvalue of A; below one where the system is stable."""
-    A = matrix("A", A)
-    A = matrix("A", A, None, len(A))
-    return float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0))
+    return float(np.max(np.abs(np.linalg.eigvals(square("A", A))), initial=0.0))
 
 
 def gramian(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """Covariance P = A P A' + B B' of the state under unit white noise (A must be stable).
 
-    By doubling (Smith 1968): P(2k) = P(k) + A^k P(k) A^k'. Only what is positive semidefinite is
-    added, so that the result is as accurate in a state with small numbers as in one with large.
+    By doubling (Smith 1968): P(2k) = P(k) + A^k P(k) A^k'. Only positive semidefinite terms are
+    added, so that states with small and with large numbers are equally accurate.
     """
     power, P = A, B @ B.T
     for squaring in range(_SQUARINGS):
@@ -63,7 +61,7 @@ def gramian(A: np.ndarray, B: np.ndarray) -> np.ndarray:
         P = P + more
         power = power @ power
         grows = np.any(np.diagonal(more) > 1e-17 * np.diagonal(P))
-        if not grows and 2**squaring >= len(A):  # what takes n steps to be seen may still come
+        if not grows and 2**squaring >= len(A):  # a state may take n steps to be driven
             break
     return 0.5 * (P + P.T)
 
@@ -78,26 +76,17 @@ def h2_norm(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = 
     return float(np.sqrt(max(float(power), 0.0) + direct))
 
 
-def hinf_norm(
-    A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = None, rtol: Number = 1e-11
-) -> float:
+def hinf_norm(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = None) -> float:
     """Greatest singular value of C (zI - A)^-1 B + D on the unit circle, by level tests.
 
     A level is reached where the symplectic pencil of the level has an eigenvalue on the circle
-    (Boyd, Balakrishnan & Kabamba 1989, in discrete time). One that is reached is raised to the
-    highest response between such eigenvalues (Bruinsma & Steinbuch 1990), which converges
-    quadratically where bisection halves; the one that is not reached is the answer. The search
-    starts from the highest of some responses, below |D| + 2 sum(s) of the Hankel singular values s.
-
-    Args:
-        A: (n, n).
-        B: (n, q).
-        C: (r, n).
-        D: (r, q), zero by default.
-        rtol: relative distance of the level that is not reached from a response that is.
+    (Boyd, Balakrishnan & Kabamba 1989, in discrete time). It is then raised to the highest response
+    between such eigenvalues (Bruinsma & Steinbuch 1990), which converges quadratically; the first
+    level that is not reached is the answer. The search starts from the highest of some responses,
+    below |D| + 2 sum(s) of the Hankel singular values s.
 
     Returns:
-        The norm, from above; inf unless A is stable.
+        The norm, from above and within 1e-11 of a response; inf unless A is stable.
     """
     A, B, C, D = _system(A, B, C, D)
     if spectral_radius(A) >= 1.0:
@@ -105,7 +94,7 @@ def hinf_norm(
     levels = Levels.of(A, B, C, D)
     lower = levels.lower
     while lower > 0.0 and lower < levels.upper:
-        above = lower * (1.0 + rtol)
+        above = lower * (1.0 + _RTOL)
         if (highest := levels.highest(above)) < above:
             return above
         lower = highest
@@ -113,7 +102,7 @@ def hinf_norm(
 
 
 class Levels(NamedTuple):
-    """A stable system, scaled, to be asked which gains its frequency response reaches."""
+    """A stable system, scaled, and bounds of the peak of its frequency response."""
 
     A: np.ndarray  # (n, n)
     B: np.ndarray  # (n, q)
@@ -141,20 +130,16 @@ class Levels(NamedTuple):
         lower = max(direct, float(np.max(_gains(*blocks, np.exp(1j * angle))))) * (1.0 - 1e-9)
         return cls(*blocks, lower, (direct + 2.0 * float(np.sum(hankel))) * (1.0 + 1e-9))
 
-    def reached(self, gain: Number) -> bool:
-        """Whether some singular value of the frequency response is as large as this."""
-        return gain <= self.lower or (gain <= self.upper and self.highest(gain) >= gain)
-
     def highest(self, gain: Number) -> float:
         """Highest response at z = 1, -1, where singular values cross this level, and between.
 
-        Below the level if and only if it is nowhere reached: eigenvalues near the circle are only
-        believed for what the response is there, and one that is above the level everywhere is so at
-        1. With z x = A x + B u, g v = C x + D u, and their adjoints l = z (A' l + C' v),
+        Below the level if and only if it is not reached anywhere: eigenvalues near the circle are
+        checked by the response, and a response above the level everywhere is so at 1. With
+        z x = A x + B u, g v = C x + D u, and their adjoints l = z (A' l + C' v),
         g u = B' l + D' v, nothing is inverted.
         """
         n, (r, q) = len(self.A), self.D.shape
-        root = np.sqrt(gain)  # input and output in units in which the level is one
+        root = np.sqrt(gain)  # scales input and output so that the level is one
         B, C, D = self.B / root, self.C / root, self.D / gain
         M = np.block(
             [
@@ -177,23 +162,21 @@ class Levels(NamedTuple):
         return float(np.max(_gains(self.A, self.B, self.C, self.D, np.exp(1j * angle))))
 
 
-def peak_gain(
-    A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = None, points: int = 200
-) -> float:
+def meets(A: np.ndarray, B: np.ndarray, C: np.ndarray, gamma: Number) -> bool:
+    """True if a system is stable and its H-infinity norm is below gamma."""
+    if spectral_radius(A) >= 1.0:
+        return False
+    if np.isinf(gamma):
+        return True
+    levels = Levels.of(A, B, C)
+    return gamma > levels.lower and (gamma > levels.upper or levels.highest(gamma) < gamma)
+
+
+def peak_gain(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = None) -> float:
     """Greatest gain found by a sweep of the frequency: never more than the H-infinity norm.
 
-    The circle is sampled evenly and, ever more densely, about the angle of each eigenvalue; then
-    closer and closer about the highest peaks.
-
-    Args:
-        A: (n, n).
-        B: (n, q).
-        C: (r, n).
-        D: (r, q), zero by default.
-        points: even samples of the half circle.
-
-    Returns:
-        The gain; inf unless A is stable.
+    The circle is sampled evenly, more densely about the angle of each eigenvalue, and then
+    repeatedly about the highest peaks.
     """
     A, B, C, D = _system(A, B, C, D)
     values = np.linalg.eigvals(A)
@@ -202,7 +185,7 @@ def peak_gain(
     widths = np.maximum(1.0 - np.abs(values), 1e-15)[:, None] * np.logspace(-1.5, 2.0, 15)
     angles = np.angle(values)[:, None]
     about = np.concatenate([angles, angles - widths, angles + widths], axis=1).ravel()
-    angle = np.concatenate([np.linspace(0.0, np.pi, points), np.abs(about)])
+    angle = np.concatenate([np.linspace(0.0, np.pi, _POINTS), np.abs(about)])
     angle = np.unique(angle[angle <= np.pi])
 
     def gains(angle: np.ndarray) -> np.ndarray:

@@ -2,23 +2,23 @@
 
     x(k+1) = A x + Bw w + Bn n,     y = C x + Dw w + Dn n,     z = L x
 
-w is white noise of unit covariance, n any signal of finite energy (a modelling error), z what the
-filter is to estimate. A gain K makes the observer ``x^(k+1) = A x^ + K (y - C x^)``, whose error
+w is white noise of unit covariance, n any signal of finite energy (a modelling error), z the output
+to estimate. A gain K makes the observer ``x^(k+1) = A x^ + K (y - C x^)``, whose error
 e = x - x^ obeys
 
     e(k+1) = (A - K C) e + (Bw - K Dw) w + (Bn - K Dn) n.
 
-Numbers may have any unit; what is computed from a plant does not depend on those of its states.
+No result depends on the units of the states.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from robins.errors import require
-from robins.filters.checks import matrix
+from robins.filters.checks import Matrix, matrix
 
 _MARGINAL = 1e-7  # eigenvalues of a defective block at 1 may be computed as far inside the circle
 _UNSEEN = 1e-9  # least singular value of the scaled Popov-Belevitch-Hautus matrix that counts as 0
@@ -27,17 +27,17 @@ _UNSEEN = 1e-9  # least singular value of the scaled Popov-Belevitch-Hautus matr
 class Plant(NamedTuple):
     """Matrices of a plant, float64; made by `plant` or `current_form`, which check them."""
 
-    A: np.ndarray  # (n, n)
-    Bw: np.ndarray  # (n, p) noise
-    Bn: np.ndarray  # (n, q) modelling error
-    C: np.ndarray  # (m, n)
-    Dw: np.ndarray  # (m, p)
-    Dn: np.ndarray  # (m, q)
-    L: np.ndarray  # (r, n) rows whose error counts
+    A: np.ndarray  # (n, n) transition
+    Bw: np.ndarray  # (n, p) process noise
+    Bn: np.ndarray  # (n, q) modelling error of the motion
+    C: np.ndarray  # (m, n) measurement
+    Dw: np.ndarray  # (m, p) measurement noise
+    Dn: np.ndarray  # (m, q) modelling error of the measurement
+    L: np.ndarray  # (r, n) rows to estimate
 
 
 class ErrorSystem(NamedTuple):
-    """How the error of an observer moves: e(k+1) = A e + Bw w + Bn n, z - z^ = L e."""
+    """Error of an observer: e(k+1) = A e + Bw w + Bn n, z - z^ = L e."""
 
     A: np.ndarray  # (n, n)
     Bw: np.ndarray  # (n, p)
@@ -45,25 +45,25 @@ class ErrorSystem(NamedTuple):
     L: np.ndarray  # (r, n)
 
 
-def plant(A: Any, Bw: Any, Bn: Any, C: Any, Dw: Any = None, Dn: Any = None, L: Any = None) -> Plant:
-    """A plant whose gain K predicts: x^(k+1) = A x^ + K (y - C x^).
+def plant(
+    A: Matrix,
+    Bw: Matrix,
+    Bn: Matrix,
+    C: Matrix,
+    Dw: Matrix | None = None,
+    Dn: Matrix | None = None,
+    L: Matrix | None = None,
+) -> Plant:
+    """Plant whose gain K predicts: x^(k+1) = A x^ + K (y - C x^).
 
-    Args:
-        A: (n, n) transition.
-        Bw: (n, p) how the noise w moves the state.
-        Bn: (n, q) how the modelling error n moves the state.
-        C: (m, n) what is measured.
-        Dw: (m, p) how w enters the measurement; nothing by default.
-        Dn: (m, q) how n enters the measurement; nothing by default.
-        L: (r, n) what is estimated; the whole state by default.
+    Arguments are the blocks of `Plant`; Dw and Dn are zero by default, L the whole state.
 
     Raises:
         TypeError: a block is not made of real numbers.
         ValueError: a block is no matrix, has the wrong shape or is not finite, or a mode that does
-            not decay by itself is not seen in y. The message names the block or the mode.
+            not decay is not observed in y. The message names the block or the mode.
     """
-    named = ((A, "A"), (Bw, "Bw"), (Bn, "Bn"), (C, "C"))
-    A, Bw, Bn, C = (matrix(name, value) for value, name in named)
+    A, Bw, Bn, C = (matrix(*one) for one in (("A", A), ("Bw", Bw), ("Bn", Bn), ("C", C)))
     n, m = A.shape[0], C.shape[0]
     require(A.shape[1] == n and n != 0, f"A is {A.shape}: the transition of a state must be square")
     require(m != 0, f"C is {C.shape}: nothing is measured")
@@ -82,26 +82,26 @@ def plant(A: Any, Bw: Any, Bn: Any, C: Any, Dw: Any = None, Dn: Any = None, L: A
     return Plant(A, Bw, Bn, C, Dw, Dn, L)
 
 
-def current_form(A: Any, Bw: Any, Bn: Any, C: Any, Dv: Any, L: Any = None, Dn: Any = None) -> Plant:
-    """A plant whose gain K corrects: x^ = x- + K (y - C x-), x- = A x^, as navigation filters do.
+def current_form(
+    A: Matrix,
+    Bw: Matrix,
+    Bn: Matrix,
+    C: Matrix,
+    Dv: Matrix,
+    L: Matrix | None = None,
+    Dn: Matrix | None = None,
+) -> Plant:
+    """Plant whose gain K corrects: x^ = x- + K (y - C x-), x- = A x^, as navigation filters do.
 
     The error after the correction obeys e(k+1) = (I - K C)(A e + Bw w + Bn n) - K (Dv v + Dn n),
     which is the error of a predictor for the plant with C A in the place of C, noise [w, v],
-    Bw = [Bw, 0], Dw = [C Bw, Dv] and Dn = C Bn + Dn. So every design takes it as it is, and the K
-    it finds is the gain of the correction. (The gain of the predictor would be A K.)
+    Bw = [Bw, 0], Dw = [C Bw, Dv] and Dn = C Bn + Dn. So the K of every design is the gain of the
+    correction. (The gain of the predictor would be A K.)
 
-    Args:
-        A: (n, n) transition from one measurement to the next.
-        Bw: (n, p) process noise over that time.
-        Bn: (n, q) modelling error over that time.
-        C: (m, n) what is measured.
-        Dv: (m, v) factor of the measurement's noise, independent of w.
-        L: (r, n) what is estimated; the whole state by default.
-        Dn: (m, q) how n enters the measurement itself; nothing by default.
+    Arguments are those of `plant`, from one measurement to the next, and Dv (m, v), the factor of
+    the measurement noise, independent of w.
 
-    Raises:
-        TypeError: as `plant`.
-        ValueError: as `plant`, the blocks named as they are given here.
+    Errors are those of `plant`.
     """
     given = plant(A, Bw, Bn, C, None, Dn, L)
     Dv = matrix("Dv", Dv)
@@ -118,8 +118,8 @@ def current_form(A: Any, Bw: Any, Bn: Any, C: Any, Dv: Any, L: Any = None, Dn: A
     )
 
 
-def error_system(plant: Plant, K: Any) -> ErrorSystem:
-    """The error of the observer with gain K: A - K C, Bw - K Dw, Bn - K Dn and L.
+def error_system(plant: Plant, K: Matrix) -> ErrorSystem:
+    """Error of the observer with gain K: A - K C, Bw - K Dw, Bn - K Dn and L.
 
     Raises:
         TypeError: K is not made of real numbers.
@@ -137,25 +137,21 @@ def _require_shape(name: str, block: np.ndarray, shape: tuple[int, int], why: st
     require(block.shape == shape, f"{name} is {block.shape}, must be {shape}: {why}")
 
 
-def _feedthrough(D: Any, name: str, m: int, B: np.ndarray, signal: str) -> np.ndarray:
+def _feedthrough(D: Matrix | None, name: str, m: int, B: np.ndarray, signal: str) -> np.ndarray:
     wanted = (m, B.shape[1])
-    if D is None:
-        return np.zeros(wanted)
-    D = matrix(name, D)
-    if D.shape == wanted:
-        return D
+    D = np.zeros(wanted) if D is None else matrix(name, D)
     why = f"C says that y has {m} components and B{signal} that {signal} has {wanted[1]}"
-    mend = ""
     if D.shape[0] == m:
-        mend = (
+        why += (
             f". If {signal} has parts of its own in y, give them columns: B{signal} = [B{signal}, "
             f"0] and {name} = [0, {name}]"
         )
-    raise ValueError(f"{name} is {D.shape}, must be {wanted}: {why}{mend}")
+    _require_shape(name, D, wanted, why)
+    return D
 
 
 def _refuse_undetectable(A: np.ndarray, C: np.ndarray) -> None:
-    """Raise if a mode with |eigenvalue| >= 1 is not seen in y (Popov-Belevitch-Hautus)."""
+    """Raise if a mode with |eigenvalue| >= 1 is not observed in y (Popov-Belevitch-Hautus)."""
     values = np.linalg.eigvals(A)
     size = np.linalg.norm(C, axis=1, keepdims=True)
     rows = C / np.where(size > 0.0, size, 1.0)

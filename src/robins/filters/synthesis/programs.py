@@ -1,8 +1,7 @@
 """Semidefinite programs of filter designs, built once a shape and solved for many plants.
 
-For a small design cvxpy spends most of its time on turning expressions into the solver's form. Here
-the plant's matrices are parameters of a problem that obeys the rules of disciplined *parametrised*
-programming, so that this happens once; another plant of the same shape only fills in numbers.
+For a small design cvxpy spends most of its time on the canonical form of expressions. By
+disciplined *parametrised* programming, the plant's matrices being parameters, this happens once.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import warnings
 from functools import lru_cache
 from threading import Lock
 from types import ModuleType
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
@@ -20,16 +19,19 @@ from robins.filters.synthesis import inequalities
 from robins.filters.synthesis.inequalities import Aim
 from robins.filters.synthesis.plant import Plant
 
+if TYPE_CHECKING:
+    from cvxpy import Parameter, Problem, Variable
+
 Form = Literal["common", "slack", "full"]
 
-# Where gamma is tight, R and with it the full-order problem are nearly singular; refining each
-# linear solve further than is usual gains a digit there and costs a tenth more elsewhere.
+# Where gamma is tight, R and with it the full-order problem are nearly singular; more refinement of
+# each linear solve gains a digit there and costs a tenth more elsewhere.
 _CLARABEL = {"iterative_refinement_max_iter": 30, "iterative_refinement_stop_ratio": 2.0}
 _LOCK = Lock()  # a program's parameters belong to one solve at a time
 
 
 class MissingExtra(RobinsError, ImportError):
-    """A design by LMI was asked for without the packages that solve one."""
+    """The packages for designs by LMI are not installed."""
 
     bad_input = False
 
@@ -37,7 +39,7 @@ class MissingExtra(RobinsError, ImportError):
 class Answer(NamedTuple):
     """The answer of a solver, unchecked."""
 
-    status: str  # the solver's own word
+    status: str
     value: float  # Trace(H); nan without a solution
     unknowns: dict[str, np.ndarray]  # by the symbols of the equations; empty without a solution
 
@@ -45,18 +47,16 @@ class Answer(NamedTuple):
 class Program(NamedTuple):
     """A problem, the parameters to fill in and the unknowns to read."""
 
-    problem: Any
-    parameters: dict[str, Any]
-    unknowns: dict[str, Any]
+    problem: Problem
+    parameters: dict[str, Parameter]
+    unknowns: dict[str, Variable]
 
 
 def solve(plant: Plant, form: Form, aim: Aim) -> Answer:
-    """Solve a design's program for one plant, whose numbers should be of order one.
+    """Solve a design program: "common" is (9) and (10), "slack" their slack form, "full" (6), (7).
 
-    Args:
-        plant: scaled such that the gain from n to z may be 1 (`robins.filters.synthesis.scaling`).
-        form: "common" for (9) and (10), "slack" for their slack form, "full" for (6) and (7).
-        aim: what is minimised, under which channels.
+    Numbers of the plant should be of order one, and the gain from n to z at most 1
+    (`robins.filters.synthesis.scaling`).
 
     Raises:
         MissingExtra: cvxpy or Clarabel is not installed.
@@ -68,8 +68,7 @@ def solve(plant: Plant, form: Form, aim: Aim) -> Answer:
         for name, parameter in program.parameters.items():
             parameter.value = getattr(plant, name)
         try:
-            # An answer that may be inaccurate says so in its status, and true norms decide. Each
-            # begins cold: a solver kept warm scales by the plant it saw first.
+            # No warnings, for true norms decide; no warm start, which scales by the first plant.
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 program.problem.solve(solver=cp.CLARABEL, warm_start=False, **_CLARABEL)
@@ -79,16 +78,16 @@ def solve(plant: Plant, form: Form, aim: Aim) -> Answer:
         status = str(program.problem.status)
         if any(value is None or not np.isfinite(value).all() for value in found.values()):
             return Answer(status, np.nan, {})
-        return Answer(status, float(program.problem.value), found)
+        return Answer(status, float(program.problem.value), found)  # type: ignore[arg-type]
 
 
 @lru_cache(maxsize=64)
 def build(form: Form, aim: Aim, n: int, p: int, q: int, m: int, r: int) -> Program:
-    """The program for n states, p and q components of w and n, m measurements and r outputs."""
+    """Program for n states, p and q components of w and n, m measurements and r outputs."""
     cp = packages()
-    sizes = {"A": (n, n), "Bw": (n, p), "Bn": (n, q), "C": (m, n)}
-    sizes |= {"Dw": (m, p), "Dn": (m, q), "L": (r, n)}
-    parameters = {name: cp.Parameter(size, name=name) for name, size in sizes.items()}
+    sizes = (n, n), (n, p), (n, q), (m, n), (m, p), (m, q), (r, n)
+    named = zip(Plant._fields, sizes, strict=True)
+    parameters = {name: cp.Parameter(size, name=name) for name, size in named}
     unknowns, matrices = getattr(inequalities, form)(cp, parameters, aim)
     cost = cp.trace(unknowns["H"])
     problem = cp.Problem(cp.Minimize(cost), [matrix >> 0 for matrix in matrices])
@@ -97,7 +96,7 @@ def build(form: Form, aim: Aim, n: int, p: int, q: int, m: int, r: int) -> Progr
 
 
 def packages() -> ModuleType:
-    """The module cvxpy, which takes a second to import and is optional.
+    """Import the optional module cvxpy, which takes a second.
 
     Raises:
         MissingExtra: it or Clarabel is not installed.

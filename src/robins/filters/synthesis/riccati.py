@@ -1,4 +1,4 @@
-"""Gains from Riccati equations: the Kalman filter, and the one that takes n for noise."""
+"""Gains from Riccati equations: the Kalman filter, also with the modelling error n as noise."""
 
 from __future__ import annotations
 
@@ -16,19 +16,17 @@ from robins.filters.synthesis import norms
 from robins.filters.synthesis.design import Design, Unreachable, certify
 from robins.filters.synthesis.plant import Plant, error_system
 
-METHOD = "riccati"
-
 _DECADES = np.arange(-2.0, 12.1, 0.25)  # of lambda, about the one that makes n as large as w
-_FARTHER, _FARTHEST = 10.0**0.25, 1e12  # steps beyond that grid and their end, if the norm falls
-_FALLS = 1e-4  # relative, in a step
+_FARTHER, _FARTHEST = 10.0**0.25, 1e12  # factor of lambda in a step beyond the grid, and its end
+_FALLS = 1e-4  # relative decrease of the norm in a step that goes on beyond the grid
 _RTOL = 1e-10  # of lambda
-_STEPS = 60  # of Newton's iteration at most; it converges quadratically once it is near
+_STEPS = 60  # of Newton's iteration at most; convergence is quadratic
 
 check_gamma = partial(positive, "gamma", of_infinity="no bound")
 
 
 def kalman_gain(plant: Plant) -> np.ndarray:
-    """Gain (n, m) of the steady Kalman filter, the least H2 norm there is; n counts for nothing.
+    """Gain (n, m) of the steady Kalman filter, of least H2 norm; n is ignored.
 
     The Riccati equation is the one with cross terms, E[Bw w (Dw w)'] = Bw Dw'.
 
@@ -40,11 +38,7 @@ def kalman_gain(plant: Plant) -> np.ndarray:
 
 
 def kalman_design(plant: Plant) -> Design:
-    """The steady Kalman filter as a design.
-
-    Raises:
-        ValueError: as `kalman_gain`.
-    """
+    """Design of the steady Kalman filter; errors are those of `kalman_gain`."""
     began = time.perf_counter()
     K = kalman_gain(plant)
     seconds = time.perf_counter() - began
@@ -62,17 +56,13 @@ def inflated_gain(plant: Plant, lambda_: norms.Number) -> np.ndarray:
 
 
 def riccati(plant: Plant, gamma: norms.Number) -> Design:
-    """The Kalman filter for noise [w, sqrt(lambda) n], with the least lambda that meets gamma.
+    """Kalman filter for noise [w, sqrt(lambda) n], with the least lambda that meets gamma.
 
-    The modelling error n is taken for white noise, ever more of it until the true H-infinity norm
-    from n to the error is gamma. No semidefinite programme is solved, and run with its own
-    covariance it is the ordinary Kalman filter with Q + lambda Bn Bn' (`channel_inflation`), start
-    and outages included. Where n and y see the same states it is as good as any gain; where n
-    drives a state that is not measured a better one can exist, and gamma can be out of reach.
-
-    Args:
-        plant: what is filtered.
-        gamma: bound on the H-infinity norm; inf is the Kalman filter.
+    lambda is the variance of n taken for white noise at which the true H-infinity norm from n to
+    the error is gamma. Run with its own covariance it is the ordinary Kalman filter with
+    Q + lambda Bn Bn' (`channel_inflation`), start and outages included. If n drives measured states
+    it is as good as any gain; if n drives a state that is not measured a better one can exist, and
+    gamma can be out of reach. With gamma = inf it is the Kalman filter.
 
     Raises:
         Unreachable: no lambda meets gamma; the message names the least gamma that one can.
@@ -82,26 +72,20 @@ def riccati(plant: Plant, gamma: norms.Number) -> Design:
     began = time.perf_counter()
     K, lambda_ = _search(plant, float(gamma))
     seconds = time.perf_counter() - began
-    return certify(plant, K, method=METHOD, gamma=gamma, lambda_=lambda_, seconds=seconds)
+    return certify(plant, K, method="riccati", gamma=gamma, lambda_=lambda_, seconds=seconds)
 
 
 def least_riccati_gamma(plant: Plant) -> float:
-    """Least H-infinity norm of the Kalman gains for noise [w, sqrt(lambda) n], over all lambda.
-
-    Raises:
-        ValueError: as `kalman_gain`.
-    """
+    """Least H-infinity norm of the `inflated_gain` over all lambda."""
     return _least(plant)[-1]
 
 
 def _search(plant: Plant, gamma: float) -> tuple[np.ndarray, float]:
-    """The gain for the least lambda that meets gamma, and that lambda."""
+    """Gain for the least lambda that meets gamma, and that lambda."""
 
     def meets(K: np.ndarray) -> bool:
         e = error_system(plant, K)
-        if norms.spectral_radius(e.A) >= 1.0:
-            return False
-        return not norms.Levels.of(e.A, e.Bn, e.L).reached(gamma)
+        return norms.meets(e.A, e.Bn, e.L, gamma)
 
     K = _gain(plant, 0.0)
     if np.isinf(gamma) or meets(K):
@@ -139,33 +123,35 @@ def _bisect(
 
 
 def _least(plant: Plant) -> tuple[np.ndarray, float, float]:
-    """The gain of the least H-infinity norm, its lambda, and that norm."""
+    """Gain of least H-infinity norm, its lambda, and that norm."""
 
     def norm(K: np.ndarray) -> float:
         e = error_system(plant, K)
         return max(norms.hinf_norm(e.A, e.Bn, e.L), norms.peak_gain(e.A, e.Bn, e.L))
 
-    gains = [_gain(plant, 0.0)]
-    grid = [0.0, *_grid(plant, gains[0])]
-    for value in grid[1:]:
-        gains.append(_gain(plant, float(value), gains[-1]))
-    reached, end = [norm(K) for K in gains], grid[-1]
-    while reached[-1] < (1.0 - _FALLS) * reached[-2] and grid[-1] < _FARTHEST * end:
-        grid.append(_FARTHER * grid[-1])
-        gains.append(_gain(plant, grid[-1], gains[-1]))
-        reached.append(norm(gains[-1]))
-    best = int(np.argmin(reached))
-    found = gains[best], grid[best], reached[best]
-    if 1 < best < len(grid) - 1:
-        ends = np.log(grid[best - 1]), np.log(grid[best + 1])
+    def at(lambda_: float, near: np.ndarray | None) -> tuple[np.ndarray, float, float]:
+        K = _gain(plant, lambda_, near)
+        return K, lambda_, norm(K)
+
+    found = [at(0.0, None)]
+    for value in _grid(plant, found[0][0]):
+        found.append(at(float(value), found[-1][0]))
+    end = found[-1][1]
+    while found[-1][2] < (1.0 - _FALLS) * found[-2][2] and found[-1][1] < _FARTHEST * end:
+        found.append(at(_FARTHER * found[-1][1], found[-1][0]))
+    best = int(np.argmin([least for _, _, least in found]))
+    K, _, least = found[best]
+    if 1 < best < len(found) - 1:
         fine = scipy.optimize.minimize_scalar(
-            lambda exponent: norm(_gain(plant, float(np.exp(exponent)), gains[best])),
-            bounds=ends, method="bounded", options={"xatol": 1e-9},
-        )  # fmt: skip
-        K = _gain(plant, lambda_ := float(np.exp(fine.x)), gains[best])
-        if (lowest := norm(K)) < reached[best]:
-            found = K, lambda_, lowest
-    return found
+            lambda exponent: at(float(np.exp(exponent)), K)[2],
+            bounds=(np.log(found[best - 1][1]), np.log(found[best + 1][1])),
+            method="bounded",
+            options={"xatol": 1e-9},
+        )
+        finer = at(float(np.exp(fine.x)), K)
+        if finer[2] < least:
+            return finer
+    return found[best]
 
 
 def _grid(plant: Plant, K: np.ndarray) -> np.ndarray:
@@ -175,8 +161,7 @@ def _grid(plant: Plant, K: np.ndarray) -> np.ndarray:
     S = plant.C @ P @ plant.C.T + plant.Dw @ plant.Dw.T
     noise = np.concatenate([np.diagonal(P), np.diagonal(S)])[:, None]
     error = np.vstack([plant.Bn, plant.Dn]) ** 2
-    seen = (noise > 0.0) & (error > 0.0)
-    share = np.where(seen, error / np.where(noise > 0.0, noise, 1.0), 0.0)
+    share = np.divide(error, noise, out=np.zeros_like(error), where=noise > 0.0)
     largest = float(np.max(share, initial=0.0))
     return 10.0**_DECADES / (largest or 1.0)
 
@@ -189,28 +174,28 @@ def _gain(plant: Plant, lambda_: float, near: np.ndarray | None = None) -> np.nd
     state = _sizes(B)[:, None]
     output = _sizes(np.hstack([D, C @ B]))
     scaled = A * state.T / state, B / state, C * state.T / output[:, None], D / output[:, None]
-    start = _stabilising(*scaled) if near is None else near * output / state
-    return _polished(*scaled, start) * state / output
+    start = _stabilising(scaled) if near is None else near * output / state
+    return _polished(scaled, start) * state / output
 
 
-def _stabilising(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> np.ndarray:
+def _stabilising(system: norms.System) -> np.ndarray:
+    A, B, C, D = system
     try:
         P = scipy.linalg.solve_discrete_are(A.T, C.T, B @ B.T, D @ D.T, s=B @ D.T)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise ValueError(why_not_steady(A, B, C, D)) from error
-    K = _update(A, B, C, D, P)
+        raise ValueError(why_not_steady(system)) from error
+    K = _update(system, P)
     if not norms.spectral_radius(A - K @ C) < 1.0:
-        raise ValueError(why_not_steady(A, B, C, D))
+        raise ValueError(why_not_steady(system))
     return K
 
 
-def _polished(
-    A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, K: np.ndarray
-) -> np.ndarray:
+def _polished(system: norms.System, K: np.ndarray) -> np.ndarray:
     """Newton's iteration (Hewer 1971) from a stabilising gain, to the last digits."""
+    A, B, C, D = system
     change = np.inf
     for _ in range(_STEPS):
-        better = _update(A, B, C, D, norms.gramian(A - K @ C, B - K @ D))
+        better = _update(system, norms.gramian(A - K @ C, B - K @ D))
         before, change = change, float(np.max(np.abs(better - K)))
         size = float(np.max(np.abs(K)))
         close = change < 1e-7 * size
@@ -222,32 +207,32 @@ def _polished(
     return K
 
 
-def _update(
-    A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, P: np.ndarray
-) -> np.ndarray:
+def _update(system: norms.System, P: np.ndarray) -> np.ndarray:
     """K = (A P C' + B D') (C P C' + D D')^-1."""
+    A, B, C, D = system
     S = C @ P @ C.T + D @ D.T
     try:
         root = np.linalg.cholesky(S)
     except np.linalg.LinAlgError as error:
-        raise ValueError(why_not_steady(A, B, C, D)) from error
+        raise ValueError(why_not_steady(system)) from error
     half = np.linalg.solve(root, C @ P @ A.T + D @ B.T)
     return np.linalg.solve(root.T, half).T
 
 
 def _sizes(rows: np.ndarray) -> np.ndarray:
+    """Norms of rows; one for a row of zeros."""
     size = np.linalg.norm(rows, axis=1)
     return np.where(size > 1e-150, size, 1.0)
 
 
-_CIRCLE = 1e-6  # eigenvalues as near to the unit circle count as on it
+_CIRCLE = 1e-6  # distance from the unit circle of eigenvalues on it
 _RANK = 1e-10  # relative singular value that counts as zero
-_ANYWHERE = (1.7 + 0.0j, 0.6 + 2.1j, -0.3 + 0.4j)  # points at which the rank is that of almost all
+_ANYWHERE = (1.7 + 0.0j, 0.6 + 2.1j, -0.3 + 0.4j)  # generic points for the normal rank
 _MEND = "give each measurement noise of its own in Dw (Dv in the current form)"
 
 
-def why_not_steady(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> str:
-    """The condition that is violated, in a sentence.
+def why_not_steady(system: norms.System) -> str:
+    """Sentence on the violated condition of a steady state; x' = A x + B w, y = C x + D w.
 
     The Riccati equation has a stabilising solution if (A, C) is detectable and
 
@@ -255,20 +240,16 @@ def why_not_steady(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -
 
     has full row rank for every z on the unit circle (Kailath, Sayed & Hassibi, *Linear Estimation*,
     2000, app. E): the noise drives every mode there, and reaches every combination of measurements.
-
-    Args:
-        A: (n, n), in units in which numbers are of order one; so are the others.
-        B: (n, p) how the noise moves the state.
-        C: (m, n).
-        D: (m, p) how the noise enters the measurement.
+    Numbers must be of order one.
     """
+    A, B, C, D = system
     n, m = len(A), len(C)
     none, noise = "the Kalman filter has no steady state: ", f"Dw has rank {_rank(D)}, not {m}, and"
 
-    def system(z: complex) -> np.ndarray:
+    def pencil(z: complex) -> np.ndarray:
         return np.block([[A - z * np.eye(n), B], [C, D]])
 
-    if lost := n + m - max(_rank(system(z)) for z in _ANYWHERE):
+    if lost := n + m - max(_rank(pencil(z)) for z in _ANYWHERE):
         which = "one combination" if lost == 1 else f"{lost} combinations"
         return (
             f"{none}{noise} the noise w does not reach {which} of the measurements through the "
@@ -276,7 +257,7 @@ def why_not_steady(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -
             f"singular; {_MEND}"
         )
     for value in np.linalg.eigvals(A):
-        if abs(abs(value) - 1.0) < _CIRCLE and _rank(system(complex(value))[:n]) < n:
+        if abs(abs(value) - 1.0) < _CIRCLE and _rank(pencil(complex(value))[:n]) < n:
             return (
                 f"{none}the mode of A at {value:.6g} on the unit circle is not driven by w: give "
                 "it noise in Bw"
@@ -284,7 +265,7 @@ def why_not_steady(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -
     if _rank(D) < m:
         angle = min(
             np.linspace(0.0, np.pi, 721),
-            key=lambda angle: np.linalg.svd(system(np.exp(1j * angle)), compute_uv=False)[-1],
+            key=lambda angle: np.linalg.svd(pencil(np.exp(1j * angle)), compute_uv=False)[-1],
         )
         return (
             f"{none}{noise} near z = exp({angle:.4g} i) the noise w does not reach some "

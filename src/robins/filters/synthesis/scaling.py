@@ -1,9 +1,9 @@
-"""Units in which a plant's numbers are of order one, and the way back.
+"""Scaling of a plant to numbers of order one, and the way back.
 
 Interior-point solvers stop at absolute tolerances, so a plant in radians, or with an angle in
-arcseconds beside a bias a thousand times smaller, gets a wrong answer without a word. The states
-are scaled as Osborne balances a matrix (*On pre-conditioning of matrices*, J. ACM 7, 1960): what
-enters a state is made as large as what leaves it. That result does not depend on the units given.
+arcseconds beside a bias a thousand times smaller, gets a wrong answer in silence. The states are
+balanced as Osborne does (*On pre-conditioning of matrices*, J. ACM 7, 1960): rows and columns of a
+state get equal norms. The result does not depend on the units of the plant.
 """
 
 from __future__ import annotations
@@ -12,16 +12,18 @@ from typing import NamedTuple
 
 import numpy as np
 
+from robins.filters.synthesis.design import FullOrder
+from robins.filters.synthesis.norms import Number
 from robins.filters.synthesis.plant import Plant
 
 _SWEEPS = 20
-_SETTLED = 1e-2  # relative change of the scales that is not worth another sweep
+_SETTLED = 1e-2  # relative change of the scales that ends the sweeps
 
 
 class Scales(NamedTuple):
-    """How large a one of each scaled channel is in units of the plant, x = diag(x) x'.
+    """Units of the scaled channels in units of the plant, x = diag(x) x'.
 
-    w and n are scalars, since their norms count all components alike; so is z.
+    w, n and z are scalars, since their norms count all components alike.
     """
 
     x: np.ndarray
@@ -44,25 +46,27 @@ class Scales(NamedTuple):
         )
 
     def gain(self, K: np.ndarray) -> np.ndarray:
-        """A gain (n, m) in units of the plant."""
+        """Gain (n, m) in units of the plant."""
         return self.x[:, None] * K / self.y
 
+    def full_order(self, Ah: np.ndarray, Bh: np.ndarray, Gh: np.ndarray) -> FullOrder:
+        """Full-order filter in units of the plant."""
+        x = self.x
+        return Ah * x[:, None] / x, Bh * x[:, None] / self.y, Gh / x * self.z
+
     def h2(self, value: float) -> float:
-        """An H2 norm in units of the plant."""
+        """H2 norm in units of the plant."""
         return value * self.z / self.w
 
     def hinf(self, value: float) -> float:
-        """An H-infinity norm in units of the plant."""
+        """H-infinity norm in units of the plant."""
         return value * self.z / self.n
 
 
-def balanced(plant: Plant, gamma: float | None = None) -> Scales:
+def balanced(plant: Plant, gamma: Number = np.inf) -> Scales:
     """Scales under which states, measurements, noise and output are of order one.
 
-    Args:
-        plant: in any units.
-        gamma: bound on the gain from n to z that is to become 1; without one, n is scaled to
-            order one itself.
+    gamma is the bound on the gain from n to z that becomes 1; inf scales n itself to order one.
     """
     x, y, w, n, z = np.ones(len(plant.A)), np.ones(len(plant.C)), 1.0, 1.0, 1.0
     for _ in range(_SWEEPS):
@@ -73,24 +77,20 @@ def balanced(plant: Plant, gamma: float | None = None) -> Scales:
         both = (enters > 0.0) & (leaves > 0.0)
         change = np.sqrt(np.divide(enters, leaves, out=np.ones_like(x), where=both))
         x = x * change
-        y = y * _or_one(_norms(scaled.C, scaled.Dw, scaled.Dn))
+        output = _norms(scaled.C, scaled.Dw, scaled.Dn)
+        y = y * np.where(output > 0.0, output, 1.0)
         scaled = Scales(x, y, w, n, z).plant(plant)
         w = w / _size(scaled.Bw, scaled.Dw)
         z = z * _size(scaled.L)
-        n = n / _size(scaled.Bn, scaled.Dn) if gamma is None else z / gamma
+        n = n / _size(scaled.Bn, scaled.Dn) if np.isinf(gamma) else z / gamma
         if np.max(np.abs(change - 1.0)) < _SETTLED:
             break
     return Scales(x, y, w, n, z)
 
 
 def _norms(*blocks: np.ndarray) -> np.ndarray:
-    """Norms of the rows of blocks side by side."""
+    """Norms of the rows of adjacent blocks."""
     return np.sqrt(sum(np.sum(block**2, axis=1) for block in blocks))
-
-
-def _or_one(norms: np.ndarray) -> np.ndarray:
-    """Norms with one in place of zero, for what is not there needs no scale."""
-    return np.where(norms > 0.0, norms, 1.0)
 
 
 def _size(*blocks: np.ndarray) -> float:

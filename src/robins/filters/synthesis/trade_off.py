@@ -1,4 +1,4 @@
-"""What a bound on the worst case costs: the true H2 norm against gamma, by every method."""
+"""Price of a bound on the worst case: the true H2 norm against gamma, by every method."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from robins.errors import require
 from robins.filters.synthesis import lmi
 from robins.filters.synthesis.closed_form import closed_form, isotropic
 from robins.filters.synthesis.design import Design, NotCertified, Unreachable
@@ -26,37 +27,34 @@ _DESIGNERS: dict[str, Callable[[Plant, float], Design]] = {
     "full-order": lmi.full,
 }
 METHODS = tuple(_DESIGNERS)
-_PLAIN = ("riccati", "closed-form")  # need no solver
-_POINTS = 6  # of a range that is chosen automatically
-_DEEPEST = 0.1  # of the Kalman filter's own norm: how far down such a range goes
+_POINTS = 6  # of a default range
+_DEEPEST = 0.1  # least gamma of a default range over the Kalman filter's own norm
 
 Progress = Callable[[int, int, str], None]
 
 
 class Attempt(NamedTuple):
-    """What one method made of one gamma."""
+    """Design by one method for one gamma."""
 
     method: str
     gamma: float
     design: Design | None
-    why: str  # there is no design; "" where there is one
-    least: float  # gamma that the method reaches, where that is why; else nan
+    why: str  # reason for no design; "" with a design
+    least: float  # gamma of the method, if that is the reason; else nan
 
 
 class TradeOff(NamedTuple):
     """All methods over all gammas."""
 
-    kalman: Design  # no bound at all
-    least: LeastGamma  # `reached` counts the designs of `attempts` in
+    kalman: Design  # without bound
+    least: LeastGamma  # `reached` includes the designs of `attempts`
     gammas: tuple[float, ...]  # falling
     attempts: list[Attempt]  # every method for the first gamma, then for the next
-    left_out: dict[str, str]  # methods that do not apply, and why
+    left_out: dict[str, str]  # inapplicable methods, with reasons
 
     def best(self, gamma: Number) -> Attempt | None:
-        """The least H2 norm for a gamma; of equals (to 1e-4) that of the simplest method."""
-        made = [
-            (o, o.design.h2) for o in self.attempts if o.gamma == gamma and o.design is not None
-        ]
+        """Attempt of least H2 norm for a gamma; of equals (to 1e-4) by the simplest method."""
+        made = [(o, o.design.h2) for o in self.attempts if o.gamma == gamma and o.design]
         least = min((h2 for _, h2 in made), default=np.nan)
         return next((o for o, h2 in made if h2 <= least * (1.0 + 1e-4)), None)
 
@@ -67,28 +65,25 @@ def trade_off(
     methods: Sequence[str] = METHODS,
     progress: Progress | None = None,
 ) -> TradeOff:
-    """Design by every method for every gamma; what a method cannot do is part of the answer.
+    """Design by every method for every gamma; the answer includes failures.
 
-    Args:
-        plant: what is filtered.
-        gammas: bounds on the H-infinity norm; by default six, from nine tenths of the Kalman
-            filter's own down to the least there is, or a tenth of the Kalman filter's.
-        methods: which, out of `METHODS`.
-        progress: called with done, total and a word on what is done.
+    By default there are six gammas, from nine tenths of the Kalman filter's own norm down to the
+    least, or a tenth of the Kalman filter's. `progress` gets the number done, the total and the
+    name of the next.
 
     Raises:
-        Unreachable: it is proved that no filter meets any of the gammas.
+        Unreachable: all gammas are below the proved least one.
         ValueError: a gamma is not positive or finite, a method is not known, or the plant has no
             steady Kalman filter.
     """
     for gamma in () if gammas is None else gammas:
         check_gamma(gamma)
-        if not np.isfinite(gamma):
-            raise ValueError("gamma must be finite here; without a bound it is the Kalman filter")
-    if unknown := [name for name in methods if name not in METHODS]:
-        raise ValueError(f"no method {unknown[0]!r}; there are {', '.join(METHODS)}")
-    tell = progress or (lambda done, total, what: None)
-    tell(0, 1, "least gamma")
+        finite = np.isfinite(gamma)
+        require(finite, "gamma must be finite here; without a bound it is the Kalman filter")
+    for name in methods:
+        require(name in METHODS, f"no method {name!r}; there are {', '.join(METHODS)}")
+    notify = progress or (lambda done, total, what: None)
+    notify(0, 1, "least gamma")
     kalman = kalman_design(plant)
     left_out = {name: why for name in methods if (why := _why_not(plant, name))}
     least = least_gamma(plant)
@@ -102,9 +97,9 @@ def trade_off(
     total = len(chosen) * len(used)
     for gamma in chosen:
         for name in used:
-            tell(len(attempts), total, f"{name}, gamma {gamma:.4g}")
+            notify(len(attempts), total, f"{name}, gamma {gamma:.4g}")
             attempts.append(_attempt(plant, gamma, name))
-            if (made := attempts[-1].design) is not None:
+            if made := attempts[-1].design:
                 least = least.with_(made)
     return TradeOff(kalman, least, chosen, attempts, left_out)
 
@@ -112,18 +107,16 @@ def trade_off(
 def _attempt(plant: Plant, gamma: float, name: str) -> Attempt:
     try:
         return Attempt(name, gamma, _DESIGNERS[name](plant, gamma), "", np.nan)
-    except Unreachable as error:
-        return Attempt(name, gamma, None, str(error), error.least)
-    except NotCertified as error:
-        return Attempt(name, gamma, None, str(error), np.nan)
+    except (Unreachable, NotCertified) as error:
+        return Attempt(name, gamma, None, str(error), getattr(error, "least", np.nan))
 
 
 def _why_not(plant: Plant, name: str) -> str:
-    """Why a method does not apply to a plant; "" where it does."""
+    """Reason why a method does not apply to a plant; "" if it does."""
     try:
         if name == "closed-form":
             isotropic(plant)
-        elif name not in _PLAIN:
+        elif name != "riccati":
             packages()
         if name == "full-order":
             lmi.refuse_unstable(plant)
@@ -139,5 +132,5 @@ def _range(least: float, own: float) -> tuple[float, ...]:
     low = max(1.02 * least, _DEEPEST * own)
     if low >= 0.9 * own:  # hardly anything to gain
         return (0.5 * (least + own),) if least < own else ()
-    # Rounded, as they are for people to read and to ask for again.
+    # Rounded for people to read and type.
     return tuple(float(f"{gamma:.4g}") for gamma in np.geomspace(0.9 * own, low, _POINTS))
