@@ -16,6 +16,7 @@ from jax.core import Tracer
 from jax.tree_util import GetAttrKey, Partial, register_pytree_with_keys
 
 from robins.errors import require
+from robins.filters.checks import finite_numbers
 
 T = TypeVar("T")
 Fields = tuple[tuple[str, ...], tuple[tuple[str, Hashable], ...]]  # names of data; kinds
@@ -107,6 +108,11 @@ def number(what: str, given: object, holds: Callable[[Numbers], Numbers] | None 
     require(holds is None or bool(np.all(holds(np.asarray(given, float)))), what, given)
     # whole numbers as leaves would break jax.grad
     return given.astype(float) if isinstance(given, jax.Array) else np.asarray(given, float)
+
+
+def finite_leaf(what: str, given: object) -> Numbers:
+    """Finite numbers as a leaf, checked where they are known (`finite_numbers`)."""
+    return finite_numbers(what, given) if is_known(given) else jax.numpy.asarray(given)
 
 
 def as_data(function: Callable[..., T]) -> Callable[..., T]:
