@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTreeDef
+from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief, Number
@@ -92,7 +92,7 @@ class Linearisation:
         return self.reuse.observation(points, prior, sensor, y, aux)
 
 
-def _form(x: State) -> tuple[PyTreeDef, tuple]:
+def _form(x: State) -> tuple:
     """Structure and shapes, which compare without `__eq__` of an element."""
     leaves, tree = jax.tree_util.tree_flatten(x, is_leaf=lambda leaf: leaf is None)
     return tree, tuple(None if leaf is None else jnp.shape(leaf) for leaf in leaves)

@@ -28,7 +28,7 @@ Given = ArrayLike | Sequence[Any]  # numbers of a user, or lists of them
 _LARGEST = float(np.sqrt(np.finfo(float).max))  # of a standard deviation
 
 
-def as_noise(value: Given, n: int, whose: str) -> Array:
+def as_noise(value: Data, n: int, whose: str) -> Array:
     """Noise factor from standard deviations or a factor."""
     noise = jnp.asarray(value, float)
     if noise.ndim not in (1, 2) or noise.shape[0] != n:
@@ -39,7 +39,7 @@ def as_noise(value: Given, n: int, whose: str) -> Array:
     return linalg.as_factor(noise)
 
 
-def _settle_noise(own: Motion | Sensor, covariance: Given | None, whose: str) -> None:
+def _settle_noise(own: Motion | Sensor, covariance: ArrayLike | None, whose: str) -> None:
     if (own.noise is None) == (covariance is None):
         raise TypeError(
             f"{whose} needs noise=, standard deviations or a factor L of the covariance L L', or "
@@ -96,10 +96,10 @@ class Motion:
 
     step: Callable[[State, Data], State]
     noise: Any = None
-    linear: Callable[[State, Data], tuple[State, Array, Given]] | None = None
-    noise_covariance: InitVar[Given | None] = None
+    linear: Callable[[State, Data], tuple[State, Array, Array]] | None = None
+    noise_covariance: InitVar[ArrayLike | None] = None
 
-    def __post_init__(self, noise_covariance: Given | None) -> None:
+    def __post_init__(self, noise_covariance: ArrayLike | None) -> None:
         """Check the noise."""
         _settle_noise(self, noise_covariance, "the motion")
 
@@ -145,9 +145,9 @@ class Sensor:
     dim: int = kind(default=-1)
     name: str = kind(default="y")
     linear: Callable[[State, Data], tuple[Data, Array]] | None = None
-    noise_covariance: InitVar[Given | None] = None
+    noise_covariance: InitVar[ArrayLike | None] = None
 
-    def __post_init__(self, noise_covariance: Given | None) -> None:
+    def __post_init__(self, noise_covariance: ArrayLike | None) -> None:
         """Check the noise, and derive dim from it."""
         _settle_noise(self, noise_covariance, f"sensor '{self.name}'")
         if self.dim < 0:

@@ -89,7 +89,9 @@ def is_factor(x: Numbers) -> Numbers:
     return (x >= 1.0) & (x < np.inf)
 
 
-def number(what: str, given: object, holds: Callable[[Numbers], Numbers] | None = None) -> Numbers:
+def number(
+    what: str, given: object, holds: Callable[[Numbers], Numbers | bool] | None = None
+) -> Numbers:
     """A number as a leaf: of float64, not of a weak type as of Python, and checked where known.
 
     Args:
@@ -132,7 +134,7 @@ def content(*trees: object) -> Hashable:
     """
 
     def raw(x) -> np.ndarray:
-        is_key = jax.dtypes.issubdtype(getattr(x, "dtype", float), jax.dtypes.prng_key)
+        is_key = jax.numpy.issubdtype(getattr(x, "dtype", float), jax.dtypes.prng_key)
         return np.asarray(jax.random.key_data(x) if is_key else x)
 
     leaves, structure = jax.tree_util.tree_flatten(trees)

@@ -11,8 +11,9 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief
-from robins.filters.limits.constrain import Function, Given, Weight, as_sensor, metric_of, nearest
+from robins.filters.limits.constrain import Function, Weight, as_sensor, metric_of, nearest
 from robins.filters.linearise import taylor
+from robins.filters.model import Given
 from robins.filters.observation import CONTRADICTS, Observation
 from robins.filters.trees import select
 

@@ -200,7 +200,7 @@ def checked_weights(rule: str, weights: Weights, form: str) -> Numbers | None:
         return None
     require(form == "multiple", f"{rule} weights are for 'multiple', not {form!r}")
 
-    def sound(a: np.ndarray) -> bool:
+    def sound(a: Numbers) -> bool:
         return bool(a.ndim == 1 and np.all(np.isfinite(a) & (a >= 0.0)) and np.any(a > 0.0))
 
     a = number(f"{rule} weights must be (n,) numbers >= 0, not all 0", weights, sound)

@@ -72,7 +72,8 @@ def channel_inflation(lambda_: Number, B: Given | Callable[[State], ArrayLike]) 
     """
     negative = "channel_inflation lambda must be a number from 0 on"
     size = number(negative, lambda_, lambda x: (x >= 0.0) & (x < np.inf))
-    if not callable(B):
-        B = finite_leaf("channel_inflation B", B)
-        require(B.ndim == 2, f"channel_inflation B has shape {B.shape}, (n, q) is wanted")
-    return ChannelInflation(size, B, acts=not is_known(size) or bool(np.any(size)))
+    channel = B if callable(B) else finite_leaf("channel_inflation B", B)
+    if not callable(channel):
+        shape = channel.shape
+        require(len(shape) == 2, f"channel_inflation B has shape {shape}, (n, q) is wanted")
+    return ChannelInflation(size, channel, acts=not is_known(size) or bool(np.any(size)))

@@ -181,7 +181,7 @@ def _levels(rho: Numbers, threshold: Number | None, false_alarm: Number, looks: 
     if threshold is None:
         return _fading.chance_levels(float(rho), MOST, float(chance / often))
     negative = "discriminator threshold must not be negative"
-    threshold = number(negative, threshold, lambda x: x >= 0.0)
+    sigmas = number(negative, threshold, lambda x: x >= 0.0)
     dof = np.maximum(np.arange(MOST + 1.0), 1.0)
     with np.errstate(invalid="ignore"):  # V that never moves exceeds nothing
-        return 1.0 + threshold * (2.0 * (1.0 - rho) / ((1.0 + rho) * dof)) ** 0.5
+        return 1.0 + sigmas * (2.0 * (1.0 - rho) / ((1.0 + rho) * dof)) ** 0.5

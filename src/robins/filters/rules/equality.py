@@ -137,7 +137,7 @@ def _rows(D: Numbers, d: Data, noise: Numbers | None) -> Numbers:
     if noise is not None and noise.shape[0] == len(D):  # other shapes are refused by `init`
         exact = ~np.any(noise.reshape(len(D), -1) != 0.0, axis=1)
     try:
-        check_rows(D, value, exact)
+        check_rows(np.asarray(D), value, exact)
     except ValueError as error:
         raise ValueError(f"equality: {error}") from None
     return D

@@ -12,9 +12,10 @@ from robins.errors import require
 from robins.filters import trees
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.checks import finite_numbers, one_of
-from robins.filters.limits.constrain import Function, Given, as_sensor
+from robins.filters.limits.constrain import Function, as_sensor
 from robins.filters.limits.interval import clip, truncate
 from robins.filters.linearise import Transition
+from robins.filters.model import Given
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory, Rule
 from robins.filters.values import Numbers, is_known, kind, number, value
