@@ -100,16 +100,11 @@ class Motion:
     noise_covariance: InitVar[ArrayLike | None] = None
 
     def __post_init__(self, noise_covariance: ArrayLike | None) -> None:
-        """Check the noise."""
+        """Check noise or covariance."""
         _settle_noise(self, noise_covariance, "the motion")
 
     def moved(self, x: State, u: Data) -> State:
-        """State after a step.
-
-        Raises:
-            TypeError: `step` computes in another width than 64 bits.
-            ValueError: it returns something of another form than a state.
-        """
+        """State after a step; refuses other widths than float64 and other forms than of a state."""
         new = _in_float64("step of the motion", self.step(x, u))
         if (found := _kinds(new)) != (wanted := _kinds(x)):
             raise ValueError(f"step of the motion returns {found} of a state {wanted}")
@@ -160,11 +155,7 @@ class Sensor:
             object.__setattr__(self, "dim", shape[0])
 
     def reading(self, x: State, aux: Data) -> Data:
-        """Predicted measurement at x.
-
-        Raises:
-            TypeError: `read` computes in another width than 64 bits.
-        """
+        """Predicted measurement at x; refuses other widths than float64."""
         return _in_float64(f"read of sensor '{self.name}'", self.read(x, aux))
 
     def noise_factor(self, x: State, aux: Data) -> Array:
@@ -175,11 +166,7 @@ class Sensor:
 
 @value
 class Model:
-    """A motion and its sensors, updated in the order given.
-
-    Raises:
-        ValueError: two sensors share a name.
-    """
+    """A motion and its sensors, of different names, updated in the order given."""
 
     motion: Motion
     sensors: tuple[Sensor, ...]
@@ -199,7 +186,7 @@ class Model:
         Raises:
             KeyError: there is none; the message lists all names.
         """
-        for s in self.sensors:
-            if s.name == name:
-                return s
-        raise KeyError(f"no sensor '{name}'; this model has {sorted(self.dims)}")
+        named = {s.name: s for s in self.sensors}
+        if name in named:
+            return named[name]
+        raise KeyError(f"no sensor '{name}'; this model has {sorted(named)}")

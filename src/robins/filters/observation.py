@@ -67,12 +67,10 @@ class Normalised(NamedTuple):
 
 def as_measurement(sensor: str, data: Data) -> Data:
     """Measurements as 64-bit floats of JAX, from arrays of any real kind or lists of numbers."""
-
-    def of_jax(x: Numbers) -> Array:
-        # a copy, since JAX computes later and the given array may change
-        return x if isinstance(x, jax.Array) else jnp.array(x)
-
-    return jax.tree_util.tree_map(of_jax, as_real(sensor, data))
+    # a copy of NumPy's, since JAX computes later and the given array may change
+    return jax.tree_util.tree_map(
+        lambda x: x if isinstance(x, jax.Array) else jnp.array(x), as_real(sensor, data)
+    )
 
 
 def as_real(sensor: str, data: Data) -> Data:

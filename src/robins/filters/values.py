@@ -50,18 +50,15 @@ def value(cls: type[T]) -> type[T]:
     kinds = {f.name for f in fields if f.metadata.get("kind")}
     names = [f.name for f in fields]
 
-    def split(x: T) -> Fields:
+    def flatten(x: T):
         fixed = tuple((n, getattr(x, n)) for n in names if n in kinds or is_kind(getattr(x, n)))
         held = {n for n, _ in fixed}
-        return tuple(n for n in names if n not in held), fixed
+        data = tuple(n for n in names if n not in held)
+        return [getattr(x, n) for n in data], (data, fixed)
 
     def flatten_with_keys(x: T):
-        data, fixed = split(x)
-        return [(GetAttrKey(n), getattr(x, n)) for n in data], (data, fixed)
-
-    def flatten(x: T):
-        data, fixed = split(x)
-        return [getattr(x, n) for n in data], (data, fixed)
+        children, aux = flatten(x)
+        return [(GetAttrKey(n), v) for n, v in zip(aux[0], children, strict=True)], aux
 
     def unflatten(aux: Fields, children) -> T:
         data, fixed = aux
@@ -84,6 +81,11 @@ def is_share(x: Numbers) -> Numbers:
     return (x > 0.0) & (x <= 1.0)
 
 
+def is_chance(x: Numbers) -> Numbers:
+    """Test for numbers in (0, 1)."""
+    return (x > 0.0) & (x < 1.0)
+
+
 def is_factor(x: Numbers) -> Numbers:
     """Test for numbers in [1, inf)."""
     return (x >= 1.0) & (x < np.inf)
@@ -92,16 +94,11 @@ def is_factor(x: Numbers) -> Numbers:
 def number(
     what: str, given: object, holds: Callable[[Numbers], Numbers | bool] | None = None
 ) -> Numbers:
-    """A number as a leaf: of float64, not of a weak type as of Python, and checked where known.
-
-    Args:
-        what: sentence of the errors.
-        given: a number, an array, or a tracer, which passes.
-        holds: numbers -> bools, all of which must be true.
+    """A number as a leaf: of float64, not of a weak type as of Python; tracers pass.
 
     Raises:
-        TypeError: it is not of real numbers.
-        ValueError: the check fails.
+        TypeError: ``what, got ...``: it is not of real numbers.
+        ValueError: ``what, got ...``: the test is not true of all of them.
     """
     if not is_known(given):
         return given

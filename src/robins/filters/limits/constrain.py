@@ -111,10 +111,9 @@ def constrain(
 
 
 def nearest(metric: Belief, o: Observation) -> tuple[State, Array, Array, Array]:
-    """State nearest to the mean that meets an exact observation.
+    """State nearest to the mean that meets an exact observation, its gain, and two masks.
 
-    Returns:
-        The state, its gain, the components used, and those that contradict what is known exactly.
+    The masks are of the components used, and of those that contradict what is known exactly.
     """
     seen = normalised(o)
     spread = jnp.where(seen.used[:, None], o.spread, 0.0)
@@ -141,7 +140,7 @@ def as_sensor(mean: State, g: Function, d: Data, noise: Given | None) -> tuple[S
 
 
 def _by_matrix(mean: State, matrix: Given) -> tuple[Partial, Partial, Array]:
-    """D x as a function, as a function with its slope, and a value of its shape."""
+    # D x as a function, as a function with its slope, and a value of its shape
     if any(manifold.is_element(leaf) for leaf in manifold.leaves(mean)):
         raise ValueError(
             "a matrix constrains a state of plain arrays, this one holds elements: "
@@ -171,10 +170,10 @@ def metric_of(belief: Belief, weight: Weight) -> tuple[Belief, Array | None]:
     """A belief of covariance W^-1, and the factor of W; the belief itself for W = P^-1."""
     n = belief.factor.shape[0]
     if isinstance(weight, str):
+        known = weight in ("covariance", "identity")
+        require(known, "weight must be 'covariance', 'identity' or a matrix", repr(weight))
         if weight == "covariance":
             return belief, None
-        if weight != "identity":
-            raise ValueError(f"weight must be 'covariance', 'identity' or a matrix, got {weight!r}")
         unit = jnp.eye(n)
         return Belief(belief.mean, unit), unit
     W = jnp.asarray(weight, float)
@@ -183,13 +182,8 @@ def metric_of(belief: Belief, weight: Weight) -> tuple[Belief, Array | None]:
     return Belief(belief.mean, linalg.solve_lower_transposed(root, jnp.eye(n))), root
 
 
-def check_rows(D: np.ndarray, d: np.ndarray, exact: np.ndarray) -> None:
-    """Refuse exact constraints that repeat each other.
-
-    Args:
-        D: (c, n).
-        d: (c,).
-        exact: (c,) bool, the rows to check: one with noise may repeat others.
+def check_rows(rule: str, D: np.ndarray, d: np.ndarray, exact: np.ndarray) -> None:
+    """Refuse constraints D x = d whose rows repeat each other where they are ``exact``, (c,) bool.
 
     Raises:
         ValueError: a row of D is zero, or depends on those above it; with the row, the rank, and
@@ -198,14 +192,11 @@ def check_rows(D: np.ndarray, d: np.ndarray, exact: np.ndarray) -> None:
     length = np.linalg.norm(D, axis=1)
     zero = length <= 1e-14 * np.max(length, initial=0.0)
     unit = D / np.where(zero, 1.0, length)[:, None]
-    basis, kept, fault = np.zeros((0, D.shape[1])), [], None
+    kept, fault = [], None
     for row in np.flatnonzero(exact):
-        rest = unit[row]
-        for _ in range(2):  # twice, so that the basis stays orthogonal
-            rest = rest - (rest @ basis.T) @ basis
-        left = np.linalg.norm(rest)
-        if left > _INDEPENDENT and not zero[row]:
-            basis = np.concatenate([basis, rest[None] / left])
+        share = np.linalg.lstsq(unit[kept].T, unit[row])[0] if kept else np.zeros(0)
+        rest = unit[row] - share @ unit[kept]
+        if np.linalg.norm(rest) > _INDEPENDENT and not zero[row]:
             kept.append(row)
         elif fault is None:
             fault = row, list(kept)
@@ -218,7 +209,7 @@ def check_rows(D: np.ndarray, d: np.ndarray, exact: np.ndarray) -> None:
     what = "is zero" if zero[row] else "depends on those above it"
     fix = "and d contradicts them" if contradicts else "and says nothing new: leave it out"
     raise ValueError(
-        f"D has rank {len(kept)} for {np.sum(exact)} exact rows: "
+        f"{rule}: D has rank {len(kept)} for {np.sum(exact)} exact rows: "
         f"row {row}, counted from 0, {what} {fix}"
     )
 

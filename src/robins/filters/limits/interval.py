@@ -147,6 +147,10 @@ def truncate(belief: Belief, g: Function, lower: Given, upper: Given) -> Bounded
     low = jnp.asarray(lower, float) + o.residual
     high = jnp.asarray(upper, float) + o.residual
 
+    def scaled(bound: Array, mean: Array, s: Array) -> Array:
+        finite = jnp.isfinite(bound)  # the derivative of inf / s is NaN
+        return jnp.where(finite, (jnp.where(finite, bound, 0.0) - mean) / s, bound)
+
     def cut(state, row):
         t, M = state
         reading, size, low, high = row
@@ -155,7 +159,7 @@ def truncate(belief: Belief, g: Function, lower: Given, upper: Given) -> Bounded
         s = jnp.sqrt(jnp.where(known, 1.0, a @ a))
         a = jnp.where(known, 0.0, a / s)
         at = reading @ t
-        alpha, v = truncated_moments(_scaled(low, at, s), _scaled(high, at, s))
+        alpha, v = truncated_moments(scaled(low, at, s), scaled(high, at, s))
         solid = v > 0.0
         root = jnp.where(solid, jnp.sqrt(jnp.where(solid, v, 1.0)), 0.0)
         column = M @ a
@@ -169,12 +173,6 @@ def truncate(belief: Belief, g: Function, lower: Given, upper: Given) -> Bounded
     *_, infeasible, denied = _active(o, low, high)
     kept = select(infeasible, belief, cut_belief)
     return Bounded(kept, (low > 0.0) | (high < 0.0), infeasible | denied)
-
-
-def _scaled(bound: Array, mean: Array, s: Array) -> Array:
-    # The derivative of inf / s is NaN.
-    finite = jnp.isfinite(bound)
-    return jnp.where(finite, (jnp.where(finite, bound, 0.0) - mean) / s, bound)
 
 
 def truncated_moments(low: Array, high: Array) -> tuple[Array, Array]:

@@ -79,15 +79,13 @@ def _root(noise: Array, taken: Array) -> tuple[Array, Array]:
     )
 
 
-def averaged(power: Array, white: White, keep: Number | Numbers) -> Array:
+def averaged(power: Array, white: White, keep: Number) -> Array:
     """Exponential average of squared residuals; components that do not count stay."""
     fresh = keep * power + (1.0 - keep) * white.residual**2
     return jnp.where(white.counts, fresh, power)
 
 
-def significant(
-    power: Array, white: White, keep: Number | Numbers, sigmas: Number | Numbers
-) -> Array:
+def significant(power: Array, white: White, keep: Number, sigmas: Number) -> Array:
     """() bool: averaged squares exceed their expectation by so many standard deviations.
 
     An average with weights (1 - keep) keep^i of squares of m unit normals has mean m and relative
@@ -126,7 +124,7 @@ def total(power: Array, white: White) -> Array:
     return jnp.sum(jnp.where(white.counts, power, 0.0))
 
 
-def ratio(N: Array, M: Array, limit: Number | Numbers) -> Array:
+def ratio(N: Array, M: Array, limit: Number) -> Array:
     """Fading factor max(1, N / M), up to a limit; 1 where M is 0."""
     solid = M > 0.0
     return jnp.where(solid, jnp.clip(N / jnp.where(solid, M, 1.0), 1.0, limit), 1.0)
@@ -151,44 +149,33 @@ def seen_by(spread: Array, S: Array) -> Array:
     return jax.lax.cond(jnp.all(pivots > _SOLID * sigma), solid, singular)
 
 
-def _where_seen(S: Array, white: White, factor: Array) -> Array:
-    """Factor of P + (lambda - 1) P H' (H P H')^+ H P: only H P H' grows, by lambda.
-
-    The added part is S T'T S' with T the orthonormal rows that span those of H S. `guard` drops
-    rows within rounding, such as the third of a unit vector.
-    """
-    root, _ = linalg.guard(white.seen, white.size)
-    T = linalg.solve_lower(root, white.seen)
-    return linalg.tria(S + (jnp.sqrt(factor) - 1.0) * ((S @ T.T) @ T))
-
-
 def faded(
-    S: Array,
-    white: White,
-    N: Array,
-    form: str,
-    weights: Numbers | None,
-    limit: Number | Numbers,
+    S: Array, white: White, N: Array, form: str, weights: Numbers | None, limit: Number
 ) -> tuple[Array, Array]:
-    """Factor S of P faded such that its share of the innovation has the power N.
+    """Factor S of P faded such that its share of the innovation has the power N, and lambda.
 
     Args:
         S: (n, n).
         white: the measurement relative to S.
         N: () power beyond that of the noise.
-        form: "lumped" lambda P, "multiple" Lam^1/2 P Lam^1/2, "projected" only what is seen.
+        form: "lumped" lambda P, "multiple" Lam^1/2 P Lam^1/2, or "projected"
+            P + (lambda - 1) P H' (H P H')^+ H P, by which only H P H' grows.
         weights: (n,) of states for "multiple", greatest 1; None: equal.
         limit: upper bound of lambda.
-
-    Returns:
-        The faded factor and the greatest lambda.
     """
+
+    def wider() -> Array:
+        # The added part is S T'T S' with T the orthonormal rows that span those of H S. `guard`
+        # drops rows within rounding, such as the third of a unit vector.
+        root, _ = linalg.guard(white.seen, white.size)
+        T = linalg.solve_lower(root, white.seen)
+        return linalg.tria(S + (jnp.sqrt(factor) - 1.0) * ((S @ T.T) @ T))
+
     if form != "multiple" or weights is None:
         factor = ratio(N, white.predicted, limit)
         if form != "projected":
             return jnp.sqrt(factor) * S, factor
-        wide = jax.lax.cond(factor > 1.0, lambda: _where_seen(S, white, factor), lambda: S)
-        return wide, factor
+        return jax.lax.cond(factor > 1.0, wider, lambda: S), factor
     each = jnp.sum((S @ white.spread.T) * seen_by(white.spread, S).T, axis=1)  # (P H' H)_jj
     factor = ratio(N, jnp.sum(weights * each) + white.left_over, limit)
     return jnp.sqrt(jnp.maximum(weights * factor, 1.0))[:, None] * S, factor

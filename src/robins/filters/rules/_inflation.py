@@ -32,12 +32,9 @@ def as_weight(weight: GivenWeight, whose: str) -> Weight:
         return _rows(jnp.asarray(weight, float), whose)
     numbers = finite_numbers(f"{whose}: weight", weight)
     require(np.any(numbers), f"{whose}: weight is zero, so no error would count")
-    if numbers.ndim == 1:
-        numbers = np.diag(numbers)
-    if numbers.ndim == 2:
-        numbers = numbers[np.any(numbers != 0.0, axis=1)]
     _check_shape(numbers, whose)
-    return numbers
+    numbers = np.diag(numbers) if numbers.ndim == 1 else numbers
+    return numbers[np.any(numbers != 0.0, axis=1)]
 
 
 def rows_of(weight: Weight, mean: State, whose: str) -> Array:

@@ -51,7 +51,7 @@ def shares(o: Observation) -> Shares:
 
 MOST = 1e12  # greatest factor of a noise: as good as infinite, and still leaves digits
 PATIENCE = 30  # measurements in a row with hardly any weight before one is used
-_HARDLY = 1e-2  # weight of a measurement; less is that of an innovation beyond some 30 deviations
+HARDLY = 1e-2  # weight of a measurement; less is that of an innovation beyond some 30 deviations
 _STEPS = 40  # bound of Newton's iterations; some four are needed
 _CLOSE = 1e-13
 
@@ -68,14 +68,9 @@ def scale_to_quantile(o: Observation, limit: ArrayLike, seen: Normalised | None 
     passing it (the secular equation of trust regions; Moré & Sorensen 1983), in one step for one
     component.
 
-    Args:
-        o: the measurement relative to the prior; components not used do not count.
-        limit: () upper bound of the NIS, more than 0.
-        seen: `normalised` of the observation, where known.
-
-    Returns:
-        () factor of the covariance R, at most `MOST`, which components without noise of their own
-        need. Its derivative is that of the root.
+    It is at most `MOST`, which components without noise of their own need; components not used do
+    not count. The limit is () and positive, ``seen`` is `normalised` of o where known. The
+    derivative is that of the root.
     """
     seen = normalised(o) if seen is None else seen
     noise = jnp.where(seen.used[:, None], o.noise, 0.0)
@@ -117,12 +112,8 @@ def scale_to_quantile(o: Observation, limit: ArrayLike, seen: Normalised | None 
 def weighed(o: Observation, scale: Array) -> tuple[Observation, Array]:
     """A measurement with noise R_ij sqrt(s_i s_j), and its weights 1 / s.
 
-    Where a weight would fall below 1 / `MOST`, the correction would grow with the innovation again:
-    1e30 would move the state by 1e18. There a component with noise is refused, with weight 0.
-
-    Args:
-        o: the measurement.
-        scale: () of the whole, or (m,) of its components.
+    s is () of the whole, or (m,) of its components. Below a weight of 1 / `MOST` the correction
+    would grow with the innovation again: there a component with noise is refused, with weight 0.
     """
     lost = scale >= (1.0 - 1e-9) * MOST
     refused = lost & jnp.any(o.noise != 0.0, axis=1)
@@ -134,11 +125,7 @@ def weighed(o: Observation, scale: Array) -> tuple[Observation, Array]:
 def reweighted(o: Observation, weight: Callable[[Array], Array], iterations: int) -> Array:
     """(m,) weights w(e_i), R_ij becoming R_ij / sqrt(w_i w_j); started at the Kalman filter, w = 1.
 
-    Args:
-        o: the measurement.
-        weight: (m,) residuals *after* that update, in deviations of their own noise (0 where there
-            is none), to (m,) weights.
-        iterations: number of updates of the weights.
+    e are the (m,) residuals *after* that update, in deviations of their own noise, 0 without noise.
     """
     of = shares(o)
     L, white, R = of.seen.factor, of.seen.white[:, None], variance(of.noise)
@@ -164,20 +151,18 @@ class Opening(Rule):
 
     @property
     def name(self) -> str:
-        """Name of the rule inside."""
         return self.inner.name
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
-        """Memory of the inner rule, and hopeless measurements in a row by sensor."""
+        # of the inner rule, and hopeless measurements in a row
         return self.inner.init(belief, dims), {name: jnp.zeros((), int) for name in dims}
 
     def before(self, memory: Memory, prior: Belief, o: Observation):
-        """Weigh a measurement by the inner rule, or recover."""
         inner, counts = memory
         inner, faded, given = self.inner.before(inner, prior, o)
         R, raised = variance(o.noise), variance(given.noise)
         weighable = o.accepted & o.present & (R > 0.0)
-        hopeless = jnp.all(~weighable | ~given.accepted | (ratio(R, raised) < _HARDLY))
+        hopeless = jnp.all(~weighable | ~given.accepted | (ratio(R, raised) < HARDLY))
         counting, hopeless = jnp.any(weighable), jnp.any(weighable) & hopeless
         due = hopeless & (counts[o.sensor].astype(float) >= self.patience)
         wide = widened_to_dof(due, prior, o, normalised(o))
@@ -197,23 +182,14 @@ def opening(rule: Rule, patience: Number | None) -> Rule:
 
     When ``patience`` measurements of a sensor in a row were refused or had a weight below 1e-2, its
     next one like that is used with full weight, and the prior is first widened along the innovation
-    r until the NIS is that of m right components (`widened` by a r r', a = 1 / m - 1 / NIS).
-
-    Notes: ``recovered``, under the name of the rule.
-
-    Args:
-        rule: with no other hook than `before`.
-        patience: measurements in a row; None returns the rule itself.
+    r until the NIS is that of m right components (`widened` by a r r', a = 1 / m - 1 / NIS). The
+    rule has no other hook than `before`; it gets the note ``recovered``. Without patience the rule
+    itself is returned.
     """
     if patience is None:
         return rule
     negative = f"{rule.name} patience must not be negative"
     return Opening(rule, number(negative, patience, lambda p: p >= 0))
-
-
-def is_hopeless(seen: Normalised, limit: ArrayLike) -> Array:
-    """True if the weight for this limit of the NIS is below `_HARDLY`."""
-    return seen.nis * _HARDLY > limit
 
 
 def widened_to_dof(due: Array, prior: Belief, o: Observation, seen: Normalised) -> Belief:
@@ -236,14 +212,7 @@ def widened(due: Array, prior: Belief, o: Observation, chosen: Array, root: Arra
         E = k V P_c V,   V_ii^2 = (G H P)_ii / P_ii,   k = max_i r_i^2 / (H P H')_ii
 
     r being the innovation. Uncorrelated states do not change, nor does a component that is known
-    exactly: its column of G is 0.
-
-    Args:
-        due: () bool; otherwise the prior is returned.
-        prior: the belief.
-        o: the measurement relative to it.
-        chosen: (m,) bool, the components.
-        root: (m, k) root of D; its other rows do not count.
+    exactly: its column of G is 0. ``root`` is an (m, k) root of D, ``chosen`` (m,) bool.
     """
 
     def wider() -> Belief:

@@ -138,18 +138,17 @@ def adaptive_h_infinity(
 
     Args:
         weight: L as in `h_infinity`.
-        zeta: sensitivity of the gain to large innovations; 0.01 to 1 hardly differ.
-        window: steps that q is taken over.
+        zeta: sensitivity of the gain to large innovations, positive; 0.01 to 1 hardly differ.
+        window: steps that q is taken over, at least 1.
         floor: least alpha, above 1: 1.05 inflates by up to 21.
-        ceiling: largest alpha.
+        ceiling: largest alpha, at least the floor.
         compensate_first: where P does not allow the xi of the step before, shrink it as in the
             patent (``policy="compensate"`` of `h_infinity`, to 0.95 xi^2) before the new one is
             chosen. The smaller P has no justification in the data.
 
     Raises:
         TypeError: the weight is not of real numbers.
-        ValueError: zeta is not positive, the window less than 1, floor not above 1, ceiling below
-            floor, or the weight is not finite or of the wrong shape.
+        ValueError: an argument is out of its range, or the weight not finite or of a wrong shape.
     """
     require(window >= 1, "window must be at least one step", window)
     if is_known((floor, ceiling)) and not np.all((floor > 1.0) & (floor <= ceiling)):

@@ -80,8 +80,7 @@ def consider(states: Given) -> Rule:
         states: indices of tangent components, or an (n,) mask of booleans.
 
     Raises:
-        ValueError: an index is negative, repeated or no integer; by `init`, the state has fewer
-            components or the mask another size.
+        ValueError: an index is negative, repeated or no integer; by `init`, sizes do not fit.
     """
     given = np.asarray(states)
     given = given if given.size else np.zeros(0, int)

@@ -90,8 +90,7 @@ def constant_gain(gains: Mapping[str, Given]) -> Rule:
         gains: (n, m) by name of the sensor, tangent spaces of state and measurement.
 
     Raises:
-        ValueError: no gain, one with entries that are not finite; by `init`, a sensor that the
-            model does not have or a gain that does not fit.
+        ValueError: no gain, or not finite; by `init`, an unknown sensor or a gain of wrong shape.
     """
     require(gains, "constant_gain: give at least one gain, {'sensor': (n, m) array}")
     what = "constant_gain: the gain of"

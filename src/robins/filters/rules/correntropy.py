@@ -13,11 +13,6 @@ from robins.filters.rules._robust import MOST, PATIENCE, opening, reweighted, we
 from robins.filters.values import Numbers, kind, number, value
 
 
-def _least(e: Array) -> Array:
-    """Least weight that leaves digits: 1e-8, less if that corrected by a milli-sigma."""
-    return 1e-3 / jnp.minimum(1e5 + jnp.abs(e), 1e-3 * MOST)
-
-
 @value
 class Correntropy(Rule):
     """The rule of `correntropy`: R_ij / sqrt(w_i w_j), w_i = G(e_i) of posterior residuals."""
@@ -33,7 +28,9 @@ class Correntropy(Rule):
 
     def weight(self, e: Array) -> Array:
         """Weights of residuals in deviations of their noise."""
-        return jnp.maximum(jnp.exp(-0.5 * (e * (1.0 / self.kernel)) ** 2), _least(e))
+        w = jnp.exp(-0.5 * (e * (1.0 / self.kernel)) ** 2)
+        # least weight that leaves digits: 1e-8, less if that corrected by a milli-sigma
+        return jnp.maximum(w, 1e-3 / jnp.minimum(1e5 + jnp.abs(e), 1e-3 * MOST))
 
 
 def correntropy(kernel: Number = 3.0, iterations: int = 3, patience: int | None = PATIENCE) -> Rule:
@@ -50,10 +47,7 @@ def correntropy(kernel: Number = 3.0, iterations: int = 3, patience: int | None 
     the prior in the same way: the result then depends on the order of the states in the factor of
     P, and a diverged state is not corrected. Here the prior stays quadratic.
 
-    A weight of 1e-12 or less is a refusal. After ``patience`` measurements with hardly any weight
-    the next one is used (`robins.filters.rules._robust.opening`).
-
-    Notes: ``correntropy.weight``, the least of the measurement, 0 if refused, and
+    Notes: ``correntropy.weight``, the least of the measurement, 0 if refused (1e-12 or less), and
     ``correntropy.recovered``. Components without noise of their own keep their weight. The Kalman
     filter is ``kernel=inf``.
 
@@ -61,10 +55,11 @@ def correntropy(kernel: Number = 3.0, iterations: int = 3, patience: int | None 
         kernel: width sigma of the kernel, in standard deviations of the noise: below 2 good
             measurements are lost, above 6 outliers of 10 sigma still count.
         iterations: of the weights, at least 1.
-        patience: measurements in a row with a weight below 1e-2; None never recovers.
+        patience: measurements in a row with a weight below 1e-2 before one is used
+            (`robins.filters.rules._robust.opening`); None never recovers.
 
     Raises:
-        ValueError: the kernel is not positive, there is no iteration, or patience is negative.
+        ValueError: an argument is out of its range.
     """
     sigma = number("correntropy kernel must be positive", kernel, lambda k: k > 0.0)
     require(iterations >= 1, "correntropy iterations must be at least 1", iterations)

@@ -13,11 +13,11 @@ from jaxtyping import Array
 from robins.filters.belief import Belief, Number
 from robins.filters.checks import one_of
 from robins.filters.chi_square import MOST, limits, within
-from robins.filters.observation import Normalised, Observation, normalised
+from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
 from robins.filters.rules import _fading
-from robins.filters.rules._robust import is_hopeless, scale_to_quantile, weighed, widened_to_dof
-from robins.filters.values import Numbers, is_factor, is_share, kind, number, value
+from robins.filters.rules._robust import HARDLY, scale_to_quantile, weighed, widened_to_dof
+from robins.filters.values import Numbers, is_chance, is_factor, is_share, kind, number, value
 
 Fade = Literal["projected", "multiple"]
 Robust = Literal["huber", "gate"]
@@ -66,10 +66,14 @@ class Discriminator(Rule):
         count = jnp.where(seen.dof == 0, memory.counter[o.sensor], longer)
         row, some = count.astype(float), seen.dof > 0
         outlier = some & (count > 0) & (row < self.patience)
-        opens = some & (row == self.patience) & is_hopeless(seen, quantile)
+        opens = some & (row == self.patience) & (seen.nis * HARDLY > quantile)
         power, S, factor = self.faded(outlier | opens, memory.power[o.sensor], prior, o)
         S = widened_to_dof(opens, Belief(prior.mean, S), o, seen).factor
-        o, weight = self.weighed(outlier, quantile, o, seen)
+        if self.robust == "gate":
+            weight = jnp.where(outlier, 0.0, 1.0)
+            o = o._replace(accepted=o.accepted & ~outlier)
+        else:
+            o, weight = weighed(o, jnp.where(outlier, scale_to_quantile(o, quantile, seen), 1.0))
         wrong = (factor > 1.0) | (some & (row >= self.patience))
         state = jnp.where(outlier, int(Verdict.OUTLIER), jnp.where(wrong, int(Verdict.MODEL), 0))
         o = o.noted(self.name, weight=weight, lambda_=factor, counter=count, state=state)
@@ -86,15 +90,6 @@ class Discriminator(Rule):
         N = jnp.where(wrong, total - white.dof, 0.0)
         S, factor = _fading.faded(prior.factor, white, N, self.fade, self.weights, self.limit)
         return power, S, factor
-
-    def weighed(
-        self, outlier: Array, quantile: Array, o: Observation, seen: Normalised
-    ) -> tuple[Observation, Array]:
-        """The measurement and its weight, reduced for an outlier."""
-        if self.robust == "gate":
-            weight = jnp.where(outlier, 0.0, 1.0)
-            return o._replace(accepted=o.accepted & ~outlier), weight
-        return weighed(o, jnp.where(outlier, scale_to_quantile(o, quantile, seen), 1.0))
 
 
 def discriminator(
@@ -175,8 +170,7 @@ def discriminator(
 
 def _levels(rho: Numbers, threshold: Number | None, false_alarm: Number, looks: Number) -> Numbers:
     """(MOST + 1,) of what tr V exceeds by chance alone, or by a threshold of deviations."""
-    rare = "discriminator false_alarm must lie in (0, 1)"
-    chance = number(rare, false_alarm, lambda p: (p > 0.0) & (p < 1.0))
+    chance = number("discriminator false_alarm must lie in (0, 1)", false_alarm, is_chance)
     often = number("discriminator looks must be at least 1 and finite", looks, is_factor)
     if threshold is None:
         return _fading.chance_levels(float(rho), MOST, float(chance / often))

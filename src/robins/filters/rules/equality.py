@@ -26,7 +26,7 @@ from robins.filters.linearise import Transition
 from robins.filters.model import Data, Given
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory, Rule
-from robins.filters.values import Numbers, finite_leaf, is_known, kind, number, value
+from robins.filters.values import Numbers, finite_leaf, is_chance, is_known, kind, number, value
 
 
 @value
@@ -106,13 +106,11 @@ def equality(
         iterations: linearisations of a function.
 
     Raises:
-        ValueError: rows of D depend on each other or contradict (the rank and the row are named),
-            numbers are not finite, a parameter is not of its range; and by `init`, D, noise or
-            weight do not fit the state.
+        ValueError: rows of D depend on each other or contradict, numbers are not finite, an
+            argument is out of its range; by `init`, D, noise or weight do not fit the state.
     """
-    between = "equality gate must lie between 0 and 1, or be None"
     if gate is not None:
-        gate = number(between, gate, lambda p: (p > 0.0) & (p < 1.0))
+        gate = number("equality gate must lie between 0 and 1, or be None", gate, is_chance)
     require(iterations >= 1, "equality iterations must be at least 1", iterations)
     d = jax.tree_util.tree_map(
         lambda leaf: finite_leaf("equality d", leaf), d, is_leaf=lambda x: isinstance(x, list)
@@ -136,8 +134,5 @@ def _rows(D: Numbers, d: Data, noise: Numbers | None) -> Numbers:
     exact = np.ones(len(D), bool)
     if noise is not None and noise.shape[0] == len(D):  # other shapes are refused by `init`
         exact = ~np.any(noise.reshape(len(D), -1) != 0.0, axis=1)
-    try:
-        check_rows(np.asarray(D), value, exact)
-    except ValueError as error:
-        raise ValueError(f"equality: {error}") from None
+    check_rows("equality", np.asarray(D), value, exact)
     return D

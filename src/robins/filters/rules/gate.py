@@ -18,7 +18,7 @@ from robins.filters.chi_square import limits, within
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Memory, Rule
 from robins.filters.rules._robust import widened
-from robins.filters.values import Numbers, kind, number, value
+from robins.filters.values import Numbers, is_chance, kind, number, value
 
 Recovery = Literal["accept", "inflate", "reinitialise"]
 Scope = Literal["joint", "component"]
@@ -50,8 +50,6 @@ class Gate(Rule):
     name = "gate"
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
-        """A `_Channel` by sensor."""
-
         def channel(m: int) -> _Channel:
             shape, residual = () if self.joint else (m,), jnp.zeros((self.kept, m))
             return _Channel(jnp.zeros(shape, int), jnp.zeros(()), residual, residual > 0.0)
@@ -59,7 +57,6 @@ class Gate(Rule):
         return {name: channel(m) for name, m in dims.items()}
 
     def before(self, memory: Memory, prior: Belief, o: Observation):
-        """Refuse what is too large, or recover."""
         was = memory[o.sensor]
         q, ratio, judged, used = self.judge(o)
         over = judged & ~(ratio <= 1.0)
@@ -141,16 +138,14 @@ def gate(
 
     Args:
         probability: share of right measurements that pass.
-        patience: refusals in a row before recovery.
+        patience: refusals in a row before recovery; at least 1 to ``reinitialise``.
         recovery: one of the above.
         scope: judge the measurement as a whole, or each component by itself.
 
     Raises:
-        ValueError: the probability is not between 0 and 1, patience is negative or too short to
-            agree in, or recovery or scope is not known.
+        ValueError: an argument is out of its range.
     """
-    between = "gate probability must lie between 0 and 1"
-    chance = number(between, probability, lambda p: (p > 0.0) & (p < 1.0))
+    chance = number("gate probability must lie between 0 and 1", probability, is_chance)
     one_of("gate recovery", recovery, Recovery)
     one_of("gate scope", scope, Scope)
     agreeing = recovery == "reinitialise"

@@ -23,7 +23,7 @@ from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 from robins.filters.rules import _inflation
 from robins.filters.rules._inflation import GivenWeight, Weight, inflated, local_bound
-from robins.filters.values import Numbers, is_known, kind, number, value
+from robins.filters.values import Numbers, is_chance, is_known, kind, number, value
 from robins.manifold import State
 
 Policy = Literal["raise", "raise_gamma", "compensate"]
@@ -109,16 +109,6 @@ class HInfinity(Rule):
 
     name = NAME
 
-    @property
-    def judges_prior(self) -> bool:
-        """True if the predicted P decides on existence."""
-        return self.estimate == "a-priori"
-
-    @property
-    def moves_on(self) -> bool:
-        """True if the estimate is the one before the measurement, and the mean moves later."""
-        return self.estimate != "a-posteriori"
-
     def weighted(self, belief: Belief) -> Array:
         """(q, n) L S."""
         return _inflation.weighted_factor(self.weight, belief, NAME)
@@ -137,7 +127,7 @@ class HInfinity(Rule):
             steps=jnp.zeros((), int),
             fresh=jnp.array(True),
             measured=jnp.array(False),
-            predicted=belief.mean if self.moves_on else (),
+            predicted=() if self.estimate == "a-posteriori" else belief.mean,
             weighted=weighted,
             events=jnp.zeros((), int),
             first=jnp.array(-1),
@@ -145,18 +135,18 @@ class HInfinity(Rule):
         )
 
     def process(self, memory: HInfinityMemory, transition: Transition):
-        if self.moves_on:
+        if self.estimate != "a-posteriori":
             memory = memory._replace(predicted=transition.mean)
         return memory, transition
 
     def before(self, memory: HInfinityMemory, prior: Belief, o: Observation):
-        if self.judges_prior:
+        if self.estimate == "a-priori":  # the predicted P decides on existence
             weighted = jnp.where(memory.fresh, self.weighted(prior), memory.weighted)
             memory = memory._replace(weighted=weighted)
         return memory._replace(fresh=jnp.array(False)), prior, o
 
     def after(self, memory: HInfinityMemory, posterior: Belief, info: StepInfo, o: Observation):
-        if not self.judges_prior:
+        if self.estimate != "a-priori":
             memory = memory._replace(weighted=self.weighted(posterior))
         memory = memory._replace(measured=memory.measured | jnp.any(info.used))
         # Noted but not remembered, so that a run which does not keep it does not compute it.
@@ -174,16 +164,25 @@ class HInfinity(Rule):
     def settle(self, memory: HInfinityMemory, belief: Belief):
         counts = memory.measured | (self.count_missing & (memory.steps > 0))
         weighted = judged = self.weighted(belief)
-        if self.judges_prior:
+        if self.estimate == "a-priori":
             judged = jnp.where(memory.fresh, weighted, memory.weighted)
         inverse, factor, weighted, acted = self.eased(belief, weighted, judged)
         wide, exists = inflated(factor, inverse * weighted)
-        if self.judges_prior:
+        if self.estimate == "a-priori":
             exists = exists & inflated(factor, inverse * judged)[1]
         active = counts & exists & (self.inverse > 0.0)
         new = trees.select(active, self.moved(memory, belief, inverse, wide), belief)
         missed = counts & ~exists
-        memory = self.noting(memory, missed | (counts & acted), missed, judged)
+        acted = missed | (counts & acted)
+        begins = acted & (memory.events == 0)
+        memory = memory._replace(
+            steps=memory.steps + 1,
+            fresh=jnp.array(True),
+            measured=memory.measured & missed,
+            events=memory.events + acted.astype(int),
+            first=jnp.where(begins, memory.steps - 1, memory.first),
+            weighted_first=jnp.where(begins, judged, memory.weighted_first),
+        )
         return memory, new, jnp.where(missed, int(Code.INFEASIBLE), int(Code.DONE))
 
     def eased(self, belief: Belief, weighted: Array, judged: Array):
@@ -202,36 +201,20 @@ class HInfinity(Rule):
         self, memory: HInfinityMemory, belief: Belief, inverse: Numbers, wide: Array
     ) -> Belief:
         """Belief with the inflated factor, and the mean that belongs to it."""
-        if not self.moves_on:
+        if self.estimate == "a-posteriori":
             return Belief(belief.mean, wide)
         # P~ L'L d / gamma^2 takes the mean on from P H'R^-1 r to P~ H'R^-1 r.
         d = manifold.local(memory.predicted, belief.mean)
         L = inverse * _inflation.rows_of(self.weight, belief.mean, NAME)
         return Belief(manifold.retract(belief.mean, wide @ ((L @ wide).T @ (L @ d))), wide)
 
-    def noting(
-        self, memory: HInfinityMemory, acted: Array, missed: Array, judged: Array
-    ) -> HInfinityMemory:
-        """Memory after a step."""
-        begins = acted & (memory.events == 0)
-        return memory._replace(
-            steps=memory.steps + 1,
-            fresh=jnp.array(True),
-            measured=memory.measured & missed,
-            events=memory.events + acted.astype(int),
-            first=jnp.where(begins, memory.steps - 1, memory.first),
-            weighted_first=jnp.where(begins, judged, memory.weighted_first),
-        )
-
     def first_infeasible(
         self, final: HInfinityMemory, before: int = 0, whole: bool = True
     ) -> tuple[int, Numbers] | None:
         """First step without a filter, and L S there; None if it existed throughout.
 
-        Args:
-            final: memory at the end of the run.
-            before: events in the memory at its start, which were another filter's.
-            whole: judge the last step too, from which nothing has been predicted.
+        ``before`` are events in the memory at the start, of another filter; ``whole`` judges the
+        last step too, from which nothing has been predicted.
         """
         missed = int(final.events) - before
         if missed > 0 and before == 0:
@@ -331,17 +314,15 @@ def h_infinity(
 
     Raises:
         TypeError: gamma or the weight is not of real numbers.
-        ValueError: gamma is not positive, the weight is not finite or of the wrong shape, policy or
-            estimate is unknown or they do not go together, or the margin is not between 0 and 1.
+        ValueError: an argument is out of its range, or policy and estimate do not go together.
     """
     inverse = 1.0 / _as_gamma(gamma)
     one_of("h_infinity policy", policy, Policy)
     one_of("h_infinity estimate", estimate, Estimate)
-    between = "margin must lie between 0 and 1"
-    left = number(between, margin, lambda m: (m > 0.0) & (m < 1.0))
+    left = number("margin must lie between 0 and 1", margin, is_chance)
     if estimate == "a-priori" and policy == "compensate":
         raise ValueError(
-            "policy='compensate' mends P after the measurement, estimate='a-priori' needs it "
+            "policy='compensate' changes P after the measurement, estimate='a-priori' needs it "
             "before: use 'raise_gamma'"
         )
     L = _inflation.as_weight(weight, NAME)

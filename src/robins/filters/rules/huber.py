@@ -42,21 +42,19 @@ def huber(
     measurement keeps correlations of its noise. The correction is about k^2 / |r| at most, so it
     falls with the size of the innovation.
 
-    A weight of 1e-12 or less is a refusal. After ``patience`` measurements with hardly any weight
-    the next one is used (`robins.filters.rules._robust.opening`).
-
-    Notes: ``huber.weight``, 1 / s, 0 if refused, and ``huber.recovered``. Components without noise
-    of their own keep their weight. The Kalman filter is ``probability=1`` or ``threshold=inf``.
+    Notes: ``huber.weight``, 1 / s, 0 if refused (1e-12 or less), and ``huber.recovered``.
+    Components without noise of their own keep their weight. The Kalman filter is ``probability=1``
+    or ``threshold=inf``.
 
     Args:
         probability: share of right measurements that keep their weight, in (0, 1].
-        threshold: k, in standard deviations, for any number of components; None takes it from the
-            probability.
-        patience: measurements in a row with a weight below 1e-2; None never recovers.
+        threshold: k > 0, in standard deviations, for any number of components; None takes it from
+            the probability.
+        patience: measurements in a row with a weight below 1e-2 before one is used
+            (`robins.filters.rules._robust.opening`); None never recovers.
 
     Raises:
-        ValueError: the probability is not in (0, 1], the threshold not positive, or patience is
-            negative.
+        ValueError: an argument is out of its range.
     """
     limit = limits(number("huber probability must lie in (0, 1]", probability, is_share))
     if threshold is not None:

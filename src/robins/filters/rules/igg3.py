@@ -87,13 +87,13 @@ def igg3(
     is the limit of k0 above every t_i.
 
     Args:
-        k0: end of full weight, in standard deviations of the innovation.
-        k1: start of the floor.
+        k0: end of full weight, in standard deviations of the innovation, positive.
+        k1: start of the floor, finite.
         floor: least weight, in [0, 1).
         patience: measurements in a row without weight before one is used; None never recovers.
 
     Raises:
-        ValueError: not 0 < k0 < k1 < inf, the floor is not in [0, 1), or patience is negative.
+        ValueError: an argument is out of its range, or not k0 < k1.
     """
     if is_known((k0, k1)):
         low, high = np.asarray(k0, float), np.asarray(k1, float)

@@ -88,7 +88,7 @@ def inequality(
 
     Raises:
         ValueError: there is no bound, one is NaN, lower exceeds upper, a row of D is zero, the
-            method is unknown; and by `init`, D does not fit the state.
+            method is unknown; by `init`, D does not fit the state.
     """
     one_of("inequality method", method, Method)
     low, high = _bounds(lower, upper)

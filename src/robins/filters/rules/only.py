@@ -24,7 +24,6 @@ class Only(Rule):
 
     @property
     def name(self) -> str:
-        """Name of the inner rule."""
         return self.inner.name
 
     @property

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
-from jaxtyping import Array
 
 from robins import linalg
 from robins.filters.belief import Belief, StepInfo
@@ -37,7 +36,24 @@ class Projection(Rule):
     def after(self, memory: Memory, posterior: Belief, info: StepInfo, o: Observation):
         if o.sensor not in self.names:
             return memory, posterior, info
-        belief, gain, used, wrong = projected(o, self.weight, self.project_covariance)
+        S = o.prior.factor
+        metric, root = metric_of(o.prior, self.weight)
+        spread = o.spread
+        if root is not None:  # D = D S S' (S S')^-1
+            solid, _ = linalg.guard(S)
+            spread = linalg.solve_spd(solid, S @ o.spread.T).T @ metric.factor
+        nothing = jnp.zeros((len(o.residual), 0))
+        exact = o._replace(spread=spread, excess=nothing, noise=nothing, deficit=None)
+        mean, gain, used, wrong = nearest(metric, exact)
+        factor = S
+        if self.project_covariance:
+            error = jnp.concatenate([o.excess, o.noise], axis=1)
+            factor = linalg.tria(S - gain @ jnp.where(used[:, None], o.spread, 0.0), gain @ error)
+            # no rounding is left across an exact constraint
+            clean = jnp.any(used & ~jnp.any(error != 0.0, axis=1))
+            lost = linalg.lost_in_rounding(factor, o.prior.sigma)
+            factor = jnp.where(clean & lost, 0.0, factor)
+        belief = Belief(mean, jnp.where(jnp.any(used), factor, S))
         info = info._replace(gain=jnp.where(used[None, :], gain, 0.0))
         info = info.contradicted_where(jnp.any(wrong))
         return memory, belief, info.noted("projection", residual=jnp.max(jnp.abs(o.residual)))
@@ -75,36 +91,7 @@ def projection(
         project_covariance: False keeps P. Better where errors of the constraint are not white.
 
     Raises:
-        ValueError: no sensor is named, or the weight is not valid; by `init`, it is not of the
-            state's dimension, or a sensor has more components than the state.
+        ValueError: no sensor is named, the weight is not valid; by `init`, sizes do not fit.
     """
     names = sensor_names("projection", sensors)
     return Projection(as_weight("projection", weight), names, project_covariance)
-
-
-def projected(
-    o: Observation, weight: Weight, project_covariance: bool = True
-) -> tuple[Belief, Array, Array, Array]:
-    """Belief projected on an observation, with gain, components used and contradicted."""
-    prior, S = o.prior, o.prior.factor
-    metric, root = metric_of(prior, weight)
-    spread = o.spread if root is None else _slope(o) @ metric.factor
-    nothing = jnp.zeros((len(o.residual), 0))
-    exact = o._replace(spread=spread, excess=nothing, noise=nothing, deficit=None)
-    mean, G, used, wrong = nearest(metric, exact)
-    factor = S
-    if project_covariance:
-        error = jnp.concatenate([o.excess, o.noise], axis=1)
-        factor = linalg.tria(S - G @ jnp.where(used[:, None], o.spread, 0.0), G @ error)
-        # no rounding is left across an exact constraint
-        clean = jnp.any(used & ~jnp.any(error != 0.0, axis=1))
-        lost = linalg.lost_in_rounding(factor, prior.sigma)
-        factor = jnp.where(clean & lost, 0.0, factor)
-    some = jnp.any(used)
-    return Belief(mean, jnp.where(some, factor, S)), G, used, wrong
-
-
-def _slope(o: Observation) -> Array:
-    """D from the spread D S: D = D S S' (S S')^-1."""
-    solid, _ = linalg.guard(o.prior.factor)
-    return linalg.solve_spd(solid, o.prior.factor @ o.spread.T).T

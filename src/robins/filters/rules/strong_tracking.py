@@ -68,7 +68,10 @@ class StrongTracking(Rule):
         V, begun = memory.power[o.sensor], memory.begun[o.sensor]
         first = white.counts & ~begun
         V = jnp.where(first, white.residual**2, _fading.averaged(V, white, self.keep))
-        N = self.excess(V, white)
+        total = _fading.total(V, white)
+        N = total - self.beta * white.dof
+        if self.sigmas is not None:
+            N = jnp.where(_fading.significant(total, white, self.keep, self.sigmas), N, 0.0)
         if self.form == "outside":
             S, factor = _faded_outside(memory, prior.factor, white, N, self.limit)
         else:
@@ -78,14 +81,6 @@ class StrongTracking(Rule):
             begun={**memory.begun, o.sensor: begun | white.counts},
         )
         return memory, Belief(prior.mean, S), o.noted(self.name, lambda_=factor)
-
-    def excess(self, V: Array, white: _fading.White) -> Array:
-        """Trace of V less beta times that of R; 0 where V is not significant."""
-        total = _fading.total(V, white)
-        N = total - self.beta * white.dof
-        if self.sigmas is None:
-            return N
-        return jnp.where(_fading.significant(total, white, self.keep, self.sigmas), N, 0.0)
 
     def after(self, memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
         return memory._replace(fresh=memory.fresh & ~jnp.any(info.used)), posterior, info

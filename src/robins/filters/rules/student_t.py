@@ -80,18 +80,15 @@ def student_t(
     such tails too, b = (nu + E[d' P^-1 d]) / (nu + n), d being the correction of the state. On
     Gaussian data the filter is slightly less efficient; weights below one are common.
 
-    A weight of 1e-12 or less is a refusal. After ``patience`` measurements with hardly any weight
-    the next one is used (`robins.filters.rules._robust.opening`).
-
-    Notes: ``student_t.weight``, 1 / c, 0 if refused; ``student_t.prior``, 1 / b; and
-    ``student_t.recovered``. Components without noise of their own do not count. The Kalman filter
-    is ``dof=inf``.
+    Notes: ``student_t.weight``, 1 / c, 0 if refused (1e-12 or less); ``.prior``, 1 / b; and
+    ``.recovered``. Components without noise do not count. The Kalman filter is ``dof=inf``.
 
     Args:
         dof: nu, degrees of freedom of the tails: 3 to 10; 1 is Cauchy.
         iterations: of c, at least 1.
         whose: tails of the measurement noise "R" only, or of "both" it and the prior.
-        patience: measurements in a row with a weight below 1e-2; None never recovers.
+        patience: measurements in a row with a weight below 1e-2 before one is used
+            (`robins.filters.rules._robust.opening`); None never recovers.
 
     Raises:
         ValueError: an argument is out of its range.
