@@ -1,4 +1,12 @@
-"""Distinguish outliers from model errors by their duration: reweigh the former, fade the latter."""
+"""Distinguish outliers from model errors by their duration: reweigh the former, fade the latter.
+
+An average V of squares shows an error of the model where it exceeds a factor that chance alone
+exceeds in a whole run with about the probability ``false_alarm``: each of the run's ``looks`` may
+fail with false_alarm / looks (Bonferroni), and the factor is the quantile of such an average
+(`chance_levels` in `robins.filters.rules._fading`). Since consecutive averages are correlated,
+false alarms are three to four times rarer than stated with rho = 0.98; with rho = 0.9 they are 1.3
+times as many. With a ``threshold`` the factor is 1 + threshold sqrt(2 (1 - rho) / ((1 + rho) m)).
+"""
 
 from __future__ import annotations
 
@@ -107,46 +115,32 @@ def discriminator(
 ) -> Rule:
     r"""Short excess is a fault of the sensor, lasting excess one of the model (a rule of robins).
 
-    g = r' S^-1 r is compared with the chi-square quantile k2 of the components present; c counts
-    the measurements of a sensor in a row for which g > k2.
+    c counts measurements of a sensor in a row with g = r' S^-1 r above k2, a chi-square quantile.
 
         0 < c < patience   outlier: R becomes s R with r' (H P H' + s R)^-1 r = k2
                            ("huber"), or the measurement is refused ("gate"); V stands
-        c = patience       where g > 100 k2 too, the prior is widened until g = m, once (`widened`
-                           in `robins.filters.rules._robust`), and V stands
+        c = patience       where g > 100 k2, the prior is widened until g = m, once; V stands
         otherwise          V = rho V + (1 - rho) r r', from V = R; where V is significantly above
                            H P H' + R the model is wrong, and the prior is faded by
                            lambda = (tr V - m) / tr H P H'
 
-    with r, H whitened by R^-1/2 as in `strong_tracking`. "Significantly" is by a factor that chance
-    alone exceeds in a whole run with about the probability ``false_alarm``: each of the run's
-    ``looks`` may fail with false_alarm / looks (Bonferroni), and the factor is the quantile of such
-    an average of squares (`chance_levels` in `robins.filters.rules._fading`). Since consecutive
-    averages are correlated, false alarms are three to four times rarer than stated with rho = 0.98;
-    with rho = 0.9 they are 1.3 times as many. With a ``threshold`` the factor is
-    1 + threshold sqrt(2 (1 - rho) / ((1 + rho) m)), as in `strong_tracking`.
-
-    A change of the model with g > k2 from the start is not detected for ``patience`` measurements,
-    and a fault of the sensor that lasts longer is taken for a change of the model.
+    with r, H whitened by R^-1/2 as in `strong_tracking`. A fault of the sensor that lasts longer
+    than ``patience`` measurements is taken for an error of the model.
 
     Notes: ``discriminator.weight`` (1 / s, 0 if refused), ``.lambda``, ``.counter`` (c) and
-    ``.state`` (a `Verdict`: 2 if faded, or c >= patience). A component that is missing, refused
-    before or without noise does not change V and c. The Kalman filter is ``probability=1`` with
-    ``threshold=inf`` or ``limit=1``.
+    ``.state`` (a `Verdict`: 2 if faded, or c >= patience). Components missing, refused before or
+    without noise do not count. ``probability=1, limit=1`` is the Kalman filter.
 
     Args:
         patience: most measurements in a row with a fault of the sensor, plus one; 1: no outliers.
         probability: share of right measurements with g <= k2, in (0, 1].
         rho: forgetting factor of V, in (0, 1].
-        fade: "projected" or "multiple" as in `strong_tracking`. "multiple" adapts faster after a
-            change, but states with weight that the sensor does not see grow without bound.
+        fade: form of `strong_tracking`. "multiple" adapts faster, but unobserved states may grow.
         robust: treatment of outliers. "gate" is safer where they last long.
-        threshold: standard deviations by which tr V must exceed its expectation, such as
-            `PUBLISHED`; None derives it from ``false_alarm`` and ``looks``.
+        threshold: standard deviations, such as `PUBLISHED`, in place of false_alarm and looks.
         limit: upper bound of lambda, at least 1.
         weights: (n,) a_j >= 0 of the states for "multiple"; None: equal, which fades all P.
-        false_alarm: probability, in (0, 1), that chance alone is taken for an error of the model at
-            some time of a run, for each sensor.
+        false_alarm: probability of a false model error in a run, by sensor, in (0, 1).
         looks: measurements of a sensor in a run, at least 1.
 
     Raises:

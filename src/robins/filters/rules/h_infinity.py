@@ -20,7 +20,7 @@ from robins.filters.kalman import Filter
 from robins.filters.linearise import Transition
 from robins.filters.model import Given
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
+from robins.filters.rule import Again, Rule
 from robins.filters.rules import _inflation
 from robins.filters.rules._inflation import GivenWeight, Weight, inflated, local_bound
 from robins.filters.values import Numbers, is_chance, is_known, kind, number, value
@@ -31,7 +31,6 @@ Estimate = Literal["a-posteriori", "a-priori", "predictor"]
 
 NAME = "h_infinity"
 F = TypeVar("F", bound=Filter)
-Again = Callable[["HInfinity"], "HInfinityMemory"]  # a rule -> the last memory of the run with it
 
 
 class Infeasible(RobinsError, ValueError):

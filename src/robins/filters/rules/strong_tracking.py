@@ -25,7 +25,7 @@ Power = Literal["classic", "ewma"]
 class _Memory(NamedTuple):
     power: dict[str, Array]  # (m,) averaged squares of each sensor's whitened residuals
     begun: dict[str, Array]  # (m,) bool: the average has a first value
-    moved: Array  # (n, 2n + 1) F S and what its linearisation left over
+    moved: Array  # (n, 2n + 1) F S and its excess
     noise: Array  # (n, n) factor of Q
     fresh: Array  # () bool: nothing has been used since the prediction
 
@@ -108,29 +108,24 @@ def strong_tracking(
         multiple   V - beta R           sum_j a_j (P H' H)_jj  Lam^1/2 P Lam^1/2
         projected  V - beta R           tr H P H'              P + (lambda-1) P H' (H P H')^+ H P
 
-    with Lam_j = max(1, a_j lambda).
-
-    The outside form is that of the paper; lumped fades Q too; multiple fades by state; projected
-    widens only what the sensor sees, so that nothing else grows without bound. Sigma points are
-    drawn from the faded prior, which for linear h equals scaling Pxz and Pzz - R, the "simplified"
-    form of some papers; ``H P H'`` includes their excess. Of several sensors after one prediction
-    the first that is used separates Q; for later ones the outside form fades as lumped does.
+    with Lam_j = max(1, a_j lambda). The outside form is that of the paper; lumped fades Q too;
+    projected widens only what the sensor sees, so that nothing else grows without bound. Sigma
+    points are drawn from the faded prior, which for linear h equals scaling Pxz and Pzz - R. After
+    the first sensor used in a step the outside form fades as lumped does.
 
     The classic V has keep = rho / (1 + rho) <= 1/2: it averages two samples, and lambda follows
     noise. ``power="ewma"`` takes keep = rho, starts at R, and fades only when
     tr V > (1 + threshold sqrt(2 (1 - keep) / ((1 + keep) m))) tr(H P H' + R).
 
-    Notes: ``strong_tracking.lambda``, for multiple the greatest. Components that are missing,
-    refused, or without noise of their own do not count. The Kalman filter is ``limit=1``,
-    ``threshold=inf`` or beta large enough.
+    Notes: ``strong_tracking.lambda``, for multiple the greatest. Components missing, refused or
+    without noise do not count. The Kalman filter is ``limit=1`` or ``threshold=inf``.
 
     Args:
         rho: forgetting factor of V, in (0, 1].
         beta: weakening factor of R, at least 1.
         form: covariance that is faded.
         power: average of V.
-        threshold: standard deviations by which V must exceed its expectation; None is 3 for
-            "ewma", and no test for "classic".
+        threshold: standard deviations of the test; None is 3 for "ewma", no test for "classic".
         limit: upper bound of lambda, at least 1.
         weights: (n,) a_j >= 0 of the states for "multiple"; None: equal, which is lumped.
 
