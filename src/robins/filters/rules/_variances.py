@@ -42,11 +42,7 @@ def numbered(name: str, values: Array) -> dict[str, Array]:
 
 
 def bounded(rule: str, forgetting: Number, floor: Number, ceiling: Number) -> dict[str, Numbers]:
-    """Forgetting factor and bounds of a scale that starts at 1, checked.
-
-    Raises:
-        ValueError: one is out of its range.
-    """
+    """Forgetting factor and bounds of a scale that starts at 1, checked."""
     return {
         "forgetting": number(f"{rule} forgetting must lie in (0, 1]", forgetting, is_share),
         "floor": number(f"{rule} floor must lie in (0, 1]", floor, is_share),

@@ -75,7 +75,14 @@ class Discriminator(Rule):
         row, some = count.astype(float), seen.dof > 0
         outlier = some & (count > 0) & (row < self.patience)
         opens = some & (row == self.patience) & (seen.nis * HARDLY > quantile)
-        power, S, factor = self.faded(outlier | opens, memory.power[o.sensor], prior, o)
+        stands, white = outlier | opens, _fading.whitened(o)
+        power = memory.power[o.sensor]
+        power = jnp.where(stands, power, _fading.averaged(power, white, self.rho))
+        total = _fading.total(power, white)
+        level = within(self.levels, white.residual)[white.dof.astype(int)]
+        excess = ~stands & _fading.exceeds(total, white, level)
+        N = jnp.where(excess, total - white.dof, 0.0)
+        S, factor = _fading.faded(prior.factor, white, N, self.fade, self.weights, self.limit)
         S = widened_to_dof(opens, Belief(prior.mean, S), o, seen).factor
         if self.robust == "gate":
             weight = jnp.where(outlier, 0.0, 1.0)
@@ -87,17 +94,6 @@ class Discriminator(Rule):
         o = o.noted(self.name, weight=weight, lambda_=factor, counter=count, state=state)
         memory = _Memory({**memory.power, o.sensor: power}, {**memory.counter, o.sensor: count})
         return memory, Belief(prior.mean, S), o
-
-    def faded(self, stands: Array, power: Array, prior: Belief, o: Observation):
-        """V, the prior's factor, and lambda; unchanged where V stands."""
-        white = _fading.whitened(o)
-        power = jnp.where(stands, power, _fading.averaged(power, white, self.rho))
-        total = _fading.total(power, white)
-        level = within(self.levels, white.residual)[white.dof.astype(int)]
-        wrong = ~stands & _fading.exceeds(total, white, level)
-        N = jnp.where(wrong, total - white.dof, 0.0)
-        S, factor = _fading.faded(prior.factor, white, N, self.fade, self.weights, self.limit)
-        return power, S, factor
 
 
 def discriminator(

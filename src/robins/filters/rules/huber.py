@@ -28,9 +28,7 @@ class Huber(Rule):
 
 
 def huber(
-    probability: Number = 0.999,
-    threshold: Number | None = None,
-    patience: int | None = PATIENCE,
+    probability: Number = 0.999, threshold: Number | None = None, patience: int | None = PATIENCE
 ) -> Rule:
     r"""Huber weight on the joint Mahalanobis distance of a measurement (Chang 2014, sec. 3).
 

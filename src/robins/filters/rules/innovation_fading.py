@@ -52,8 +52,13 @@ class InnovationFading(Rule):
         return memory._replace(faded=jnp.zeros((), bool)), transition
 
     def before(self, memory: Memory, prior: Belief, o: Observation):
-        R = variance(o.noise)
-        window, counts = self.filled(memory.windows[o.sensor], o, R)
+        R, old = variance(o.noise), memory.windows[o.sensor]
+        here = o.accepted & o.present & (R > 0.0)
+        e = jnp.where(here, o.residual, 0.0)
+        rolled = jnp.concatenate([(ratio(e**2, R) - 1.0)[None, :], old.surplus[:-1]])
+        surplus = jnp.where(here[None, :], rolled, old.surplus)
+        filled = jnp.minimum(old.filled + here.astype(int), self.window)
+        window, counts = Window(surplus, filled), here & (filled == self.window)
         mean = jnp.sum(window.surplus, axis=0) / self.window
         unexplained = jnp.sum(jnp.where(counts, mean, 0.0))
         explained = jnp.sum(jnp.where(counts, ratio(reading_variance(o), R), 0.0))
@@ -67,15 +72,6 @@ class InnovationFading(Rule):
         memory = memory._replace(windows=windows, faded=memory.faded | (factor > 1.0))
         prior = prior._replace(factor=jnp.sqrt(factor) * prior.factor)
         return memory, prior, o.noted(self.name, lambda_=factor)
-
-    def filled(self, old: Window, o: Observation, R: Array) -> tuple[Window, Array]:
-        """Window with another sample, and the components that count: used, with a full window."""
-        here = o.accepted & o.present & (R > 0.0)
-        e = jnp.where(here, o.residual, 0.0)
-        rolled = jnp.concatenate([(ratio(e**2, R) - 1.0)[None, :], old.surplus[:-1]])
-        surplus = jnp.where(here[None, :], rolled, old.surplus)
-        filled = jnp.minimum(old.filled + here.astype(int), self.window)
-        return Window(surplus, filled), here & (filled == self.window)
 
 
 def innovation_fading(window: int = 10, limit: Number = 5.0, reach: Number = float("inf")) -> Rule:
