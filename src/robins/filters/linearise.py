@@ -1,9 +1,8 @@
 r"""Ways to linearise: first-order Taylor, unscented, cubature.
 
-All of them answer with the same thing, a statistical linear regression
-y ~ F x + c + e, e ~ N(0, Omega) (Särkkä 2013, sec. 5.3; Arasaratnam, Haykin & Elliott 2007), so one
-Kalman update serves them all. What the update needs is not F but F S, the *spread*: for
-sigma points it falls out without inverting S, which may then be singular.
+All of them return a statistical linear regression y ~ F x + c + e, e ~ N(0, Omega) (Särkkä 2013,
+sec. 5.3; Arasaratnam, Haykin & Elliott 2007), so one Kalman update serves them all. The update
+needs not F but F S, the *spread*: sigma points give it without inverting S, which may be singular.
 
 Symmetric points m +- c s_i (s_i column i of S, c^2 = alpha^2 (n + kappa)) split each
 function value into an odd part o_i, which makes the spread, o_i / c, and an even part a_i =
@@ -12,18 +11,17 @@ function value into an odd part o_i, which makes the spread, o_i / c, and an eve
     Omega = 2 w sum a_i a_i' + (beta - alpha^2) b b',        w = 1 / (2 c^2).
 
 The textbook form sums squares about the mean with weights Wc_0 of either sign and size 1/alpha^2;
-here the cancellation has been done on paper. So no subtraction is left whenever beta >= alpha^2, at
-any alpha; and for beta < alpha^2 a shift of the a_i by s b removes it as long as
-1 + 2 n w (beta - alpha^2) >= 0, that is kappa alpha^2 + n beta >= 0. Beyond that Omega can be truly
-indefinite: the update then takes the rest away again, and says `Code.INDEFINITE` where no
-covariance is left.
+here the cancellation is analytic. No subtraction is left for beta >= alpha^2, at any alpha; for
+beta < alpha^2 a shift of the a_i by s b removes it as long as 1 + 2 n w (beta - alpha^2) >= 0, that
+is kappa alpha^2 + n beta >= 0. Beyond that Omega can be indefinite: the update then subtracts a
+deficit, and returns `Code.INDEFINITE` where no covariance is left.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,37 +38,37 @@ NARROWEST = 1e3 * float(jnp.finfo(float).eps)  # (n + lambda) / n of sigma point
 
 
 class Transition(NamedTuple):
-    """A motion seen from a belief, linearised."""
+    """Linearisation of a motion about a belief."""
 
     mean: State  # predicted
     spread: Array  # (n, n) F S; cross-covariance with the state before is S @ spread.T
-    excess: Array  # (n, k) factor of what the linearisation leaves over; k = 0 for Taylor
+    excess: Array  # (n, k) factor of the linearisation error Omega; k = 0 for Taylor
     noise: Array  # (n, q) factor of the process noise
-    deficit: Array | None = None  # (n,) vector to take away again, for indefinite weights
-    points: Points | None = None  # where sigma points are used again in the update
+    deficit: Array | None = None  # (n,) vector whose square is subtracted, for indefinite weights
+    points: Points | None = None  # where the update reuses sigma points
 
 
 class Points(NamedTuple):
-    """Sigma points that have moved with the state, and the noise they know nothing of."""
+    """Predicted sigma points, and the process noise that they do not include."""
 
     states: State  # leading axis 2n + 1, centre first
     noise: Array  # (n, n) factor
 
 
 class Reuse(NamedTuple):
-    """How to update with the points of the prediction."""
+    """Update with the points of the prediction."""
 
     draw: Callable[[Belief], Points]
-    observation: Callable[[Points, Belief, Sensor, Any, Any], Observation]
+    observation: Callable[[Points, Belief, Sensor, Data, Data], Observation]
 
 
 class Linearisation:
-    """A way to linearise; values of its kinds are made by `taylor`, `unscented` and their kin.
+    """A way to linearise: `taylor`, `unscented`, `cubature`, `iterated`.
 
     Attributes:
-        transition: ``(belief, motion, u) -> Transition``: where the motion takes a belief, and how.
-        observation: ``(prior, sensor, y, aux) -> Observation``: a measurement as a belief sees it.
-        reuse: how to update with the points of the prediction; None where they are drawn anew.
+        transition: ``(belief, motion, u) -> Transition``, a prediction.
+        observation: ``(prior, sensor, y, aux) -> Observation``, a measurement relative to a belief.
+        reuse: update with the points of the prediction; None where each update draws its own.
     """
 
     @property
@@ -78,46 +76,45 @@ class Linearisation:
         return None
 
     def transition(self, belief: Belief, motion: Motion, u: Data) -> Transition:
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no method `transition`")
 
     def observation(self, prior: Belief, sensor: Sensor, y: Data, aux: Data) -> Observation:
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no method `observation`")
 
-    def drawn(self, belief: Belief) -> Any:
+    def drawn(self, belief: Belief) -> Data:
         return () if self.reuse is None else self.reuse.draw(belief)
 
     def first_observation(
-        self, points: Any, prior: Belief, sensor: Sensor, y: Data, aux: Data
+        self, points: Data, prior: Belief, sensor: Sensor, y: Data, aux: Data
     ) -> Observation:
         if self.reuse is None:
             return self.observation(prior, sensor, y, aux)
         return self.reuse.observation(points, prior, sensor, y, aux)
 
 
-def _form(x: Any) -> tuple[Any, tuple]:
-    """Structure and shapes, which compare without asking an element for its `__eq__`."""
+def _form(x: State) -> tuple:
+    """Structure and shapes, which compare without `__eq__` of an element."""
     leaves, tree = jax.tree_util.tree_flatten(x, is_leaf=lambda leaf: leaf is None)
     return tree, tuple(None if leaf is None else jnp.shape(leaf) for leaf in leaves)
 
 
 def _magnitude(x: State) -> Array:
     """Size of the numbers behind each tangent component of a state: rounding is 1e-16 of it."""
-    x = jax.lax.stop_gradient(x)
 
     def of(leaf):
         if not manifold.is_element(leaf):
             return jnp.abs(leaf).reshape(-1)
-        # How far one unit in the last place leads, whatever the element is made of.
+        # tangent vector of one unit in the last place, in any representation
         moved = jax.tree_util.tree_map(lambda v: jnp.nextafter(v, jnp.inf), leaf)
         return jnp.abs(leaf.local(moved)).reshape(-1) / jnp.finfo(float).eps
 
-    return jnp.concatenate([of(leaf) for leaf in manifold.leaves(x)])
+    return jnp.concatenate([of(leaf) for leaf in manifold.leaves(jax.lax.stop_gradient(x))])
 
 
 def _observe(
-    sensor: Sensor, prior: Belief, z: Any, y: Data, aux: Data, spread, excess, size, deficit=None
+    sensor: Sensor, prior: Belief, z: State, y: Data, aux: Data, spread, excess, size, deficit=None
 ) -> Observation:
-    """An observation from what a linearisation found."""
+    """Observation from a predicted measurement z and its linearisation."""
     if (reads := _form(z)) != (given := _form(y)):
         reads, given = (tree.unflatten(shapes) for tree, shapes in (reads, given))
         raise ValueError(
@@ -142,17 +139,16 @@ def _observe(
     )
 
 
-def _jacobian(g, x):
+def _jacobian(g: Callable[[State], State], x: State) -> tuple[State, Array]:
     """``g(x)`` and the Jacobian of g between the tangent spaces at x and at g(x)."""
     value = g(x)
     origin = jnp.zeros(manifold.dim(x))
-    slope = jax.jacfwd(lambda d: manifold.local(value, g(manifold.retract(x, d))))(origin)
-    return value, slope
+    return value, jax.jacfwd(lambda d: manifold.local(value, g(manifold.retract(x, d))))(origin)
 
 
 @value
 class Taylor(Linearisation):
-    """The way of `taylor`."""
+    """Value behind `taylor`."""
 
     def transition(self, belief: Belief, motion: Motion, u) -> Transition:
         if motion.linear is not None:
@@ -176,8 +172,7 @@ class Taylor(Linearisation):
 def taylor() -> Linearisation:
     """First-order Taylor expansion at the mean: the extended Kalman filter.
 
-    Uses a model's ``linear`` where it has one, else forward-mode automatic differentiation on the
-    manifold.
+    By ``linear`` of the model where it is given, else by forward-mode automatic differentiation.
     """
     return Taylor()
 
@@ -191,11 +186,11 @@ class Weights(NamedTuple):
 
 
 def sigma_weights(n: int, alpha: Number, beta: Number, kappa: Number) -> Weights:
-    """The one place where sigma weights are made.
+    """Weights of the sigma points of n dimensions.
 
     Raises:
-        ValueError: n + kappa or alpha is not positive, so that no points exist; or they would lie
-            so close together that their differences are rounding.
+        ValueError: n + kappa or alpha is not positive, or the points are so close together that
+            their differences are rounding.
     """
     if not (alpha > 0.0 and n + kappa > 0.0):
         raise ValueError(
@@ -208,27 +203,24 @@ def sigma_weights(n: int, alpha: Number, beta: Number, kappa: Number) -> Weights
             f"sigma points with alpha = {alpha} are too close together: n + lambda = {c_sq:.1e} of "
             f"n = {n} vanishes in rounding; take alpha from 1e-3 to 1"
         )
-    w = 1.0 / (2.0 * c_sq)
     wm0 = 1.0 - n / c_sq
-    ring = jnp.full(2 * n, w)
+    ring = jnp.full(2 * n, 1.0 / (2.0 * c_sq))
     mean = jnp.concatenate([jnp.array([wm0]), ring])
     cov = jnp.concatenate([jnp.array([wm0 + 1.0 - alpha**2 + beta]), ring])
     return Weights(mean, cov, math.sqrt(c_sq))
 
 
 def sigma_points(belief: Belief, reach: Number) -> State:
-    """States at the mean, then at +reach and at -reach times each column of the factor.
-
-    Returns:
-        The state's pytree with a leading axis of 2n + 1.
-    """
+    """States, with a leading axis of 2n + 1: the mean, then +reach and -reach times the columns."""
     n = belief.factor.shape[0]
     ring = reach * belief.factor.T
     offsets = jnp.concatenate([jnp.zeros((1, n)), ring, -ring])
     return jax.vmap(lambda d: manifold.retract(belief.mean, d))(offsets)
 
 
-def _regress(values: Any, n: int, alpha: Number, beta: Number, kappa: Number):
+def _regress(
+    values: State, n: int, alpha: Number, beta: Number, kappa: Number
+) -> tuple[State, Array, Array, Array | None]:
     """Mean, spread, excess, deficit of function values at the sigma points (module docstring)."""
     w = sigma_weights(n, alpha, beta, kappa)
     ring = 1.0 / (2.0 * w.reach**2)
@@ -243,7 +235,7 @@ def _regress(values: Any, n: int, alpha: Number, beta: Number, kappa: Number):
     offset, even, spread = split(centre)
     mean = manifold.retract(centre, offset + 2.0 * ring * jnp.sum(even, axis=0))
     if any(manifold.is_element(x) for x in manifold.leaves(centre)):
-        # On a curved space the deviations are read off about the mean, not about the centre point.
+        # On a curved space deviations are about the mean, not about the centre point.
         _, even, spread = split(mean)
     b = 2.0 * ring * jnp.sum(even, axis=0)
 
@@ -263,7 +255,7 @@ def _regress(values: Any, n: int, alpha: Number, beta: Number, kappa: Number):
 
 @value
 class Unscented(Linearisation):
-    """The way of `unscented`. Its numbers choose columns and signs, so they are kinds."""
+    """Value behind `unscented`. Its numbers choose columns and signs, so they are kinds."""
 
     numbers: tuple[float, float, float] = kind()
     redraw: bool = kind()
@@ -272,27 +264,30 @@ class Unscented(Linearisation):
     def reuse(self) -> Reuse | None:
         return None if self.redraw else Reuse(self.draw, self.observe_again)
 
+    def reach(self, n: int) -> float:
+        """Distance c of the points, in columns of the factor."""
+        return sigma_weights(n, *self.numbers).reach
+
     def transition(self, belief: Belief, motion: Motion, u) -> Transition:
         n = belief.factor.shape[0]
-        points = sigma_points(belief, sigma_weights(n, *self.numbers).reach)
+        points = sigma_points(belief, self.reach(n))
         values = jax.vmap(lambda x: motion.moved(x, u))(points)
         mean, spread, excess, deficit = _regress(values, n, *self.numbers)
         noise = motion.noise_factor(belief.mean, u)
-        moved = None if self.redraw else Points(values, _square(noise))
+        moved = None if self.redraw else Points(values, of_width(noise, n))
         return Transition(mean, spread, excess, noise, deficit, moved)
 
     def observation(self, prior: Belief, sensor: Sensor, y, aux) -> Observation:
         n = prior.factor.shape[0]
-        weights = sigma_weights(n, *self.numbers)
-        values = jax.vmap(lambda x: sensor.reading(x, aux))(sigma_points(prior, weights.reach))
+        reach = self.reach(n)
+        values = jax.vmap(lambda x: sensor.reading(x, aux))(sigma_points(prior, reach))
         z, spread, excess, deficit = _regress(values, n, *self.numbers)
-        size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / weights.reach
+        size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / reach
         return _observe(sensor, prior, z, y, aux, spread, excess, size, deficit)
 
     def draw(self, belief: Belief) -> Points:
         n = belief.factor.shape[0]
-        reach = sigma_weights(n, *self.numbers).reach
-        return Points(sigma_points(belief, reach), jnp.zeros((n, n)))
+        return Points(sigma_points(belief, self.reach(n)), jnp.zeros((n, n)))
 
     def observe_again(self, points: Points, prior: Belief, sensor: Sensor, y, aux) -> Observation:
         n = prior.factor.shape[0]
@@ -305,48 +300,44 @@ class Unscented(Linearisation):
                 "sigma points can be used again only where kappa alpha^2 + n beta >= 0, got "
                 f"alpha = {alpha}, beta = {beta}, kappa = {kappa}, n = {n}"
             )
-        # State and reading are the same combinations of the same unit deviations, the noise of the
-        # motion aside: state = S T with T T' = I, so what of the reading lies along T is its
-        # spread and what lies across is left over.
+        # State and reading are combinations of the same unit deviations, process noise aside:
+        # state = S T with T T' = I, so the part of the reading along T is its spread, and the part
+        # across T its excess.
         wide = jnp.concatenate([*state, points.noise], axis=1)
         deviation = jnp.concatenate([*reading, jnp.zeros((sensor.dim, n))], axis=1)
         solid, independent = linalg.guard(prior.factor)
         T = jnp.where(independent[:, None], linalg.solve_lower(solid, wide), 0.0)
         spread = deviation @ T.T
-        size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / (
-            sigma_weights(n, *self.numbers).reach
-        )
+        size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / self.reach(n)
         return _observe(sensor, prior, z, y, aux, spread, deviation - spread @ T, size)
 
 
 def unscented(
     alpha: Number = 1.0, beta: Number = 2.0, kappa: Number = 0.0, redraw: bool = True
 ) -> Linearisation:
-    """Sigma points (Julier & Uhlmann 2004), drawn anew before every prediction and update.
+    """Sigma points (Julier & Uhlmann 2004), drawn before every prediction and update.
 
-    The defaults use points at +- sqrt(n) standard deviations. ``alpha``, ``beta`` and ``kappa`` are
-    plain numbers without unit; kappa alpha^2 + n beta >= 0 keeps every covariance a sum of squares.
-    On linear models all of them give the Kalman filter.
+    The defaults use points at +- sqrt(n) standard deviations. kappa alpha^2 + n beta >= 0 keeps
+    every covariance a sum of squares. On linear models all of them give the Kalman filter.
 
     Args:
-        alpha: spread of the points.
+        alpha: spread of the points, without unit, as beta and kappa.
         beta: 2 is best for Gaussians.
         kappa: 3 - n in older texts, 0 here.
-        redraw: False updates with the points that were predicted, as many papers print the filter.
-            Points know nothing of the process noise, so the gain leaves it out: less is learned
-            from a measurement than could be, unless the noise is small. Only the first update after
-            a prediction that no rule has faded has such points; the others draw.
+        redraw: False updates with the predicted points, as in many papers. These do not include the
+            process noise, so the gain ignores it: not optimal unless the noise is small. Only the
+            first update after a prediction that no rule has faded has such points; the others draw.
     """
-    # kinds have a hash, which an array has not
+    # kinds must be hashable, which arrays are not
     return Unscented((float(alpha), float(beta), float(kappa)), redraw)
 
 
-def _square(noise: Array) -> Array:
-    """The same noise with as many columns as rows."""
-    n, q = noise.shape
-    if q > n:
-        return linalg.tria(noise)
-    return jnp.concatenate([noise, jnp.zeros((n, n - q))], axis=1)
+def of_width(factor: Array, width: int) -> Array:
+    """Factor of the same covariance with so many columns, at least one a row."""
+    n, k = factor.shape
+    if k > width:
+        factor, k = linalg.tria(factor), n
+    return jnp.concatenate([factor, jnp.zeros((n, width - k))], axis=1)
 
 
 def cubature() -> Linearisation:
@@ -356,12 +347,12 @@ def cubature() -> Linearisation:
 
 def unscented_transform(
     belief: Belief,
-    g: Callable[[State], Any],
+    g: Callable[[State], State],
     alpha: Number = 1.0,
     beta: Number = 2.0,
     kappa: Number = 0.0,
 ) -> Belief:
-    """Push a belief through a function, with no noise added, by sigma points."""
+    """Propagate a belief through a function by sigma points, without noise."""
     n = belief.factor.shape[0]
     values = jax.vmap(g)(sigma_points(belief, sigma_weights(n, alpha, beta, kappa).reach))
     mean, spread, excess, deficit = _regress(values, n, alpha, beta, kappa)

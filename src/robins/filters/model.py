@@ -1,31 +1,34 @@
 """The model of a filter: a motion, and sensors.
 
-Functions in a model are part of its *shape*: exchanging one compiles anew. Everything else (noise
+Functions in a model are part of its *shape*: exchanging one compiles again. Everything else (noise
 factors, parameters bound with ``jax.tree_util.Partial``) is data: it may change, be batched with
 `jax.vmap` or differentiated without a new compilation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import InitVar
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.values import kind, value
+from robins.manifold import State
 
+T = TypeVar("T")
 Data = Any  # a pytree of arrays, such as a measurement or an input
+Given = ArrayLike | Sequence[Any]  # numbers of a user, or lists of them
 _LARGEST = float(np.sqrt(np.finfo(float).max))  # of a standard deviation
 
 
-def as_noise(value: Any, n: int, whose: str) -> Array:
+def as_noise(value: Data, n: int, whose: str) -> Array:
     """Noise factor from standard deviations or a factor."""
     noise = jnp.asarray(value, float)
     if noise.ndim not in (1, 2) or noise.shape[0] != n:
@@ -36,7 +39,7 @@ def as_noise(value: Any, n: int, whose: str) -> Array:
     return linalg.as_factor(noise)
 
 
-def _settle_noise(own: Motion | Sensor, covariance: Any, whose: str) -> None:
+def _settle_noise(own: Motion | Sensor, covariance: ArrayLike | None, whose: str) -> None:
     if (own.noise is None) == (covariance is None):
         raise TypeError(
             f"{whose} needs noise=, standard deviations or a factor L of the covariance L L', or "
@@ -45,7 +48,7 @@ def _settle_noise(own: Motion | Sensor, covariance: Any, whose: str) -> None:
     if covariance is not None:
         object.__setattr__(own, "noise", linalg.factor(covariance, f"noise covariance of {whose}"))
     leaves = [] if callable(own.noise) else jax.tree_util.tree_leaves(own.noise)
-    # as NumPy's, for JAX's own comparisons are stand-ins inside a trace
+    # of NumPy, since comparisons of JAX arrays are traced inside a trace
     leaves = [np.asarray(x) for x in leaves if not isinstance(x, Tracer)]
     if any(x.dtype.kind not in "biuf" for x in leaves):
         raise TypeError(f"noise of {whose} is not of real numbers")
@@ -58,25 +61,25 @@ def _settle_noise(own: Motion | Sensor, covariance: Any, whose: str) -> None:
         )
 
 
-def _kinds(tree: Any) -> Any:
-    """Kind and shape of each number of a pytree, for messages."""
-    return jax.tree_util.tree_map(lambda a: f"{jnp.result_type(a)}{jnp.shape(a)}", tree)
+def _kinds(x: State) -> str:
+    """Types and shapes of the numbers of a state, for messages."""
+    return str(jax.tree_util.tree_map(lambda a: f"{jnp.result_type(a)}{jnp.shape(a)}", x))
 
 
-def _check_width(whose: str, found: Any) -> None:
-    """Refuse what a user's function returns in another width than all of robins computes in."""
+def _in_float64(whose: str, found: T) -> T:
+    """Result of a user's function, refused in another width than float64."""
     for leaf in jax.tree_util.tree_leaves(found):
-        kind = str(jnp.result_type(leaf))
-        if kind != "float64":
+        if (width := str(jnp.result_type(leaf))) != "float64":
             raise TypeError(
-                f"{whose} returns {kind}, and filters compute in float64: name no other dtype in "
+                f"{whose} returns {width}, and filters compute in float64: name no other dtype in "
                 "it, or end it with .astype(float)"
             )
+    return found
 
 
 @value
 class Motion:
-    """How the state moves from one step to the next.
+    """Motion of the state over one step.
 
     Attributes:
         step: ``(x, u) -> x``; u is the input of this step (increments, a time step, nothing).
@@ -84,36 +87,30 @@ class Motion:
             deviations, (n, k) factor with Q = L L', or ``(x, u) -> `` one of these.
         linear: optional ``(x, u) -> (new x, F, noise)`` where an analytic transition exists;
             `taylor` then uses it in place of automatic differentiation.
-        noise_covariance: (n, n) Q, in the place of `noise` (looked at, so not inside `jit`).
+        noise_covariance: (n, n) Q, in the place of `noise` (not inside `jit`).
 
     Raises:
         TypeError: both of noise and its covariance are given, or neither.
         ValueError: the covariance is none.
     """
 
-    step: Callable[[Any, Any], Any]
+    step: Callable[[State, Data], State]
     noise: Any = None
-    linear: Callable[[Any, Any], Any] | None = None
-    noise_covariance: InitVar[Any] = None
+    linear: Callable[[State, Data], tuple[State, Array, Array]] | None = None
+    noise_covariance: InitVar[ArrayLike | None] = None
 
-    def __post_init__(self, noise_covariance: Any) -> None:
-        """Take the noise as it was given."""
+    def __post_init__(self, noise_covariance: ArrayLike | None) -> None:
+        """Check noise or covariance."""
         _settle_noise(self, noise_covariance, "the motion")
 
-    def moved(self, x, u):
-        """The state after a step.
-
-        Raises:
-            TypeError: `step` computes in another width than 64 bits.
-            ValueError: it returns something of another form than a state.
-        """
-        new = self.step(x, u)
-        _check_width("step of the motion", new)
-        if (found := str(_kinds(new))) != (wanted := str(_kinds(x))):
+    def moved(self, x: State, u: Data) -> State:
+        """State after a step; refuses other widths than float64 and other forms than of a state."""
+        new = _in_float64("step of the motion", self.step(x, u))
+        if (found := _kinds(new)) != (wanted := _kinds(x)):
             raise ValueError(f"step of the motion returns {found} of a state {wanted}")
         return new
 
-    def noise_factor(self, x, u):
+    def noise_factor(self, x: State, u: Data) -> Array:
         """Process noise factor at x."""
         value = self.noise(x, u) if callable(self.noise) else self.noise
         return as_noise(value, manifold.dim(x), "the motion")
@@ -121,32 +118,32 @@ class Motion:
 
 @value
 class Sensor:
-    """One measurement: what it would read at a state, and how noisy it is.
+    """Reading of one sensor at a state, and its noise.
 
     Attributes:
         read: ``(x, aux) -> z``, an (m,) array or a pytree with elements such as `Angle`; aux is
-            what the reading needs besides the state (star direction, antenna rate, ...), or None.
+            data besides the state (star direction, antenna rate, ...), or None.
         noise: (m,) standard deviations, (m, k) factor with R = L L', or
             ``(x, aux) -> `` one of these.
-        dim: tangent dimension m of the measurement; may be left out where the noise tells it.
+        dim: tangent dimension m of the measurement; by default the length of the noise.
         name: key of its measurements in a run.
         linear: optional ``(x, aux) -> (z, H)`` with an analytic Jacobian.
-        noise_covariance: (m, m) R, in the place of `noise` (looked at, so not inside `jit`).
+        noise_covariance: (m, m) R, in the place of `noise` (not inside `jit`).
 
     Raises:
-        TypeError: both of noise and its covariance are given, or neither; nothing tells dim.
+        TypeError: both of noise and its covariance are given, or neither; dim is not known.
         ValueError: the covariance is none.
     """
 
-    read: Callable[[Any, Any], Any]
+    read: Callable[[State, Data], Data]
     noise: Any = None
     dim: int = kind(default=-1)
     name: str = kind(default="y")
-    linear: Callable[[Any, Any], Any] | None = None
-    noise_covariance: InitVar[Any] = None
+    linear: Callable[[State, Data], tuple[Data, Array]] | None = None
+    noise_covariance: InitVar[ArrayLike | None] = None
 
-    def __post_init__(self, noise_covariance: Any) -> None:
-        """Take the noise as it was given."""
+    def __post_init__(self, noise_covariance: ArrayLike | None) -> None:
+        """Check the noise, and derive dim from it."""
         _settle_noise(self, noise_covariance, f"sensor '{self.name}'")
         if self.dim < 0:
             shape = () if callable(self.noise) else jnp.shape(self.noise)
@@ -157,17 +154,11 @@ class Sensor:
                 )
             object.__setattr__(self, "dim", shape[0])
 
-    def reading(self, x, aux):
-        """What it would read at x.
+    def reading(self, x: State, aux: Data) -> Data:
+        """Predicted measurement at x; refuses other widths than float64."""
+        return _in_float64(f"read of sensor '{self.name}'", self.read(x, aux))
 
-        Raises:
-            TypeError: `read` computes in another width than 64 bits.
-        """
-        z = self.read(x, aux)
-        _check_width(f"read of sensor '{self.name}'", z)
-        return z
-
-    def noise_factor(self, x, aux):
+    def noise_factor(self, x: State, aux: Data) -> Array:
         """Measurement noise factor at x."""
         value = self.noise(x, aux) if callable(self.noise) else self.noise
         return as_noise(value, self.dim, f"sensor '{self.name}'")
@@ -175,11 +166,7 @@ class Sensor:
 
 @value
 class Model:
-    """A motion and its sensors, updated in the order given.
-
-    Raises:
-        ValueError: two sensors share a name.
-    """
+    """A motion and its sensors, of different names, updated in the order given."""
 
     motion: Motion
     sensors: tuple[Sensor, ...]
@@ -194,12 +181,12 @@ class Model:
         return {s.name: s.dim for s in self.sensors}
 
     def sensor(self, name: str) -> Sensor:
-        """The sensor of this name.
+        """Sensor of this name.
 
         Raises:
-            KeyError: there is none; the message lists those there are.
+            KeyError: there is none; the message lists all names.
         """
-        for s in self.sensors:
-            if s.name == name:
-                return s
-        raise KeyError(f"no sensor '{name}'; this model has {sorted(self.dims)}")
+        named = {s.name: s for s in self.sensors}
+        if name in named:
+            return named[name]
+        raise KeyError(f"no sensor '{name}'; this model has {sorted(named)}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,27 +11,30 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import linalg, manifold
-from robins.filters.belief import Belief, with_notes
+from robins.filters.belief import Belief, Number, with_notes
+from robins.filters.model import Data, Given
+from robins.filters.values import Numbers
+from robins.manifold import State
 
-# A quantity known exactly carries the rounding of many steps. This share of what it was summed from
-# is far above that rounding, and far below the noise of any sensor.
+# A quantity known exactly carries the rounding of many steps. This share of its summands is far
+# above that rounding, and far below the noise of any sensor.
 CONTRADICTS = 1e-9
 
 
 class Observation(NamedTuple):
-    """A measurement seen from a belief, linearised. Not a JAX type: `sensor` is a string."""
+    """A measurement linearised about a belief. Not a JAX type: `sensor` is a string."""
 
     sensor: str
-    prior: Belief  # the belief it is seen from
+    prior: Belief
     residual: Array  # (m,) y minus its prediction; 0 where missing
     present: Array  # (m,) bool, the component was measured
     accepted: Array  # (m,) bool, the component is used; rules may refuse what is present
     spread: Array  # (m, n) H S
-    excess: Array  # (m, k) factor of what the linearisation leaves over; k = 0 for Taylor
+    excess: Array  # (m, k) factor of the linearisation error Omega; k = 0 for Taylor
     noise: Array  # (m, q) measurement noise factor
-    size: Array  # (m,) of what the spread was summed from: 1e-14 of it is rounding
-    deficit: Array | None = None  # (m,) vector to take away again, for indefinite weights
-    notes: Mapping[str, Any] = {}  # what rules say of it before the update, by their names
+    size: Array  # (m,) size of the summands of the spread: 1e-14 of it is rounding
+    deficit: Array | None = None  # (m,) vector whose square is subtracted, for indefinite weights
+    notes: Mapping[str, Number] = {}  # of rules, before the update
     unweighed: Array | None = None  # (m, q) noise before a robust rule raised it; None: none did
 
     @property
@@ -43,17 +46,17 @@ class Observation(NamedTuple):
         return jnp.sqrt(jnp.maximum(square - taken, 0.0))
 
     def raised(self, noise: Array, accepted: Array) -> Observation:
-        """A copy with the noise factor and the accepted components that a robust rule chooses."""
+        """Copy with noise factor and accepted components of a robust rule."""
         before = self.noise if self.unweighed is None else self.unweighed
         return self._replace(noise=noise, accepted=accepted, unweighed=before)
 
-    def noted(self, rule: str, **notes: Any) -> Observation:
-        """A copy with notes of a rule, which the update copies to its `StepInfo` (`with_notes`)."""
+    def noted(self, rule: str, **notes: Number) -> Observation:
+        """Copy with notes of a rule, which the update copies to its `StepInfo` (`with_notes`)."""
         return self._replace(notes=with_notes(self.notes, rule, notes))
 
 
 class Normalised(NamedTuple):
-    """An innovation in units of what was expected of it."""
+    """An innovation in units of its expected standard deviation."""
 
     factor: Array  # (m, m) lower factor of the innovation covariance; identity rows where not used
     used: Array  # (m,) bool, accepted and independent of the components above
@@ -62,27 +65,28 @@ class Normalised(NamedTuple):
     dof: Array  # () number of components used
 
 
-def as_measurement(sensor: str, data: Any) -> Any:
+def as_measurement(sensor: str, data: Data) -> Data:
     """Measurements as 64-bit floats of JAX, from arrays of any real kind or lists of numbers."""
-
-    def of_jax(x: Any) -> jax.Array:
-        # a copy: what JAX computes later must not change with the array that was given
-        return x if isinstance(x, jax.Array) else jnp.array(x)
-
-    return jax.tree_util.tree_map(of_jax, as_real(sensor, data))
+    # a copy of NumPy's, since JAX computes later and the given array may change
+    return jax.tree_util.tree_map(
+        lambda x: x if isinstance(x, jax.Array) else jnp.array(x), as_real(sensor, data)
+    )
 
 
-def as_real(sensor: str, data: Any) -> Any:
+def as_real(sensor: str, data: Data) -> Data:
     """Measurements as 64-bit floats, of NumPy where they are not of JAX; no copy where they are.
 
     Raises:
         TypeError: they are not real numbers.
     """
 
-    def is_list(leaf):
+    def is_list(leaf: Data) -> bool:
         return isinstance(leaf, list)
 
-    def as_numbers(leaf):
+    def is_real(leaf: Data) -> bool:
+        return type(leaf) in (np.ndarray, np.float64) and leaf.dtype == float
+
+    def as_numbers(leaf: Given) -> Numbers:
         array = leaf if isinstance(leaf, jax.Array) else np.asarray(leaf)
         if not jnp.issubdtype(array.dtype, np.floating) and array.dtype.kind not in "iu":
             raise TypeError(
@@ -91,17 +95,13 @@ def as_real(sensor: str, data: Any) -> Any:
             )
         return array.astype(float)
 
-    if all(map(_is_real, jax.tree_util.tree_leaves(data, is_leaf=is_list))):
+    if all(map(is_real, jax.tree_util.tree_leaves(data, is_leaf=is_list))):
         return data
     return jax.tree_util.tree_map(as_numbers, data, is_leaf=is_list)
 
 
-def _is_real(leaf: Any) -> bool:
-    return type(leaf) in (np.ndarray, np.float64) and leaf.dtype == float
-
-
-def innovation(z: Any, y: Any) -> tuple[Array, Array]:
-    """Tangent vector from a predicted to a real measurement, and which components are present.
+def innovation(z: State, y: Data) -> tuple[Array, Array]:
+    """Tangent vector from a predicted to a real measurement, and mask of present components.
 
     A component is missing where the measurement itself is NaN or infinite; a prediction that is
     not finite is a fault of the model and stays visible. Missing numbers are replaced before any
@@ -113,28 +113,27 @@ def innovation(z: Any, y: Any) -> tuple[Array, Array]:
     return jnp.where(present, manifold.local(z, filled), 0.0), present
 
 
-def _present(predicted, measured) -> Array:
+def _present(predicted: State, measured: State) -> Array:
     if not manifold.is_element(predicted):
         return jnp.isfinite(jnp.reshape(measured, -1))
-    # An element has fewer tangent components than numbers: ask which of them come out finite.
+    # An element has fewer tangent components than numbers: test the tangent vector.
     whole = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(measured)]))
     return jnp.isfinite(jnp.reshape(predicted.local(measured), -1)) | whole
 
 
 def left_out(o: Observation) -> tuple[Array, Array, Array, Array | None, Array]:
-    """Spread, excess, noise, deficit without the rows that are not used, and which ones are.
+    """Spread, excess, noise and deficit without the rows not used, and the mask of used rows.
 
     A row is not used if it was not accepted, or if it has no noise and repeats components above it
-    or reads what is known exactly: its spread is then rounding, which would correlate it with
-    everything. Such a row becomes unit noise, uncorrelated with the rest, so shapes stay and
-    nothing else changes.
+    or reads what is known exactly: its spread is then rounding, correlated with everything. It
+    becomes unit noise, uncorrelated with the rest, which keeps shapes.
     """
     kept = [jnp.where(o.accepted[:, None], b, 0.0) for b in (o.spread, o.excess, o.noise)]
     exact = o.accepted & ~jnp.any(kept[2] != 0.0, axis=1)
     size = jnp.where(exact, o.size, 0.0)
     used = jax.lax.cond(
         linalg.plainly_independent(o.noise),
-        lambda: o.accepted,  # noise of their own: nothing to look for, which is the usual case
+        lambda: o.accepted,  # all have noise, the usual case
         lambda: linalg.independent_rows(jnp.concatenate(kept, axis=1), size),
     )
     spread, excess, noise = (jnp.where(used[:, None], b, 0.0) for b in kept)
@@ -151,10 +150,10 @@ def whiten(factor: Array, used: Array, residual: Array) -> Normalised:
 
 
 def contradicted(o: Observation, seen: Normalised) -> Array:
-    """(m,) bool: components that are known exactly, but measure something else.
+    """(m,) bool: components that measure something else than what is known exactly.
 
-    They are known from the belief and the components that are used (R = 0 and P = 0, or one exact
-    sensor twice), so their residual follows from the other residuals.
+    It is known from the belief and the used components (R = 0 and P = 0, or one exact sensor
+    twice), so their residual follows from the other residuals.
     """
     idle = o.accepted & ~seen.used
 
@@ -162,8 +161,7 @@ def contradicted(o: Observation, seen: Normalised) -> Array:
         wide = jnp.concatenate([o.spread, o.excess, o.noise], axis=1)
         used = jnp.where(seen.used[:, None], wide, 0.0)
         if o.deficit is None:
-            # By an orthogonal transform: products of rows, divided by a pivot that is small
-            # against its row, would be rounding.
+            # An orthogonal transform, since products of rows over a small pivot are rounding.
             m = len(used)
             top = jnp.concatenate([used, jnp.diag(jnp.where(seen.used, 0.0, 1.0))], axis=1)
             share = linalg.tria(jnp.concatenate([top, jnp.pad(wide, ((0, 0), (0, m)))]))[m:, :m]
@@ -177,7 +175,7 @@ def contradicted(o: Observation, seen: Normalised) -> Array:
 
 
 def normalised(o: Observation) -> Normalised:
-    """The innovation normalised as the update would: what rules judge a measurement by."""
+    """Innovation normalised as in the update, by which rules judge a measurement."""
     spread, excess, noise, deficit, used = left_out(o)
     factor = linalg.tria(spread, excess, noise)
     if deficit is not None:

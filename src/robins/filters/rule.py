@@ -1,7 +1,7 @@
 """A rule: one published adaptation of the Kalman filter, as pure hooks.
 
-Rules know nothing of how the model was linearised, and keep what they remember in the filter's
-state, so that a run stays one scan, a batch one `vmap`, and streaming use the same code.
+Rules are independent of the linearisation, and keep their memory in the filter's state, so that a
+run stays one scan, a batch one `vmap`, and streaming uses the same code.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from jaxtyping import ArrayLike
+from jaxtyping import Array, ArrayLike
 
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.linearise import Transition
@@ -18,7 +18,7 @@ from robins.filters.observation import Observation
 from robins.filters.values import kind, value
 
 Memory = Any  # a pytree of arrays; its shapes may not change from step to step
-Again = Callable[["Rule"], Memory]  # the same run with another rule, to its end
+Again = Callable[["Rule"], Memory]  # memory at the end of the same run with another rule
 
 
 class Rule:
@@ -30,18 +30,16 @@ class Rule:
         process: ``(memory, transition) -> (memory, transition)``, after the model was linearised
             and before the covariance is formed: adapt ``noise``, remember ``spread``.
         before: ``(memory, prior, observation) -> (memory, prior, observation)``: fade the prior,
-            refuse components (``accepted``), scale ``noise``, say so (`Observation.noted`). A rule
-            that hands back *another* prior has the measurement linearised about it again, keeping
-            noise, refusals and notes; one that does not touch the prior must hand back the same
-            object.
+            refuse components (``accepted``), scale ``noise``, note it (`Observation.noted`). For
+            *another* prior the measurement is linearised again, keeping noise, refusals and notes;
+            a rule that does not change the prior must return the same object.
         after: ``(memory, posterior, info, observation) -> (memory, posterior, info)``: inflate,
             project, learn from the innovation; may add to ``info.notes``. The observation is the
             one the update used.
         name: prefix of its notes.
-        settle: ``(memory, belief) -> (memory, belief, code)``, once a step, when all its
-            measurements are in and the state is about to be predicted: inflate what the whole step
-            left. A code other than ``DONE`` says that the step cannot be taken: the belief then
-            stays, the memory of this hook is kept.
+        settle: ``(memory, belief) -> (memory, belief, code)``, once a step, after all its
+            measurements and before the prediction: inflate. With a code other than ``DONE`` the
+            step is not taken: the belief stays, the memory of this hook is kept.
 
     Rules are values (`robins.filters.values`): a class with `value` before it, whose numbers are
     fields and whose hooks are methods.
@@ -49,7 +47,7 @@ class Rule:
 
     name = "rule"
 
-    def __new__(cls, *args: Any, **kw: Any) -> Any:
+    def __new__(cls, *args, **kw) -> Any:
         """``Rule(before=f)`` is a rule of functions."""
         return object.__new__(Hooks if cls is Rule else cls)
 
@@ -69,34 +67,33 @@ class Rule:
     ) -> tuple[Memory, Belief, StepInfo]:
         return memory, posterior, info
 
-    def settle(self, memory: Memory, belief: Belief, /) -> tuple[Memory, Belief, Any]:
+    def settle(self, memory: Memory, belief: Belief, /) -> tuple[Memory, Belief, Array | int]:
         return memory, belief, int(Code.DONE)
 
     @property
     def settles(self) -> bool:
-        """True if it does anything once a step."""
+        """True if it has the hook `settle`."""
         return type(self).settle is not Rule.settle
 
     @property
     def reports(self) -> bool:
-        """True if there can be something to report."""
+        """True if it has the hook `report`."""
         return type(self).report is not Rule.report
 
     def report(
         self, start: Memory, final: Memory, again: Again | None, time: ArrayLike | None
     ) -> None:
-        """Raise what it has to report of a run, which compiled code cannot.
+        """Raise errors of a run, which compiled code cannot.
 
         Args:
-            start: memory that the run began with.
-            final: the one that it ended with.
-            again: runs with another rule in the place of this one to another `final`; None where
-                samples came one by one.
+            start: memory at the start of the run.
+            final: memory at its end.
+            again: the run with another rule in the place of this one; None in a stream.
             time: (T,) seconds of the steps.
         """
 
 
-_ANY: Any = None  # the hooks of `Rule` look at nothing of theirs
+_ANY: Any = None  # the hooks of `Rule` do not use self
 _SETTLE = partial(Rule.settle, _ANY)
 
 
@@ -104,12 +101,14 @@ _SETTLE = partial(Rule.settle, _ANY)
 class Hooks(Rule):
     """A rule of functions of a user, each equal to itself only."""
 
-    init: Any = kind(default=partial(Rule.init, _ANY))
-    process: Any = kind(default=partial(Rule.process, _ANY))
-    before: Any = kind(default=partial(Rule.before, _ANY))
-    after: Any = kind(default=partial(Rule.after, _ANY))
+    init: Callable[..., Memory] = kind(default=partial(Rule.init, _ANY))
+    process: Callable[..., tuple[Memory, Transition]] = kind(default=partial(Rule.process, _ANY))
+    before: Callable[..., tuple[Memory, Belief, Observation]] = kind(
+        default=partial(Rule.before, _ANY)
+    )
+    after: Callable[..., tuple[Memory, Belief, StepInfo]] = kind(default=partial(Rule.after, _ANY))
     name: str = kind(default="rule")
-    settle: Any = kind(default=_SETTLE)
+    settle: Callable[..., tuple[Memory, Belief, Array | int]] = kind(default=_SETTLE)
 
     @property
     def settles(self) -> bool:

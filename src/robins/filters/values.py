@@ -1,8 +1,7 @@
 """Values: frozen dataclasses whose numbers JAX may exchange, batch and differentiate.
 
 A field holds *data* (numbers, or values and tuples of them) unless it is a *kind*: declared so by
-`kind`, or a name or a plain function by its content. Kinds choose what is compiled; two values of
-equal kinds share it.
+`kind`, or a name or a plain function. Values of equal kinds share what is compiled.
 """
 
 from __future__ import annotations
@@ -17,24 +16,23 @@ from jax.core import Tracer
 from jax.tree_util import GetAttrKey, Partial, register_pytree_with_keys
 
 from robins.errors import require
+from robins.filters.checks import finite_numbers
 
 T = TypeVar("T")
-if TYPE_CHECKING:  # which knows no operator of a scalar of NumPy with an array of JAX
+Fields = tuple[tuple[str, ...], tuple[tuple[str, Hashable], ...]]  # names of data; kinds
+if TYPE_CHECKING:  # stubs lack operators between a scalar of NumPy and an array of JAX
     Numbers = jax.Array | Any
 else:
-    Numbers = jax.Array | np.ndarray | np.generic  # of a leaf; JAX's stand-ins are arrays too
+    Numbers = jax.Array | np.ndarray | np.generic  # a leaf; tracers of JAX are arrays too
 
 
 def kind(**how: Any) -> Any:
-    """A field that chooses what is compiled."""
+    """Field that chooses what is compiled."""
     return dataclasses.field(metadata={"kind": True}, **how)
 
 
 def is_kind(x: object) -> bool:
-    """True of a name or a plain function, into which JAX cannot look.
-
-    A `Partial`, or a callable that is a pytree such as a network, is data.
-    """
+    """True if x is a name or a plain function, not a `Partial` or a callable pytree."""
     return isinstance(x, str) or (callable(x) and jax.tree_util.all_leaves([x]))
 
 
@@ -44,28 +42,25 @@ def is_kind(x: object) -> bool:
 def value(cls: type[T]) -> type[T]:
     """Make a class a frozen dataclass that JAX takes as an argument.
 
-    Its instances are equal by identity. A transformation builds them without calling ``__init__``
-    or ``__post_init__``, since it puts stand-ins, batches and ``None`` in the place of numbers.
+    Its instances are equal by identity. A transformation builds them without ``__init__`` and
+    ``__post_init__``, since it replaces numbers by tracers, batches and ``None``.
     """
     cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     kinds = {f.name for f in fields if f.metadata.get("kind")}
     names = [f.name for f in fields]
 
-    def split(x: Any) -> tuple[tuple[str, ...], tuple[tuple[str, Any], ...]]:
+    def flatten(x: T):
         fixed = tuple((n, getattr(x, n)) for n in names if n in kinds or is_kind(getattr(x, n)))
         held = {n for n, _ in fixed}
-        return tuple(n for n in names if n not in held), fixed
-
-    def flatten_with_keys(x: Any) -> Any:
-        data, fixed = split(x)
-        return [(GetAttrKey(n), getattr(x, n)) for n in data], (data, fixed)
-
-    def flatten(x: Any) -> Any:
-        data, fixed = split(x)
+        data = tuple(n for n in names if n not in held)
         return [getattr(x, n) for n in data], (data, fixed)
 
-    def unflatten(aux: Any, children: Any) -> Any:
+    def flatten_with_keys(x: T):
+        children, aux = flatten(x)
+        return [(GetAttrKey(n), v) for n, v in zip(aux[0], children, strict=True)], aux
+
+    def unflatten(aux: Fields, children) -> T:
         data, fixed = aux
         x = object.__new__(cls)
         for n, v in (*fixed, *zip(data, children, strict=True)):
@@ -77,52 +72,67 @@ def value(cls: type[T]) -> type[T]:
 
 
 def is_known(x: object) -> bool:
-    """True if it holds no stand-in of a transformation."""
+    """True if it holds no tracer of a transformation."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree_util.tree_leaves(x))
 
 
-def number(what: str, given: Any, holds: Callable[[Any], Any] | None = None) -> Any:
-    """A number as a leaf: of float64, and checked where it is known.
+def is_share(x: Numbers) -> Numbers:
+    """Test for numbers in (0, 1]."""
+    return (x > 0.0) & (x <= 1.0)
 
-    A float of Python is of a weak type: mixed with arrays it would be another program.
 
-    Args:
-        what: is wrong where the check fails, for the error.
-        given: a number or an array, or a stand-in of a transformation, which passes.
-        holds: numbers -> bools, all of which must be true.
+def is_chance(x: Numbers) -> Numbers:
+    """Test for numbers in (0, 1)."""
+    return (x > 0.0) & (x < 1.0)
+
+
+def is_factor(x: Numbers) -> Numbers:
+    """Test for numbers in [1, inf)."""
+    return (x >= 1.0) & (x < np.inf)
+
+
+def number(
+    what: str, given: object, holds: Callable[[Numbers], Numbers | bool] | None = None
+) -> Numbers:
+    """A number as a leaf: of float64, not of a weak type as of Python; tracers pass.
 
     Raises:
-        TypeError: it is not of real numbers.
-        ValueError: the check fails.
+        TypeError: ``what, got ...``: it is not of real numbers.
+        ValueError: ``what, got ...``: the test is not true of all of them.
     """
     if not is_known(given):
         return given
     if np.asarray(given).dtype.kind not in "biuf":
         raise TypeError(f"{what}, got {given!r}")
     require(holds is None or bool(np.all(holds(np.asarray(given, float)))), what, given)
-    return given if isinstance(given, jax.Array) else np.asarray(given, float)
+    # whole numbers as leaves would break jax.grad
+    return given.astype(float) if isinstance(given, jax.Array) else np.asarray(given, float)
 
 
-def as_data(function: Callable[..., Any]) -> Callable[..., Any]:
+def finite_leaf(what: str, given: object) -> Numbers:
+    """Finite numbers as a leaf, checked where they are known (`finite_numbers`)."""
+    return finite_numbers(what, given) if is_known(given) else jax.numpy.asarray(given)
+
+
+def as_data(function: Callable[..., T]) -> Callable[..., T]:
     """A function as data: a plain one as a `Partial` that binds nothing."""
     return Partial(function) if is_kind(function) else function
 
 
 def on_device(tree: T) -> T:
-    """The same with arrays of JAX for numbers of NumPy, which each call would hand over anew."""
+    """Copy with arrays of JAX for numbers of NumPy, which each call would transfer again."""
     return jax.tree_util.tree_map(jax.numpy.asarray, tree)
 
 
-def content(*trees: Any) -> Hashable:
+def content(*trees: object) -> Hashable:
     """Key of values with equal kinds and numbers, for programs that fold them.
 
-    Functions are the same by identity.
+    Functions are compared by identity.
     """
+
+    def raw(x) -> np.ndarray:
+        is_key = jax.numpy.issubdtype(getattr(x, "dtype", float), jax.dtypes.prng_key)
+        return np.asarray(jax.random.key_data(x) if is_key else x)
+
     leaves, structure = jax.tree_util.tree_flatten(trees)
-    keyed = [jax.random.key_data(x) if _is_key(x) else x for x in leaves]
-    arrays = [np.asarray(x) for x in keyed]
-    return structure, tuple((a.dtype.str, a.shape, a.tobytes()) for a in arrays)
-
-
-def _is_key(x: Any) -> bool:
-    return isinstance(x, jax.Array) and jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return structure, tuple((a.dtype.str, a.shape, a.tobytes()) for a in map(raw, leaves))

@@ -3,10 +3,4 @@
 from robins.filters.limits.constrain import Constrained, constrain
 from robins.filters.limits.interval import Bounded, clip, truncate
 
-__all__ = [
-    "Bounded",
-    "Constrained",
-    "clip",
-    "constrain",
-    "truncate",
-]
+__all__ = ["Bounded", "Constrained", "clip", "constrain", "truncate"]

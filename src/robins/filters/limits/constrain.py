@@ -1,26 +1,25 @@
 """Hold a belief to an equality: exact or noisy, linear or not, nearest in any metric.
 
-A constraint g(x) = d is a measurement of g that reads d, without noise if it is exact. So it is
-linearised and used as one, and components that are known already are left out. Only its gain may
-differ: with V = P the constrained state is the most probable one, with V = W^-1 the one nearest
-to the mean in the metric W,
+A constraint g(x) = d is a measurement of g that reads d, without noise if it is exact; components
+already known are left out. Only its gain may differ: with V = P the constrained state is the most
+probable one, with V = W^-1 the one nearest to the mean in the metric W,
 
     G = V D' (D V D')^-1,   x* = x - G (g(x) - d),   P* = (I - G D) P (I - G D)' + G R_d G'
 
 (Simon & Chia 2002, sec. II), D the slope of g and R_d the covariance of the constraint's error. No
-covariance is got by subtracting another.
+covariances are subtracted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.errors import require
@@ -28,23 +27,22 @@ from robins.filters.belief import Belief
 from robins.filters.iterated import iterated
 from robins.filters.kalman import updated
 from robins.filters.linearise import taylor
-from robins.filters.model import Data, Sensor, as_noise
+from robins.filters.model import Data, Given, Sensor, as_noise
 from robins.filters.observation import Observation, contradicted, normalised
 from robins.filters.values import as_data, is_known
 from robins.manifold import State
 
-Given = ArrayLike | Sequence[Any]
-Function = Given | Callable[[State], Any]  # a matrix D, for D x, or a function of the state
+Function = Given | Callable[[State], Data]  # a matrix D, for D x, or a function of the state
 Weight = Literal["covariance", "identity"] | Given
 
 ITERATIONS = 4
 
-# Of a row of unit length, what those above must leave; cond(D D') is then below 1e12.
+# Least remainder of a row of unit length after those above; cond(D D') is then below 1e12.
 _INDEPENDENT = 1e-6
 
 
 class Constrained(NamedTuple):
-    """A belief held to a constraint of c components, and how far it was from it."""
+    """A belief held to a constraint of c components, and its residual before."""
 
     belief: Belief
     residual: Array  # (c,) d - g(x) before
@@ -58,7 +56,7 @@ class Constrained(NamedTuple):
 def constrain(
     belief: Belief,
     g: Function,
-    d: Any = None,
+    d: Data = None,
     weight: Weight = "covariance",
     noise: Given | None = None,
     hard: bool = False,
@@ -66,22 +64,21 @@ def constrain(
 ) -> Constrained:
     """Hold a belief to ``g(x) = d``; may be compiled, with D, d, weight and noise as data.
 
-    Without noise the mean is put on the constraint and nothing is uncertain across it. With noise,
-    constraint and belief are weighed against each other as a measurement would be.
+    Without noise the mean is put on the constraint and nothing is uncertain across it. With noise
+    the constraint is weighed as a measurement.
 
     Args:
-        belief: what to hold.
+        belief: to be held.
         g: (c, n) matrix D, for D x with x the numbers of a state of arrays in tangent order; or a
             function of the state, with values in an array or in elements such as `Angle`.
-        d: what g(x) must equal, of the form of g(x); zero if left out.
+        d: value of g(x), of the same form; zero if left out.
         weight: metric W in which the constrained state is nearest to the mean: "covariance" for
             P^-1 (the only one that weighs noise), "identity", or a positive definite (n, n) matrix
             in tangent coordinates.
         noise: (c,) standard deviations of the constraint's error, or a (c, k) factor of R_d.
-        hard: put the mean on the constraint although that is noisy, and count its noise in the
-            covariance; weights other than "covariance" always do. Worse than no constraint where
-            R_d exceeds D P D'.
-        iterations: how often a function is linearised, by Gauss-Newton.
+        hard: put the mean on a noisy constraint, and its noise into the covariance, as weights
+            other than "covariance" always do. Worse than no constraint where R_d exceeds D P D'.
+        iterations: linearisations of a function, by Gauss-Newton.
 
     Raises:
         ValueError: shapes do not fit, a matrix is given for a state that holds elements, or
@@ -114,10 +111,9 @@ def constrain(
 
 
 def nearest(metric: Belief, o: Observation) -> tuple[State, Array, Array, Array]:
-    """The state nearest to the mean that meets an exact observation, and how it is found.
+    """State nearest to the mean that meets an exact observation, its gain, and two masks.
 
-    Returns:
-        The state, its gain, the components used, and those that contradict what is known exactly.
+    The masks are of the components used, and of those that contradict what is known exactly.
     """
     seen = normalised(o)
     spread = jnp.where(seen.used[:, None], o.spread, 0.0)
@@ -127,8 +123,8 @@ def nearest(metric: Belief, o: Observation) -> tuple[State, Array, Array, Array]
     return mean, gain, seen.used, contradicted(o, seen)
 
 
-def as_sensor(mean: State, g: Function, d: Any, noise: Given | None) -> tuple[Sensor, Any]:
-    """A constraint as a sensor, and what that sensor reads."""
+def as_sensor(mean: State, g: Function, d: Data, noise: Given | None) -> tuple[Sensor, Data]:
+    """A constraint as a sensor, and its measurement."""
     read, linear, value = (g, None, g(mean)) if callable(g) else _by_matrix(mean, g)
     c = manifold.dim(value)
     if d is not None:
@@ -143,8 +139,8 @@ def as_sensor(mean: State, g: Function, d: Any, noise: Given | None) -> tuple[Se
     return Sensor(Partial(_of_state, as_data(read)), root, c, "constraint", linear), target
 
 
-def _by_matrix(mean: State, matrix: Given) -> tuple[Any, Any, Array]:
-    """D x as a function, the same with its slope, and a value of it."""
+def _by_matrix(mean: State, matrix: Given) -> tuple[Partial, Partial, Array]:
+    # D x as a function, as a function with its slope, and a value of its shape
     if any(manifold.is_element(leaf) for leaf in manifold.leaves(mean)):
         raise ValueError(
             "a matrix constrains a state of plain arrays, this one holds elements: "
@@ -155,12 +151,10 @@ def _by_matrix(mean: State, matrix: Given) -> tuple[Any, Any, Array]:
         raise ValueError(
             f"D is {D.shape}: one column for each of {manifold.dim(mean)} states is wanted"
         )
-
     return Partial(_product, D), Partial(_product_linear, D), jnp.zeros(len(D))
 
 
-def _of_state(read: Callable[[State], Any], x: State, aux: Data) -> Any:
-    """A function of the state alone, as a sensor reads."""
+def _of_state(read: Callable[[State], Data], x: State, aux: Data) -> Data:
     return read(x)
 
 
@@ -176,10 +170,10 @@ def metric_of(belief: Belief, weight: Weight) -> tuple[Belief, Array | None]:
     """A belief of covariance W^-1, and the factor of W; the belief itself for W = P^-1."""
     n = belief.factor.shape[0]
     if isinstance(weight, str):
+        known = weight in ("covariance", "identity")
+        require(known, "weight must be 'covariance', 'identity' or a matrix", repr(weight))
         if weight == "covariance":
             return belief, None
-        if weight != "identity":
-            raise ValueError(f"weight must be 'covariance', 'identity' or a matrix, got {weight!r}")
         unit = jnp.eye(n)
         return Belief(belief.mean, unit), unit
     W = jnp.asarray(weight, float)
@@ -188,29 +182,21 @@ def metric_of(belief: Belief, weight: Weight) -> tuple[Belief, Array | None]:
     return Belief(belief.mean, linalg.solve_lower_transposed(root, jnp.eye(n))), root
 
 
-def check_rows(D: np.ndarray, d: np.ndarray, exact: np.ndarray) -> None:
-    """Refuse exact constraints that repeat each other, at the boundary.
-
-    Args:
-        D: (c, n).
-        d: (c,).
-        exact: (c,) bool, the rows to look at: one with noise may say again what is said.
+def check_rows(rule: str, D: np.ndarray, d: np.ndarray, exact: np.ndarray) -> None:
+    """Refuse constraints D x = d whose rows repeat each other where they are ``exact``, (c,) bool.
 
     Raises:
-        ValueError: a row of D is zero, or depends on those above it; it says which row, the rank,
-            and whether the rows can be met at all.
+        ValueError: a row of D is zero, or depends on those above it; with the row, the rank, and
+            whether all rows can be met.
     """
     length = np.linalg.norm(D, axis=1)
     zero = length <= 1e-14 * np.max(length, initial=0.0)
     unit = D / np.where(zero, 1.0, length)[:, None]
-    basis, kept, fault = np.zeros((0, D.shape[1])), [], None
+    kept, fault = [], None
     for row in np.flatnonzero(exact):
-        rest = unit[row]
-        for _ in range(2):  # twice, so that the basis stays orthogonal
-            rest = rest - (rest @ basis.T) @ basis
-        left = np.linalg.norm(rest)
-        if left > _INDEPENDENT and not zero[row]:
-            basis = np.concatenate([basis, rest[None] / left])
+        share = np.linalg.lstsq(unit[kept].T, unit[row])[0] if kept else np.zeros(0)
+        rest = unit[row] - share @ unit[kept]
+        if np.linalg.norm(rest) > _INDEPENDENT and not zero[row]:
             kept.append(row)
         elif fault is None:
             fault = row, list(kept)
@@ -221,25 +207,24 @@ def check_rows(D: np.ndarray, d: np.ndarray, exact: np.ndarray) -> None:
     scale = np.abs(d[row]) + np.abs(share) @ np.abs(d[above])
     contradicts = np.abs(d[row] - share @ d[above]) > 1e-9 * scale
     what = "is zero" if zero[row] else "depends on those above it"
-    mend = "and d contradicts them" if contradicts else "and says nothing new: leave it out"
+    fix = "and d contradicts them" if contradicts else "and says nothing new: leave it out"
     raise ValueError(
-        f"D has rank {len(kept)} for {np.sum(exact)} exact rows: "
-        f"row {row}, counted from 0, {what} {mend}"
+        f"{rule}: D has rank {len(kept)} for {np.sum(exact)} exact rows: "
+        f"row {row}, counted from 0, {what} {fix}"
     )
 
 
 def as_weight(rule: str, weight: Weight) -> Weight:
-    """The metric W of a rule, checked: a name, or a matrix as a leaf."""
+    """Metric W of a rule, checked: a name, or a matrix as a leaf."""
     if isinstance(weight, str):
-        known = weight in ("covariance", "identity")
         sentence = f"{rule} weight must be 'covariance', 'identity' or a matrix"
-        require(known, sentence, repr(weight))
+        require(weight in ("covariance", "identity"), sentence, repr(weight))
         return weight
     if not is_known(weight):
         return weight
     W = np.asarray(weight, float)
     if not np.all(np.diag(linalg.factor(W, f"{rule} weight")) > 0.0):
-        raise ValueError(f"{rule} weight is not positive definite: each state wants a weight")
+        raise ValueError(f"{rule} weight is not positive definite: each state needs a weight")
     return W
 
 

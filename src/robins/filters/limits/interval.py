@@ -1,4 +1,4 @@
-"""Hold a belief within bounds: move its mean to the nearest state inside, or cut its density."""
+"""Hold a belief within bounds: clip its mean to the nearest state inside, or truncate it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief
-from robins.filters.limits.constrain import Function, Given, Weight, as_sensor, metric_of, nearest
+from robins.filters.limits.constrain import Function, Weight, as_sensor, metric_of, nearest
 from robins.filters.linearise import taylor
+from robins.filters.model import Given
 from robins.filters.observation import CONTRADICTS, Observation
 from robins.filters.trees import select
 
@@ -22,17 +23,17 @@ _FOLDS = 40.0
 
 
 class Bounded(NamedTuple):
-    """A belief within bounds on c readings, and what there was to do."""
+    """A belief within bounds on c components."""
 
     belief: Belief
-    outside: Array  # (c,) bool: the mean was out of these bounds
-    # () bool: no state fulfils all bounds, and the belief is as it was; or a reading that is known
-    # exactly violates its own, and stays
+    outside: Array  # (c,) bool: the mean violated these bounds
+    # () bool: no state fulfils all bounds, and the belief stays; or a component that is known
+    # exactly violates its own
     infeasible: Array
 
 
-def _seen(belief: Belief, g: Function) -> Observation:
-    """g(x), which is bounded, as a measurement that reads zero: its residual is -g(x)."""
+def _observed(belief: Belief, g: Function) -> Observation:
+    """Measurement of g(x) that reads zero: its residual is -g(x)."""
     sensor, zero = as_sensor(belief.mean, g, None, None)
     return taylor().observation(belief, sensor, zero, None)
 
@@ -44,11 +45,11 @@ def clip(
 
         x* = argmin (x - m)' W (x - m)   subject to   lower <= D x <= upper
 
-    exactly, by the dual active-set method (Goldfarb & Idnani 1983), of which the solution is the
-    projection on the rows that are active. Functions are linearised once, about the mean.
+    exactly, by the dual active-set method (Goldfarb & Idnani 1983): the projection on the active
+    rows. Functions are linearised once, about the mean.
 
     Args:
-        belief: what to hold.
+        belief: to be held.
         g: (c, n) matrix or function of the state with values in an array, as in `constrain`.
         lower: (c,); -inf where there is none.
         upper: (c,); inf where there is none.
@@ -58,30 +59,28 @@ def clip(
         ValueError: shapes do not fit.
     """
     metric, _ = metric_of(belief, weight)
-    o = _seen(metric, g)
+    o = _observed(metric, g)
     value = -o.residual
     low, high = jnp.asarray(lower, float), jnp.asarray(upper, float)
     at_low, at_high, infeasible, denied = _active(o, low - value, high - value)
-    # Which rows are active does not change with small changes, so gradients pass them by.
+    # The active rows are locally constant, so they have no derivative.
     shift = jnp.where(at_low, low - value, jnp.where(at_high, high - value, 0.0))
     moved = nearest(metric, o._replace(residual=shift, accepted=at_low | at_high))[0]
-    mean = jax.tree_util.tree_map(
-        lambda new, old: jnp.where(infeasible, old, new), moved, belief.mean
-    )
+    mean = select(infeasible, belief.mean, moved)
     outside = (value < low) | (value > high)
     return Bounded(belief._replace(mean=mean), outside, infeasible | denied)
 
 
 def _active(o: Observation, low: Array, high: Array) -> tuple[Array, Array, Array, Array]:
-    """Lower and upper bounds that are active at the nearest state, and whether there is one.
+    """Lower and upper bounds that are active at the nearest state.
 
     Returns:
-        (c,) and (c,) bool; () whether no state fulfils the bounds of what may move; () whether a
-        reading that is known exactly violates its own.
+        (c,) and (c,) bool; () no state fulfils the bounds of components that may move; () a
+        component that is known exactly violates its own.
 
-    In units of the belief the state nearest to 0 is sought with N t >= b, rows of N of unit length.
-    A violated row is met by a step in the space of the active ones; where a multiplier would turn
-    negative on the way, its row is let go first.
+    In units of the belief: the least t with N t >= b, rows of N of unit length. A violated row is
+    met by a step in the space of the active ones; a row whose multiplier would turn negative on the
+    way is dropped first.
     """
     spread, size, low, high = jax.lax.stop_gradient((o.spread, o.size, low, high))
     c = len(low)
@@ -135,28 +134,22 @@ def _active(o: Observation, low: Array, high: Array) -> tuple[Array, Array, Arra
 def truncate(belief: Belief, g: Function, lower: Given, upper: Given) -> Bounded:
     """Cut the density at ``lower <= g(x) <= upper`` and keep its mean and covariance.
 
-    Row by row: z = D_i x is N(mu, s^2), its density cut to the bounds has mean mu + s alpha and
-    variance s^2 v, and the regression of the state on z stays (Simon & Simon 2010, sec. 2.4),
+    Row by row: z = D_i x is N(mu, s^2), truncated it has mean mu + s alpha and variance s^2 v, and
+    the regression of the state on z stays (Simon & Simon 2010, sec. 2.4),
 
         x := x + P D_i' alpha / s,   S := S (I - (1 - v^1/2) a a'),   a = S' D_i' / s
 
     whose square is P - (1 - v) P D_i' D_i P / s^2: no variance grows. Exact for one row, and for
-    rows whose readings are not correlated; for others it depends on their order. Where no state is
-    inside all bounds the belief stays.
-
-    Args:
-        belief: what to cut.
-        g: (c, n) matrix or function of the state with values in an array, as in `constrain`; a
-            function is linearised about the mean.
-        lower: (c,); -inf where there is none.
-        upper: (c,); inf where there is none.
-
-    Raises:
-        ValueError: shapes do not fit.
+    uncorrelated rows; for others it depends on their order. Where no state is inside all bounds the
+    belief stays. Arguments and errors are those of `clip`.
     """
-    o = _seen(belief, g)
+    o = _observed(belief, g)
     low = jnp.asarray(lower, float) + o.residual
     high = jnp.asarray(upper, float) + o.residual
+
+    def scaled(bound: Array, mean: Array, s: Array) -> Array:
+        finite = jnp.isfinite(bound)  # the derivative of inf / s is NaN
+        return jnp.where(finite, (jnp.where(finite, bound, 0.0) - mean) / s, bound)
 
     def cut(state, row):
         t, M = state
@@ -166,7 +159,7 @@ def truncate(belief: Belief, g: Function, lower: Given, upper: Given) -> Bounded
         s = jnp.sqrt(jnp.where(known, 1.0, a @ a))
         a = jnp.where(known, 0.0, a / s)
         at = reading @ t
-        alpha, v = truncated_moments(_scaled(low, at, s), _scaled(high, at, s))
+        alpha, v = truncated_moments(scaled(low, at, s), scaled(high, at, s))
         solid = v > 0.0
         root = jnp.where(solid, jnp.sqrt(jnp.where(solid, v, 1.0)), 0.0)
         column = M @ a
@@ -182,14 +175,8 @@ def truncate(belief: Belief, g: Function, lower: Given, upper: Given) -> Bounded
     return Bounded(kept, (low > 0.0) | (high < 0.0), infeasible | denied)
 
 
-def _scaled(bound: Array, mean: Array, s: Array) -> Array:
-    # The slope of inf / s would be no number.
-    finite = jnp.isfinite(bound)
-    return jnp.where(finite, (jnp.where(finite, bound, 0.0) - mean) / s, bound)
-
-
 def truncated_moments(low: Array, high: Array) -> tuple[Array, Array]:
-    """Mean and variance of a standard normal number cut to low <= z <= high.
+    """Mean and variance of a standard normal number truncated to low <= z <= high.
 
     By quadrature about the greatest density inside: the closed forms in erf lose a variance of
     1/low^2 among numbers of low^2, and all digits a hundred deviations out.

@@ -1,4 +1,4 @@
-"""What fading rules share: innovations in units of the noise, their power, faded covariances."""
+"""Innovations in units of the noise, their power, and faded covariances, for fading rules."""
 
 from __future__ import annotations
 
@@ -19,36 +19,33 @@ from robins.filters.values import Numbers, number
 
 Weights = ArrayLike | Sequence[Number] | None
 
-_SOLID = 1e-6  # pivots below this share of a state's deviation are not divided by just so
-_FLOOR = 1e-10  # and nothing is taken to be more certain than this share
+_SOLID = 1e-6  # least pivot that is divided by, as a share of a state's deviation
+_FLOOR = 1e-10  # least deviation otherwise, as the same share
 
 
 class White(NamedTuple):
-    """A measurement whitened by R^-1/2, so that traces add what has no unit."""
+    """A measurement whitened by R^-1/2, so that traces have no unit."""
 
     residual: Array  # (m,) R^-1/2 r
     spread: Array  # (m, n) R^-1/2 H S
-    left_over: Array  # () trace of what the linearisation leaves over
+    left_over: Array  # () trace of R^-1 Omega, the linearisation error
     counts: Array  # (m,) bool: used, and with noise of its own; the others are zero
     seen: Array  # (m, n) H S in the sensor's units
-    size: Array  # (m,) of what those may have been summed from
+    size: Array  # (m,) size of its summands
 
     @property
     def predicted(self) -> Array:
-        """Trace of R^-1 H P H', with what the linearisation leaves over."""
+        """Trace of R^-1 (H P H' + Omega)."""
         return jnp.sum(self.spread**2) + self.left_over
 
     @property
     def dof(self) -> Array:
-        """Number of components, which is the trace of R^-1 R."""
+        """Number of components, the trace of R^-1 R."""
         return jnp.sum(self.counts).astype(float)
 
 
 def whitened(o: Observation) -> White:
-    """An innovation, and what was expected of it, in units of the sensor's own noise.
-
-    A component without noise of its own has no such unit and does not count.
-    """
+    """Innovation and its expectation in units of the noise, for components that have noise."""
     root, counts = _root(o.noise, o.accepted & o.present)
     n = o.spread.shape[1]
     away = jnp.zeros_like(o.residual) if o.deficit is None else o.deficit
@@ -56,8 +53,8 @@ def whitened(o: Observation) -> White:
     white = linalg.solve_lower(root, jnp.concatenate(columns, axis=1))
     left_over = jnp.sum(white[:, n + 2 :] ** 2) - jnp.sum(white[:, 1] ** 2)
     seen = jnp.where(counts[:, None], o.spread, 0.0)
-    # A component may be made of what others read, as of a vector that is turned: in units of the
-    # noise it has the rounding of the largest.
+    # A component may be a combination of others, as of a rotated vector: in units of the noise it
+    # has the rounding of the largest.
     deviation = jnp.where(counts, jnp.sqrt(jnp.sum(o.noise**2, axis=1)), 1.0)
     largest = jnp.max(jnp.where(counts, o.size / deviation, 0.0))
     size = jnp.where(counts, jnp.maximum(o.size, largest * deviation), o.size)
@@ -65,12 +62,12 @@ def whitened(o: Observation) -> White:
 
 
 def _root(noise: Array, taken: Array) -> tuple[Array, Array]:
-    """Factor of R without the rows not taken, safe to solve with, and which rows it knows."""
+    """Factor of R without the rows not taken, safe to solve with, and its independent rows."""
     m = len(noise)
     kept = jnp.where(taken[:, None], noise, 0.0)
     if noise.shape[1] < m:
         return linalg.guard(kept)
-    # The usual noise is a triangle already, and what is missing correlates with nothing.
+    # The usual noise is a triangle, uncorrelated with missing components.
     square = kept[:, :m] + jnp.diag(jnp.where(taken, 0.0, 1.0))
     whole = jnp.concatenate([square, kept[:, m:]], axis=1)
     apart = ~jnp.any((kept[:, :m] != 0.0) & ~taken[None, :])
@@ -82,16 +79,14 @@ def _root(noise: Array, taken: Array) -> tuple[Array, Array]:
     )
 
 
-def averaged(power: Array, white: White, keep: Number | Numbers) -> Array:
-    """A step of the exponential average of squared residuals; those that do not count stay."""
+def averaged(power: Array, white: White, keep: Number) -> Array:
+    """Exponential average of squared residuals; components that do not count stay."""
     fresh = keep * power + (1.0 - keep) * white.residual**2
     return jnp.where(white.counts, fresh, power)
 
 
-def significant(
-    power: Array, white: White, keep: Number | Numbers, sigmas: Number | Numbers
-) -> Array:
-    """Whether averaged squares exceed what the filter expects by so many standard deviations.
+def significant(power: Array, white: White, keep: Number, sigmas: Number) -> Array:
+    """() bool: averaged squares exceed their expectation by so many standard deviations.
 
     An average with weights (1 - keep) keep^i of squares of m unit normals has mean m and relative
     variance 2 (1 - keep) / ((1 + keep) m).
@@ -102,16 +97,16 @@ def significant(
 
 
 def exceeds(power: Array, white: White, level: Array) -> Array:
-    """Whether averaged squares exceed so many times what the filter expects."""
+    """() bool: averaged squares exceed so many times their expectation."""
     return power > level * (white.predicted + white.dof)
 
 
 def chance_levels(keep: float, most: int, probability: float) -> np.ndarray:
-    """(most + 1,) what the average of `significant` exceeds so rarely, of 0, 1, ..., most squares.
+    """(most + 1,) quantiles of the average of `significant`, of 0, 1, ..., most squares.
 
     With weights w = (1 - keep) keep^i its cumulants are those of c_s = m sum w^s, s = 1, 2, 3. The
-    chi-square of h = c_2^3 / c_3^2 degrees that is shifted and scaled to the first two has the
-    third as well (Imhof, Biometrika 48, 1961, after Pearson 1959):
+    chi-square of h = c_2^3 / c_3^2 degrees, shifted and scaled to the first two, has the third as
+    well (Imhof, Biometrika 48, 1961, after Pearson 1959):
 
         level = 1 + (chi2_h^-1(1 - probability) - h) sqrt(c_2 / h) / m
     """
@@ -125,22 +120,21 @@ def chance_levels(keep: float, most: int, probability: float) -> np.ndarray:
 
 
 def total(power: Array, white: White) -> Array:
-    """Trace of the averaged power of the components that count."""
+    """Trace of the averaged power."""
     return jnp.sum(jnp.where(white.counts, power, 0.0))
 
 
-def ratio(N: Array, M: Array, limit: Number | Numbers) -> Array:
-    """Fading factor max(1, N / M), up to a limit; 1 where there is nothing to fade."""
+def ratio(N: Array, M: Array, limit: Number) -> Array:
+    """Fading factor max(1, N / M), up to a limit; 1 where M is 0."""
     solid = M > 0.0
     return jnp.where(solid, jnp.clip(N / jnp.where(solid, M, 1.0), 1.0, limit), 1.0)
 
 
 def seen_by(spread: Array, S: Array) -> Array:
-    """H where only S and the spread H S are known.
+    """H from S and the spread H S.
 
-    Where S is all but singular H = (H S) S' (S S')^-1 has a floor under what is all but certain:
-    for A in the range of S, H A errs by 1e-10 of a state's deviation at most, and a state known
-    exactly may be among them.
+    For S nearly singular H = (H S) S' (S S')^-1 has a floor under small deviations: for A in the
+    range of S, H A errs by 1e-10 of a state's deviation at most; states may be known exactly.
     """
     sigma = jnp.sqrt(jnp.sum(S**2, axis=1))
 
@@ -155,45 +149,33 @@ def seen_by(spread: Array, S: Array) -> Array:
     return jax.lax.cond(jnp.all(pivots > _SOLID * sigma), solid, singular)
 
 
-def _where_seen(S: Array, white: White, factor: Array) -> Array:
-    """Factor of P + (lambda - 1) P H' (H P H')^+ H P: H P H' grows by lambda and nothing else does.
-
-    The added part is S T'T S' with T the orthonormal rows that span those of H S. A vector has
-    three components and shows two directions: what rounding leaves of the third is none.
-    """
-    root, _ = linalg.guard(white.seen, white.size)
-    T = linalg.solve_lower(root, white.seen)
-    return linalg.tria(S + (jnp.sqrt(factor) - 1.0) * ((S @ T.T) @ T))
-
-
 def faded(
-    S: Array,
-    white: White,
-    N: Array,
-    form: str,
-    weights: Numbers | None,
-    limit: Number | Numbers,
+    S: Array, white: White, N: Array, form: str, weights: Numbers | None, limit: Number
 ) -> tuple[Array, Array]:
-    """A factor S of P faded such that the channel expects N more than its noise.
+    """Factor S of P faded such that its share of the innovation has the power N, and lambda.
 
     Args:
         S: (n, n).
-        white: the measurement as S lets it expect.
-        N: () excess power to be explained.
-        form: "lumped" lambda P, "multiple" Lam^1/2 P Lam^1/2, "projected" only what is seen.
-        weights: (n,) of states for "multiple", greatest 1; None for all alike.
+        white: the measurement relative to S.
+        N: () power beyond that of the noise.
+        form: "lumped" lambda P, "multiple" Lam^1/2 P Lam^1/2, or "projected"
+            P + (lambda - 1) P H' (H P H')^+ H P, by which only H P H' grows.
+        weights: (n,) of states for "multiple", greatest 1; None: equal.
         limit: upper bound of lambda.
-
-    Returns:
-        The faded factor and lambda (the greatest of them where there are several).
     """
-    if form == "projected":
+
+    def wider() -> Array:
+        # The added part is S T'T S' with T the orthonormal rows that span those of H S. `guard`
+        # drops rows within rounding, such as the third of a unit vector.
+        root, _ = linalg.guard(white.seen, white.size)
+        T = linalg.solve_lower(root, white.seen)
+        return linalg.tria(S + (jnp.sqrt(factor) - 1.0) * ((S @ T.T) @ T))
+
+    if form != "multiple" or weights is None:
         factor = ratio(N, white.predicted, limit)
-        wider = jax.lax.cond(factor > 1.0, lambda: _where_seen(S, white, factor), lambda: S)
-        return wider, factor
-    if form == "lumped" or weights is None:
-        factor = ratio(N, white.predicted, limit)
-        return jnp.sqrt(factor) * S, factor
+        if form != "projected":
+            return jnp.sqrt(factor) * S, factor
+        return jax.lax.cond(factor > 1.0, wider, lambda: S), factor
     each = jnp.sum((S @ white.spread.T) * seen_by(white.spread, S).T, axis=1)  # (P H' H)_jj
     factor = ratio(N, jnp.sum(weights * each) + white.left_over, limit)
     return jnp.sqrt(jnp.maximum(weights * factor, 1.0))[:, None] * S, factor
@@ -205,7 +187,7 @@ def checked_weights(rule: str, weights: Weights, form: str) -> Numbers | None:
         return None
     require(form == "multiple", f"{rule} weights are for 'multiple', not {form!r}")
 
-    def sound(a: np.ndarray) -> bool:
+    def sound(a: Numbers) -> bool:
         return bool(a.ndim == 1 and np.all(np.isfinite(a) & (a >= 0.0)) and np.any(a > 0.0))
 
     a = number(f"{rule} weights must be (n,) numbers >= 0, not all 0", weights, sound)
@@ -213,7 +195,7 @@ def checked_weights(rule: str, weights: Weights, form: str) -> Numbers | None:
 
 
 def check_size(rule: str, a: Numbers | None, belief: Belief) -> None:
-    """Refuse more or fewer weights than the state has components."""
+    """Refuse weights that are not one a component of the state."""
     n = belief.factor.shape[0]
     count = n if a is None else len(a)
     require(count == n, f"{rule} weights are {count}, the state has {n} components")

@@ -1,9 +1,8 @@
-"""What the H-infinity rules share: weights, local bounds, and inflation of a factor."""
+"""Weights, local bounds and inflation of a factor, shared by the H-infinity rules."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,19 +13,18 @@ from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.checks import finite_numbers
+from robins.filters.model import Given
 from robins.filters.values import Numbers, is_known
 from robins.manifold import State
 
-Weight = Numbers | Callable[[State], Any]  # (q, n) L, or mean -> (q, n) or (n,)
-Rows = Callable[[State], Array]  # mean -> (q, n)
+Weight = Numbers | Callable[[State], ArrayLike]  # (q, n) L, or mean -> (q, n) or (n,)
+GivenWeight = Weight | Given
 
 
-def as_weight(weight: Any, whose: str) -> Weight:
-    """L, the rows whose error is bounded, as a leaf of a rule.
+def as_weight(weight: GivenWeight, whose: str) -> Weight:
+    """L, the rows whose error is bounded, as a leaf of the rule named for messages.
 
-    Args:
-        weight: (q, n) matrix, (n,) diagonal, or ``mean -> `` one of these, which stays as it is.
-        whose: rule it belongs to, for messages.
+    From a (q, n) matrix, an (n,) diagonal, or ``mean -> `` one of these, which stays as it is.
     """
     if callable(weight):
         return weight
@@ -34,12 +32,9 @@ def as_weight(weight: Any, whose: str) -> Weight:
         return _rows(jnp.asarray(weight, float), whose)
     numbers = finite_numbers(f"{whose}: weight", weight)
     require(np.any(numbers), f"{whose}: weight is zero, so no error would count")
-    if numbers.ndim == 1:
-        numbers = np.diag(numbers)
-    if numbers.ndim == 2:
-        numbers = numbers[np.any(numbers != 0.0, axis=1)]
     _check_shape(numbers, whose)
-    return numbers
+    numbers = np.diag(numbers) if numbers.ndim == 1 else numbers
+    return numbers[np.any(numbers != 0.0, axis=1)]
 
 
 def rows_of(weight: Weight, mean: State, whose: str) -> Array:
@@ -62,9 +57,9 @@ def _check_shape(L: Numbers, whose: str) -> None:
         )
 
 
-def weighted_factor(rows: Rows, belief: Belief, whose: str) -> Float[Array, "q n"]:
+def weighted_factor(weight: Weight, belief: Belief, whose: str) -> Float[Array, "q n"]:
     """L S, whose greatest singular value is the local bound."""
-    L, n = rows(belief.mean), belief.factor.shape[0]
+    L, n = rows_of(weight, belief.mean, whose), belief.factor.shape[0]
     if L.shape[1] != n:
         raise ValueError(f"{whose}: weight has {L.shape[1]} columns, the state has {n} components")
     return L @ belief.factor
@@ -82,8 +77,7 @@ def inflated(
 ) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     """Factor of ``S (I - A'A)^-1 S'`` for A = L S / gamma, and whether that exists.
 
-    It exists when I - A'A has a Cholesky factor, which is asked before anything is solved. Where it
-    does not, the factor comes back as it was.
+    It exists when I - A'A has a Cholesky factor; otherwise S is returned.
     """
     return _divided(factor, jnp.eye(factor.shape[0]) - A.T @ A)
 
@@ -94,8 +88,8 @@ def deflated(
     """Factor of the largest P that leaves L P L' within share gamma^2, and whether that is less.
 
     With S'L'LS / gamma^2 = U diag(a) U' it is S U diag(min(1, share / a)) U'S'. As an inverse that
-    is I + (a - share)_+ / share, so that only what is too much has a root taken. Derivatives take
-    what is too much as given.
+    is I + (a - share)_+ / share, so that only the excess has a root taken. Derivatives take the
+    excess as given.
     """
     n = factor.shape[0]
     excess = linalg.symmetric_root(jax.lax.stop_gradient(A.T @ A - share * jnp.eye(n)))
@@ -103,7 +97,7 @@ def deflated(
     return lower, jnp.any(excess != 0.0)
 
 
-def _divided(factor, M):
+def _divided(factor: Array, M: Array) -> tuple[Array, Array]:
     """Lower factor of S M^-1 S', and whether M is positive definite.
 
     With N upper triangular, N N' = M, the product S N^-T is lower triangular as S is. N is the

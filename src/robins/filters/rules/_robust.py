@@ -1,4 +1,4 @@
-"""Shared by robust rules: parts of an innovation, weights, refusals, and the way out of a lock."""
+"""Parts of an innovation, weights, refusals and recovery from them, shared by robust rules."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from robins.filters.values import Numbers, number, value
 class Shares(NamedTuple):
     """Parts of S = H P H' + Omega + R in units of S = L L', where they add up to the identity.
 
-    With R and P rescaled, L^-1 S L^-T is a weighted sum of these parts: no subtraction, however
-    large the weights, and no factor larger than the measurement.
+    With R and P rescaled, L^-1 S L^-T is a weighted sum of these m x m parts: no subtraction.
     """
 
     seen: Normalised  # the innovation, with L and w = L^-1 r
@@ -33,8 +32,8 @@ class Shares(NamedTuple):
 
 
 def shares(o: Observation) -> Shares:
-    """The parts of an innovation's covariance."""
-    # What `normalised` does, and its blocks again: looking for what is used twice costs time.
+    """Parts of the covariance of an innovation."""
+    # `normalised` inlined, since `left_out` costs time and its blocks are needed here
     spread, excess, padded, deficit, used = left_out(o)
     L = linalg.tria(spread, excess, padded)
     if deficit is not None:
@@ -50,10 +49,10 @@ def shares(o: Observation) -> Shares:
     return Shares(seen, noise, rest, prior, jnp.diag(jnp.where(used, 0.0, 1.0)))
 
 
-MOST = 1e12  # noise raised this far is noise of infinity, and still leaves digits to compare with
-PATIENCE = 30  # measurements in a row with hardly any weight before one is believed
-_HARDLY = 1e-2  # weight of a measurement; less is that of an innovation beyond some 30 deviations
-_STEPS = 40  # some four are needed; forty is a bound, not a plan
+MOST = 1e12  # greatest factor of a noise: as good as infinite, and still leaves digits
+PATIENCE = 30  # measurements in a row with hardly any weight before one is used
+HARDLY = 1e-2  # weight of a measurement; less is that of an innovation beyond some 30 deviations
+_STEPS = 40  # bound of Newton's iterations; some four are needed
 _CLOSE = 1e-13
 
 
@@ -65,18 +64,13 @@ def scale_to_quantile(o: Observation, limit: ArrayLike, seen: Normalised | None 
 
         g(s) = w' (I + (s - 1) B)^-1 w,
 
-    and 1 / g is concave in s, so that Newton's steps on it climb to the root from s = 1 without
-    ever passing it (the secular equation of trust regions; Moré & Sorensen 1983), and reach it in
-    one where there is one component.
+    and 1 / g is concave in s, so that Newton's steps on it climb from s = 1 to the root without
+    passing it (the secular equation of trust regions; Moré & Sorensen 1983), in one step for one
+    component.
 
-    Args:
-        o: the measurement as the prior sees it; components not used do not count.
-        limit: () upper bound of the NIS, more than 0.
-        seen: `normalised` of the observation, where it is known already.
-
-    Returns:
-        () the factor of the covariance R, at most `MOST`: an innovation without noise of its own
-        cannot be made likely. Its derivative is that of the root.
+    It is at most `MOST`, which components without noise of their own need; components not used do
+    not count. The limit is () and positive, ``seen`` is `normalised` of o where known. The
+    derivative is that of the root.
     """
     seen = normalised(o) if seen is None else seen
     noise = jnp.where(seen.used[:, None], o.noise, 0.0)
@@ -90,7 +84,7 @@ def scale_to_quantile(o: Observation, limit: ArrayLike, seen: Normalised | None 
     B_, unit_, ratio_ = jax.lax.stop_gradient((B, unit, ratio))
 
     def at(s):
-        """Of the unit innovation: (I + (s-1) B)^-1 u, g and -g'."""
+        """(I + (s-1) B)^-1 u, g and -g' of the unit innovation u."""
         L = linalg.cholesky(jnp.eye(len(unit_)) + (s - 1.0) * B_)
         v = linalg.solve_spd(L, unit_[:, None])[:, 0]
         return v, unit_ @ v, v @ (B_ @ v)
@@ -107,8 +101,8 @@ def scale_to_quantile(o: Observation, limit: ArrayLike, seen: Normalised | None 
 
     first = jnp.ones(()), (unit_, jnp.sum(unit_**2), unit_ @ (B_ @ unit_)), 0
     s, (v, g, slope), _ = jax.lax.while_loop(unfinished, newton, first)
-    # One more step whose value is rounding but whose derivative is the root's: dg is 2 v'du -
-    # (s-1) v'dB v, whatever else v depends on.
+    # One more step, of a value within rounding, has the derivative of the root: dg is 2 v'du -
+    # (s-1) v'dB v, independent of dv.
     again = 2.0 * (v @ unit) - v @ v - (s - 1.0) * (v @ (B @ v))
     free = above & (s < MOST) & (slope > 0.0)
     turn = jnp.where(free, g / jnp.where(free, slope, 1.0), 0.0)
@@ -118,13 +112,8 @@ def scale_to_quantile(o: Observation, limit: ArrayLike, seen: Normalised | None 
 def weighed(o: Observation, scale: Array) -> tuple[Observation, Array]:
     """A measurement with noise R_ij sqrt(s_i s_j), and its weights 1 / s.
 
-    A weight cannot fall below 1 / `MOST`, so that beyond it the pull of a reading would grow again:
-    one of 1e30 would move the state by 1e18. There a component is refused, and its weight is 0. One
-    without noise of its own keeps its place.
-
-    Args:
-        o: the measurement.
-        scale: () of the whole, or (m,) of its components.
+    s is () of the whole, or (m,) of its components. Below a weight of 1 / `MOST` the correction
+    would grow with the innovation again: there a component with noise is refused, with weight 0.
     """
     lost = scale >= (1.0 - 1e-9) * MOST
     refused = lost & jnp.any(o.noise != 0.0, axis=1)
@@ -134,13 +123,9 @@ def weighed(o: Observation, scale: Array) -> tuple[Observation, Array]:
 
 
 def reweighted(o: Observation, weight: Callable[[Array], Array], iterations: int) -> Array:
-    """(m,) weights w(e_i), R_ij becoming R_ij / sqrt(w_i w_j); begun at the Kalman filter, w = 1.
+    """(m,) weights w(e_i), R_ij becoming R_ij / sqrt(w_i w_j); started at the Kalman filter, w = 1.
 
-    Args:
-        o: the measurement.
-        weight: (m,) residuals *after* that update, in deviations of their own noise (0 where there
-            is none), to (m,) weights.
-        iterations: of the weights.
+    e are the (m,) residuals *after* that update, in deviations of their own noise, 0 without noise.
     """
     of = shares(o)
     L, white, R = of.seen.factor, of.seen.white[:, None], variance(of.noise)
@@ -150,7 +135,7 @@ def reweighted(o: Observation, weight: Callable[[Array], Array], iterations: int
         scaled = of.noise / jnp.sqrt(w)[:, None]
         W = linalg.solve_lower(L, scaled)
         root = linalg.cholesky(of.prior + W @ W.T + of.idle)
-        # What is left of the residual after the update is R S^-1 r.
+        # residual after the update, R S^-1 r
         e = scaled @ (W.T @ linalg.solve_spd(root, white))
         return weight(e[:, 0] / own)
 
@@ -166,18 +151,19 @@ class Opening(Rule):
 
     @property
     def name(self) -> str:
-        """Name of the rule inside."""
         return self.inner.name
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
-        """Memory of the rule inside, and hopeless measurements in a row by sensor."""
+        # of the inner rule, and hopeless measurements in a row
         return self.inner.init(belief, dims), {name: jnp.zeros((), int) for name in dims}
 
     def before(self, memory: Memory, prior: Belief, o: Observation):
-        """Let the rule inside weigh a measurement, or take it as it was."""
         inner, counts = memory
         inner, faded, given = self.inner.before(inner, prior, o)
-        counting, hopeless = _judged(o, given)
+        R, raised = variance(o.noise), variance(given.noise)
+        weighable = o.accepted & o.present & (R > 0.0)
+        hopeless = jnp.all(~weighable | ~given.accepted | (ratio(R, raised) < HARDLY))
+        counting, hopeless = jnp.any(weighable), jnp.any(weighable) & hopeless
         due = hopeless & (counts[o.sensor].astype(float) >= self.patience)
         wide = widened_to_dof(due, prior, o, normalised(o))
         count = jnp.where(hopeless & ~due, counts[o.sensor] + 1, 0)
@@ -191,27 +177,14 @@ class Opening(Rule):
         return memory, select(due, wide, Belief(*faded)), given
 
 
-def _judged(o: Observation, given: Observation) -> tuple[Array, Array]:
-    """Two bools: a rule could weigh a measurement, and left it hardly any weight."""
-    R, raised = variance(o.noise), variance(given.noise)
-    counting = o.accepted & o.present & (R > 0.0)
-    hopeless = jnp.all(~counting | ~given.accepted | (ratio(R, raised) < _HARDLY))
-    return jnp.any(counting), jnp.any(counting) & hopeless
-
-
 def opening(rule: Rule, patience: Number | None) -> Rule:
-    r"""A robust rule that does not refuse for ever.
+    r"""A robust rule that does not refuse for ever, as a diverged filter would.
 
-    A filter that has gone wrong would give weight to no measurement any more. So when ``patience``
-    measurements of a sensor in a row were refused or had a weight below 1e-2, its next one that is
-    like that is used with full weight, and the prior is first widened along the innovation r until
-    the NIS is that of m right components (`widened` by a r r', a = 1 / m - 1 / NIS).
-
-    Notes: ``recovered``, under the name of the rule.
-
-    Args:
-        rule: with no other hook than `before`.
-        patience: measurements in a row; None leaves the rule as it is.
+    When ``patience`` measurements of a sensor in a row were refused or had a weight below 1e-2, its
+    next one like that is used with full weight, and the prior is first widened along the innovation
+    r until the NIS is that of m right components (`widened` by a r r', a = 1 / m - 1 / NIS). The
+    rule has no other hook than `before`; it gets the note ``recovered``. Without patience the rule
+    itself is returned.
     """
     if patience is None:
         return rule
@@ -219,39 +192,27 @@ def opening(rule: Rule, patience: Number | None) -> Rule:
     return Opening(rule, number(negative, patience, lambda p: p >= 0))
 
 
-def is_hopeless(seen: Normalised, limit: ArrayLike) -> Array:
-    """True if the weight by that limit of the NIS is below `_HARDLY`."""
-    return seen.nis * _HARDLY > limit
-
-
 def widened_to_dof(due: Array, prior: Belief, o: Observation, seen: Normalised) -> Belief:
-    """The prior, `widened` along the innovation until the NIS is at most its degrees of freedom."""
+    """Prior `widened` along the innovation until the NIS is at most its degrees of freedom."""
     a = ratio(jnp.ones(()), seen.dof.astype(float)) - ratio(jnp.ones(()), seen.nis)
     due = due & (a > 0.0)
     return widened(due, prior, o, seen.used, jnp.sqrt(jnp.where(due, a, 1.0)) * o.residual[:, None])
 
 
 def widened(due: Array, prior: Belief, o: Observation, chosen: Array, root: Array) -> Belief:
-    r"""The prior with a covariance D added to what some components see, where that is due.
+    r"""Prior with a covariance D added in the measurement space of some components, where due.
 
         P' = P + G D G' + E,   G = P H' (H P H')^-1,   H G = I,   so that H P' H' >= H P H' + D,
 
-    H being the rows of those components. What the state's other directions are correlated with
-    these moves them too, and by as much as the error that is now believed: a velocity would be
-    known as well as ever, about a mean that the jump of a position has thrown far off. So what the
-    components do not tell of a state, P_c = P - G H P, grows by the share that they do tell,
+    H being the rows of those components. The correction also moves states correlated with them, by
+    as much as the error: after the jump of a position a velocity would be far off, with its old
+    variance. So the covariance given the components, P_c = P - G H P, grows by the share of each
+    state that they determine,
 
         E = k V P_c V,   V_ii^2 = (G H P)_ii / P_ii,   k = max_i r_i^2 / (H P H')_ii
 
-    r being the innovation, and a state that is not correlated with them stays as it was. So does a
-    component that is known exactly: its column of G is 0.
-
-    Args:
-        due: () bool; without it the prior stands.
-        prior: the belief.
-        o: the measurement as this belief sees it.
-        chosen: (m,) bool, the components.
-        root: (m, k) root of D; its other rows do not count.
+    r being the innovation. Uncorrelated states do not change, nor does a component that is known
+    exactly: its column of G is 0. ``root`` is an (m, k) root of D, ``chosen`` (m,) bool.
     """
 
     def wider() -> Belief:
@@ -259,12 +220,12 @@ def widened(due: Array, prior: Belief, o: Observation, chosen: Array, root: Arra
         solid, independent = linalg.guard(spread, o.size)
         G_root = S @ (spread.T @ linalg.solve_spd(solid, root))
         T = jnp.where(independent[:, None], linalg.solve_lower(solid, spread), 0.0)
-        told = S @ T.T
+        known = S @ T.T
         growth = jnp.where(chosen & independent, ratio(o.residual**2, variance(spread)), 0.0)
-        share = jnp.max(growth) * ratio(variance(told), variance(S))
+        share = jnp.max(growth) * ratio(variance(known), variance(S))
         some = share > 0.0  # twice: the slope of a root at 0 is infinite
         share = jnp.where(some, jnp.sqrt(jnp.where(some, share, 1.0)), 0.0)
-        untold = share[:, None] * (S - told @ T)
-        return prior._replace(factor=linalg.tria(S, G_root, untold))
+        rest = share[:, None] * (S - known @ T)
+        return prior._replace(factor=linalg.tria(S, G_root, rest))
 
     return jax.lax.cond(due, wider, lambda: Belief(*prior))

@@ -1,18 +1,17 @@
-"""Noise by its variances: what the rules that learn or weigh a noise have in common.
+"""Noise by its variances, for rules that learn or weigh a noise.
 
-A learnt noise is kept as a ratio to the nominal one, component by component. Units then do not
-matter, and a nominal noise that changes from step to step stays what it is: the nominal one.
+A learnt noise is a ratio to the nominal one, component by component: without units, and valid for a
+nominal noise that changes from step to step.
 """
 
 from __future__ import annotations
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from robins.filters.belief import Number
 from robins.filters.observation import Observation
-from robins.filters.values import Numbers, number
+from robins.filters.values import Numbers, is_factor, is_share, number
 
 
 def variance(factor: Array) -> Array:
@@ -21,7 +20,7 @@ def variance(factor: Array) -> Array:
 
 
 def reading_variance(o: Observation) -> Array:
-    """(m,) diagonal of ``H P H' + Omega``: the share of the state in the innovation."""
+    """(m,) diagonal of ``H P H' + Omega``, the share of the state in the innovation."""
     total = variance(o.spread) + variance(o.excess)
     return total if o.deficit is None else total - o.deficit**2
 
@@ -43,14 +42,9 @@ def numbered(name: str, values: Array) -> dict[str, Array]:
 
 
 def bounded(rule: str, forgetting: Number, floor: Number, ceiling: Number) -> dict[str, Numbers]:
-    """The share that is kept from sample to sample, and the bounds of a scale that begins at 1.
-
-    Raises:
-        ValueError: one is not of its range.
-    """
-    share, above = lambda x: (x > 0.0) & (x <= 1.0), lambda x: (x >= 1.0) & (x < np.inf)
+    """Forgetting factor and bounds of a scale that starts at 1, checked."""
     return {
-        "forgetting": number(f"{rule} forgetting must lie in (0, 1]", forgetting, share),
-        "floor": number(f"{rule} floor must lie in (0, 1]", floor, share),
-        "ceiling": number(f"{rule} ceiling must be finite and not below 1", ceiling, above),
+        "forgetting": number(f"{rule} forgetting must lie in (0, 1]", forgetting, is_share),
+        "floor": number(f"{rule} floor must lie in (0, 1]", floor, is_share),
+        "ceiling": number(f"{rule} ceiling must be finite and not below 1", ceiling, is_factor),
     }

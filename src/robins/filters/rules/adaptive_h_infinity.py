@@ -1,9 +1,9 @@
-"""Choose the bound of an H-infinity filter step by step, from the size of the innovations."""
+"""Adapt the bound of an H-infinity filter to the size of the innovations."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,15 +13,8 @@ from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-from robins.filters.rules._inflation import (
-    Weight,
-    as_weight,
-    deflated,
-    inflated,
-    local_bound,
-    rows_of,
-    weighted_factor,
-)
+from robins.filters.rules import _inflation
+from robins.filters.rules._inflation import GivenWeight, Weight, local_bound
 from robins.filters.values import Numbers, is_known, kind, number, value
 
 NAME = "adaptive_h_infinity"
@@ -30,11 +23,11 @@ LARGEST = 1e200  # a NIS beyond it counts as this, so that sums stay finite
 
 
 class AdaptiveMemory(NamedTuple):
-    """What the rule remembers from step to step."""
+    """Memory of `adaptive_h_infinity`."""
 
     nis: Array  # (window,) NIS of the last steps, summed over sensors; a ring
     dof: Array  # (window,) components used in them
-    at: Array  # () where in the ring this step is
+    at: Array  # () place of this step in the ring
     inverse: Array  # () 1 / xi of the last step; 0 before there was one
 
 
@@ -53,29 +46,27 @@ class AdaptiveHInfinity(Rule):
 
     def weighted(self, belief: Belief) -> Array:
         """(q, n) L S."""
-        return weighted_factor(lambda mean: rows_of(self.weight, mean, NAME), belief, NAME)
+        return _inflation.weighted_factor(self.weight, belief, NAME)
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> AdaptiveMemory:
-        self.weighted(belief)  # refuses a weight of another number of states
+        self.weighted(belief)  # checks the shape of the weight
         ring = jnp.zeros(self.window)
         return AdaptiveMemory(ring, ring, jnp.zeros((), int), jnp.zeros(()))
 
     def chosen(self, memory: AdaptiveMemory) -> tuple[Array, Array]:
-        """Q and alpha."""
+        """Ratio q, and alpha."""
         dof = jnp.sum(memory.dof)
         q = jnp.where(dof > 0.0, jnp.sum(memory.nis) / jnp.maximum(dof, 1.0), 1.0)
         alpha = 1.0 + 1.0 / (self.zeta * jnp.maximum(q - 1.0, 1e-6))
         return q, jnp.clip(alpha, self.floor, self.ceiling)
 
     def compensated(self, memory: AdaptiveMemory, factor: Array, weighted: Array):
-        """The factor that allows the last xi, and whether it had to be made."""
-        asked = memory.inverse * local_bound(weighted) >= 1.0
-        shrunk, _ = deflated(factor, memory.inverse * weighted, SHARE)
-        return jnp.where(asked, shrunk, factor), asked
+        """Factor that allows the last xi, and whether it had to be shrunk."""
+        needed = memory.inverse * local_bound(weighted) >= 1.0
+        shrunk, _ = _inflation.deflated(factor, memory.inverse * weighted, SHARE)
+        return jnp.where(needed, shrunk, factor), needed
 
-    def after(
-        self, memory: AdaptiveMemory, posterior: Belief, info: StepInfo, observation: Observation
-    ):
+    def after(self, memory: AdaptiveMemory, posterior: Belief, info: StepInfo, o: Observation):
         here = memory.at
         memory = memory._replace(
             nis=memory.nis.at[here].add(jnp.minimum(info.nis, LARGEST)),
@@ -86,51 +77,49 @@ class AdaptiveHInfinity(Rule):
         q, alpha = self.chosen(memory)
         notes = {"q": q, "alpha": alpha, "xi": jnp.sqrt(alpha) * bound, "bound": bound}
         if self.compensate_first:
-            factor, asked = self.compensated(memory, posterior.factor, weighted)
+            factor, acted = self.compensated(memory, posterior.factor, weighted)
             left = local_bound(self.weighted(posterior._replace(factor=factor)))
-            notes |= {"xi": jnp.sqrt(alpha) * left, "compensated": asked & (memory.dof[here] > 0.0)}
+            notes |= {"xi": jnp.sqrt(alpha) * left, "compensated": acted & (memory.dof[here] > 0.0)}
         return memory, posterior, info.noted(NAME, **notes)
 
     def settle(self, memory: AdaptiveMemory, belief: Belief):
         counts = memory.dof[memory.at] > 0.0
         weighted = self.weighted(belief)
-        factor, asked = belief.factor, jnp.array(False)
+        factor, shrunk = belief.factor, jnp.array(False)
         if self.compensate_first:
-            factor, asked = self.compensated(memory, factor, weighted)
+            factor, shrunk = self.compensated(memory, factor, weighted)
             weighted = self.weighted(belief._replace(factor=factor))
         alpha, bound = self.chosen(memory)[1], local_bound(weighted)
         xi = jnp.sqrt(alpha) * bound
         inverse = jnp.where(xi > 0.0, 1.0 / jnp.where(xi > 0.0, xi, 1.0), 0.0)
-        wide, exists = inflated(factor, inverse * weighted)
-        acts = counts & exists & (asked | (inverse > 0.0))
+        wide, exists = _inflation.inflated(factor, inverse * weighted)
+        acts = counts & exists & (shrunk | (inverse > 0.0))
         code = jnp.where(counts & ~exists, int(Code.INFEASIBLE), int(Code.DONE))
         new = belief._replace(factor=jnp.where(acts, wide, belief.factor))
-        return self.following(memory, counts, inverse), new, code
-
-    def following(self, memory: AdaptiveMemory, counts: Array, inverse: Array) -> AdaptiveMemory:
-        """The memory of the next step, with its place in the ring made empty."""
+        # the place of the next step in the ring is emptied
         following = jnp.where(counts, (memory.at + 1) % self.window, memory.at)
-        return AdaptiveMemory(
+        memory = AdaptiveMemory(
             nis=memory.nis.at[following].multiply(jnp.where(counts, 0.0, 1.0)),
             dof=memory.dof.at[following].multiply(jnp.where(counts, 0.0, 1.0)),
             at=following,
             inverse=jnp.where(counts, inverse, memory.inverse),
         )
+        return memory, new, code
 
 
 def adaptive_h_infinity(
-    weight: Any,
+    weight: GivenWeight,
     zeta: Number = 1.0,
     window: int = 10,
     floor: Number = 1.05,
     ceiling: Number = 1e6,
     compensate_first: bool = False,
 ) -> Rule:
-    """H-infinity with a bound of its own at each step: a *reconstruction*.
+    """H-infinity filter with a bound of its own at each step: a *reconstruction*.
 
     After the adaptive-compensation H-infinity filter of a patent on transfer alignment (Southeast
-    University) whose formulas (6) to (24) are lost; the kind of each step is known from its words,
-    the formulas are a reading of them and were not checked against the source:
+    University) whose formulas (6) to (24) are lost; the formulas here are a reading of its text and
+    were not checked against the source:
 
         q      NIS over its degrees of freedom, over the last ``window`` steps with a measurement
         alpha  1 + 1 / (zeta max(q - 1, 1e-6)), kept between ``floor`` and ``ceiling``
@@ -138,35 +127,34 @@ def adaptive_h_infinity(
         P      becomes (P^-1 - xi^-2 L'L)^-1 before the next prediction, as in `h_infinity`
 
     so it exists by construction, is nearly the Kalman filter while innovations are as expected
-    (q = 1 if the model is right), and raises the gain when they are not. It cannot tell a wrong
-    motion, where that is right, from a wrong measurement, where it is not. With L / xi_k for the
+    (q = 1 if the model is right), and raises the gain when they are not: rightly for a wrong
+    motion, wrongly for a wrong measurement, which it cannot distinguish. With L / xi_k for the
     weights of the steps, the bound of `h_infinity` holds for gamma = 1.
 
     Notes, after each sensor (the last one's are the step's): ``adaptive_h_infinity.q``, ``.alpha``,
-    ``.xi`` and ``.bound``, sqrt(lambda_max(L P L')), in units of L x; ``.compensated`` if asked
-    for. Derivatives take the local bound as given. ``floor = ceiling = inf`` is the Kalman filter.
+    ``.xi`` and ``.bound``, sqrt(lambda_max(L P L')), in units of L x; ``.compensated`` with
+    ``compensate_first``. Derivatives take the local bound as given. ``floor = ceiling = inf`` is
+    the Kalman filter.
 
     Args:
-        weight: L, which errors count and in what units: (q, n) matrix, (n,) diagonal, or
-            ``mean -> `` one of these. No default.
-        zeta: how fast surprise raises the gain; 0.01 to 1 hardly differ.
-        window: steps that q is taken over.
+        weight: L as in `h_infinity`.
+        zeta: sensitivity of the gain to large innovations, positive; 0.01 to 1 hardly differ.
+        window: steps that q is taken over, at least 1.
         floor: least alpha, above 1: 1.05 inflates by up to 21.
-        ceiling: largest alpha.
-        compensate_first: as the patent orders it: where P does not allow the xi of the step before,
-            shrink it (``policy="compensate"`` of `h_infinity`, to 0.95 xi^2) before choosing the
-            new one. The smaller P has no justification in the data.
+        ceiling: largest alpha, at least the floor.
+        compensate_first: where P does not allow the xi of the step before, shrink it as in the
+            patent (``policy="compensate"`` of `h_infinity`, to 0.95 xi^2) before the new one is
+            chosen. The smaller P has no justification in the data.
 
     Raises:
         TypeError: the weight is not of real numbers.
-        ValueError: zeta is not positive, the window less than 1, floor not above 1, ceiling below
-            floor, or the weight is not finite or of the wrong shape.
+        ValueError: an argument is out of its range, or the weight not finite or of a wrong shape.
     """
     require(window >= 1, "window must be at least one step", window)
     if is_known((floor, ceiling)) and not np.all((floor > 1.0) & (floor <= ceiling)):
         raise ValueError(f"1 < floor <= ceiling is wanted, got floor {floor}, ceiling {ceiling}")
     return AdaptiveHInfinity(
-        weight=as_weight(weight, NAME),
+        weight=_inflation.as_weight(weight, NAME),
         zeta=number("zeta must be positive", zeta, lambda z: z > 0.0),
         floor=number("floor must be a real number", floor),
         ceiling=number("ceiling must be a real number", ceiling),

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
 from robins.filters.belief import Belief, Number
-from robins.filters.checks import finite_numbers
 from robins.filters.linearise import Transition
+from robins.filters.model import Given
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory, Rule
-from robins.filters.values import Numbers, is_known, kind, number, value
+from robins.filters.values import Numbers, finite_leaf, is_known, kind, number, value
 from robins.manifold import State
 
 
@@ -24,8 +23,8 @@ class ChannelInflation(Rule):
     """The rule of `channel_inflation`: Q + lambda B B'."""
 
     size: Numbers  # () lambda
-    B: Any  # (n, q), or a function of the mean
-    acts: bool = kind()  # lambda is not 0, which has no columns
+    B: Numbers | Callable[[State], ArrayLike]  # (n, q), or a function of the mean
+    acts: bool = kind()  # lambda is not 0
 
     name = "channel_inflation"
 
@@ -51,17 +50,14 @@ class ChannelInflation(Rule):
         return memory, prior, o.noted(self.name, lambda_=jnp.asarray(self.size))
 
 
-def channel_inflation(lambda_: Number, B: Any) -> Rule:
-    """Process noise Q + lambda B B', B being the way by which a modelling error enters the state.
+def channel_inflation(lambda_: Number, B: Given | Callable[[State], ArrayLike]) -> Rule:
+    """Process noise Q + lambda B B' for a modelling error that enters the state through B.
 
-    Fictitious noise (Jazwinski 1970, ch. 8) with a size that can be derived: with the lambda of a
+    Fictitious noise (Jazwinski 1970, ch. 8) whose size can be derived: with the lambda of a
     `robins.filters.synthesis.riccati` design the steady gain is the design's, whose true
-    H-infinity norm from the modelling error to the estimate is gamma. As the covariance goes on by
-    itself, start, outages and a motion that changes are treated as the Kalman filter treats them.
-    The bound is proved for the steady state only.
-
-    The error enters through the motion: a channel that is in the measurement too (Dn of a plant)
-    is not covered.
+    H-infinity norm from the modelling error to the estimate is gamma. Start, outages and a motion
+    that changes are treated as in the Kalman filter; the bound is proved for the steady state only.
+    A channel that is in the measurement too (Dn of a plant) is not covered.
 
     Notes: ``channel_inflation.lambda``. lambda = 0 is the Kalman filter, bit for bit.
 
@@ -71,12 +67,13 @@ def channel_inflation(lambda_: Number, B: Any) -> Rule:
             such a matrix; the mean is the predicted one.
 
     Raises:
-        ValueError: lambda is negative or not finite, B is no matrix or not finite; when the filter
-            is run, B has another number of rows than the state has components.
+        ValueError: lambda is negative or not finite, B is no matrix or not finite; by `init`, B has
+            another number of rows than the state has components.
     """
     negative = "channel_inflation lambda must be a number from 0 on"
     size = number(negative, lambda_, lambda x: (x >= 0.0) & (x < np.inf))
-    if not callable(B):
-        B = finite_numbers("channel_inflation B", B) if is_known(B) else B
-        require(B.ndim == 2, f"channel_inflation B has shape {B.shape}, (n, q) is wanted")
-    return ChannelInflation(size, B, acts=not is_known(size) or bool(np.any(size)))
+    channel = B if callable(B) else finite_leaf("channel_inflation B", B)
+    if not callable(channel):
+        shape = channel.shape
+        require(len(shape) == 2, f"channel_inflation B has shape {shape}, (n, q) is wanted")
+    return ChannelInflation(size, channel, acts=not is_known(size) or bool(np.any(size)))

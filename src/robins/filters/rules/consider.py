@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike
 
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
+from robins.filters.model import Given
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory, Rule
 from robins.filters.values import kind, value
@@ -21,13 +20,13 @@ from robins.filters.values import kind, value
 class Consider(Rule):
     """The rule of `consider`: K_c = (I - M) K, P+ = P_best + (M K) S_y (M K)'."""
 
-    states: tuple[int, ...] = kind()  # considered
-    size: int | None = kind()  # of the mask that they were given by
+    states: tuple[int, ...] = kind()  # indices of the considered states
+    size: int | None = kind()  # size of a given mask
 
     name = "consider"
 
     def held(self, n: int) -> np.ndarray:
-        """M, of a state of n components."""
+        """Diagonal of M, for a state of n components."""
         fits = self.size in (None, n)
         require(fits, f"consider mask is ({self.size},), the state needs ({n},)")
         last = max(self.states, default=-1)
@@ -46,8 +45,8 @@ class Consider(Rule):
             return memory, posterior, info.noted(self.name, withheld=jnp.zeros(()))
         some = jnp.any(info.used)
         column = jnp.asarray(held)[:, None]
-        told = jnp.where(column, info.gain @ info.factor, 0.0)
-        factor = jnp.where(some, linalg.tria(posterior.factor, told), posterior.factor)
+        columns = jnp.where(column, info.gain @ info.factor, 0.0)
+        factor = jnp.where(some, linalg.tria(posterior.factor, columns), posterior.factor)
         move = manifold.local(o.prior.mean, posterior.mean)
         mean = manifold.retract(o.prior.mean, jnp.where(held, 0.0, move))
         sigma = o.prior.sigma
@@ -57,8 +56,8 @@ class Consider(Rule):
         return memory, Belief(mean, factor), info.noted(self.name, withheld=withheld)
 
 
-def consider(states: Sequence[Any] | ArrayLike) -> Rule:
-    """The Schmidt filter: considered states keep their mean and count in every covariance.
+def consider(states: Given) -> Rule:
+    """Schmidt filter: considered states keep their mean and count in every covariance.
 
     The gain of the considered states p is put to zero (Schmidt 1966; Zanetti & D'Souza 2012,
     sec. III), which leaves the covariance of any other gain than the best,
@@ -66,29 +65,23 @@ def consider(states: Sequence[Any] | ArrayLike) -> Rule:
         K_c = (I - M) K,   P+ = (I - K_c H) P (I - K_c H)' + K_c R K_c'
                               = P_best + (M K) S_y (M K)',         M = diag(1 on p, else 0)
 
-    S_y the covariance of the innovation: what the measurement would have told of p is put back as
-    columns beside the factor. So P_pp stays as predicted and nothing is subtracted. For states
-    that are weakly observed and wrongly modelled (a scale factor, a lever arm): their uncertainty
-    keeps the others honest, but a model fault is not poured into them.
+    S_y the covariance of the innovation: the information on p is added as columns beside the
+    factor. So P_pp stays as predicted and nothing is subtracted. For states that are weakly
+    observed and wrongly modelled (a scale factor, a lever arm): their uncertainty counts, but they
+    do not absorb model errors.
 
-    Give it first: the mean is that of the measured update, so what rules before it did in `after`
-    to the means of considered states is undone. `StepInfo.gain` becomes K_c.
+    Put it first: corrections of considered states by `after` of rules before it are undone.
+    `StepInfo.gain` becomes K_c.
 
-    Notes: ``consider.withheld``, the greatest move withheld from a considered state, in its
+    Notes: ``consider.withheld``, the greatest correction withheld from a considered state, in its
     standard deviations. No state considered is the Kalman filter, bit for bit.
 
     Args:
         states: indices of tangent components, or an (n,) mask of booleans.
 
     Raises:
-        ValueError: an index is negative, repeated or no integer; by `init`, the state has fewer
-            components or the mask another size.
+        ValueError: an index is negative, repeated or no integer; by `init`, sizes do not fit.
     """
-    return Consider(*_chosen(states))
-
-
-def _chosen(states: Sequence[Any] | ArrayLike) -> tuple[tuple[int, ...], int | None]:
-    """Indices, and the size of the mask that they were given by."""
     given = np.asarray(states)
     given = given if given.size else np.zeros(0, int)
     indices = given.dtype.kind in "iu" and not np.any(given < 0)
@@ -99,5 +92,5 @@ def _chosen(states: Sequence[Any] | ArrayLike) -> tuple[tuple[int, ...], int | N
         states,
     )
     if given.dtype == bool:
-        return tuple(np.flatnonzero(given).tolist()), given.size
-    return tuple(given.tolist()), None
+        return Consider(tuple(np.flatnonzero(given).tolist()), given.size)
+    return Consider(tuple(given.tolist()), None)

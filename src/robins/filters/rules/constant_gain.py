@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -11,16 +11,16 @@ from jaxtyping import Array
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
-from robins.filters.checks import finite_numbers
 from robins.filters.kalman import FilterState
+from robins.filters.model import Given
 from robins.filters.observation import Observation, left_out
 from robins.filters.rule import Rule
 from robins.filters.trees import select
-from robins.filters.values import Numbers, is_known, value
+from robins.filters.values import Numbers, finite_leaf, value
 
 
 class Fixed(NamedTuple):
-    """Memory of the rule. Gains are data: exchange them in a state, and nothing compiles anew."""
+    """Memory of the rule. Gains are data: another one in a state compiles nothing."""
 
     gains: dict[str, Array]  # (n, m) by sensor
 
@@ -29,7 +29,7 @@ class Fixed(NamedTuple):
 class ConstantGain(Rule):
     """The rule of `constant_gain`: `corrected` by the gains in the memory."""
 
-    gains: dict[str, Numbers]  # (n, m) by sensor, which a state begins with
+    gains: dict[str, Numbers]  # (n, m) by sensor
 
     name = "constant_gain"
 
@@ -53,13 +53,13 @@ class ConstantGain(Rule):
 def corrected(
     gain: Array, posterior: Belief, info: StepInfo, o: Observation
 ) -> tuple[Belief, StepInfo]:
-    """x- + K (y - h(x-)) and (I - K H) P- (I - K H)' + K (Omega + R) K'; as it is if none is used.
+    """x- + K (y - h(x-)) and (I - K H) P- (I - K H)' + K (Omega + R) K'.
 
     Args:
-        gain: (n, m) K, whose columns of what was not used are left out.
-        posterior: of the usual update.
-        info: of the same.
-        o: the measurement, as the prior sees it.
+        gain: (n, m) K, whose columns of components not used are left out.
+        posterior: belief of the usual update, returned if nothing is used.
+        info: information of the usual update.
+        o: the measurement relative to the prior.
     """
     spread, excess, noise, deficit, used = left_out(o)
     used = used & info.used
@@ -74,41 +74,34 @@ def corrected(
     return belief, info._replace(gain=K).noted("constant_gain", moved=jnp.max(jnp.abs(moved)))
 
 
-def constant_gain(gains: Mapping[str, Any]) -> Rule:
-    """Update the mean with a constant gain, and state the covariance that this gain truly has.
+def constant_gain(gains: Mapping[str, Given]) -> Rule:
+    """Update the mean with a constant gain, and compute the covariance for this gain.
 
         x+ = x- + K (y - h(x-)),   P+ = (I - K H) P- (I - K H)' + K (Omega + R) K'
 
-    The gain of a steady-state design (`robins.filters.synthesis`), in current form. The second line
-    holds for any gain (Joseph's form; Brown & Hwang 2012, eq. 4.2.11), so the stated sigma is that
-    of this filter in this model, not of the best one, and grows while the sensor is lost. Columns
-    of components that are missing or refused are left out. Put it last, so that rules that fade the
-    prior come before it; sensors without a gain are updated as usual.
+    The gain of a steady-state design (`robins.filters.synthesis`), in current form. The covariance
+    holds for any gain (Joseph's form; Brown & Hwang 2012, eq. 4.2.11), and grows while the sensor
+    is lost. Columns of components that are missing or refused are left out; sensors without a gain
+    are updated as usual. Put it after rules that fade the prior.
 
-    Notes: ``constant_gain.moved``, the largest component that the update moved the mean by.
+    Notes: ``constant_gain.moved``, the largest component of the correction.
 
     Args:
         gains: (n, m) by name of the sensor, tangent spaces of state and measurement.
 
     Raises:
-        ValueError: no gain, one with entries that are not finite; by `init`, a sensor that the
-            model does not have or a gain that does not fit.
+        ValueError: no gain, or not finite; by `init`, an unknown sensor or a gain of wrong shape.
     """
     require(gains, "constant_gain: give at least one gain, {'sensor': (n, m) array}")
-    return ConstantGain({name: _as_gain(name, K) for name, K in gains.items()})
+    what = "constant_gain: the gain of"
+    return ConstantGain({name: finite_leaf(f"{what} '{name}'", K) for name, K in gains.items()})
 
 
-def _as_gain(name: str, K: Any) -> Any:
-    return finite_numbers(f"constant_gain: the gain of '{name}'", K) if is_known(K) else K
-
-
-def with_gains(state: FilterState, gains: Mapping[str, Any]) -> FilterState:
-    """A filter state that goes on with other gains of the same shapes.
-
-    Gains are data here: they may be traced or batched, and nothing compiles anew.
+def with_gains(state: FilterState, gains: Mapping[str, Given]) -> FilterState:
+    """Filter state with other gains of the same shapes, which may be traced or batched.
 
     Raises:
-        ValueError: the filter has no `constant_gain` rule, or names or shapes are others.
+        ValueError: the filter has no `constant_gain` rule, or names or shapes differ.
     """
     if not any(isinstance(one, Fixed) for one in state.memory):
         raise ValueError("this filter has no constant_gain rule whose gains could be exchanged")

@@ -13,14 +13,9 @@ from robins.filters.rules._robust import MOST, PATIENCE, opening, reweighted, we
 from robins.filters.values import Numbers, kind, number, value
 
 
-def _least(e: Array) -> Array:
-    """A weight as good as none that leaves digits: 1e-8, less if that pulled by a milli-sigma."""
-    return 1e-3 / jnp.minimum(1e5 + jnp.abs(e), 1e-3 * MOST)
-
-
 @value
 class Correntropy(Rule):
-    """The rule of `correntropy`: R_ij / sqrt(w_i w_j), w_i = G(e_i) of what the update leaves."""
+    """The rule of `correntropy`: R_ij / sqrt(w_i w_j), w_i = G(e_i) of posterior residuals."""
 
     kernel: Numbers  # () sigma
     iterations: int = kind()
@@ -33,7 +28,9 @@ class Correntropy(Rule):
 
     def weight(self, e: Array) -> Array:
         """Weights of residuals in deviations of their noise."""
-        return jnp.maximum(jnp.exp(-0.5 * (e * (1.0 / self.kernel)) ** 2), _least(e))
+        w = jnp.exp(-0.5 * (e * (1.0 / self.kernel)) ** 2)
+        # least weight that leaves digits: 1e-8, less if that corrected by a milli-sigma
+        return jnp.maximum(w, 1e-3 / jnp.minimum(1e5 + jnp.abs(e), 1e-3 * MOST))
 
 
 def correntropy(kernel: Number = 3.0, iterations: int = 3, patience: int | None = PATIENCE) -> Rule:
@@ -45,27 +42,24 @@ def correntropy(kernel: Number = 3.0, iterations: int = 3, patience: int | None 
 
         w_i = G(e_i),   R_ij becomes R_ij / sqrt(w_i w_j),   e = residual after that update,
 
-    begun at the Kalman filter, w = 1: each iteration then raises the objective, and a prior that
-    knows little is led by its measurement. Chen et al. begin at the prior, where a poor prior makes
-    every measurement an outlier, and weigh the components of the prior in the same way: there the
-    result depends on the order of the states in the factor of P, and a state far off is
-    locked out. Here the prior stays quadratic.
+    started at the Kalman filter, w = 1: each iteration then raises the objective. Chen et al. start
+    at the prior, where a poor prior makes every measurement an outlier, and weigh the components of
+    the prior in the same way: the result then depends on the order of the states in the factor of
+    P, and a diverged state is not corrected. Here the prior stays quadratic.
 
-    A weight of 1e-12 or less is a refusal. After ``patience`` measurements with hardly any weight
-    the next one is believed (`robins.filters.rules._robust.opening`).
-
-    Notes: ``correntropy.weight``, the least of the measurement, 0 if refused, and
+    Notes: ``correntropy.weight``, the least of the measurement, 0 if refused (1e-12 or less), and
     ``correntropy.recovered``. Components without noise of their own keep their weight. The Kalman
     filter is ``kernel=inf``.
 
     Args:
-        kernel: width sigma of the kernel, in standard deviations of the noise. It is a hidden
-            tuning: below 2 good measurements are lost, above 6 outliers of 10 sigma still count.
+        kernel: width sigma of the kernel, in standard deviations of the noise: below 2 good
+            measurements are lost, above 6 outliers of 10 sigma still count.
         iterations: of the weights, at least 1.
-        patience: measurements in a row with a weight below 1e-2; None never recovers.
+        patience: measurements in a row with a weight below 1e-2 before one is used
+            (`robins.filters.rules._robust.opening`); None never recovers.
 
     Raises:
-        ValueError: the kernel is not positive, there is no iteration, or patience is negative.
+        ValueError: an argument is out of its range.
     """
     sigma = number("correntropy kernel must be positive", kernel, lambda k: k > 0.0)
     require(iterations >= 1, "correntropy iterations must be at least 1", iterations)

@@ -1,25 +1,20 @@
-"""Hold the state to a constraint that is always true."""
+"""Hold the state to an equality constraint throughout a run."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from robins.errors import require
 from robins.filters import trees
 from robins.filters.belief import Belief, Code, Number, StepInfo
-from robins.filters.checks import finite_numbers
 from robins.filters.chi_square import limits, within
 from robins.filters.limits.constrain import (
     ITERATIONS,
-    Constrained,
     Function,
-    Given,
     Weight,
     as_sensor,
     as_weight,
@@ -28,9 +23,10 @@ from robins.filters.limits.constrain import (
     constrain,
 )
 from robins.filters.linearise import Transition
+from robins.filters.model import Data, Given
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory, Rule
-from robins.filters.values import Numbers, is_known, kind, number, value
+from robins.filters.values import Numbers, finite_leaf, is_chance, is_known, kind, number, value
 
 
 @value
@@ -38,7 +34,7 @@ class Equality(Rule):
     """The rule of `equality`: x - G (g(x) - d), G = V D' (D V D')^-1."""
 
     g: Function
-    d: Any  # of the form of g(x); None is zero
+    d: Data  # of the form of g(x); None is zero
     weight: Weight
     noise: Numbers | None
     limit: Numbers | None  # (most + 1,) of the NIS by components, where there is a gate
@@ -52,7 +48,7 @@ class Equality(Rule):
         n = belief.factor.shape[0]
         check_size("equality", self.weight, n)
         require(not sensor.dim > n, f"equality has {sensor.dim} components, the state only {n}")
-        return jnp.zeros((), bool)  # whether this step has used a noisy constraint
+        return jnp.zeros((), bool)  # this step has used a noisy constraint
 
     def process(self, memory: Memory, transition: Transition):
         return jnp.zeros((), bool), transition
@@ -61,7 +57,9 @@ class Equality(Rule):
         held = constrain(
             posterior, self.g, self.d, self.weight, self.noise, self.hard, self.iterations
         )
-        refused = self.refused(held)
+        refused = jnp.zeros((), bool)
+        if self.limit is not None:
+            refused = held.nis > within(self.limit, held.residual)[held.dof]
         skip = refused | memory
         belief = trees.select(skip, posterior, held.belief)
         worst = jnp.max(jnp.abs(held.residual))
@@ -71,16 +69,10 @@ class Equality(Rule):
         code = jnp.where(partly, int(Code.PARTLY_MISSING), info.code)
         return memory | (self.noise is not None), belief, info._replace(code=code)
 
-    def refused(self, held: Constrained) -> Array:
-        """() whether the gate refuses the constraint."""
-        if self.limit is None:
-            return jnp.zeros((), bool)
-        return held.nis > within(self.limit, held.residual)[held.dof]
-
 
 def equality(
     g: Function,
-    d: Any = None,
+    d: Data = None,
     weight: Weight = "covariance",
     noise: Given | None = None,
     hard: bool = False,
@@ -91,14 +83,12 @@ def equality(
 
         G = V D' (D V D')^-1,   x* = x - G (g(x) - d),   P* = (I - G D) P (I - G D)' + G R_d G'
 
-    with V = P or W^-1. A constraint without noise holds after each sensor's update, and nothing is
-    uncertain across it any more, so that no trace of P grows (W = P^-1: no variance at all). Wants
-    ``form="sqrt"`` where other sensors follow: P is singular. A noisy one is information: it is
-    used once a step, by the first sensor, and as a measurement would be, K = P D' (D P D' +
-    R_d)^-1. Errors of it that last from step to step are not white, and want a state of their own.
-
-    It also holds where the sensor's measurement is missing. What comes with data (air data, a map
-    that is read) is a sensor, not a rule.
+    with V = P or W^-1. A constraint without noise holds after each sensor's update, also where its
+    measurement is missing, and nothing is uncertain across it, so that no trace of P grows (W =
+    P^-1: no variance at all). P is singular: where other sensors follow use ``form="sqrt"``. A
+    noisy constraint is information: it is used once a step, by the first sensor, as a measurement,
+    K = P D' (D P D' + R_d)^-1. If its errors are not white, give them a state. A constraint that
+    comes with data (air data, a map) is a sensor, not a rule.
 
     Notes: ``equality.residual``, the greatest entry of d - g(x) before; ``equality.nis``, all of
     them squared by D P D' + R_d; ``equality.refused``. A constraint that contradicts what is known
@@ -107,38 +97,32 @@ def equality(
 
     Args:
         g: (c, n) matrix D or a function of the state, as in `constrain`.
-        d: what it equals; zero if left out.
+        d: value of g(x); zero if left out.
         weight: "covariance", "identity" or an (n, n) matrix W.
         noise: (c,) standard deviations or a (c, k) factor of R_d; exact if left out.
         hard: put the mean on a noisy constraint, as other weights always do.
-        gate: probability below which a residual is chance: beyond that chi-square quantile the
-            constraint is refused. None: never.
-        iterations: how often a function is linearised.
+        gate: probability of the chi-square quantile beyond which the constraint is refused. None:
+            never.
+        iterations: linearisations of a function.
 
     Raises:
-        ValueError: rows of D depend on each other or contradict (the rank and the row are named),
-            numbers are not finite, a parameter is not of its range; and by `init`, D, noise or
-            weight do not fit the state.
+        ValueError: rows of D depend on each other or contradict, numbers are not finite, an
+            argument is out of its range; by `init`, D, noise or weight do not fit the state.
     """
-    between = "equality gate must lie between 0 and 1, or be None"
     if gate is not None:
-        gate = number(between, gate, lambda p: (p > 0.0) & (p < 1.0))
+        gate = number("equality gate must lie between 0 and 1, or be None", gate, is_chance)
     require(iterations >= 1, "equality iterations must be at least 1", iterations)
     d = jax.tree_util.tree_map(
-        lambda leaf: _finite("d", leaf), d, is_leaf=lambda x: isinstance(x, list)
+        lambda leaf: finite_leaf("equality d", leaf), d, is_leaf=lambda x: isinstance(x, list)
     )
-    root = None if noise is None else _finite("noise", noise)
+    root = None if noise is None else finite_leaf("equality noise", noise)
     metric = as_weight("equality", weight)
-    D = g if callable(g) else _rows(_finite("D", g), d, root)
+    D = g if callable(g) else _rows(finite_leaf("equality D", g), d, root)
     limit = None if gate is None else limits(gate)
     return Equality(D, d, metric, root, limit, hard, iterations)
 
 
-def _finite(name: str, given: Any) -> Any:
-    return finite_numbers(f"equality {name}", given) if is_known(given) else given
-
-
-def _rows(D: Any, d: Any, noise: Any) -> Any:
+def _rows(D: Numbers, d: Data, noise: Numbers | None) -> Numbers:
     """D, checked where all is known."""
     if not is_known((D, d, noise)):
         return D
@@ -148,10 +132,7 @@ def _rows(D: Any, d: Any, noise: Any) -> Any:
     if value.shape != (len(D),):
         raise ValueError(f"equality d is {value.shape}: ({len(D)},), one for each row of D")
     exact = np.ones(len(D), bool)
-    if noise is not None and noise.shape[0] == len(D):  # others are refused where they are used
+    if noise is not None and noise.shape[0] == len(D):  # other shapes are refused by `init`
         exact = ~np.any(noise.reshape(len(D), -1) != 0.0, axis=1)
-    try:
-        check_rows(D, value, exact)
-    except ValueError as error:
-        raise ValueError(f"equality: {error}") from None
+    check_rows("equality", np.asarray(D), value, exact)
     return D

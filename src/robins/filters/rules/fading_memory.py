@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 
 import jax.numpy as jnp
-import numpy as np
 
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory, Rule
-from robins.filters.values import Numbers, number, value
+from robins.filters.values import Numbers, is_factor, number, value
 
 
 @value
@@ -32,16 +31,13 @@ class FadingMemory(Rule):
 def fading_memory(factor: Number = 1.01) -> Rule:
     """Exponential data weighting (Anderson 1973; Simon 2006, sec. 7.4): alpha^2 F P F' + Q.
 
-    In the least-squares problem that the filter solves, whatever is j steps old weighs
-    alpha^(-2j) of what is new: errors of a model that builds up over the steps are forgotten. The
-    covariance is then a weight, an upper bound where the model is right.
+    In the least-squares problem of the filter, data j steps old have alpha^(-2j) of the weight of
+    new data, so accumulated model errors are forgotten. The covariance is then a weight, an upper
+    bound where the model is right.
 
-    The belief is widened by alpha when all measurements of a step are in, before it is predicted:
-    for a linear motion the equation above, and sigma points are drawn from the widened belief. A
-    smoother so finds the belief that was predicted.
-
-    It fades every step, measured or not, and every state, seen or not: what is never measured
-    grows as alpha^(2k).
+    The belief is widened by alpha after all measurements of a step, before the prediction, so that
+    sigma points and smoothers use the widened belief. It fades every step, measured or not, and
+    every state: variances never measured grow as alpha^(2k).
 
     Notes: ``fading_memory.factor``. factor = 1 is the Kalman filter, bit for bit.
 
@@ -51,12 +47,13 @@ def fading_memory(factor: Number = 1.01) -> Rule:
     Raises:
         ValueError: the factor is not finite or below 1.
     """
-    below = "fading_memory factor must be finite and not below 1"
-    return FadingMemory(number(below, factor, lambda a: (a >= 1.0) & (a < np.inf)))
+    return FadingMemory(
+        number("fading_memory factor must be finite and not below 1", factor, is_factor)
+    )
 
 
 def per_step(memory_s: Number, step_s: Number) -> float:
-    """The factor with which the weight of data falls to 1/e in a time: exp(step / (2 memory)).
+    """Factor with which the weight of data falls to 1/e in a time: exp(step / (2 memory)).
 
     Args:
         memory_s: time constant [s] of the weight, infinity for the Kalman filter.

@@ -1,4 +1,4 @@
-"""Refuse a measurement whose innovation is too large to be chance, with a way to recover."""
+"""Refuse a measurement whose innovation is too large to be chance, with recovery."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from robins.filters.chi_square import limits, within
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Memory, Rule
 from robins.filters.rules._robust import widened
-from robins.filters.values import Numbers, kind, number, value
+from robins.filters.values import Numbers, is_chance, kind, number, value
 
 Recovery = Literal["accept", "inflate", "reinitialise"]
 Scope = Literal["joint", "component"]
@@ -28,12 +28,12 @@ _OPEN = 100.0
 
 
 class _Channel(NamedTuple):
-    """What a gate remembers of a sensor; g is () for a joint gate, (m,) for one by component."""
+    """Memory of a sensor; g is () for a joint gate, (m,) for one by component."""
 
     refused: Array  # (g) refusals in a row
     ratio: Array  # () greatest test ratio of the last measurement
     residual: Array  # (k, m) the last innovations that were too large, newest last
-    known: Array  # (k, m) bool, components they had
+    known: Array  # (k, m) bool, their components
 
 
 @value
@@ -50,18 +50,14 @@ class Gate(Rule):
     name = "gate"
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
-        """A `_Channel` by sensor."""
-        return {name: self.channel(m) for name, m in dims.items()}
+        def channel(m: int) -> _Channel:
+            shape, residual = () if self.joint else (m,), jnp.zeros((self.kept, m))
+            return _Channel(jnp.zeros(shape, int), jnp.zeros(()), residual, residual > 0.0)
 
-    def channel(self, m: int) -> _Channel:
-        """Nothing refused yet, of a sensor of m components."""
-        shape = () if self.joint else (m,)
-        residual = jnp.zeros((self.kept, m))
-        return _Channel(jnp.zeros(shape, int), jnp.zeros(()), residual, residual > 0.0)
+        return {name: channel(m) for name, m in dims.items()}
 
     def before(self, memory: Memory, prior: Belief, o: Observation):
-        """Refuse what is too large, or recover."""
-        was: _Channel = memory[o.sensor]
+        was = memory[o.sensor]
         q, ratio, judged, used = self.judge(o)
         over = judged & ~(ratio <= 1.0)
         due, residual, known = self.due(was, over, used, o)
@@ -77,7 +73,7 @@ class Gate(Rule):
         return memory, prior, o._replace(accepted=o.accepted & passed)
 
     def judge(self, o: Observation):
-        """Limit, ratio to it, whether there is something to judge, and the components used."""
+        """Limit q, ratio to it, whether something is judged, and the components used."""
         seen = normalised(o)
         if self.joint:
             q = within(self.limit, o.residual)[seen.dof]
@@ -87,7 +83,7 @@ class Gate(Rule):
         return self.limit[1], square / variance / self.limit[1], seen.used, seen.used
 
     def due(self, was: _Channel, over: Array, used: Array, o: Observation):
-        """End of patience, and the refusals remembered."""
+        """Recoveries that are due, and the refusals remembered."""
         due, scatter = over & (was.refused.astype(float) >= self.patience), self.scatter
         if scatter is None:
             return due, was.residual, was.known
@@ -96,17 +92,15 @@ class Gate(Rule):
         known = jnp.where(fresh, _push(was.known, used), was.known)
         agree = _agree_as_one if self.joint else _agree_each
         due = jax.lax.cond(
-            jnp.any(due),
-            lambda: due & agree(scatter, residual, known, o.noise),
-            lambda: due,
+            jnp.any(due), lambda: due & agree(scatter, residual, known, o.noise), lambda: due
         )
         return due, residual, known
 
     def recovered(self, due, chosen, ratio, q, prior: Belief, o: Observation) -> Belief:
-        """The prior, widened where recovery is due."""
+        """Prior, widened where recovery is due."""
         jump = jnp.where(chosen, o.residual, 0.0)
         if not self.kept:
-            # a root of what is not 0 where none is due: its slope in q would be NaN
+            # keeps the root off 0 where none is due: its derivative in q would be NaN
             excess = 1.0 - 1.0 / jnp.where(due, ratio, 2.0)
             jump = jump * jnp.where(due, jnp.sqrt(excess / q), 0.0)
         root = jump[:, None] if self.joint else jnp.diag(jump)
@@ -124,11 +118,11 @@ def gate(
     r"""Chi-square gate on the innovation of a sensor (Bar-Shalom et al. 2001, sec. 2.3.2).
 
     A measurement is refused when its NIS r' S^-1 r exceeds q, the chi-square quantile for the
-    components present; by component, when r_i^2 / S_ii exceeds that of one. A filter that has gone
-    wrong would refuse for ever, so after ``patience`` refusals of a sensor in a row the next
-    measurement that is too large recovers it:
+    components present; by component, when r_i^2 / S_ii exceeds that of one. A diverged filter would
+    refuse for ever, so after ``patience`` refusals of a sensor in a row the next measurement that
+    is too large recovers it:
 
-    - ``accept`` uses it with the gain there is, which follows a jump of many deviations only in
+    - ``accept`` uses it with the present gain, which follows a jump of many deviations only in
       hundreds of measurements;
     - ``inflate`` first widens the prior covariance along the innovation until the NIS is q or
       less, by D = a r r', a = 1 / q - 1 / NIS; by component by D = diag(a_i r_i^2), with a_i =
@@ -136,7 +130,7 @@ def gate(
     - ``reinitialise`` uses it only if it and the refused ones before it *agree*: their scatter
       about their mean, sum (r_k - mean)' R^-1 (r_k - mean), is within the chi-square quantile of
       patience times m degrees of freedom. It then widens what is seen by D = r r' + 100 R, and
-      the state follows the measurement. Refusals that disagree go on being refused.
+      the state follows the measurement. Otherwise it is refused.
 
     Notes: ``gate.ratio``, min(NIS / q, 1), where 1 is refused or recovered (the innovation test
     ratio of autopilots; by component the greatest), ``gate.refused``, refusals in a row (the most),
@@ -144,16 +138,14 @@ def gate(
 
     Args:
         probability: share of right measurements that pass.
-        patience: refusals in a row before recovery.
-        recovery: what then happens.
+        patience: refusals in a row before recovery; at least 1 to ``reinitialise``.
+        recovery: one of the above.
         scope: judge the measurement as a whole, or each component by itself.
 
     Raises:
-        ValueError: the probability is not between 0 and 1, patience is negative or too short to
-            agree in, or recovery or scope is none of those above.
+        ValueError: an argument is out of its range.
     """
-    between = "gate probability must lie between 0 and 1"
-    chance = number(between, probability, lambda p: (p > 0.0) & (p < 1.0))
+    chance = number("gate probability must lie between 0 and 1", probability, is_chance)
     one_of("gate recovery", recovery, Recovery)
     one_of("gate scope", scope, Scope)
     agreeing = recovery == "reinitialise"
@@ -174,7 +166,7 @@ def _push(rows: Array, newest: Array) -> Array:
 
 
 def _scatter(residual: Array, known: Array) -> Array:
-    """Deviations from the mean, 0 in components that were not always there."""
+    """Deviations from the mean, 0 in components that were not always present."""
     shared = jnp.all(known, axis=0, keepdims=True)
     return jnp.where(shared, residual - jnp.mean(residual, axis=0, keepdims=True), 0.0)
 
@@ -183,7 +175,7 @@ def _agree_as_one(table: Array, residual: Array, known: Array, noise: Array) -> 
     shared = jnp.all(known, axis=0)
     N = jnp.where(shared[:, None], noise, 0.0)
     L = linalg.tria(N, jnp.diag(jnp.where(shared, 0.0, 1.0)))
-    # A component without noise agrees only if it repeats: the least pivot makes all else huge.
+    # A component without noise agrees only if it repeats: over the least pivot all else is huge.
     L = L + jnp.diag(jnp.where(jnp.diagonal(L) == 0.0, jnp.finfo(float).tiny, 0.0))
     white = linalg.solve_lower(L, _scatter(residual, known).T)
     count = jnp.sum(shared)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple, TypeGuard, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,40 +18,31 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.checks import one_of
 from robins.filters.kalman import Filter
 from robins.filters.linearise import Transition
+from robins.filters.model import Given
 from robins.filters.observation import Observation
-from robins.filters.rule import Rule
-from robins.filters.rules._inflation import (
-    Weight,
-    as_weight,
-    deflated,
-    inflated,
-    local_bound,
-    rows_of,
-    weighted_factor,
-)
-from robins.filters.values import Numbers, is_known, kind, number, value
+from robins.filters.rule import Again, Rule
+from robins.filters.rules import _inflation
+from robins.filters.rules._inflation import GivenWeight, Weight, inflated, local_bound
+from robins.filters.values import Numbers, is_chance, is_known, kind, number, value
 from robins.manifold import State
-
-__all__ = ["HInfinityMemory", "Infeasible", "h_infinity", "with_gamma"]
 
 Policy = Literal["raise", "raise_gamma", "compensate"]
 Estimate = Literal["a-posteriori", "a-priori", "predictor"]
 
 NAME = "h_infinity"
 F = TypeVar("F", bound=Filter)
-Again = Callable[["HInfinity"], "HInfinityMemory"]  # a rule -> the last memory of the run with it
 
 
 class Infeasible(RobinsError, ValueError):
-    """No H-infinity filter exists for the gamma asked for.
+    """No H-infinity filter exists for the given gamma.
 
     Attributes:
-        step: row of the measurements after which the bound broke, from 0; in a stream, predictions
-            before it less one.
+        step: row of the measurements after which the bound broke, from 0; in a stream, number of
+            predictions before it less one.
         time_s: time of that step [s], or None where times are not known.
-        gamma: asked for.
+        gamma: the given bound.
         local_bound: sqrt(lambda_max(L P L')) there, which gamma must exceed.
-        gamma_min: least gamma for all of the run, or None where it cannot be run again.
+        gamma_min: least gamma for the whole run, or None where it cannot be run again.
     """
 
     def __init__(
@@ -75,12 +66,12 @@ class Infeasible(RobinsError, ValueError):
 
 
 class HInfinityMemory(NamedTuple):
-    """What `h_infinity` remembers from step to step."""
+    """Memory of `h_infinity`."""
 
     steps: Array  # () predictions so far
-    fresh: Array  # () bool, no sensor has been asked since the prediction
+    fresh: Array  # () bool, no update since the prediction
     measured: Array  # () bool, something was used since the prediction
-    predicted: Any  # mean as predicted; () where the estimate does not need it
+    predicted: State  # mean as predicted; () where the estimate does not need it
     weighted: Array  # (q, n) L S that the last step is judged by
     events: Array  # () steps in which the policy acted
     first: Array  # () the first of them
@@ -88,12 +79,10 @@ class HInfinityMemory(NamedTuple):
 
 
 def least_gamma(exists: Callable[[float], bool], lower: float, rtol: float = 1e-4) -> float:
-    """Least feasible gamma above a lower bound: doubled until it exists, then bisected.
-
-    Feasibility is monotone in gamma. The number returned exists, and is at most rtol too large.
+    """Least feasible gamma above a lower bound, at most rtol too large: doubled, then bisected.
 
     Raises:
-        ValueError: nothing up to 2^100 times the lower bound exists.
+        ValueError: no gamma up to 2^100 times the lower bound is feasible.
     """
     low, high = lower, 2.0 * lower
     while not exists(high):
@@ -119,25 +108,11 @@ class HInfinity(Rule):
 
     name = NAME
 
-    @property
-    def judges_prior(self) -> bool:
-        """True if the predicted P decides on existence."""
-        return self.estimate == "a-priori"
-
-    @property
-    def moves_on(self) -> bool:
-        """True if the estimate is the one before the measurement, and the mean moves later."""
-        return self.estimate != "a-posteriori"
-
-    def rows(self, mean: State) -> Array:
-        """L at a mean."""
-        return rows_of(self.weight, mean, NAME)
-
     def weighted(self, belief: Belief) -> Array:
         """(q, n) L S."""
-        return weighted_factor(self.rows, belief, NAME)
+        return _inflation.weighted_factor(self.weight, belief, NAME)
 
-    def in_force(self, bound: Array) -> Any:
+    def in_force(self, bound: Array) -> Numbers:
         """1 / gamma of this step, as the policy leaves it."""
         if self.policy != "raise_gamma":
             return self.inverse
@@ -151,7 +126,7 @@ class HInfinity(Rule):
             steps=jnp.zeros((), int),
             fresh=jnp.array(True),
             measured=jnp.array(False),
-            predicted=belief.mean if self.moves_on else (),
+            predicted=() if self.estimate == "a-posteriori" else belief.mean,
             weighted=weighted,
             events=jnp.zeros((), int),
             first=jnp.array(-1),
@@ -159,20 +134,18 @@ class HInfinity(Rule):
         )
 
     def process(self, memory: HInfinityMemory, transition: Transition):
-        if self.moves_on:
+        if self.estimate != "a-posteriori":
             memory = memory._replace(predicted=transition.mean)
         return memory, transition
 
-    def before(self, memory: HInfinityMemory, prior: Belief, observation: Observation):
-        if self.judges_prior:
-            seen = self.weighted(prior)
-            memory = memory._replace(weighted=jnp.where(memory.fresh, seen, memory.weighted))
-        return memory._replace(fresh=jnp.array(False)), prior, observation
+    def before(self, memory: HInfinityMemory, prior: Belief, o: Observation):
+        if self.estimate == "a-priori":  # the predicted P decides on existence
+            weighted = jnp.where(memory.fresh, self.weighted(prior), memory.weighted)
+            memory = memory._replace(weighted=weighted)
+        return memory._replace(fresh=jnp.array(False)), prior, o
 
-    def after(
-        self, memory: HInfinityMemory, posterior: Belief, info: StepInfo, observation: Observation
-    ):
-        if not self.judges_prior:
+    def after(self, memory: HInfinityMemory, posterior: Belief, info: StepInfo, o: Observation):
+        if self.estimate != "a-priori":
             memory = memory._replace(weighted=self.weighted(posterior))
         memory = memory._replace(measured=memory.measured | jnp.any(info.used))
         # Noted but not remembered, so that a run which does not keep it does not compute it.
@@ -189,48 +162,19 @@ class HInfinity(Rule):
 
     def settle(self, memory: HInfinityMemory, belief: Belief):
         counts = memory.measured | (self.count_missing & (memory.steps > 0))
-        weighted = self.weighted(belief)
-        judged = weighted
-        if self.judges_prior:
+        weighted = judged = self.weighted(belief)
+        if self.estimate == "a-priori":
             judged = jnp.where(memory.fresh, weighted, memory.weighted)
         inverse, factor, weighted, acted = self.eased(belief, weighted, judged)
         wide, exists = inflated(factor, inverse * weighted)
-        if self.judges_prior:
+        if self.estimate == "a-priori":
             exists = exists & inflated(factor, inverse * judged)[1]
         active = counts & exists & (self.inverse > 0.0)
         new = trees.select(active, self.moved(memory, belief, inverse, wide), belief)
         missed = counts & ~exists
-        memory = self.noting(memory, missed | (counts & acted), missed, judged)
-        return memory, new, jnp.where(missed, int(Code.INFEASIBLE), int(Code.DONE))
-
-    def eased(self, belief: Belief, weighted: Array, judged: Array):
-        """1 / gamma, a factor and L S as the policy has them, and whether it had to act."""
-        if self.policy == "raise_gamma":
-            inverse = self.in_force(local_bound(judged))
-            return inverse, belief.factor, weighted, inverse < self.inverse
-        if self.policy == "compensate":
-            A = self.inverse * weighted
-            factor, acted = deflated(belief.factor, A, 1.0 - self.margin)
-            weighted = self.weighted(belief._replace(factor=factor))
-            return self.inverse, factor, weighted, acted
-        return self.inverse, belief.factor, weighted, jnp.array(False)
-
-    def moved(self, memory: HInfinityMemory, belief: Belief, inverse: Any, wide: Array) -> Belief:
-        """The belief with the inflated factor, and the mean that belongs to it."""
-        new = Belief(belief.mean, wide)
-        if not self.moves_on:
-            return new
-        # P~ L'L d / gamma^2 takes the mean on from P H'R^-1 r to P~ H'R^-1 r.
-        d = manifold.local(memory.predicted, belief.mean)
-        L = inverse * self.rows(belief.mean)
-        return new._replace(mean=manifold.retract(belief.mean, wide @ ((L @ wide).T @ (L @ d))))
-
-    def noting(
-        self, memory: HInfinityMemory, acted: Array, missed: Array, judged: Array
-    ) -> HInfinityMemory:
-        """Memory of a step that closes."""
+        acted = missed | (counts & acted)
         begins = acted & (memory.events == 0)
-        return memory._replace(
+        memory = memory._replace(
             steps=memory.steps + 1,
             fresh=jnp.array(True),
             measured=memory.measured & missed,
@@ -238,27 +182,49 @@ class HInfinity(Rule):
             first=jnp.where(begins, memory.steps - 1, memory.first),
             weighted_first=jnp.where(begins, judged, memory.weighted_first),
         )
+        return memory, new, jnp.where(missed, int(Code.INFEASIBLE), int(Code.DONE))
+
+    def eased(self, belief: Belief, weighted: Array, judged: Array):
+        """1 / gamma, factor and L S under the policy, and whether it acted."""
+        if self.policy == "raise_gamma":
+            inverse = self.in_force(local_bound(judged))
+            return inverse, belief.factor, weighted, inverse < self.inverse
+        if self.policy == "compensate":
+            A = self.inverse * weighted
+            factor, acted = _inflation.deflated(belief.factor, A, 1.0 - self.margin)
+            weighted = self.weighted(belief._replace(factor=factor))
+            return self.inverse, factor, weighted, acted
+        return self.inverse, belief.factor, weighted, jnp.array(False)
+
+    def moved(
+        self, memory: HInfinityMemory, belief: Belief, inverse: Numbers, wide: Array
+    ) -> Belief:
+        """Belief with the inflated factor, and the mean that belongs to it."""
+        if self.estimate == "a-posteriori":
+            return Belief(belief.mean, wide)
+        # P~ L'L d / gamma^2 takes the mean on from P H'R^-1 r to P~ H'R^-1 r.
+        d = manifold.local(memory.predicted, belief.mean)
+        L = inverse * _inflation.rows_of(self.weight, belief.mean, NAME)
+        return Belief(manifold.retract(belief.mean, wide @ ((L @ wide).T @ (L @ d))), wide)
 
     def first_infeasible(
         self, final: HInfinityMemory, before: int = 0, whole: bool = True
     ) -> tuple[int, Numbers] | None:
-        """Step, and L S there, where a run first had no filter; None if it had.
+        """First step without a filter, and L S there; None if it existed throughout.
 
-        Args:
-            final: memory that the run ended with.
-            before: events in the one that it began with, which were another filter's.
-            whole: judge the last step too, from which nothing has been predicted.
+        ``before`` are events in the memory at the start, of another filter; ``whole`` judges the
+        last step too, from which nothing has been predicted.
         """
         missed = int(final.events) - before
         if missed > 0 and before == 0:
-            return int(final.first), jnp.asarray(final.weighted_first)  # of a stream in C
-        if missed > 0:  # the first was another filter's; where one step is missed the rest are
+            return int(final.first), jnp.asarray(final.weighted_first)  # NumPy in a stream in C
+        if missed > 0:  # the first was another filter's; after a missed step all are missed
             return int(final.steps) - 1 - missed, final.weighted
-        if not whole or not bool(final.measured):
+        if not whole or not final.measured:
             return None
         n = final.weighted.shape[1]
         exists = inflated(jnp.eye(n), self.inverse * final.weighted)[1]
-        return None if bool(exists) else (int(final.steps) - 1, final.weighted)
+        return None if exists else (int(final.steps) - 1, final.weighted)
 
     @property
     def reports(self) -> bool:
@@ -271,13 +237,12 @@ class HInfinity(Rule):
         again: Again | None,
         time: ArrayLike | None,
     ) -> None:
-        """Say under policy "raise" that the filter did not exist at some step.
+        """Raise under policy "raise" where the filter did not exist at some step.
 
-        One sample at a time, a step is judged when the next prediction closes it: until then more
-        sensors may come.
+        In a stream a step is judged by the next prediction: until then more sensors may come.
 
         Raises:
-            Infeasible: it did not.
+            Infeasible: it did not exist.
         """
         if not self.reports:
             return
@@ -297,13 +262,13 @@ class HInfinity(Rule):
             least = least_gamma(exists, gamma)
         times = () if time is None else np.asarray(time)
         time_s = float(times[step]) if 0 <= step < len(times) else None
-        bound = float(local_bound(jnp.asarray(weighted)))  # in C a stream has arrays of NumPy
+        bound = float(local_bound(jnp.asarray(weighted)))  # NumPy in a stream in C
         raise Infeasible(step, time_s, gamma, bound, least)
 
 
 def h_infinity(
-    gamma: Any,
-    weight: Any,
+    gamma: Given,
+    weight: GivenWeight,
     policy: Policy = "raise",
     estimate: Estimate = "a-posteriori",
     margin: float = 0.05,
@@ -315,15 +280,14 @@ def h_infinity(
 
         |x0 - x0_hat|^2_{P0^-1} + sum |w_k|^2_{Q^-1} + sum |v_k|^2_{R^-1}
 
-    whatever the disturbances are. When the measurements of a step have given P as in the Kalman
-    filter, and before the next prediction,
+    for all disturbances. After the Kalman updates of a step, and before the next prediction,
 
         it exists if   lambda_max(L P L') < gamma^2
         P becomes      (P^-1 - gamma^-2 L'L)^-1 = P + P L' (gamma^2 I - L P L')^-1 L P
 
     in square-root form S N^-T with N N' = I - (L S / gamma)' (L S / gamma): it exists where this
-    has a Cholesky factor. The beliefs that a run reports are those before the inflation. P is
-    then no covariance of the error: NEES, NIS and chi-square gates do not apply as they stand.
+    has a Cholesky factor. A run reports the beliefs before the inflation. P is then no covariance
+    of the error: NEES, NIS and chi-square gates do not apply as they stand.
 
     Notes, after each sensor (the last one's are the step's): ``h_infinity.bound``,
     sqrt(lambda_max(L P L')); ``.gamma``, in force by the policy; ``.margin``, 1 - bound^2 /
@@ -332,42 +296,39 @@ def h_infinity(
 
     Args:
         gamma: bound, in units of L x per unit of whitened noise; inf is the Kalman filter, bit for
-            bit. It is a number of the rule, and another one compiles nothing: see `with_gamma`.
-        weight: L, which errors count and in what units: (q, n) matrix, (n,) diagonal, or
-            ``mean -> `` one of these. There is no default: gamma means nothing without it.
-        policy: what to do where the filter does not exist. "raise": stop predicting, with code
+            bit. `with_gamma` exchanges it.
+        weight: L, the errors that count, in their units: (q, n) matrix, (n,) diagonal, or
+            ``mean -> `` one of these. gamma means nothing without it.
+        policy: action where the filter does not exist. "raise": stop predicting, with code
             ``INFEASIBLE``; `run` then raises `Infeasible`. "raise_gamma": in that step, the least
             gamma that leaves ``margin``. "compensate": shrink P in the directions at fault until
             ``margin`` is left; the smaller P has no justification in the data.
-        estimate: whose error is bounded. "a-posteriori": the one after the measurement. "a-priori":
-            the one before it, with gain P~ H' R^-1 for the inflated P~; exists where
-            lambda_max(L P L') < gamma^2 for the *predicted* P. "predictor": the same gain under the
-            test after the measurement, as Simon (2006) has it in eq. 11.89 and 11.90: a weaker
-            test, which does not guarantee the bound.
+        estimate: estimate whose error is bounded. "a-posteriori": after the measurement.
+            "a-priori": before it, with gain P~ H' R^-1 for the inflated P~; exists where
+            lambda_max(L P L') < gamma^2 for the *predicted* P. "predictor": the same gain with the
+            test after the measurement (Simon 2006, eq. 11.89 and 11.90), which is weaker and does
+            not guarantee the bound.
         margin: 1 - bound^2 / gamma^2 that the policies leave, between 0 and 1.
-        count_missing: whether a step counts in which nothing was measured, or all was refused. By
-            default it does not, and P stays as it is.
+        count_missing: inflate also in steps in which nothing was measured, or all was refused.
 
     Raises:
         TypeError: gamma or the weight is not of real numbers.
-        ValueError: gamma is not positive, the weight is not finite or of the wrong shape, policy or
-            estimate is unknown or they do not go together, or the margin is not between 0 and 1.
+        ValueError: an argument is out of its range, or policy and estimate do not go together.
     """
-    asked = _as_gamma(gamma)
+    inverse = 1.0 / _as_gamma(gamma)
     one_of("h_infinity policy", policy, Policy)
     one_of("h_infinity estimate", estimate, Estimate)
-    between = "margin must lie between 0 and 1"
-    left = number(between, margin, lambda m: (m > 0.0) & (m < 1.0))
+    left = number("margin must lie between 0 and 1", margin, is_chance)
     if estimate == "a-priori" and policy == "compensate":
         raise ValueError(
-            "policy='compensate' mends P after the measurement, estimate='a-priori' needs it "
+            "policy='compensate' changes P after the measurement, estimate='a-priori' needs it "
             "before: use 'raise_gamma'"
         )
-    L = as_weight(weight, NAME)
-    return HInfinity(1.0 / asked, L, left, policy, estimate, count_missing)
+    L = _inflation.as_weight(weight, NAME)
+    return HInfinity(inverse, L, left, policy, estimate, count_missing)
 
 
-def _as_gamma(gamma: Any) -> Any:
+def _as_gamma(gamma: Given) -> Numbers:
     if not is_known(gamma):
         return jnp.asarray(gamma, float)
     value = np.asarray(gamma)
@@ -377,27 +338,23 @@ def _as_gamma(gamma: Any) -> Any:
     return value.astype(float)
 
 
-def with_gamma(filter_: F, gamma: Any) -> F:
-    """The filter with another gamma, positive or inf, in each of its `h_infinity` rules.
+def with_gamma(filter_: F, gamma: Given) -> F:
+    """Filter with another gamma in each of its `h_infinity` rules, also in its parts.
 
-    Gamma may be traced, so that a batch of gammas is one `jax.vmap`, and nothing compiles anew. A
-    state of the filter goes on with it.
-
-    Args:
-        filter_: with such rules, also in its parts.
-        gamma: as `h_infinity` takes it.
+    Gamma may be traced, so that a batch of gammas is one `jax.vmap`, without a new compilation. A
+    state of the filter continues with it.
 
     Raises:
         TypeError: gamma is not one real number.
         ValueError: gamma is not positive, or the filter has no `h_infinity` rule.
     """
     inverse = 1.0 / _as_gamma(gamma)
-    parts, structure = jax.tree_util.tree_flatten(filter_, is_leaf=_is_rule)
+
+    def is_rule(part: object) -> bool:
+        return isinstance(part, HInfinity)
+
+    parts, structure = jax.tree_util.tree_flatten(filter_, is_leaf=is_rule)
     none = "this filter has no h_infinity rule whose gamma could be exchanged"
-    require(any(map(_is_rule, parts)), none)
-    put = [replace(one, inverse=inverse) if _is_rule(one) else one for one in parts]
+    require(any(map(is_rule, parts)), none)
+    put = [replace(one, inverse=inverse) if is_rule(one) else one for one in parts]
     return jax.tree_util.tree_unflatten(structure, put)
-
-
-def _is_rule(one: object) -> TypeGuard[HInfinity]:
-    return isinstance(one, HInfinity)

@@ -9,7 +9,7 @@ from robins.filters.chi_square import MOST, limits, within
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Memory, Rule
 from robins.filters.rules._robust import PATIENCE, opening, scale_to_quantile, weighed
-from robins.filters.values import Numbers, number, value
+from robins.filters.values import Numbers, is_share, number, value
 
 
 @value
@@ -21,7 +21,6 @@ class Huber(Rule):
     name = "huber"
 
     def before(self, memory: Memory, prior: Belief, o: Observation):
-        """Noise of the measurement, scaled by s."""
         seen = normalised(o)
         s = scale_to_quantile(o, within(self.limit, o.residual)[seen.dof], seen)
         o, weight = weighed(o, s)
@@ -29,9 +28,7 @@ class Huber(Rule):
 
 
 def huber(
-    probability: Number = 0.999,
-    threshold: Number | None = None,
-    patience: int | None = PATIENCE,
+    probability: Number = 0.999, threshold: Number | None = None, patience: int | None = PATIENCE
 ) -> Rule:
     r"""Huber weight on the joint Mahalanobis distance of a measurement (Chang 2014, sec. 3).
 
@@ -40,28 +37,24 @@ def huber(
         r' (H P H' + s R)^-1 r = k^2,   k^2 = the chi-square quantile of the components present,
 
     solved exactly (Chang iterates his eq. 23, s <- s NIS(s) / k^2). One weight for the whole
-    measurement: correlated noise stays what it is, and no unit enters. The state is pulled by about
-    k^2 / |r| at the most: the further off a measurement is, the less it moves the state.
+    measurement keeps correlations of its noise. The correction is about k^2 / |r| at most, so it
+    falls with the size of the innovation.
 
-    A weight of 1e-12 or less is a refusal. After ``patience`` measurements with hardly any weight
-    the next one is believed (`robins.filters.rules._robust.opening`).
-
-    Notes: ``huber.weight``, 1 / s, 0 if refused, and ``huber.recovered``. Components without noise
-    of their own cannot be weighed down. The Kalman filter is ``probability=1`` or
-    ``threshold=inf``.
+    Notes: ``huber.weight``, 1 / s, 0 if refused (1e-12 or less), and ``huber.recovered``.
+    Components without noise of their own keep their weight. The Kalman filter is ``probability=1``
+    or ``threshold=inf``.
 
     Args:
         probability: share of right measurements that keep their weight, in (0, 1].
-        threshold: k, in standard deviations, whatever the number of components; None takes it from
+        threshold: k > 0, in standard deviations, for any number of components; None takes it from
             the probability.
-        patience: measurements in a row with a weight below 1e-2; None never recovers.
+        patience: measurements in a row with a weight below 1e-2 before one is used
+            (`robins.filters.rules._robust.opening`); None never recovers.
 
     Raises:
-        ValueError: the probability is not in (0, 1], the threshold not positive, or patience is
-            negative.
+        ValueError: an argument is out of its range.
     """
-    share = "huber probability must lie in (0, 1]"
-    limit = limits(number(share, probability, lambda p: (p > 0.0) & (p <= 1.0)))
+    limit = limits(number("huber probability must lie in (0, 1]", probability, is_share))
     if threshold is not None:
         k = number("huber threshold must be positive", threshold, lambda k: k > 0.0)
         limit = k[..., None] ** 2 * np.ones(MOST + 1)

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from robins.errors import require
 from robins.filters.belief import Belief, Number
-from robins.filters.observation import Normalised, Observation, normalised
+from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Memory, Rule
 from robins.filters.rules._robust import widened
 from robins.filters.values import Numbers, is_known, number, value
@@ -28,7 +28,7 @@ class Igg3(Rule):
     name = "igg3"
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
-        return {name: jnp.zeros((), int) for name in dims}  # in a row with no weight left
+        return {name: jnp.zeros((), int) for name in dims}  # measurements in a row without weight
 
     def before(self, memory: Memory, prior: Belief, o: Observation):
         seen = normalised(o)
@@ -40,7 +40,11 @@ class Igg3(Rule):
         earlier, recovered = memory[o.sensor], jnp.zeros((), bool)
         if self.patience is not None:
             recovered = hopeless & (earlier.astype(float) >= self.patience)
-            prior = self.recovered(recovered, t, prior, o, seen)
+            far = t > self.k0
+            beyond = jnp.where(far, t, self.k1)
+            a = jnp.max(jnp.where(far, 1.0 / self.k0**2 - 1.0 / beyond**2, 0.0))
+            root = jnp.sqrt(jnp.where(recovered, a, 1.0)) * o.residual[:, None]
+            prior = widened(recovered, prior, o, seen.used, root)
         weight = jnp.where(recovered, 1.0, weight)
         count = jnp.where(hopeless & ~recovered, earlier + 1, 0)
         count = jnp.where(measured, count, earlier)
@@ -57,16 +61,6 @@ class Igg3(Rule):
         weight = jnp.where(far, jnp.maximum(self.k0 / beyond * share**2, self.floor), 1.0)
         return jnp.where((t >= self.k1) & (self.floor * t > self.k0), 0.0, weight)
 
-    def recovered(
-        self, due: Array, t: Array, prior: Belief, o: Observation, seen: Normalised
-    ) -> Belief:
-        """The prior, widened where that is due until no t exceeds k0."""
-        far = t > self.k0
-        beyond = jnp.where(far, t, self.k1)
-        a = jnp.max(jnp.where(far, 1.0 / self.k0**2 - 1.0 / beyond**2, 0.0))
-        root = jnp.sqrt(jnp.where(due, a, 1.0)) * o.residual[:, None]
-        return widened(due, prior, o, seen.used, root)
-
 
 def igg3(
     k0: Number = 1.5, k1: Number = 4.0, floor: Number = 1e-4, patience: int | None = 10
@@ -80,12 +74,12 @@ def igg3(
         R_ij becomes R_ij / sqrt(w_i w_j)
 
     With the floor at zero a component beyond k1 is refused; else one beyond k0 / floor, which even
-    by the floor would pull more than one of full weight can.
+    with the floor would correct more than one of full weight can.
 
-    A filter that has gone wrong would give weight to no measurement any more. So when no component
-    of a sensor has had more weight than the floor ``patience`` times in a row, its next such
-    measurement is used with full weight, and the prior covariance is first widened along the
-    innovation until no t_i exceeds k0, by `robins.filters.rules._robust.widened` with
+    When no component of a sensor has had more weight than the floor ``patience`` times in a row, as
+    of a diverged filter, its next such measurement is used with full weight, and the prior
+    covariance is first widened along the innovation until no t_i exceeds k0, by
+    `robins.filters.rules._robust.widened` with
 
         D = a r r',   a = max_i (1 / k0^2 - 1 / t_i^2)
 
@@ -93,13 +87,13 @@ def igg3(
     is the limit of k0 above every t_i.
 
     Args:
-        k0: end of full weight, in standard deviations of the innovation.
-        k1: begin of none.
+        k0: end of full weight, in standard deviations of the innovation, positive.
+        k1: start of the floor, finite.
         floor: least weight, in [0, 1).
-        patience: measurements in a row that may be left without weight; None never recovers.
+        patience: measurements in a row without weight before one is used; None never recovers.
 
     Raises:
-        ValueError: not 0 < k0 < k1 < inf, the floor is not in [0, 1), or patience is negative.
+        ValueError: an argument is out of its range, or not k0 < k1.
     """
     if is_known((k0, k1)):
         low, high = np.asarray(k0, float), np.asarray(k1, float)

@@ -12,9 +12,10 @@ from robins.errors import require
 from robins.filters import trees
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.checks import finite_numbers, one_of
-from robins.filters.limits.constrain import Function, Given, as_sensor
+from robins.filters.limits.constrain import Function, as_sensor
 from robins.filters.limits.interval import clip, truncate
 from robins.filters.linearise import Transition
+from robins.filters.model import Given
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory, Rule
 from robins.filters.values import Numbers, is_known, kind, number, value
@@ -38,7 +39,7 @@ class Inequality(Rule):
         count = len(self.low)
         if sensor.dim != count:
             raise ValueError(f"inequality has {count} bounds for {sensor.dim} components of g")
-        return jnp.zeros((), bool)  # whether this step has been cut
+        return jnp.zeros((), bool)  # this step has been truncated
 
     def process(self, memory: Memory, transition: Transition):
         return jnp.zeros((), bool), transition
@@ -65,19 +66,18 @@ def inequality(
 ) -> Rule:
     """Keep ``lower <= g(x) <= upper`` after each update (Simon 2010, secs. 2.5 and 2.6).
 
-    "active-set" puts a mean that is outside on the nearest state inside, by the metric P^-1 (Gupta
-    & Hauser 2007), and keeps P. A projection on a convex set never leads away from a truth in it,
-    in its own metric, so P stays as honest as it was; held as an equality the bound would freeze
-    the states it touches. "truncation" takes mean and covariance of the density inside the bounds
-    (Simon & Simon 2010): smaller errors while the bound has something to say. But the same bound is
-    then used as information again and again: where the state hardly moves from step to step the
-    mean is pushed away from it, and P gets too small.
+    "active-set" moves a mean that is outside to the nearest state inside, in the metric P^-1 (Gupta
+    & Hauser 2007), and keeps P. A projection on a convex set, in its own metric, never increases
+    the distance to a truth inside, so P stays consistent; as an equality the bound would freeze the
+    states. "truncation" takes mean and covariance of the density inside the bounds (Simon & Simon
+    2010): smaller errors while the bound is active. But it reuses the bound as information: where
+    the state hardly moves between steps the mean is pushed away from it, and P gets too small.
 
     Truncation acts when something was measured, and at the first sensor of each step; clipping
     always. Notes: ``inequality.outside``, the number of bounds that the mean violated;
-    ``inequality.infeasible``, whether no state fulfils them all (the belief then stays) or one that
-    is known exactly does not: the update is then `Code.CONTRADICTED`. Bounds at infinity are the
-    Kalman filter.
+    ``inequality.infeasible``, true where no state fulfils them all (the belief then stays) or one
+    that is known exactly does not: the update is then `Code.CONTRADICTED`. Bounds at infinity are
+    the Kalman filter.
 
     Args:
         g: (c, n) matrix D, or a function of the state with values in an array, linearised about
@@ -88,7 +88,7 @@ def inequality(
 
     Raises:
         ValueError: there is no bound, one is NaN, lower exceeds upper, a row of D is zero, the
-            method is unknown; and by `init`, D does not fit the state.
+            method is unknown; by `init`, D does not fit the state.
     """
     one_of("inequality method", method, Method)
     low, high = _bounds(lower, upper)

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from robins.errors import require
@@ -15,22 +14,22 @@ from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 from robins.filters.rules._variances import ratio, reading_variance, variance
-from robins.filters.values import Numbers, kind, number, value
+from robins.filters.values import Numbers, is_factor, kind, number, value
 
 
 class Window(NamedTuple):
-    """The last samples of a sensor, newest first; each component has its own."""
+    """The last samples of each component of a sensor, newest first."""
 
     surplus: Array  # (window, m) e_i^2 / R_ii - 1; 0 where not filled yet
     filled: Array  # (m,) int, samples in it
 
 
 class Memory(NamedTuple):
-    """Windows by sensor, and whether this step has been faded already."""
+    """Windows by sensor, and state of the step."""
 
     windows: dict[str, Window]
-    faded: Array  # () bool
-    start: Array  # (n,) standard deviations at the start, which `reach` is counted in
+    faded: Array  # () bool, this step has been faded
+    start: Array  # (n,) standard deviations at the start, the unit of `reach`
 
 
 @value
@@ -53,70 +52,59 @@ class InnovationFading(Rule):
         return memory._replace(faded=jnp.zeros((), bool)), transition
 
     def before(self, memory: Memory, prior: Belief, o: Observation):
-        R = variance(o.noise)
-        seen, counts = self.seen(memory.windows[o.sensor], o, R)
-        mean = jnp.sum(seen.surplus, axis=0) / self.window
-        unexplained = jnp.sum(jnp.where(counts, mean, 0.0))
-        explained = jnp.sum(jnp.where(counts, ratio(reading_variance(o), R), 0.0))
-        factor = jnp.clip(ratio(unexplained, explained), 1.0, self.limit)
-        factor = jnp.where(memory.faded | self.too_far(factor, memory, prior), 1.0, factor)
-        windows = {**memory.windows, o.sensor: seen}
-        memory = memory._replace(windows=windows, faded=memory.faded | (factor > 1.0))
-        prior = prior._replace(factor=jnp.sqrt(factor) * prior.factor)
-        return memory, prior, o.noted(self.name, lambda_=factor)
-
-    def seen(self, old: Window, o: Observation, R: Array) -> tuple[Window, Array]:
-        """The window with a sample more, and the components that count: used, and it is full."""
+        R, old = variance(o.noise), memory.windows[o.sensor]
         here = o.accepted & o.present & (R > 0.0)
         e = jnp.where(here, o.residual, 0.0)
         rolled = jnp.concatenate([(ratio(e**2, R) - 1.0)[None, :], old.surplus[:-1]])
         surplus = jnp.where(here[None, :], rolled, old.surplus)
         filled = jnp.minimum(old.filled + here.astype(int), self.window)
-        return Window(surplus, filled), here & (filled == self.window)
-
-    def too_far(self, factor: Array, memory: Memory, prior: Belief) -> Array:
-        """True if a factor would take a standard deviation beyond the reach."""
-        # a state known exactly at the start has no scale to hold it to
+        window, counts = Window(surplus, filled), here & (filled == self.window)
+        mean = jnp.sum(window.surplus, axis=0) / self.window
+        unexplained = jnp.sum(jnp.where(counts, mean, 0.0))
+        explained = jnp.sum(jnp.where(counts, ratio(reading_variance(o), R), 0.0))
+        factor = jnp.clip(ratio(unexplained, explained), 1.0, self.limit)
+        # a state known exactly at the start has no scale
         scaled = memory.start > 0.0
         most = self.reach * jnp.where(scaled, memory.start, 1.0)
-        return jnp.any(scaled & (jnp.sqrt(factor) * prior.sigma > most))
+        too_far = jnp.any(scaled & (jnp.sqrt(factor) * prior.sigma > most))
+        factor = jnp.where(memory.faded | too_far, 1.0, factor)
+        windows = {**memory.windows, o.sensor: window}
+        memory = memory._replace(windows=windows, faded=memory.faded | (factor > 1.0))
+        prior = prior._replace(factor=jnp.sqrt(factor) * prior.factor)
+        return memory, prior, o.noted(self.name, lambda_=factor)
 
 
 def innovation_fading(window: int = 10, limit: Number = 5.0, reach: Number = float("inf")) -> Rule:
     """One fading factor from the mean innovation of a window (Mehra 1972, covariance matching).
 
-    The form that robust adaptive filters of integrated navigation pair with robust weights
-    (RAUKF), whitened by R so that radians and metres may be added. With e the innovation and the
-    mean taken over the last ``window`` samples of the sensor:
+    The form of robust adaptive filters of integrated navigation (RAUKF), whitened by R so that
+    radians and metres may be added. With e the innovation and the mean over the last ``window``
+    samples of the sensor:
 
         lambda = clip( sum_i (mean e_i^2 / R_ii - 1) / sum_i (H P- H')_ii / R_ii,  1,  limit )
         P-  :=  lambda P-
 
-    R is the noise as the rules before this one leave it: behind a robust weight w the terms are
-    w_i e_i^2 / R_ii, so that an outlier does not fade. A component that is missing or refused is
-    left out of the sums, and its window does not move; it does not count before its window is full.
-
-    A step is faded once: by the first of its sensors whose lambda exceeds 1; those after it see the
-    prior that this one has left.
+    R is the noise after the rules before this one: with a robust weight w the terms are
+    w_i e_i^2 / R_ii, so that an outlier does not fade. A component that is missing or refused, or
+    whose window is not full, does not count. A step is faded once, by the first of its sensors
+    whose lambda exceeds 1.
 
     One factor for all states also fades those that no sensor of the filter sees, and no measurement
     reduces their covariance again: with a star sensor alone the covariance of the position grows
     until the model is no longer linear over it. So a step that would take any standard deviation
-    beyond ``reach`` times what it was at the start is not faded.
+    beyond ``reach`` times the one at the start is not faded.
 
     Notes: ``innovation_fading.lambda``. limit = 1 is the Kalman filter, bit for bit.
 
     Args:
         window: samples in the mean.
         limit: greatest lambda.
-        reach: greatest standard deviation that fading leads to, over the one at the start.
+        reach: greatest standard deviation after fading, over the one at the start.
 
     Raises:
-        ValueError: a parameter is not of its range.
+        ValueError: a parameter is out of its range.
     """
     require(window >= 1, "innovation_fading window must be 1 sample or more", window)
-    below = "innovation_fading limit must be finite and not below 1"
-    most = number(below, limit, lambda x: (x >= 1.0) & (x < np.inf))
+    most = number("innovation_fading limit must be finite and not below 1", limit, is_factor)
     farthest = number("innovation_fading reach must be at least 1", reach, lambda x: x >= 1.0)
-
     return InnovationFading(most, farthest, window)

@@ -24,7 +24,6 @@ class Only(Rule):
 
     @property
     def name(self) -> str:
-        """Name of the rule inside."""
         return self.inner.name
 
     @property
@@ -36,24 +35,24 @@ class Only(Rule):
         return self.inner.settles
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
-        seen = {name: m for name, m in dims.items() if name in self.names}
-        if not seen:
+        own = {name: m for name, m in dims.items() if name in self.names}
+        if not own:
             raise ValueError(
                 f"only: the rule '{self.name}' is for {list(self.names)}, "
                 f"this filter has {list(dims)}"
             )
-        return self.inner.init(belief, seen)
+        return self.inner.init(belief, own)
 
     def process(self, memory: Memory, transition: Transition):
         return self.inner.process(memory, transition)
 
     def before(self, memory: Memory, prior: Belief, o: Observation):
-        known = o.sensor in self.names
-        return self.inner.before(memory, prior, o) if known else (memory, prior, o)
+        own = o.sensor in self.names
+        return self.inner.before(memory, prior, o) if own else (memory, prior, o)
 
     def after(self, memory: Memory, posterior: Belief, info: StepInfo, o: Observation):
-        known = o.sensor in self.names
-        return self.inner.after(memory, posterior, info, o) if known else (memory, posterior, info)
+        own = o.sensor in self.names
+        return self.inner.after(memory, posterior, info, o) if own else (memory, posterior, info)
 
     def settle(self, memory: Memory, belief: Belief):
         return self.inner.settle(memory, belief)
@@ -61,20 +60,19 @@ class Only(Rule):
     def report(
         self, start: Memory, final: Memory, again: Again | None, time: ArrayLike | None
     ) -> None:
-        anew = None if again is None else lambda inner: again(replace(self, inner=inner))
-        self.inner.report(start, final, anew, time)
+        repeat = None if again is None else lambda inner: again(replace(self, inner=inner))
+        self.inner.report(start, final, repeat, time)
 
 
 def only(sensors: str | Sequence[str], rule: Rule) -> Rule:
     """A rule that acts on measurements of the named sensors only.
 
-    Its `before` and `after` are called for these alone, and it begins with their dimensions alone.
-    Its hooks of a step (`process`, `settle`) are called as usual. Other sensors carry no notes of
-    it.
+    `before` and `after` are called, and dimensions given to `init`, for these alone; `process` and
+    `settle` are called as usual.
 
     Args:
-        sensors: a name, or several; those that a filter does not have are left out, so that one
-            rule can serve several local filters.
+        sensors: a name, or several; those that a filter does not have are ignored, so that one rule
+            can serve several local filters.
         rule: any other.
 
     Raises:

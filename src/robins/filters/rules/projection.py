@@ -1,11 +1,10 @@
-"""Put the state on a constraint whose numbers come with the data."""
+"""Project the state on a constraint whose numbers come with the data."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
-from jaxtyping import Array
 
 from robins import linalg
 from robins.filters.belief import Belief, StepInfo
@@ -37,7 +36,24 @@ class Projection(Rule):
     def after(self, memory: Memory, posterior: Belief, info: StepInfo, o: Observation):
         if o.sensor not in self.names:
             return memory, posterior, info
-        belief, gain, used, wrong = projected(o, self.weight, self.project_covariance)
+        S = o.prior.factor
+        metric, root = metric_of(o.prior, self.weight)
+        spread = o.spread
+        if root is not None:  # D = D S S' (S S')^-1
+            solid, _ = linalg.guard(S)
+            spread = linalg.solve_spd(solid, S @ o.spread.T).T @ metric.factor
+        nothing = jnp.zeros((len(o.residual), 0))
+        exact = o._replace(spread=spread, excess=nothing, noise=nothing, deficit=None)
+        mean, gain, used, wrong = nearest(metric, exact)
+        factor = S
+        if self.project_covariance:
+            error = jnp.concatenate([o.excess, o.noise], axis=1)
+            factor = linalg.tria(S - gain @ jnp.where(used[:, None], o.spread, 0.0), gain @ error)
+            # no rounding is left across an exact constraint
+            clean = jnp.any(used & ~jnp.any(error != 0.0, axis=1))
+            lost = linalg.lost_in_rounding(factor, o.prior.sigma)
+            factor = jnp.where(clean & lost, 0.0, factor)
+        belief = Belief(mean, jnp.where(jnp.any(used), factor, S))
         info = info._replace(gain=jnp.where(used[None, :], gain, 0.0))
         info = info.contradicted_where(jnp.any(wrong))
         return memory, belief, info.noted("projection", residual=jnp.max(jnp.abs(o.residual)))
@@ -46,27 +62,25 @@ class Projection(Rule):
 def projection(
     sensors: str | Sequence[str], weight: Weight = "covariance", project_covariance: bool = True
 ) -> Rule:
-    """Measurements of the named sensors are constraints, and are met instead of weighed.
+    """Take measurements of the named sensors as constraints, by projection.
 
-    With the measurement linearised as d = D x + error, error ~ N(0, R_d), the Kalman update gives
-    way to the projection (Simon & Chia 2002, sec. II)
+    With the measurement linearised as d = D x + error, error ~ N(0, R_d), the projection (Simon &
+    Chia 2002, sec. II) replaces the Kalman update,
 
         G = V D' (D V D')^-1,   x* = x - G (D x - d),   P* = (I - G D) P (I - G D)' + G R_d G'
 
-    with V = P, or W^-1. The gain takes the constraint for exact; its noise, and what the
-    linearisation leaves over, is counted in P* alone. `equality` is for a constraint whose numbers
-    are the same throughout a run; to weigh the measurement, leave the rule out.
+    with V = P, or W^-1. The gain takes the constraint as exact; its noise and the linearisation
+    error count in P* alone. For a constraint whose numbers are the same throughout a run use
+    `equality`.
 
-    Where R_d is zero P* is *singular*: nothing is uncertain across the constraint. Updates that
-    follow, predictions and sigma points are sound with ``form="sqrt"``; ``form="joseph"`` says
-    `Code.INDEFINITE`, and the information sum of `distributed` does not take the step, since there
-    is nothing to invert: give the sensor a noise far below what matters (1e-3 m/s), or apply it
-    ``at_master``. What was met already is left out. A weight other than "covariance" wants a prior
-    that is not singular: of a combination that is known exactly D is not seen.
+    Where R_d is zero P* is *singular*. Later updates, predictions and sigma points then need
+    ``form="sqrt"``: ``form="joseph"`` returns `Code.INDEFINITE`, and the information sum of
+    `distributed` does not take the step, since P* has no inverse: give the sensor a small noise
+    (1e-3 m/s), or apply it ``at_master``. Components already met are left out. A weight other than
+    "covariance" needs a prior that is not singular, to recover D.
 
-    It goes before rules that look at the posterior: what rules before it did to that is lost.
-
-    A constraint that contradicts what is known exactly cannot be met: `Code.CONTRADICTED`.
+    Put it before rules that use the posterior: changes of it by earlier rules are lost. A
+    constraint that contradicts what is known exactly makes the update `Code.CONTRADICTED`.
 
     Notes: ``projection.residual``, the greatest component of d - D x.
 
@@ -74,40 +88,10 @@ def projection(
         sensors: a name, or several.
         weight: metric W in which the state is moved least: "covariance" for P^-1, "identity", or a
             positive definite (n, n) matrix in tangent coordinates.
-        project_covariance: False leaves P as it was: the mean is on the constraint, and the filter
-            does not know it. Better where the error of the constraint lasts from step to step.
+        project_covariance: False keeps P. Better where errors of the constraint are not white.
 
     Raises:
-        ValueError: no sensor is named, or the weight is none; by `init`, it is not of the state's
-            dimension, or a sensor has more components than the state.
+        ValueError: no sensor is named, the weight is not valid; by `init`, sizes do not fit.
     """
     names = sensor_names("projection", sensors)
     return Projection(as_weight("projection", weight), names, project_covariance)
-
-
-def projected(
-    o: Observation, weight: Weight, project_covariance: bool = True
-) -> tuple[Belief, Array, Array, Array]:
-    """The belief on the constraint that an observation is, and the rest of `nearest`."""
-    prior, S = o.prior, o.prior.factor
-    metric, root = metric_of(prior, weight)
-    spread = o.spread if root is None else _slope(o) @ metric.factor
-    nothing = jnp.zeros((len(o.residual), 0))
-    exact = o._replace(spread=spread, excess=nothing, noise=nothing, deficit=None)
-    mean, G, used, wrong = nearest(metric, exact)
-    factor = S
-    if project_covariance:
-        error = jnp.concatenate([o.excess, o.noise], axis=1)
-        factor = linalg.tria(S - G @ jnp.where(used[:, None], o.spread, 0.0), G @ error)
-        # Across an exact constraint nothing is left, not even rounding.
-        clean = jnp.any(used & ~jnp.any(error != 0.0, axis=1))
-        lost = linalg.lost_in_rounding(factor, prior.sigma)
-        factor = jnp.where(clean & lost, 0.0, factor)
-    some = jnp.any(used)
-    return Belief(mean, jnp.where(some, factor, S)), G, used, wrong
-
-
-def _slope(o: Observation) -> Array:
-    """D, of which the spread D S is known: D = D S S' (S S')^-1."""
-    solid, _ = linalg.guard(o.prior.factor)
-    return linalg.solve_spd(solid, o.prior.factor @ o.spread.T).T

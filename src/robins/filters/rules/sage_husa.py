@@ -20,19 +20,19 @@ from robins.filters.values import Numbers, is_known, kind, value
 
 
 class Scale(NamedTuple):
-    """Variances as multiples of the nominal ones, and how many samples each was learnt from."""
+    """Variances as multiples of the nominal ones, and the samples of each."""
 
     ratio: Array  # (k,)
     samples: Array  # (k,) int
 
 
 class LastStep(NamedTuple):
-    """What a step leaves for the next one to learn Q from."""
+    """Sample of Q, for the next step."""
 
     moved: Array  # (n,) diagonal of F P F' + Omega
     nominal: Array  # (n,) diagonal of the model's Q
     posterior: Array  # (n,) diagonal of P after the last update
-    correction: Array  # (n,) sum of what the updates moved the mean by
+    correction: Array  # (n,) sum of the corrections of the mean
     measured: Array  # () bool
 
 
@@ -50,7 +50,7 @@ class SageHusa(Rule):
     name = "sage_husa"
 
     def learnt(self, old: Scale, sample: Array, here: Array) -> Scale:
-        """The scale after a sample of those components that are here."""
+        """Scale after a sample of the components that are here."""
         k, b = (old.samples + 1).astype(float), self.forgetting
         d = 1.0 / (k + 1.0) if self.endless else (1.0 - b) / (1.0 - b ** (k + 1.0))
         new = jnp.clip((1.0 - d) * old.ratio + d * sample, self.floor, self.ceiling)
@@ -58,10 +58,14 @@ class SageHusa(Rule):
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
         n = belief.factor.shape[0]
-        sensors = {name: _nominal(m) for name, m in dims.items()} if self.of_sensor else {}
+
+        def nominal(k: int) -> Scale:
+            return Scale(jnp.ones(k), jnp.zeros(k, int))
+
+        sensors = {name: nominal(m) for name, m in dims.items()} if self.of_sensor else {}
         nothing = jnp.zeros(n)
         last = LastStep(nothing, nothing, nothing, nothing, jnp.zeros((), bool))
-        return sensors, (_nominal(n), last) if self.of_motion else ()
+        return sensors, (nominal(n), last) if self.of_motion else ()
 
     def process(self, memory: Memory, transition: Transition):
         if not self.of_motion:
@@ -106,10 +110,6 @@ class SageHusa(Rule):
         return (sensors, motion), posterior, info._replace(notes=notes)
 
 
-def _nominal(k: int) -> Scale:
-    return Scale(jnp.ones(k), jnp.zeros(k, int))
-
-
 def sage_husa(
     forgetting: Number = 0.98,
     adapt: Literal["R", "Q", "QR"] = "R",
@@ -118,34 +118,34 @@ def sage_husa(
 ) -> Rule:
     """Noise by moments of the innovation (Sage & Husa 1969), weighed by age.
 
-    With e the innovation, P- the predicted covariance, b the forgetting and k = 1, 2, ... the
-    samples a component was measured in:
+    With e the innovation, P- the predicted covariance, b the forgetting factor and k = 1, 2, ...
+    the samples of a component:
 
         d_k = (1 - b) / (1 - b^(k+1))
         R_k = (1 - d_k) R_(k-1) + d_k diag(e e' - H P- H')               used in update k
         Q_k = (1 - d_k) Q_(k-1) + d_k diag(K e e' K' + P+ - F P F')      used in prediction k + 1
 
-    The bracket may be negative, so positivity has a guard: only variances are learnt (the nominal
-    correlations stay), and each is clipped to [floor, ceiling] times its nominal value after every
-    sample. The nominal values are those of the model at that step. For R that is the noise as the
-    rules before this one leave it; so put a gate before it, and weights that belong to one
-    sample after it. A component that is missing or refused does not count.
+    The bracket may be negative, so only variances are learnt (the nominal correlations stay), and
+    each is clipped to [floor, ceiling] times its nominal value after every sample. The nominal
+    values are those of the model at that step; for R, the noise after the rules before this one: so
+    put a gate before it, and weights of single samples after it. A component that is missing or
+    refused does not count.
 
     R and Q are not identifiable together from e: either explains an innovation that is too large.
-    "QR" is for comparison with papers that do it; keep to "R", or to "Q" where the sensor is known.
-    In "R" a wrong model of motion is taken for a noisy sensor, and the filter stops listening.
+    "QR" is for comparison with papers; use "R", or "Q" where the sensor is known. With "R" a wrong
+    model of motion is taken for a noisy sensor, which the filter then ignores.
 
     Notes, a number a component: ``sage_husa.r_scale.i`` and ``sage_husa.q_scale.i``, the ratios in
     use. floor = ceiling = 1 is the Kalman filter, bit for bit.
 
     Args:
         forgetting: b, in (0, 1]: about 1 / (1 - b) samples are remembered, 1 remembers all.
-        adapt: what to learn.
+        adapt: noise to learn.
         floor: least variance, as a share of the nominal one.
         ceiling: greatest variance, as a multiple of the nominal one.
 
     Raises:
-        ValueError: a parameter is not of its range.
+        ValueError: a parameter is out of its range.
     """
     known = _variances.bounded("sage_husa", forgetting, floor, ceiling)
     one_of("sage_husa adapt", adapt, ("R", "Q", "QR"))

@@ -7,17 +7,16 @@ from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from robins import linalg
 from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.checks import one_of
-from robins.filters.linearise import Transition
+from robins.filters.linearise import Transition, of_width
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 from robins.filters.rules import _fading
-from robins.filters.values import Numbers, kind, number, value
+from robins.filters.values import Numbers, is_factor, is_share, kind, number, value
 
 Form = Literal["outside", "lumped", "multiple", "projected"]
 Power = Literal["classic", "ewma"]
@@ -26,7 +25,7 @@ Power = Literal["classic", "ewma"]
 class _Memory(NamedTuple):
     power: dict[str, Array]  # (m,) averaged squares of each sensor's whitened residuals
     begun: dict[str, Array]  # (m,) bool: the average has a first value
-    moved: Array  # (n, 2n + 1) F S and what its linearisation left over
+    moved: Array  # (n, 2n + 1) F S and its excess
     noise: Array  # (n, n) factor of Q
     fresh: Array  # () bool: nothing has been used since the prediction
 
@@ -37,7 +36,7 @@ class StrongTracking(Rule):
 
     keep: Numbers  # () share of V that is kept
     beta: Numbers  # ()
-    sigmas: Numbers | None  # () by which V must exceed what is expected; None asks for nothing
+    sigmas: Numbers | None  # () threshold of V, in standard deviations; None: no test
     limit: Numbers  # () greatest lambda
     weights: Numbers | None  # (n,) a_j, the greatest 1
     form: Form = kind()
@@ -59,9 +58,9 @@ class StrongTracking(Rule):
     def process(self, memory: _Memory, transition: Transition):
         if self.form != "outside":
             return memory, transition
-        noise = transition.noise
         moved = jnp.concatenate([transition.spread, transition.excess], axis=1)
-        moved, noise = _fitted(moved, memory.moved.shape[1]), _fitted(noise, len(noise))
+        moved = of_width(moved, memory.moved.shape[1])
+        noise = of_width(transition.noise, len(transition.noise))
         return memory._replace(moved=moved, noise=noise, fresh=jnp.array(True)), transition
 
     def before(self, memory: _Memory, prior: Belief, o: Observation):
@@ -69,26 +68,19 @@ class StrongTracking(Rule):
         V, begun = memory.power[o.sensor], memory.begun[o.sensor]
         first = white.counts & ~begun
         V = jnp.where(first, white.residual**2, _fading.averaged(V, white, self.keep))
-        S, factor = self.faded(memory, prior.factor, white, self.excess(V, white))
+        total = _fading.total(V, white)
+        N = total - self.beta * white.dof
+        if self.sigmas is not None:
+            N = jnp.where(_fading.significant(total, white, self.keep, self.sigmas), N, 0.0)
+        if self.form == "outside":
+            S, factor = _faded_outside(memory, prior.factor, white, N, self.limit)
+        else:
+            S, factor = _fading.faded(prior.factor, white, N, self.form, self.weights, self.limit)
         memory = memory._replace(
             power={**memory.power, o.sensor: V},
             begun={**memory.begun, o.sensor: begun | white.counts},
         )
         return memory, Belief(prior.mean, S), o.noted(self.name, lambda_=factor)
-
-    def excess(self, V: Array, white: _fading.White) -> Array:
-        """Tr V less beta times that of R; 0 where V is not large enough."""
-        total = _fading.total(V, white)
-        N = total - self.beta * white.dof
-        if self.sigmas is None:
-            return N
-        return jnp.where(_fading.significant(total, white, self.keep, self.sigmas), N, 0.0)
-
-    def faded(self, memory: _Memory, S: Array, white: _fading.White, N: Array):
-        """The factor S as the form fades it, and lambda."""
-        if self.form == "outside":
-            return _faded_outside(memory, S, white, N, self.limit)
-        return _fading.faded(S, white, N, self.form, self.weights, self.limit)
 
     def after(self, memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
         return memory._replace(fresh=memory.fresh & ~jnp.any(info.used)), posterior, info
@@ -116,51 +108,40 @@ def strong_tracking(
         multiple   V - beta R           sum_j a_j (P H' H)_jj  Lam^1/2 P Lam^1/2
         projected  V - beta R           tr H P H'              P + (lambda-1) P H' (H P H')^+ H P
 
-    with Lam_j = max(1, a_j lambda).
+    with Lam_j = max(1, a_j lambda). The outside form is that of the paper; lumped fades Q too;
+    projected widens only what the sensor sees, so that nothing else grows without bound. Sigma
+    points are drawn from the faded prior, which for linear h equals scaling Pxz and Pzz - R. After
+    the first sensor used in a step the outside form fades as lumped does.
 
-    The outside form is that of the paper; lumped fades Q too; multiple knows which states may have
-    moved; projected widens only what the sensor sees, so that nothing else grows without bound.
-    Sigma points are drawn anew from the faded prior; where h is linear that is the same as scaling
-    Pxz and Pzz - R, the "simplified" form of some papers. ``H P H'`` contains what sigma points
-    find left over. Where several sensors follow one prediction, the first that is used knows Q
-    apart; the later ones see a posterior, which the outside form fades as lumped does.
+    The classic V has keep = rho / (1 + rho) <= 1/2: it averages two samples, and lambda follows
+    noise. ``power="ewma"`` takes keep = rho, starts at R, and fades only when
+    tr V > (1 + threshold sqrt(2 (1 - keep) / ((1 + keep) m))) tr(H P H' + R).
 
-    The classic V is an average with the weights of keep = rho / (1 + rho) <= 1/2: it remembers two
-    samples, and lambda follows noise. ``power="ewma"`` takes keep = rho, starts at R, and fades
-    only when tr V > (1 + threshold sqrt(2 (1 - keep) / ((1 + keep) m))) tr(H P H' + R).
-
-    Notes: ``strong_tracking.lambda``, for multiple the greatest. Components that are
-    missing, refused, or without noise of their own leave V and lambda alone. The Kalman filter is
-    ``limit=1``, ``threshold=inf`` or beta large enough.
+    Notes: ``strong_tracking.lambda``, for multiple the greatest. Components missing, refused or
+    without noise do not count. The Kalman filter is ``limit=1`` or ``threshold=inf``.
 
     Args:
         rho: forgetting factor of V, in (0, 1].
-        beta: weakening, at least 1: so many R are noise.
-        form: which covariance is faded.
-        power: how V is averaged.
-        threshold: standard deviations by which V must exceed what is expected; None is 3 for
-            "ewma", and no test for "classic".
+        beta: weakening factor of R, at least 1.
+        form: covariance that is faded.
+        power: average of V.
+        threshold: standard deviations of the test; None is 3 for "ewma", no test for "classic".
         limit: upper bound of lambda, at least 1.
-        weights: (n,) a_j >= 0 of the states for "multiple"; None is all alike (then as lumped).
+        weights: (n,) a_j >= 0 of the states for "multiple"; None: equal, which is lumped.
 
     Raises:
-        ValueError: an argument is out of its range; when the filter starts, if the weights are not
-            one a state.
+        ValueError: an argument is out of its range; by `init`, the weights are not one a state.
     """
-    share = "strong_tracking rho must lie in (0, 1]"
-    kept = number(share, rho, lambda r: (r > 0.0) & (r <= 1.0))
-    below = "strong_tracking beta must be at least 1 and finite"
-    weakened = number(below, beta, lambda b: (b >= 1.0) & (b < np.inf))
+    kept = number("strong_tracking rho must lie in (0, 1]", rho, is_share)
     one_of("strong_tracking form", form, Form)
     one_of("strong_tracking power", power, Power)
     sigmas = 3.0 if threshold is None and power == "ewma" else threshold
     negative = "strong_tracking threshold must not be negative"
-    below = "strong_tracking limit must be at least 1 and finite"
     return StrongTracking(
         keep=kept / (1.0 + kept) if power == "classic" else kept,
-        beta=weakened,
+        beta=number("strong_tracking beta must be at least 1 and finite", beta, is_factor),
         sigmas=None if sigmas is None else number(negative, sigmas, lambda t: t >= 0.0),
-        limit=number(below, limit, lambda x: (x >= 1.0) & (x < np.inf)),
+        limit=number("strong_tracking limit must be at least 1 and finite", limit, is_factor),
         weights=_fading.checked_weights("strong_tracking", weights, form),
         form=form,
         power=power,
@@ -168,7 +149,7 @@ def strong_tracking(
 
 
 def _faded_outside(memory: _Memory, S: Array, white: _fading.White, N: Array, limit: Numbers):
-    """P + (lambda - 1) F P F', which is lambda F P F' + Q; P itself instead of F P F' once used."""
+    """P + (lambda - 1) F P F' = lambda F P F' + Q; after the first update lambda P."""
     n = len(S)
     whole = jnp.concatenate([S, jnp.zeros((n, memory.moved.shape[1] - n))], axis=1)
     moved = jnp.where(memory.fresh, memory.moved, whole)
@@ -179,11 +160,3 @@ def _faded_outside(memory: _Memory, S: Array, white: _fading.White, N: Array, li
     more = factor > 1.0
     gain = jnp.sqrt(jnp.where(more, factor - 1.0, 1.0))
     return jax.lax.cond(more, lambda: linalg.tria(S, gain * moved), lambda: S), factor
-
-
-def _fitted(columns: Array, width: int) -> Array:
-    """The same covariance from a factor of so many columns, at least one a row."""
-    n, k = columns.shape
-    if k > width:
-        columns, k = linalg.tria(columns), n
-    return jnp.concatenate([columns, jnp.zeros((n, width - k))], axis=1)

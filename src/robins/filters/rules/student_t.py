@@ -39,7 +39,7 @@ class StudentT(Rule):
         return memory, prior, o.noted("student_t", weight=weight, prior=1.0 / b)
 
     def scales(self, o: Observation, n: int) -> tuple[Array, Array]:
-        """B and c, of a state of n components."""
+        """Scales b and c, for a state of n components."""
         of = shares(o)
         noisy = jnp.any(of.noise != 0.0, axis=1)
         m = jnp.sum(noisy).astype(float)
@@ -65,42 +65,33 @@ class StudentT(Rule):
 
 
 def student_t(
-    dof: Number = 5.0,
-    iterations: int = 3,
-    whose: Whose = "R",
-    patience: int | None = PATIENCE,
+    dof: Number = 5.0, iterations: int = 3, whose: Whose = "R", patience: int | None = PATIENCE
 ) -> Rule:
     r"""Student's t filter by variational Bayes (Huang, Zhang, Li, Wu & Chambers 2017, sec. III).
 
-    Noise of v ~ t(0, R, nu) is Gaussian of covariance R / u with u ~ Gamma(nu/2, nu/2) (Roth,
-    Özkan & Gustafsson 2013). Given the posterior of the state, u has the mean 1 / c below; given
-    that, the update is a Kalman update with c R. With e the residual *after* the update,
+    Noise v ~ t(0, R, nu) is Gaussian of covariance R / u with u ~ Gamma(nu/2, nu/2) (Roth, Özkan &
+    Gustafsson 2013). Given the posterior of the state, u has the mean 1 / c below; given u, the
+    update is a Kalman update with c R. With e the residual *after* the update,
 
         c = (nu + E[e' R^-1 e]) / (nu + m),   e ~ N(c R S^-1 r, c R - c R S^-1 c R)
         S = b H P H' + c R,                   b = 1
 
     iterated from c = 1, in the space of the measurement: m x m. ``whose="both"`` gives the prior
-    such tails too, b = (nu + E[d' P^-1 d]) / (nu + n), d being the correction of the state: a
-    surprise is then shared between prior and measurement. Both are scales about the covariances
-    given, so that on Gaussian data the filter is a little wasteful; weights below one are common
-    and mean nothing by themselves.
+    such tails too, b = (nu + E[d' P^-1 d]) / (nu + n), d being the correction of the state. On
+    Gaussian data the filter is slightly less efficient; weights below one are common.
 
-    A weight of 1e-12 or less is a refusal. After ``patience`` measurements with hardly any weight
-    the next one is believed (`robins.filters.rules._robust.opening`).
-
-    Notes: ``student_t.weight``, 1 / c, 0 if refused; ``student_t.prior``, 1 / b; and
-    ``student_t.recovered``. Components without noise of their own do not count. The Kalman filter
-    is ``dof=inf``.
+    Notes: ``student_t.weight``, 1 / c, 0 if refused (1e-12 or less); ``.prior``, 1 / b; and
+    ``.recovered``. Components without noise do not count. The Kalman filter is ``dof=inf``.
 
     Args:
-        dof: nu, degrees of freedom of the tails: 3 to 10; 1 are those of Cauchy.
+        dof: nu, degrees of freedom of the tails: 3 to 10; 1 is Cauchy.
         iterations: of c, at least 1.
         whose: tails of the measurement noise "R" only, or of "both" it and the prior.
-        patience: measurements in a row with a weight below 1e-2; None never recovers.
+        patience: measurements in a row with a weight below 1e-2 before one is used
+            (`robins.filters.rules._robust.opening`); None never recovers.
 
     Raises:
-        ValueError: dof is not positive, there is no iteration, whose is neither, or patience is
-            negative.
+        ValueError: an argument is out of its range.
     """
     nu = number("student_t dof must be positive", dof, lambda nu: nu > 0.0)
     require(iterations >= 1, "student_t iterations must be at least 1", iterations)

@@ -19,7 +19,7 @@ from robins.filters.values import Numbers, kind, number, value
 
 
 class InverseGamma(NamedTuple):
-    """The distribution of each variance, as a multiple of its nominal value; mean rate / shape."""
+    """Distribution of each variance, as a multiple of its nominal value; mean rate / shape."""
 
     shape: Array  # (m,) alpha, half the number of samples it is worth
     rate: Array  # (m,) beta
@@ -27,9 +27,9 @@ class InverseGamma(NamedTuple):
 
 
 def _left(factor: Array, residual: Array, noise: Array) -> Array:
-    """(m,) expected square of what measurements differ from the posterior by.
+    """(m,) expected square of the posterior residual, by the measurement alone.
 
-    In measurement space, without the state: with S = H P- H' + R,
+    With S = H P- H' + R,
 
         y - H x+ = R S^-1 e,        H P+ H' = R - R S^-1 R.
     """
@@ -68,7 +68,7 @@ class VariationalBayes(Rule):
         return memory, prior, o._replace(noise=_variances.scaled(o.noise, scale))
 
     def iterated(self, known: InverseGamma, o: Observation) -> Array:
-        """(m,) multiples of the nominal noise for the update; as they were of what is not used."""
+        """(m,) multiples of the nominal noise for the update, where a component is used."""
         a, b = self.forgetting * known.shape + 0.5, self.forgetting * known.rate
         scale = jnp.clip(b / a, self.floor, self.ceiling)
         spread, excess, noise, deficit, used = left_out(o._replace(accepted=o.accepted & o.present))
@@ -85,13 +85,7 @@ class VariationalBayes(Rule):
 
     def after(self, memory: Known, posterior: Belief, info: StepInfo, o: Observation):
         known = memory[o.sensor]
-        memory = {**memory, o.sensor: self.learnt(known, info, o)}
-        notes = info.notes | _variances.numbered("variational_bayes.r_scale", known.scale)
-        return memory, posterior, info._replace(notes=notes)
-
-    def learnt(self, known: InverseGamma, info: StepInfo, o: Observation) -> InverseGamma:
-        """Knowledge of the variances after an update."""
-        # Rules behind this one may have weighed the noise again: that is part of the nominal one.
+        # weights by rules after this one are part of the nominal noise
         R = _variances.variance(o.noise)
         here = info.used & (R > 0.0)
         noise = jnp.where(here[:, None], o.noise, 0.0)
@@ -102,7 +96,9 @@ class VariationalBayes(Rule):
         b = self.forgetting * known.rate + 0.5 * left
         shape = jnp.where(here, a, known.shape)
         rate = jnp.where(here, jnp.clip(b, self.floor * a, self.ceiling * a), known.rate)
-        return InverseGamma(shape, rate, rate / shape)
+        memory = {**memory, o.sensor: InverseGamma(shape, rate, rate / shape)}
+        notes = info.notes | _variances.numbered("variational_bayes.r_scale", known.scale)
+        return memory, posterior, info._replace(notes=notes)
 
 
 def variational_bayes(
@@ -114,36 +110,35 @@ def variational_bayes(
 ) -> Rule:
     """Measurement noise of unknown size, VB-AKF (Särkkä & Nummenmaa 2009).
 
-    State and variances are estimated together, as a Gaussian times inverse gammas: with a-, b- what
-    is known of variance i before the sample, in multiples of the nominal one,
+    State and variances are estimated together, as a Gaussian times inverse gammas: with a-, b- of
+    variance i before the sample, in multiples of the nominal one,
 
         a = rho a- + 1/2
         repeat:  R = diag(b / a);  x+, P+ from the Kalman update with this R;
                  b = rho b- + ( (y - H x+)_i^2 + (H P+ H')_ii ) / 2
 
-    The update uses the last R, the next sample begins with the last b. Since the *posterior*
-    residual and its covariance are used, b stays positive by itself. rho b- / a is the first R, so
-    the estimate of one sample is less than its own square; the mean of many is right.
+    The update uses the last R, the next sample starts with the last b. With the *posterior*
+    residual and its covariance b is positive. rho b- / a is the first R, so the estimate of one
+    sample is less than its own square; the mean of many is unbiased.
 
     Nominal correlations stay: rows of the noise factor are scaled. The nominal noise is that of the
-    model at the step, as the rules before this one leave it. What is learnt is what the update did
-    use, with the weights of rules behind this one; so put gates and weights behind it, where they
-    judge by the noise that was learnt. A component that is missing, or refused by any rule, does
-    not change the estimate.
+    model at the step, after the rules before this one. Learning uses the weights of rules after
+    this one: so put gates and weights there, where they judge by the learnt noise. A component that
+    is missing, or refused by any rule, does not change the estimate.
 
     Notes, a number a component: ``variational_bayes.r_scale.i``, the multiples in use.
     floor = ceiling = 1 is the Kalman filter, bit for bit.
 
     Args:
         forgetting: rho, in (0, 1]: about 1 / (1 - rho) samples are remembered, 1 remembers all.
-        iterations: updates per sample, the final one included. A third moves the mean of what is
-            learnt by one per cent and costs 15 % of a step.
-        initial_dof: how many samples the nominal noise is worth at the start.
+        iterations: updates per sample, the final one included. A third changes the mean of the
+            estimate by one per cent and costs 15 % of a step.
+        initial_dof: samples that the nominal noise is worth at the start.
         floor: least variance, as a share of the nominal one.
         ceiling: greatest variance, as a multiple of the nominal one.
 
     Raises:
-        ValueError: a parameter is not of its range.
+        ValueError: a parameter is out of its range.
     """
     known = _variances.bounded("variational_bayes", forgetting, floor, ceiling)
     require(iterations >= 1, "variational_bayes iterations must be 1 or more", iterations)
