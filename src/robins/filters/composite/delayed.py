@@ -10,14 +10,14 @@ and is exact where shortcuts that move the belief back in time are not (Bar-Shal
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo, is_failure
@@ -26,14 +26,15 @@ from robins.filters.model import Data, Model, Motion, Sensor
 from robins.filters.trees import select
 from robins.filters.values import kind, value
 
+T = TypeVar("T")
 _WHOLE = 1e-6  # how far an age may be off a whole number: the rounding of a ratio of times
 
 
 class Late(NamedTuple):
     """A measurement and how many steps ago it was made; 0 is now."""
 
-    value: Any  # as the sensor reads it, NaN where missing
-    age: Any  # whole steps
+    value: Data  # as the sensor reads it, NaN where missing
+    age: ArrayLike  # whole steps
 
 
 class _Past(NamedTuple):
@@ -42,8 +43,8 @@ class _Past(NamedTuple):
     before: FilterState  # the state a step begins with
     moved: Array  # bool, begins with a prediction; False where the run or a reset begins
     u: Data
-    y: dict[str, Any]  # by sensor, NaN where nothing is known yet
-    aux: dict[str, Any]
+    y: dict[str, Data]  # by sensor, NaN where nothing is known yet
+    aux: dict[str, Data]
     asked: Array  # (., sensors) bool, the filter has been asked to update with the sensor
     known: Array  # (., sensors) bool, a measurement has been used
     log_likelihood: Array  # (., sensors)
@@ -52,7 +53,7 @@ class _Past(NamedTuple):
 class Delay(NamedTuple):
     """Memory of a delayed filter."""
 
-    inner: Any  # memory of the filter itself
+    inner: Data  # memory of the filter itself
     past: _Past
     now: Array  # number of the present step
     reach: Array  # how many steps back there are to go
@@ -197,7 +198,7 @@ class Delayed(Around):
         sensors = tuple(mine if s.name == sensor.name else s for s in model.sensors)
         return which, Model(model.motion, sensors)
 
-    def placed(self, held: Delay, which: int, value: Data, age: Any) -> _Place:
+    def placed(self, held: Delay, which: int, value: Data, age: ArrayLike) -> _Place:
         """Place of a measurement of this age."""
         age = jnp.asarray(age, float)
         there = jnp.any(jnp.stack([jnp.any(jnp.isfinite(x)) for x in jax.tree.leaves(value)]))
@@ -248,7 +249,7 @@ class Delayed(Around):
 
 
 def delayed(
-    filter_: Filter, model: Model, depth: int, u: Data = None, aux: Mapping[str, Any] | None = None
+    filter_: Filter, model: Model, depth: int, u: Data = None, aux: Mapping[str, Data] | None = None
 ) -> Filter:
     """A filter that takes measurements up to ``depth`` steps late, in any order.
 
@@ -336,29 +337,31 @@ def _outer(inner: FilterState, memory: Delay) -> FilterState:
     return inner._replace(memory=memory)
 
 
-def _numbers(tree: Any) -> Any:
+def _numbers(tree: T) -> T:
     return jax.tree_util.tree_map(jnp.asarray, tree)
 
 
-def _plain(tree: Any) -> Any:
+def _plain(tree: Data) -> Data:
     """The same with arrays for numbers of Python, which are of weak types."""
     return jax.tree_util.tree_map(lambda x: x if isinstance(x, jax.Array) else np.asarray(x), tree)
 
 
-def _row(tree: Any, at: Any) -> Any:
+def _row(tree: T, at: ArrayLike) -> T:
     return jax.tree_util.tree_map(lambda a: a[at], tree)
 
 
-def _rows(tree: Any, count: int) -> Any:
+def _rows(tree: T, count: int) -> T:
     return jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), tree)
 
 
-def _with(rows: dict[str, Any], name: str, enter: Any, value: Any) -> dict[str, Any]:
+def _with(
+    rows: dict[str, Data], name: str, enter: Callable[..., Array], value: Data
+) -> dict[str, Data]:
     """The same rows with something entered for one sensor."""
     return {**rows, name: jax.tree_util.tree_map(enter, rows[name], value)}
 
 
-def _unread(sensor: Sensor, state: FilterState, aux: Data) -> Any:
+def _unread(sensor: Sensor, state: FilterState, aux: Data) -> Data:
     """A measurement of a sensor that tells nothing."""
     like = jax.eval_shape(sensor.read, state.belief.mean, aux)
     return jax.tree_util.tree_map(lambda leaf: jnp.full(leaf.shape, jnp.nan), like)
@@ -376,7 +379,7 @@ def _change(earlier: Array, later: Array, own: StepInfo, taken: Array) -> Array:
     return jnp.where(taken, change, -jnp.inf)
 
 
-def _check_same(what: str, found: Any, known: Any) -> None:
+def _check_same(what: str, found: Data, known: Data) -> None:
     """Raise if two pytrees differ in structure, shapes or kinds of number."""
     if _form(found) != _form(known):
         raise ValueError(
@@ -386,6 +389,6 @@ def _check_same(what: str, found: Any, known: Any) -> None:
         )
 
 
-def _form(tree: Any) -> tuple:
+def _form(tree: Data) -> tuple:
     leaves, structure = jax.tree_util.tree_flatten(tree)
     return structure, tuple((jnp.shape(x), str(jnp.result_type(x))) for x in leaves)

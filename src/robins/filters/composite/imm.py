@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -28,12 +28,13 @@ from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.composite.mixture import innovation, log_normalised, matched
 from robins.filters.kalman import Again, Filter, FilterState, Prediction
-from robins.filters.model import Data, Motion, Sensor
+from robins.filters.model import Data, Given, Motion, Sensor
 from robins.filters.trees import equal, select
 from robins.filters.values import Numbers, is_known, kind, value
 
-Of = Callable[..., tuple[Any, Any, dict[str, Array]]]
-Every = tuple[Any, Any, Sequence[dict[str, Array]]]
+T = TypeVar("T")
+Of = Callable[..., tuple[Data, Data, dict[str, Array]]]
+Every = tuple[Data, Data, Sequence[dict[str, Array]]]
 
 
 @value
@@ -72,7 +73,7 @@ class Several:
         """One of them."""
         return self.modes[i]
 
-    def every(self, of: Of, states: Any, *rows: Any) -> Every:
+    def every(self, of: Of, states: Data, *rows: Data) -> Every:
         """States, what was found with a leading axis of modes, and the notes of each.
 
         Args:
@@ -87,11 +88,11 @@ class Several:
         after, found, notes = zip(*done, strict=True)
         return after, _stack(found), notes
 
-    def beliefs(self, states: Any) -> Belief:
+    def beliefs(self, states: Data) -> Belief:
         """Beliefs with a leading axis of modes."""
         return _stack([s.belief for s in states])
 
-    def state(self, states: Any, i: int) -> FilterState:
+    def state(self, states: Data, i: int) -> FilterState:
         """State of one mode."""
         return states[i]
 
@@ -115,8 +116,8 @@ class Family:
         numbers: pytree of arrays, one row a mode.
     """
 
-    make: Callable[[Any], Filter | Mode]
-    numbers: Any
+    make: Callable[[Data], Filter | Mode]
+    numbers: Data
 
     @property
     def size(self) -> int:
@@ -129,7 +130,7 @@ class Family:
             )
         return next(iter(lengths))[0]
 
-    def of(self, row: Any) -> Mode:
+    def of(self, row: Data) -> Mode:
         """The mode of one row."""
         return _as_mode(self.make(row))
 
@@ -137,18 +138,18 @@ class Family:
         """Mode of row i."""
         return self.of(_at(jax.tree_util.tree_map(np.asarray, self.numbers), i))
 
-    def every(self, of: Of, states: Any, *rows: Any) -> Every:
+    def every(self, of: Of, states: Data, *rows: Data) -> Every:
         """As `Several.every`; one mode is traced, for all, and states have a leading axis."""
         numbers = jax.tree_util.tree_map(jnp.asarray, self.numbers)
         one = jax.vmap(lambda row, *part: of(self.of(row), *part))
         after, found, notes = one(numbers, states, *rows)
         return after, found, [_at(notes, i) for i in range(self.size)]
 
-    def beliefs(self, states: Any) -> Belief:
+    def beliefs(self, states: Data) -> Belief:
         """Beliefs with a leading axis of modes."""
         return states.belief
 
-    def state(self, states: Any, i: int) -> FilterState:
+    def state(self, states: Data, i: int) -> FilterState:
         """State of one mode."""
         return _at(states, i)
 
@@ -163,15 +164,13 @@ def _as_mode(one: Filter | Mode) -> Mode:
     return one if isinstance(one, Mode) else Mode(one)
 
 
-def _at(tree: Any, i: Any) -> Any:
+def _at(tree: T, i: ArrayLike) -> T:
     return jax.tree_util.tree_map(lambda a: a[i], tree)
 
 
-def _stack(trees: Sequence[Any]) -> Any:
+def _stack(trees: Sequence[T]) -> T:
     return jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *trees)
 
-
-Rows = ArrayLike | Sequence[Any]  # numbers, or rows of them
 
 WRONG = "imm.wrong"  # note of a bank: (names,) probability that each of `Filter.suspects` is wrong
 
@@ -181,7 +180,7 @@ _ONE = 1e-9  # how far a sum of probabilities may be off
 class Interaction(NamedTuple):
     """Memory of a mixture of filters."""
 
-    states: Any  # of the modes: a tuple, or those of a family with a leading axis
+    states: Data  # of the modes: a tuple, or those of a family with a leading axis
     log_probability: Array  # (modes,)
 
 
@@ -222,7 +221,7 @@ class Imm(Filter):
             raise ValueError(f"modes of imm bring {sorted(unknown)}; the model has {list(dims)}")
         return FilterState(belief, Interaction(states, jnp.asarray(self.log_first)))
 
-    def mixed(self, states: Any, log_now: Array) -> tuple[Any, Array]:
+    def mixed(self, states: Data, log_now: Array) -> tuple[Data, Array]:
         """Where each filter begins, and the predicted log-probabilities."""
         joint = log_now[:, None] + jnp.asarray(self.log_change)
         log_weight, log_next = jax.vmap(log_normalised, in_axes=1)(joint)
@@ -299,8 +298,8 @@ class Imm(Filter):
 
 def imm(
     modes: Sequence[Filter | Mode] | Family,
-    transition: Rows,
-    start: Rows | None = None,
+    transition: Given,
+    start: Given | None = None,
     likeliest: bool = False,
     wrong: Mapping[str, Sequence[int]] | None = None,
 ) -> Filter:
@@ -346,7 +345,7 @@ def imm(
     return Imm(all_, log_change, log_first, likeliest, of)
 
 
-def _log_probabilities(name: str, given: Rows, shape: tuple[int, ...]) -> Numbers:
+def _log_probabilities(name: str, given: Given, shape: tuple[int, ...]) -> Numbers:
     known = is_known(given)
     chance = np.asarray(given, float) if known else jnp.asarray(given)
     require(
