@@ -120,11 +120,11 @@ def _finds(problem: Problem, name: str, s: Statistics) -> list[str]:
     return said
 
 
-def _scores(problem: Problem, s: Statistics) -> dict[str, Any]:
-    """By suspect or fault: the share of faults found, the time that took, wrong accusations."""
+def _scores(problem: Problem, s: Statistics) -> dict[str, float]:
+    """Share of the faults found, the time that took, and wrong accusations, by suspect or fault."""
     if not s.suspects or problem.faults is None:
         return {}
-    out: dict[str, Any] = {}
+    out: dict[str, float] = {}
     real = [name for name, true in problem.faults.items() if np.any(true)]
     for name in dict.fromkeys([*s.suspects, *real]):
         if name in real:
@@ -280,8 +280,8 @@ def _scatter(b: StateBlock, found: dict[str, Statistics]) -> dict[str, Any]:
     )
 
 
-def _wrong(problem: Problem, found: dict[str, Statistics]) -> dict[str, Any]:
-    """How likely each suspect is wrong, in the first run and over all, and when it truly is."""
+def _wrong(problem: Problem, found: dict[str, Statistics]) -> dict[str, xr.Variable]:
+    """Probability that each suspect is wrong, in the first run and over all, and the truth."""
     data = tables("wrong", [s.first_run.get("wrong", {}) for s in found.values()])
     if not data:
         return {}

@@ -184,6 +184,7 @@ class Composite(Filter):
             one.report(first, last, None if again is None else rerun, time)
 
 
+@value
 class Around(Composite):
     """A filter around another one, `inner`, whose state it has where it says nothing else."""
 

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
+from jaxtyping import Array, ArrayLike
 
 from robins.filters import Filter
 from robins.filters.composite.imm import WRONG
 from robins.results import array
+from robins.systems.tables import Update
 
 HELD = 0.5  # probability above which a suspect is held for wrong
 _SHOWN = 4  # spans in a sentence
 
-Wrong = Mapping[str, Any]
+Wrong = Mapping[str, ArrayLike]
 """Probability that each suspect is wrong, by its name; leading axis E epochs."""
 
 
-def probabilities(filter_: Filter, updates: Mapping[str, Any]) -> dict[str, Any]:
+def probabilities(filter_: Filter, updates: Mapping[str, Update]) -> dict[str, Array]:
     """Probability of each suspect of a filter after its last update of each step.
 
     Args:
         filter_: with `Filter.suspects`.
-        updates: by sensor, each with the ``notes`` of its updates; leading axes as you like.
+        updates: by sensor, with their notes; leading axes as you like.
     """
     notes = [update.notes for update in updates.values()][-1:]
     return {
@@ -50,20 +52,21 @@ def edges(which: np.ndarray) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in change.reshape(-1, 2)]
 
 
-def tables(role: str, found: Sequence[Wrong], **attrs: Any) -> dict[str, Any]:
+def tables(role: str, found: Sequence[Wrong], runs: int | None = None) -> dict[str, xr.Variable]:
     """An array of probabilities (filter, time, suspect); nothing where no filter has a suspect.
 
     Args:
         role: "wrong" or "mean_wrong".
         found: by filter, in their order; NaN where a filter does not have a suspect.
-        attrs: as of `robins.results.array`.
+        runs: over which "mean_wrong" is the mean.
     """
     names = list(dict.fromkeys(name for of in found for name in of))
     if not names:
         return {}
     blank = np.full(np.shape(next(iter(of[names[0]] for of in found if names[0] in of))), np.nan)
+    about = {} if runs is None else {"runs": runs}
     rows = [[np.asarray(of.get(name, blank), float) for name in names] for of in found]
-    return array(role, np.moveaxis(np.array(rows), 1, 2), axes=names, **attrs)
+    return array(role, np.moveaxis(np.array(rows), 1, 2), axes=names, **about)
 
 
 def sentences(name: str, time_s: np.ndarray, wrong: Wrong) -> list[str]:

@@ -86,8 +86,6 @@ def log_density(innovation: Normalised) -> Float[Array, ""]:
 class Scored(Around):
     """The filter of `scored`."""
 
-    inner: Filter
-
     # `Filter` wraps both for steps that are not taken; here the inner filter does so itself.
     @jax.jit
     def predict(self, state: FilterState, motion: Motion, u: Data = None):

@@ -179,7 +179,7 @@ def adaptive(
         return excited(list(parts.values()), row.numbers)
 
     if not names:
-        return bank(make, [row._replace(numbers=(loud(row), None)) for row in plain], change)
+        return bank(make, [Row((loud(row), None), row.wrong) for row in plain], change)
     each = [*plain, *(Row(quiet, (name,)) for name in names for _ in ("begins", "lasts"))]
     off_of = map(Supposed, *sensors_off(len(plain), len(names)))
     rows = [Row((loud(row), of), row.wrong) for row, of in zip(each, off_of, strict=True)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -11,7 +10,8 @@ from jaxtyping import ArrayLike
 
 from robins.filters.composite.imm import Family, Mode, imm
 from robins.filters.kalman import Filter
-from robins.filters.values import Numbers
+from robins.filters.model import Data
+from robins.filters.values import Numbers, kind, value
 
 Hypotheses = int | slice | Sequence[int] | np.ndarray
 """One of a bank, or some."""
@@ -19,20 +19,22 @@ Hypotheses = int | slice | Sequence[int] | np.ndarray
 EVERY = slice(None)
 
 
-class Row(NamedTuple):
+@value
+class Row:
     """A hypothesis."""
 
-    numbers: Any  # of its mode, a pytree
-    wrong: tuple[str, ...] = ()  # names of instruments, or "motion", that are wrong where it holds
+    numbers: Data  # of its mode
+    # names of instruments, or "motion", that are wrong where it holds
+    wrong: tuple[str, ...] = kind(default=())
 
 
-def stacked(rows: Sequence[Row]) -> Any:
+def stacked(rows: Sequence[Row]) -> Data:
     """The numbers of all rows, with a leading axis of hypotheses."""
     return jax.tree_util.tree_map(lambda *x: np.stack(x), *(row.numbers for row in rows))
 
 
 def bank(
-    make: Callable[[Any], Filter | Mode],
+    make: Callable[[Data], Filter | Mode],
     rows: Sequence[Row],
     change: Numbers,
     start: ArrayLike | None = None,

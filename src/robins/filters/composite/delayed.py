@@ -93,7 +93,6 @@ class _Redone(NamedTuple):
 class Delayed(Around):
     """The filter of `delayed`."""
 
-    inner: Filter
     model: Model
     u: Data  # one input
     aux: dict[str, Data]  # one of each sensor

@@ -157,7 +157,6 @@ def _wide_sensor(sensor: Sensor, names: Sequence[str], of: Supposed) -> Sensor:
 class Supposing(Around):
     """The filter of `supposing`."""
 
-    inner: Filter
     of: Supposed
     scaled: Scaled
     names: tuple[str, ...] = kind()
@@ -201,7 +200,6 @@ def _narrow(wide: FilterState) -> FilterState:
 class Narrowed(Around):
     """The filter of `narrowed`."""
 
-    inner: Filter
     names: tuple[str, ...] = kind()
 
     def parts(self, state: FilterState) -> tuple[FilterState, ...]:

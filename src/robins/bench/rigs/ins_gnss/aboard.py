@@ -10,6 +10,7 @@ fixes are known.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from importlib import resources
 from typing import Any
 
@@ -79,7 +80,11 @@ def aboard(flight: Any) -> Aboard:
         fields=_FIELDS,
     )
     wide = not hasattr(chosen.case(world).start.mean, "q_nb")
-    told = _given_h(given, kit.rates_hz, world, "ins_" if wide else "", chosen.filter.suspects)
+    macros = {
+        "MEAN(field)": f"mean_{'ins_' if wide else ''}##field",
+        "TELL_WRONG(result, to)": _told_wrong(chosen.filter.suspects),
+    }
+    told = _given_h(given, kit.rates_hz, world, macros)
     here = resources.files("robins.bench.rigs.ins_gnss")
     files = {name: (here / name).read_text("utf-8") for name in _FILES}
     return Aboard(problem, "filter", {**files, "navigation_given.h": told})
@@ -104,16 +109,16 @@ def _begun(world: Case, width: int) -> Case:
     return first._replace(start=world.start, u=Block(Increments(*padded), first.u.noise_scale))
 
 
+def _told_wrong(suspects: tuple[str, ...]) -> str:
+    """C that copies the probabilities of a result in the order of the wire."""
+    where = {name: f"(result).wrong[{i}]" for i, name in enumerate(suspects)}
+    return ", ".join(f"(to)[{k}] = {where.get(one, 'NAN')}" for k, one in enumerate(SUSPECTS))
+
+
 def _given_h(
-    given: Replay,
-    rates_hz: tuple[float, float],
-    world: Case,
-    mean: str,
-    suspects: tuple[str, ...],
+    given: Replay, rates_hz: tuple[float, float], world: Case, macros: Mapping[str, str]
 ) -> str:
     """`navigation_given.h`: what the part is told, and room for what it keeps."""
-    where = {name: f"(result).wrong[{i}]" for i, name in enumerate(suspects)}
-    wrong = [where.get(name, "NAN") for name in SUSPECTS]
     g, aids, longest_s = given.gnss, given.aids, given.update.longest_block
     sample_s, fix_s = (1.0 / rate for rate in rates_hz)
     window_s = fix_s if g.velocity_window is None else g.velocity_window
@@ -148,9 +153,7 @@ def _given_h(
         "PIECES": world.u.increments.dt.shape[1],
         "VELOCITIES": int(model.VELOCITY in world.y),
         "REST": int(model.STANDSTILL in world.y),
-        "MEAN(field)": f"mean_{mean}##field",
-        # of the result of an update, in the order of the wire
-        "TELL_WRONG(result, to)": ", ".join(f"(to)[{k}] = {x}" for k, x in enumerate(wrong)),
+        **macros,
     }
     axes = axes_of(given.imu.orientation).tolist()
     rows = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in axes)
