@@ -157,7 +157,6 @@ def _given_h(
     }
     axes = axes_of(given.imu.orientation).tolist()
     rows = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in axes)
-    cases = [f"    case {int(k)}: return {v!r};" for k, v in sorted(g.sigma_factor.items())]
     lines = [
         "/* What the part was told when it was exported: s, m, m/s; sizes of what it keeps. */",
         "#ifndef NAVIGATION_GIVEN_H",
@@ -168,7 +167,7 @@ def _given_h(
         "/* by which the sigmas of a fix of this quality are multiplied */",
         "static inline double factor_of(int quality) {",
         "  switch (quality) {",
-        *cases,
+        *(f"    case {int(k)}: return {v!r};" for k, v in sorted(g.sigma_factor.items())),
         "    default: return 1.0;",
         "  }",
         "}",
