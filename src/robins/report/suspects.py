@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from robins.report import series, style
@@ -31,7 +32,7 @@ def suspects(solution: xr.Dataset) -> Picture | None:
             if mean is not None:
                 clock.plot(axes, mean.x, mean.values[i, :, k], **style.look(i))
         axes.set(ylim=(-0.03, 1.03))
-    keys = [style.filter_keys(filters)[i] for i in stating]
+    keys: list[Line2D | Patch] = [style.filter_keys(filters)[i] for i in stating]
     if true is not None and np.any(true):
         keys.append(Patch(color=style.BAND, label="truly wrong"))
     style.legend(figure, [*keys, *([style.outage_key()] if series.outage(solution) else [])])

@@ -64,9 +64,11 @@ def tables(role: str, found: Sequence[Wrong], runs: int | None = None) -> dict[s
     if not names:
         return {}
     blank = np.full(np.shape(next(iter(of[names[0]] for of in found if names[0] in of))), np.nan)
-    about = {} if runs is None else {"runs": runs}
     rows = [[np.asarray(of.get(name, blank), float) for name in names] for of in found]
-    return array(role, np.moveaxis(np.array(rows), 1, 2), axes=names, **about)
+    values = np.moveaxis(np.array(rows), 1, 2)
+    if runs is None:
+        return array(role, values, axes=names)
+    return array(role, values, axes=names, runs=runs)
 
 
 def sentences(name: str, time_s: np.ndarray, wrong: Wrong) -> list[str]:
