@@ -20,7 +20,7 @@ from robins.filters.synthesis.inequalities import Aim
 from robins.filters.synthesis.plant import Plant
 
 if TYPE_CHECKING:
-    from cvxpy import Parameter, Problem, Variable
+    import cvxpy
 
 Form = Literal["common", "slack", "full"]
 
@@ -47,9 +47,9 @@ class Answer(NamedTuple):
 class Program(NamedTuple):
     """A problem, the parameters to fill in and the unknowns to read."""
 
-    problem: Problem
-    parameters: dict[str, Parameter]
-    unknowns: dict[str, Variable]
+    problem: cvxpy.Problem
+    parameters: dict[str, cvxpy.Parameter]
+    unknowns: dict[str, cvxpy.Variable]
 
 
 def solve(plant: Plant, form: Form, aim: Aim) -> Answer:
