@@ -28,7 +28,7 @@ from robins.systems.airship.model import NINE, PRODUCT, WIND_STATES, States
 from robins.systems.airship.parameters import Airship
 from robins.systems.airship.world import Course, World, lay_out, simulate
 from robins.systems.judgement import Claim, ratio_claims
-from robins.systems.parts import ENU, during
+from robins.systems.parts import ENU
 from robins.systems.study import Case, Contender, Instrument, Norm, Recipe, StateBlock, Study, View
 
 # --------------------------------------------------------------------------------- the filters
@@ -199,7 +199,9 @@ def view(given: Airship, course: Course) -> View:
         for t in (given.counted.begin - 1e-9, given.counted.end + 1e-9)
     )
     at_s = [lost.begin + t for lost in given.sar.lost[:1] for t in _AROUND_LOSS_S]
-    blown = during((given.wind.span,), course.epoch_s) & given.wind.gusty
+    span, time = given.wind.span, course.epoch_s
+    # an epoch tells of the second before it
+    blown = (time > span.begin + 1e-9) & (time <= span.end + 1e-9) & given.wind.gusty
     return View(
         epoch_s=course.epoch_s,
         blocks=BLOCKS,
