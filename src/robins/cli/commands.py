@@ -319,6 +319,7 @@ app.add_command(sensitivity)
         "robins export transfer-alignment/s0 --filter kf-flexure --to alignment-c --fast",
         "make -C drive-c check",
         "robins export satellite/s1 --filter mixed-bias --to adm --board",
+        "robins export rocket/a1 --filter huber --to rocket-c --adjust 'rules[0].inner.limit'",
     ),
 )
 @click.argument("scenario")
@@ -329,6 +330,7 @@ app.add_command(sensitivity)
 @option("--small/--fast", "small", default=True, help="Keep loops, or write them out.")
 @option("--float32", is_flag=True, help="Single precision, and what it costs.")
 @option("--board", is_flag=True, help="Build it as a part of the bench too.")
+@option("--adjust", multiple=True, metavar="NAME", help="A number to be set on board; repeatable.")
 @option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Of the recorded run.")
 @SETTINGS
 @TRUST
@@ -341,7 +343,8 @@ def export(scenario: str, to: Path, small: bool, as_json: bool, **options: Any) 
     state and each code with those of this program. With --float32 it runs the scenario in single
     precision too, and tells what that costs against the simulated truth. With --board it builds a
     program that stands for a part of the bench: the satellite's attitude determination, or the
-    navigation computer of INS/GNSS.
+    navigation computer of INS/GNSS. A number named by --adjust is a field of the state in the place
+    of a constant; a name that the filter does not have lists those it has.
     """
     write(scenario, to, fast=not small, as_json=as_json, **options)
 

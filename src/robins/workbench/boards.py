@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -20,11 +21,12 @@ from robins.bench.rigs import RIGS, rig_of
 from robins.bench.run.setup import changed, read
 from robins.bench.wire.c_header import firmware
 from robins.campaign.monte_carlo import reported_rows
-from robins.filters import SENTENCES, Code
+from robins.filters import SENTENCES, Code, FilterState
+from robins.filters.composite.adjustable import adjustable
 from robins.program import DOUBLE, SINGLE, Precision, Program, trace_steps
 from robins.program.harness import Key, Recorded, check_c, makefile, recorded_h
 from robins.program.library import Entry, Library, symbol
-from robins.systems.study import Problem
+from robins.systems.study import Case, Problem
 from robins.workbench.board_runs import (
     BoardRun,
     Calls,
@@ -70,6 +72,7 @@ def export_filter(
     seed: int = 0,
     settings: Sequence[str] = (),
     board: bool = False,
+    adjust: Sequence[str] = (),
 ) -> Exported:
     """Write a filter of a scenario as C99, with a test for the user's own compiler.
 
@@ -83,10 +86,11 @@ def export_filter(
         seed: of the run that is recorded for the test.
         settings: "path=value" texts that change the scenario.
         board: build it, too, as a part of the bench, for this machine.
+        adjust: numbers of the filter that are fields of its state, to be set on board.
 
     Raises:
-        InputError: there is no such scenario or filter, it calls Python at its steps, or the folder
-            holds something; or no part of a rig is made of such a filter.
+        InputError: there is no such scenario, filter or number, it calls Python at its steps, or
+            the folder holds something; or no part of a rig is made of such a filter.
         robins.program.ProgramError: the filter does what has no place in C yet; the message names
             the line of the model or the rule.
         robins.program.BuildError: single precision is asked for, and there is no compiler here by
@@ -107,6 +111,8 @@ def export_filter(
     if why := problem.contenders[wanted].on_host:
         what = f"filter '{wanted}' cannot be exported: {why}, which no program in C does"
         raise InputError(what, label, "choose another by --filter")
+    if adjust:
+        asked = asked._replace(problem=_adjustable(problem, wanted, adjust))
     precision = SINGLE if float32 else DOUBLE
     unroll = None if fast else SMALL
     library, c, record, found = _library(asked, unroll, precision)
@@ -124,6 +130,20 @@ def export_filter(
     made = _built(to, rig.exported) if rig else None
     scalars = {entry.name: len(entry.program.live) for entry in library.entries}
     return Exported(to, tuple(files), wanted, scalars, len(c), precision.kind, found, made)
+
+
+def _adjustable(problem: Problem, name: str, numbers: Sequence[str]) -> Problem:
+    """The problem with some numbers of a filter in its state."""
+    one = problem.contenders[name]
+    with refusing("--adjust"):
+        filter_ = adjustable(one.filter, numbers)
+
+    def case(world: Any) -> Case:
+        made = one.case(world)
+        begun = isinstance(made.start, FilterState)
+        return made._replace(start=filter_.begun(made.start)) if begun else made
+
+    return replace(problem, contenders={name: one._replace(filter=filter_, case=case)})
 
 
 def _rig_for(name: str) -> Rig:

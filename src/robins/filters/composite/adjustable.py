@@ -1,0 +1,125 @@
+"""A filter with some of its numbers in its state: to be set on board, without a new program.
+
+A program of scalars folds the numbers of a filter: a threshold is a constant of the C. Numbers that
+`adjustable` names are fields of the state in their place, which begin with the filter's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
+
+from robins.filters.belief import Belief
+from robins.filters.kalman import Again, Around, Filter, FilterState
+from robins.filters.model import Data, Motion, Sensor
+from robins.filters.rule import Memory
+from robins.filters.values import kind, number, value
+
+
+class Adjusted(NamedTuple):
+    """Memory of a filter with numbers in its state."""
+
+    inner: Memory  # of the filter itself
+    numbers: dict[str, Array]  # by name
+
+
+@value
+class Adjustable(Around):
+    """The filter of `adjustable`."""
+
+    names: tuple[str, ...] = kind()
+
+    def begun(self, state: FilterState) -> FilterState:
+        """A state of the filter inside with its numbers."""
+        named = named_numbers(self.inner)
+        numbers = {name: jnp.asarray(named[name], float) for name in self.names}
+        return state._replace(memory=Adjusted(state.memory, numbers))
+
+    def filter_of(self, state: FilterState) -> Filter:
+        """The filter inside with the numbers of a state."""
+        held = {name: state.memory.numbers[name] for name in self.names}
+        flat, shape = jax.tree_util.tree_flatten_with_path(self.inner)
+        return shape.unflatten([held.get(_named(path), leaf) for path, leaf in flat])
+
+    def parts(self, state: FilterState) -> tuple[FilterState, ...]:
+        return (state._replace(memory=state.memory.inner),)
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        return self.begun(self.inner.init(belief, dims))
+
+    @jax.jit
+    def predict(self, state: FilterState, motion: Motion, u: Data = None):
+        new, prediction = self.filter_of(state).predict(*self.parts(state), motion, u)
+        return self._with(new, state), prediction
+
+    @jax.jit
+    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None):
+        new, info = self.filter_of(state).update(*self.parts(state), sensor, y, aux)
+        return self._with(new, state), info
+
+    def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        return self._with(self.filter_of(state).reset(*self.parts(state), belief), state)
+
+    def report(
+        self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
+    ) -> None:
+        # a rerun with other numbers must not take those of the state
+        own = replace(self, inner=self.filter_of(start), names=())
+        super(Adjustable, own).report(start, final, again, time)
+
+    def _with(self, new: FilterState, old: FilterState) -> FilterState:
+        return new._replace(memory=old.memory._replace(inner=new.memory))
+
+
+def named_numbers(filter_: Filter) -> dict[str, ArrayLike]:
+    """The numbers of a filter by their names, such as "rules[0].limit"."""
+    flat, _ = jax.tree_util.tree_flatten_with_path(filter_)
+    return {_named(path): leaf for path, leaf in flat}
+
+
+def _named(path: tuple[object, ...]) -> str:
+    return jax.tree_util.keystr(path).removeprefix(".")
+
+
+def adjustable(filter_: Filter, names: Sequence[str]) -> Adjustable:
+    """The same filter with some of its numbers in its state.
+
+    It gives the estimates of the filter inside. `adjusted` sets a number; in exported C it is a
+    field of the state, ``memory_numbers_`` and its name.
+
+    Args:
+        filter_: from `kalman` and its kin.
+        names: of numbers, as `named_numbers` lists them.
+
+    Raises:
+        ValueError: the filter has no number of a name.
+    """
+    known = list(named_numbers(filter_))
+    for name in names:
+        if name not in known:
+            listed = ", ".join(known) or "none"
+            raise ValueError(f"no number '{name}' in this filter; its numbers are: {listed}")
+    return Adjustable(filter_, tuple(names))
+
+
+def adjusted(state: FilterState, numbers: Mapping[str, ArrayLike]) -> FilterState:
+    """A state of an `adjustable` filter with other numbers, by name; one number fills a table.
+
+    Raises:
+        TypeError: one is not of real numbers.
+        ValueError: the state has no number of a name, or one of another shape.
+    """
+    held = state.memory.numbers
+    for name, given in numbers.items():
+        if name not in held:
+            raise ValueError(f"no number '{name}' in this state; it has {sorted(held)}")
+        found = jnp.asarray(number(f"{name} must be real", given), float)
+        if found.shape not in ((), held[name].shape):
+            raise ValueError(f"{name} has shape {held[name].shape}, got {found.shape}")
+        held = held | {name: jnp.broadcast_to(found, held[name].shape)}
+    return state._replace(memory=state.memory._replace(numbers=held))
