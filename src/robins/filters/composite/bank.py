@@ -57,7 +57,7 @@ def bank(
 
 def transitions(
     count: int,
-    edges: Sequence[tuple[Hypotheses, Hypotheses, ArrayLike]],
+    edges: Sequence[tuple[Hypotheses, Hypotheses, ArrayLike | Sequence[float]]],
     rest: Sequence[int] | np.ndarray | None = None,
 ) -> np.ndarray:
     """(count, count) probabilities of a change in one step, row i those from hypothesis i.
