@@ -17,14 +17,13 @@ from jaxtyping import Array, ArrayLike
 from robins.filters.belief import Belief
 from robins.filters.kalman import Again, Around, Filter, FilterState
 from robins.filters.model import Data, Motion, Sensor
-from robins.filters.rule import Memory
 from robins.filters.values import kind, number, value
 
 
 class Adjusted(NamedTuple):
     """Memory of a filter with numbers in its state."""
 
-    inner: Memory  # of the filter itself
+    inner: Data  # memory of the filter itself
     numbers: dict[str, Array]  # by name
 
 
