@@ -140,8 +140,9 @@ def _adjustable(problem: Problem, name: str, numbers: Sequence[str]) -> Problem:
 
     def case(world: Any) -> Case:
         made = one.case(world)
-        begun = isinstance(made.start, FilterState)
-        return made._replace(start=filter_.begun(made.start)) if begun else made
+        if isinstance(made.start, FilterState):
+            return made._replace(start=filter_.begun(made.start))
+        return made
 
     return replace(problem, contenders={name: one._replace(filter=filter_, case=case)})
 

@@ -53,16 +53,16 @@ class Adjustable(Around):
 
     @jax.jit
     def predict(self, state: FilterState, motion: Motion, u: Data = None):
-        new, prediction = self.filter_of(state).predict(*self.parts(state), motion, u)
+        new, prediction = self.filter_of(state).predict(self.parts(state)[0], motion, u)
         return self._with(new, state), prediction
 
     @jax.jit
     def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None):
-        new, info = self.filter_of(state).update(*self.parts(state), sensor, y, aux)
+        new, info = self.filter_of(state).update(self.parts(state)[0], sensor, y, aux)
         return self._with(new, state), info
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
-        return self._with(self.filter_of(state).reset(*self.parts(state), belief), state)
+        return self._with(self.filter_of(state).reset(self.parts(state)[0], belief), state)
 
     def report(
         self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
