@@ -23,6 +23,7 @@ from robins.bench.wire.c_header import firmware
 from robins.campaign.monte_carlo import reported_rows
 from robins.filters import SENTENCES, Code, FilterState
 from robins.filters.composite.adjustable import adjustable
+from robins.filters.model import Data
 from robins.program import DOUBLE, SINGLE, Precision, Program, trace_steps
 from robins.program.harness import Key, Recorded, check_c, makefile, recorded_h
 from robins.program.library import Entry, Library, symbol
@@ -138,7 +139,7 @@ def _adjustable(problem: Problem, name: str, numbers: Sequence[str]) -> Problem:
     with refusing("--adjust"):
         filter_ = adjustable(one.filter, numbers)
 
-    def case(world: Any) -> Case:
+    def case(world: Data) -> Case:
         made = one.case(world)
         if isinstance(made.start, FilterState):
             return made._replace(start=filter_.begun(made.start))

@@ -6,9 +6,8 @@ A program of scalars folds the numbers of a filter: a threshold is a constant of
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +19,8 @@ from robins.filters.model import Data, Motion, Sensor
 from robins.filters.values import kind, number, value
 
 
-class Adjusted(NamedTuple):
+@value
+class Adjusted:
     """Memory of a filter with numbers in its state."""
 
     inner: Data  # memory of the filter itself
@@ -72,7 +72,7 @@ class Adjustable(Around):
         super(Adjustable, own).report(start, final, again, time)
 
     def _with(self, new: FilterState, old: FilterState) -> FilterState:
-        return new._replace(memory=old.memory._replace(inner=new.memory))
+        return new._replace(memory=replace(old.memory, inner=new.memory))
 
 
 def named_numbers(filter_: Filter) -> dict[str, ArrayLike]:
@@ -81,7 +81,7 @@ def named_numbers(filter_: Filter) -> dict[str, ArrayLike]:
     return {_named(path): leaf for path, leaf in flat}
 
 
-def _named(path: tuple[object, ...]) -> str:
+def _named(path: tuple[Hashable, ...]) -> str:
     return jax.tree_util.keystr(path).removeprefix(".")
 
 
@@ -121,4 +121,4 @@ def adjusted(state: FilterState, numbers: Mapping[str, ArrayLike]) -> FilterStat
         if found.shape not in ((), held[name].shape):
             raise ValueError(f"{name} has shape {held[name].shape}, got {found.shape}")
         held = held | {name: jnp.broadcast_to(found, held[name].shape)}
-    return state._replace(memory=state.memory._replace(numbers=held))
+    return state._replace(memory=replace(state.memory, numbers=held))
