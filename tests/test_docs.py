@@ -186,7 +186,7 @@ def test_the_readme_shows_the_library():
 
 
 ANSWERS = {"reports", "suspects"}  # properties of a filter with a default
-OPTIONAL = {"members", "report"} | ANSWERS  # all that has one
+OPTIONAL = {"members", "report", "suspicions"} | ANSWERS  # all that has one
 
 
 @pytest.mark.parametrize("page", ["architecture.md", "filters/index.md", "filters/protocol.md"])

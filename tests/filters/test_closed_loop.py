@@ -15,6 +15,7 @@ from robins.filters import (
     Motion,
     Reading,
     Sensor,
+    adaptive,
     kalman,
     run,
     run_closed,
@@ -53,6 +54,18 @@ def loop(target=3.0, due=True):
 @pytest.fixture(scope="module")
 def closed():
     return run_closed(kalman(), MODEL, START, loop())
+
+
+def test_a_bank_states_what_is_wrong_where_no_sensor_is_due():
+    """As a run over the same readings, which are missing there."""
+    bank = adaptive((1.0, 8.0))
+    closed = run_closed(bank, MODEL, START, loop())
+    due = np.arange(1, STEPS + 1) % EVERY == 0
+    y = jnp.where(jnp.asarray(due)[:, None], closed.readings.y["seen"], jnp.nan)
+    found = run(bank, MODEL, START, y, closed.readings.u)
+    noted, wanted = (steps.info["seen"].notes["imm.wrong"] for steps in (closed.steps, found.steps))
+    np.testing.assert_allclose(noted, wanted, rtol=1e-9, atol=1e-14)
+    assert np.all(np.asarray(noted) > 0.0)
 
 
 def test_equals_a_run_over_what_the_world_answered(closed):

@@ -25,11 +25,11 @@ from robins.systems.ins_gnss.robust import (
     fresh,
     in_hindsight,
     robust,
-    stretches,
     supposed,
     widened,
 )
 from robins.systems.ins_gnss.start import at_rest
+from robins.systems.suspects import spans
 
 SMOOTH = """
 imu_rate = "50 Hz"
@@ -266,12 +266,12 @@ def test_hindsight_is_that_of_all_sequences_of_modes():
     np.testing.assert_allclose(found.strayed, total[:, STRAYED], rtol=1e-9)
 
 
-def test_stretches_are_first_and_last_times():
+def test_spans_are_first_and_last_times():
     time_s = np.arange(8.0)
     which = np.array([1, 1, 0, 0, 1, 0, 1, 1], bool)
-    assert stretches(time_s, which) == [(0.0, 1.0), (4.0, 4.0), (6.0, 7.0)]
-    assert stretches(time_s, ~which | which) == [(0.0, 7.0)]
-    assert stretches(time_s, which & ~which) == []
+    assert spans(time_s, which) == [(0.0, 1.0), (4.0, 4.0), (6.0, 7.0)]
+    assert spans(time_s, ~which | which) == [(0.0, 7.0)]
+    assert spans(time_s, which & ~which) == []
 
 
 @pytest.mark.parametrize("name", ["robust", "robust+rts"], ids=["bank", "smoothed"])

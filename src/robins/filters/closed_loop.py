@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo
-from robins.filters.kalman import Filter, FilterState
+from robins.filters.kalman import WRONG, Filter, FilterState
 from robins.filters.model import Data, Model, Sensor
 from robins.filters.run import Step, check_names, everything, nothing, report_run
 from robins.filters.tally import Tally
@@ -62,8 +62,12 @@ def _without(
     like = jax.eval_shape(lambda s, z, a: filter_.update(s, sensor, z, a)[1], state, y, aux)
     blank = jax.tree_util.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
     m = sensor.dim
+    notes = blank.notes | ({WRONG: filter_.suspicions(state)} if filter_.suspects else {})
     return state, blank._replace(
-        innovation=jnp.full(m, jnp.nan), factor=jnp.eye(m), code=jnp.asarray(int(Code.MISSING))
+        innovation=jnp.full(m, jnp.nan),
+        factor=jnp.eye(m),
+        code=jnp.asarray(int(Code.MISSING)),
+        notes=notes,
     )
 
 

@@ -51,6 +51,8 @@ class Prediction(NamedTuple):
     origin: Belief | None = None  # where it began, if a rule has settled another belief
 
 
+WRONG = "imm.wrong"  # note of a bank: (names,) probability that each of `Filter.suspects` is wrong
+
 Follow = Callable[[Sequence[Belief], Belief], FilterState]
 Again = Callable[["Filter"], FilterState]  # the same run with another filter, to its end
 
@@ -101,6 +103,10 @@ class Filter:
         Its updates note the probability of each as ``imm.wrong``, in this order.
         """
         return ()
+
+    def suspicions(self, state: FilterState) -> Array:
+        """(names,) probability that each of the `suspects` is wrong."""
+        return jnp.zeros(0)
 
     @property
     def reports(self) -> bool:
@@ -203,6 +209,9 @@ class Around(Composite):
     @property
     def suspects(self) -> tuple[str, ...]:
         return self.inner.suspects
+
+    def suspicions(self, state: FilterState) -> Array:
+        return self.inner.suspicions(self.parts(state)[0])
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
         return self.inner.init(belief, dims)

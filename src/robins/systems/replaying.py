@@ -21,7 +21,7 @@ import xarray as xr
 from robins import rotation
 from robins.filters import Belief, Code, StepWarning, Tally, doubts, rts_smoother, run
 from robins.filters.analysis.consistency import grand_mean_nis
-from robins.filters.composite.imm import WRONG
+from robins.filters.kalman import WRONG
 from robins.filters.run import Step
 from robins.filters.whiteness import joined
 from robins.ins.blocks import Blocks

@@ -10,7 +10,7 @@ import xarray as xr
 from jaxtyping import Array, ArrayLike
 
 from robins.filters import Filter
-from robins.filters.composite.imm import WRONG
+from robins.filters.kalman import WRONG
 from robins.results import array
 from robins.systems.tables import Update
 

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from robins.campaign.monte_carlo import solved, worlds
 from robins.filters import Belief, Code, Filter, Model, StepInfo
-from robins.filters.composite.imm import WRONG
+from robins.filters.kalman import WRONG
 from robins.filters.run import nothing
 from robins.filters.trees import select
 from robins.manifold import State

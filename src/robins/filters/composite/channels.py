@@ -136,19 +136,19 @@ class JoinedFilter(Composite):
     title: ClassVar[str]
 
     def fuse(self, beliefs: Sequence[Belief]) -> Belief:
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must have `fuse`")
 
     def apart(self, beliefs: Sequence[Belief], i: int) -> Array:
         return are_apart(beliefs, i, None)
 
     def first_shares(self, belief: Belief) -> Array:
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must have `first_shares`")
 
     def parted(self, belief: Belief, shares: Array) -> list[Belief]:
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must have `parted`")
 
     def moved(self, state: FilterState, motion: Motion, u: Data) -> Moved:
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must have `moved`")
 
     @property
     def filters(self) -> tuple[Filter, ...]:

@@ -27,7 +27,7 @@ from jaxtyping import Array, ArrayLike
 from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.composite.mixture import innovation, log_normalised, matched
-from robins.filters.kalman import Again, Filter, FilterState, Prediction
+from robins.filters.kalman import WRONG, Again, Filter, FilterState, Prediction
 from robins.filters.model import Data, Given, Motion, Sensor
 from robins.filters.trees import equal, select
 from robins.filters.values import Numbers, is_known, kind, value
@@ -172,8 +172,6 @@ def _stack(trees: Sequence[T]) -> T:
     return jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *trees)
 
 
-WRONG = "imm.wrong"  # note of a bank: (names,) probability that each of `Filter.suspects` is wrong
-
 _ONE = 1e-9  # how far a sum of probabilities may be off
 
 
@@ -208,6 +206,13 @@ class Imm(Filter):
     @property
     def suspects(self) -> tuple[str, ...]:
         return tuple(name for name, _ in self.wrong)
+
+    def suspicions(self, state: FilterState) -> Array:
+        return self._by_name(jnp.exp(state.memory.log_probability))
+
+    def _by_name(self, probability: Array) -> Array:
+        each = [jnp.sum(probability[np.asarray(modes)]) for _, modes in self.wrong]
+        return jnp.stack(each) if each else jnp.zeros(0)
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
         own = set()
@@ -254,8 +259,7 @@ class Imm(Filter):
         notes = {f"imm.{i}.{k}": v for i, own in enumerate(each) for k, v in own.items()}
         notes["imm.probability"] = probability = jnp.exp(log_post)
         if self.wrong:
-            each = [jnp.sum(probability[np.asarray(modes)]) for _, modes in self.wrong]
-            notes[WRONG] = jnp.stack(each)
+            notes[WRONG] = self._by_name(probability)
         info = self.told(seen, log_prior, log_post, used)._replace(notes=notes)
         # Where no mode has moved the mixture stands bit for bit.
         was, now = self.modes.beliefs(states), self.modes.beliefs(after)

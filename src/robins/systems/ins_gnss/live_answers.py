@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from robins.filters.composite.imm import WRONG
+from robins.filters.kalman import WRONG
 from robins.filters.run import Step
 from robins.systems.ins_gnss.robust import navigation
 from robins.systems.parts import Block

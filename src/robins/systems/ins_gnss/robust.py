@@ -43,7 +43,6 @@ from robins.linalg import block_diagonal
 from robins.systems.ins_gnss.model import IMU, POSITION, VELOCITY, Velocity
 from robins.systems.parts import Block, moved_by
 from robins.systems.study import Case
-from robins.systems.suspects import spans as stretches  # noqa: F401 its name of before
 
 SCALES = (1.0, 8.0, 64.0)
 RISE, FALL = 1e-4, 1e-2  # probability in a step that the process noise changes upwards, and back
