@@ -55,13 +55,13 @@ def outcome():
     return simulate(problem({"motion": PUSHED, "fix": PUSHED}), RUNS)
 
 
-def test_a_push_is_found_at_once_and_nothing_else_is_accused(outcome):
+def test_a_push_is_found_at_once_and_there_is_hardly_a_false_alarm(outcome):
     found = outcome.metrics["bank"]
-    assert found["motion_fault_found_share"] == 1.0
-    assert found["motion_fault_found_after_s"] == 0.0
-    assert found["motion_accused_wrongly_share"] < 0.1
-    assert found["fix_fault_found_share"] == 0.0  # the bank has no such hypothesis
-    assert "fix_accused_wrongly_share" not in found
+    assert found["motion_faults_detected_share"] == 1.0
+    assert found["motion_detection_delay_s"] == 0.0
+    assert found["motion_false_alarm_share"] < 0.1
+    assert found["fix_faults_detected_share"] == 0.0  # the bank has no such hypothesis
+    assert "fix_false_alarm_share" not in found
     assert "bank finds motion wrong in 3 of 3 runs, first at 10.5 s in the median." in outcome.notes
 
 
@@ -79,7 +79,7 @@ def test_what_is_believed_and_what_is_true_are_arrays_with_roles(outcome):
 
 def test_where_faults_are_not_known_nothing_is_scored():
     found = simulate(problem(None), 1)
-    assert not any("accused" in name or "fault" in name for name in found.metrics["bank"])
+    assert not any("alarm" in name or "detect" in name for name in found.metrics["bank"])
     assert found.solution is not None
     assert "truly_wrong" not in found.solution
     assert any(note.startswith("bank finds motion wrong: 10.5 to") for note in found.notes)
@@ -103,7 +103,7 @@ def test_scores_are_those_of_loops():
         for run, row in enumerate(chance):
             right = [k for k in range(first, EPOCHS) if not faults[name][k]]
             share = sum(row[k] > 0.5 for k in right) / len(right)
-            assert s.accused(name)[run] == pytest.approx(share, rel=1e-14)
+            assert s.false_alarms(name)[run] == pytest.approx(share, rel=1e-14)
             assert s.first_wrong(name)[run] == next(k for k in range(EPOCHS) if row[k] > 0.5)
             expected, k = [], 0
             while k < EPOCHS:

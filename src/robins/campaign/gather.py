@@ -17,7 +17,7 @@ from robins.systems.study import Problem
 
 
 class State(NamedTuple):
-    """How far a campaign is.
+    """Progress of a campaign.
 
     Attributes:
         found: statistics by filter of all shards that are there and whole, joined in the order of

@@ -33,7 +33,7 @@ Blocks = tuple[tuple[str, int, int], ...]  # name, first and last of the reporte
 
 
 def _kept(step: Step) -> Any:
-    """What a campaign keeps of a step: enough for errors, bounds and innovations."""
+    """Part of a step that a campaign keeps: enough for errors, bounds and innovations."""
     info = {name: u._replace(notes=step.info[name].notes) for name, u in updates(step).items()}
     return step.posterior, info, step.prediction.code == int(Code.DONE)
 
@@ -41,7 +41,7 @@ def _kept(step: Step) -> Any:
 def _judged(
     blocks: Blocks, belief: Belief, truth: State, rows: Array | None, lost: Array
 ) -> dict[str, Any]:
-    """Of one epoch the error of what the filters of a problem report alike, and what was stated."""
+    """Error and stated sigma of the reported components at one epoch."""
     whole, factor = local(belief.mean, truth), belief.factor
     error = whole if rows is None else rows @ whole
     stated = factor if rows is None else rows @ factor
@@ -67,7 +67,7 @@ def reported_rows(reported: Any, case: Case) -> tuple[Array | None, int | None]:
 
 
 def solved(filter_, model, case: Case, keep: Callable[[Step], Any]) -> tuple[Any, Case, Tally]:
-    """What is kept of the steps of a filter, the case with all that it was given, and how it went.
+    """Kept parts of the steps of a filter, its case with all its inputs, and the tally.
 
     A case in closed loop knows its truth and its measurements only when the filter has run.
     """
@@ -224,7 +224,7 @@ _NEEDED = ("innovation", "sigma", "nis", "dof")  # of each run's updates, by its
 
 
 def parted(record: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Of a record what statistics need of each run, and what is shown of the first one only."""
+    """Split a record: the part that statistics need of each run, and that of the first run only."""
     named = {"mean": record["mean"], "updates": record["updates"]}
     needed = {
         name: {field: getattr(u, field) for field in _NEEDED}

@@ -121,7 +121,7 @@ def _finds(problem: Problem, name: str, s: Statistics) -> list[str]:
 
 
 def _scores(problem: Problem, s: Statistics) -> dict[str, float]:
-    """Share of the faults found, the time that took, and wrong accusations, by suspect or fault."""
+    """Detected share and detection delay of faults, and false alarms, by suspect or fault."""
     if not s.suspects or problem.faults is None:
         return {}
     out: dict[str, float] = {}
@@ -130,12 +130,12 @@ def _scores(problem: Problem, s: Statistics) -> dict[str, float]:
         if name in real:
             delays = s.delays(name) if name in s.suspects else np.array([[-1]])
             found = delays[delays >= 0]
-            out[f"{name}_fault_found_share"] = float(np.mean(delays >= 0))
+            out[f"{name}_faults_detected_share"] = float(np.mean(delays >= 0))
             if len(found):
                 step_s = float(np.median(np.diff(problem.epoch_s)))
-                out[f"{name}_fault_found_after_s"] = float(np.median(found)) * step_s
+                out[f"{name}_detection_delay_s"] = float(np.median(found)) * step_s
         if name in s.suspects:
-            out[f"{name}_accused_wrongly_share"] = float(np.mean(s.accused(name)))
+            out[f"{name}_false_alarm_share"] = float(np.mean(s.false_alarms(name)))
     return out
 
 

@@ -185,9 +185,9 @@ class Statistics:
                 self._each(f"peaks of {norm.name}", np.stack(worst, axis=1))
 
     def _suspected(self, wrong: Mapping[str, np.ndarray]) -> None:
-        """Mean probability, and by run when a suspect is first held for wrong and whether rightly.
+        """Mean probability; by run the first alarm, false alarms, and delays of detection.
 
-        A fault is a run of epochs; it is found if its suspect is held for wrong within it.
+        A suspect alarms above `HELD`. A fault is a run of epochs, detected by an alarm within it.
         """
         for name, chance in wrong.items():
             held = chance > HELD
@@ -197,7 +197,9 @@ class Statistics:
                 continue
             true = np.zeros(held.shape[1], bool) | self.faults.get(name, False)
             right = np.flatnonzero(~true[self.counted]) + self.count_from
-            self._each(f"accused {name}", np.sum(held[:, right], axis=1) / max(len(right), 1))
+            self._each(
+                f"false alarms of {name}", np.sum(held[:, right], axis=1) / max(len(right), 1)
+            )
             delays = [_first(held[:, a:b]) for a, b in edges(true)]
             self._each(f"delay {name}", np.transpose(delays).reshape(len(held), len(delays)))
 
@@ -342,15 +344,15 @@ class Statistics:
         return self.sums[f"wrong {suspect}"] / self.runs
 
     def first_wrong(self, suspect: str) -> np.ndarray:
-        """(runs,) epoch at which it is first held for wrong; -1: never."""
+        """(runs,) epoch of its first alarm; -1: none."""
         return self._all(f"first wrong {suspect}")
 
-    def accused(self, suspect: str) -> np.ndarray:
-        """(runs,) share of the counted epochs without its fault at which it is held for wrong."""
-        return self._all(f"accused {suspect}")
+    def false_alarms(self, suspect: str) -> np.ndarray:
+        """(runs,) share of alarms among the counted epochs without its fault."""
+        return self._all(f"false alarms of {suspect}")
 
     def delays(self, suspect: str) -> np.ndarray:
-        """(runs, faults) epochs from the begin of a fault until it is held for wrong; -1: never."""
+        """(runs, faults) epochs from the begin of each fault to its detection; -1: none."""
         return self._all(f"delay {suspect}")
 
     @property

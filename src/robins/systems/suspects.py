@@ -14,7 +14,7 @@ from robins.filters.kalman import WRONG
 from robins.results import array
 from robins.systems.tables import Update
 
-HELD = 0.5  # probability above which a suspect is held for wrong
+HELD = 0.5  # probability of being wrong above which a suspect raises an alarm
 _SHOWN = 4  # spans in a sentence
 
 Wrong = Mapping[str, ArrayLike]

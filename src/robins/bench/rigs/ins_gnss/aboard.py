@@ -45,7 +45,7 @@ _FIELDS = {
 
 
 def aboard(flight: Any) -> Aboard:
-    """What the part `navigation` is made of, for the drive or the log of a flight.
+    """Filter, problem and C files of the part `navigation`, for the drive or the log of a flight.
 
     Raises:
         RigError: nobody speaks as imu or gnss, the log cannot be navigated, or the part is asked

@@ -44,7 +44,7 @@ _SHARED = ("system", "title", "imu", "start", "aids", "update", "outages", "log"
 
 
 class Journey(Replay):
-    """What the navigation computer believes, and where the samples come from.
+    """Beliefs of the navigation computer, and the source of the samples.
 
     A configuration of a replay, with the files of a ``log``; or a scenario of a simulated drive,
     whose sensors are believed as they are drawn. With neither, boards at ``imu`` and ``gnss`` speak
@@ -61,7 +61,7 @@ class Journey(Replay):
 
     @classmethod
     def model_validate_json(cls, json_data: str | bytes | bytearray, **options: Any) -> Journey:
-        """Of a scenario; that of a drive is taken apart: what is true, and what is believed."""
+        """Parse a scenario; that of a drive is split into truth and beliefs."""
         said = json.loads(json_data)
         if "legs" in said:
             gnss = {k: v for k, v in said.get("gnss", {}).items() if k in Gnss.model_fields}
