@@ -17,7 +17,7 @@ from robins.bench.ports.port import open_pair
 from robins.bench.rigs.satellite.messages import HELD, SAFE, SHORT, SILENT, USED, WIRE
 from robins.cli import main
 from robins.filters import OnlineFilter
-from robins.program import Memory
+from robins.program import NativeState
 from robins.systems.satellite.nodes import STAR, believable
 from robins.workbench.boards import SMALL, export_filter
 
@@ -132,7 +132,7 @@ def test_one_that_comes_late_waits_for_a_star_frame_as_the_part_does(program, of
 def test_it_has_the_bits_of_the_same_filter_in_c_on_the_host(program, of):
     reached, loop = flown(of, meddled=False)
     told = answers(program, of, reached)["estimate"]
-    host = OnlineFilter(of.filter, of.model, of.start, partial(Memory, unroll=SMALL))
+    host = OnlineFilter(of.filter, of.model, of.start, partial(NativeState, unroll=SMALL))
     for k, inputs in enumerate(reached):
         host.predict(inputs["gyro"]["theta_b"])
         if "star" in inputs:

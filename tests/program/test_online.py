@@ -22,10 +22,10 @@ from robins.filters import (
     unscented,
 )
 from robins.filters.rules import Infeasible, gate, h_infinity, with_gamma
-from robins.program import BuildError, Memory, ProgramError, trace
+from robins.program import BuildError, NativeState, ProgramError, trace
 
 # Compiled without optimisation, which is quicker for so few calls; the bits are the same.
-C = partial(Memory, flags=QUICK)
+C = partial(NativeState, flags=QUICK)
 EKF, MODEL = kalman(), line()
 
 

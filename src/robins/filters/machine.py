@@ -1,7 +1,7 @@
 """Machines: a state of a filter, stepped by functions compiled by JAX or as programs.
 
-`ByProgram` passes the functions of the filter, each under a name, to a memory that compiles them
-for this one state: in C it is that of `robins.program`, which knows no filter.
+`ProgramStepper` passes the functions of the filter, each under a name, to a `CompiledState`, which
+compiles them for this one state: in C it is that of `robins.program`, which knows no filter.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ Name = Literal["jax", "c"]
 Codes = tuple[Numbers, dict[str, Numbers]]  # of a step: of its prediction, and by sensor
 
 
-class Memory(Protocol):
-    """Memory of a state that compiles functions of it, such as `robins.program.Memory`."""
+class CompiledState(Protocol):
+    """A state with compiled functions that step it, such as `robins.program.NativeState`."""
 
     state: Data
 
@@ -41,7 +41,8 @@ class Memory(Protocol):
         ...
 
 
-Machine = Callable[[FilterState, Hashable], Memory]  # of a state, and the content of the functions
+# Of a state, and the content of the functions.
+Machine = Callable[[FilterState, Hashable], CompiledState]
 
 
 def _predicted(filter_, motion, state, u):
@@ -66,7 +67,7 @@ _step = jax.jit(_stepped, static_argnames=("keep",))
 _look = jax.jit(_answer, static_argnames=("question",))
 
 
-class ByJax:
+class JaxStepper:
     """A state, stepped by functions that JAX compiles."""
 
     is_numpy = False
@@ -98,8 +99,8 @@ class ByJax:
         return _look(self._filter, self._model, self.state, args, question)
 
 
-class ByProgram:
-    """`ByJax` with a memory, which folds the numbers of filter and model into its programs."""
+class ProgramStepper:
+    """`JaxStepper` with a memory, which folds the numbers of filter and model into its programs."""
 
     is_numpy = True
 
@@ -136,7 +137,7 @@ class ByProgram:
 
 def on(
     machine: Machine | str, filter_: Filter, model: Model, state: FilterState
-) -> ByJax | ByProgram:
+) -> JaxStepper | ProgramStepper:
     """Place a state on a machine: "jax", "c", or a function that makes a memory.
 
     Raises:
@@ -145,14 +146,14 @@ def on(
         robins.program.ProgramError: the state holds numbers that have no place in a program.
     """
     if callable(machine):
-        return ByProgram(filter_, model, state, machine)
+        return ProgramStepper(filter_, model, state, machine)
     one_of("machine", machine, Name)
     if machine == "jax":
-        return ByJax(filter_, model, state)
+        return JaxStepper(filter_, model, state)
     # Imported here: a filter needs neither programs nor a compiler.
-    from robins.program import Memory
+    from robins.program import NativeState
 
-    return ByProgram(filter_, model, state, Memory)
+    return ProgramStepper(filter_, model, state, NativeState)
 
 
 def settled(state: FilterState) -> FilterState:

@@ -54,7 +54,7 @@ class OnlineFilter:
             start: initial belief or saved state.
             machine: "jax", or "c" for compiled programs of scalars, which need a C compiler. The
                 first call of each kind takes seconds to compile; programs are kept on disk. Or a
-                function that makes a `robins.filters.machine.Memory` of a state.
+                function that makes a `robins.filters.machine.CompiledState` of a state.
 
         Raises:
             ValueError: there is no such machine.

@@ -142,7 +142,7 @@ def _alike(x: Any, known: Form) -> bool:
     return form(x) == known
 
 
-class Memory:
+class NativeState:
     """A state in the memory of C, and functions that step it or look at it.
 
     Attributes:

@@ -12,6 +12,9 @@ that what they know is the whole when it is added up (Carlson 1990):
     zero-reset    locals forget all, the master keeps it
     rescale       locals keep c Y_i, the master takes the (1 - c) Y_i that they give away
 
+Zero-reset leaves a local filter nothing to judge measurements by, and sigma points of an unknown
+state reach beyond any model: give it Taylor and no robust rules.
+
 A local filter that measures nothing stays in the fusion: it holds a share of what was known, and to
 leave it out would multiply P by 1 / (1 - b_i). With linear models fusion-reset with scalar or root
 sharing, and zero-reset, *are* the centralised filter. With a ``timeout`` one that has been silent
@@ -159,7 +162,18 @@ _TRACE = 1e-8
 
 @value
 class Federated(JoinedFilter):
-    """The filter of `federated`."""
+    """The filter of `federated`.
+
+    The belief of its state is the fused one, after a prediction and after each sensor. What an
+    update says of itself (innovation, gain, NIS, log-likelihood) is what the sensor's local filter
+    says, which knows less than the whole: the log-likelihoods of a run do not sum to that of the
+    data. Notes: ``federated.share``, the mean share of that local filter, and
+    ``federated.silent``, steps since it used a measurement.
+
+    Rules of a local filter work on its share. With sharing after the prediction a local filter with
+    rules predicts for itself, through the map that makes its share of the common prediction; one
+    without rules only corrects.
+    """
 
     centre: Filter  # how the fused belief and the master's are predicted
     fixed: Numbers | None  # (channels,) or (channels, n) shares, where they are given
@@ -287,21 +301,9 @@ def federated(
 ) -> Filter:
     """A federated Kalman filter (Carlson 1990); runs, streams and batches as any `Filter`.
 
-    The belief of its state is the fused one, after a prediction and after each sensor. What an
-    update says of itself (innovation, gain, NIS, log-likelihood) is what the sensor's local filter
-    says, which knows less than the whole: the log-likelihoods of a run do not sum to that of the
-    data. Notes: ``federated.share``, the mean share of that local filter, and
-    ``federated.silent``, steps since it used a measurement.
-
-    Rules of a local filter work on its share. With sharing after the prediction a local filter with
-    rules predicts for itself, through the map that makes its share of the common prediction; one
-    without rules only corrects.
-
     Args:
         channels: from `channel`; every sensor of the model belongs to exactly one.
         mode: "fusion-reset", "no-reset", "zero-reset" or "rescale" (module docstring).
-            Zero-reset leaves a local filter nothing to judge measurements by, and sigma points of
-            an unknown state reach beyond any model: give it Taylor and no robust rules.
         sharing: "root", "scalar" or "half"; how, see `robins.filters.composite.fusion`.
         shares: "equal"; "trace" or "diagonal", from the local covariances at every step; or (N,) or
             (N, n) numbers that sum to one with the master's, such as `observability_shares`.
@@ -315,48 +317,55 @@ def federated(
             that of the local filters.
         timeout: fusion-reset: steps without a measurement that it used after which the share of a
             local filter goes to the others, until it uses one again; None never. With linear models
-            it changes nothing that is fused but where local filters have rules.
+            it changes what is fused only where local filters have rules.
 
     Raises:
         ValueError: a sensor in two channels, an unknown mode, sharing or kind of shares, shares
-            that are negative, not finite or do not sum to one, a master or a timeout that the mode
-            has not; at `init`, a sensor without a channel.
+            that do not sum to one, a master or a timeout that the mode has not; at `init`, a
+            sensor without a channel.
     """
     channels = tuple(channels)
     owners(channels)
-    one_of("mode", mode, Mode)
-    check_sharing(sharing)
+    _check_kinds(mode, sharing, after_prediction)
     within = "the master's share must lie from 0 to below 1"
     of_master = number(within, master, lambda b: (b >= 0.0) & (b < 1.0))
-    kept = number("keep must lie between 0 and 1", keep, lambda c: (c > 0.0) & (c < 1.0))
     has_master = _has_master(mode, shares, of_master)
     fixed = _fixed_shares(shares, len(channels), of_master)
     weighing = shares if isinstance(shares, str) else "given"
     if sharing == "scalar" and (weighing == "diagonal" or (fixed is not None and fixed.ndim == 2)):
         raise ValueError("scalar sharing takes one share a channel: use 'root' for one a state")
-    if after_prediction and mode != "fusion-reset":
-        raise ValueError(f"sharing after the prediction is of mode 'fusion-reset', not {mode!r}")
-    patience = None
-    if timeout is not None:
-        require(mode == "fusion-reset", f"mode {mode!r} does not share anew: it has no timeout")
-        short = "federated timeout must be at least one step"
-        patience = number(short, timeout, lambda steps: steps >= 1)
-    if sharing == "half":
-        warnings.warn(HALF, UserWarning, stacklevel=2)
     usual = sharing == "root" if after_prediction is None else after_prediction
     return Federated(
         channels=channels,
         centre=kalman(linearise),
         fixed=fixed,
         master=of_master,
-        keep=kept,
-        timeout=patience,
+        keep=number("keep must lie between 0 and 1", keep, lambda c: (c > 0.0) & (c < 1.0)),
+        timeout=_steps(mode, timeout),
         mode=mode,
         sharing=sharing,
         weighing=weighing,
         has_master=has_master,
         late=mode == "zero-reset" or (mode == "fusion-reset" and usual),
     )
+
+
+def _check_kinds(mode: str, sharing: str, after_prediction: bool | None) -> None:
+    one_of("mode", mode, Mode)
+    check_sharing(sharing)
+    if after_prediction and mode != "fusion-reset":
+        raise ValueError(f"sharing after the prediction is of mode 'fusion-reset', not {mode!r}")
+    if sharing == "half":
+        warnings.warn(HALF, UserWarning, stacklevel=3)
+
+
+def _steps(mode: str, timeout: int | None) -> Numbers | None:
+    """Steps of silence before a share is handed over; refused where the mode has none."""
+    if timeout is None:
+        return None
+    require(mode == "fusion-reset", f"mode {mode!r} does not share anew: it has no timeout")
+    short = "federated timeout must be at least one step"
+    return number(short, timeout, lambda steps: steps >= 1)
 
 
 def _rescaled(members: Sequence[FilterState], keep: Numbers) -> list[Belief]:

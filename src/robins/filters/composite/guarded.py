@@ -88,7 +88,13 @@ class Watch(NamedTuple):
 
 @value
 class Guarded(Composite):
-    """The filter of `guarded`."""
+    """The filter of `guarded`.
+
+    What an update says of itself is what the filter with the greater weight says; a sensor of the
+    assumption that has the smaller one is refused. Notes: those of the filter, those of the
+    reference as ``reference.`` and their name, ``guarded.weight``, ``guarded.evidence`` (the
+    greatest, as a share of the limit) and ``guarded.trips``.
+    """
 
     filter: Filter
     reference: Filter
@@ -249,19 +255,13 @@ def guarded(
     The test is of harm to the estimate, and relies on the reference's covariance: where that is
     overconfident (NEES per state above one) a ratio larger by that makes up for it.
 
-    What an update says of itself is what the filter with the greater weight says; a sensor of the
-    assumption that has the smaller one is refused. Notes: those of the filter, those of the
-    reference as ``reference.`` and their name, ``guarded.weight``, ``guarded.evidence`` (the
-    greatest, as a share of the limit) and ``guarded.trips``.
-
     Args:
         filter: believes the assumption.
         reference: does without; of the same state. Each may be a filter of filters.
         assumption: sensors that the reference does not use.
         judges: sensors that both use and that are beyond question.
-        groups: tangent components that are judged together, by their sum, such as
-            ``[(3, 4), (6, 7)]``; others are not watched. Two axes tell twice as fast as one. By
-            default each component by itself.
+        groups: tangent components judged together, by their sum, such as ``[(3, 4), (6, 7)]``:
+            faster than one by one, the default. Others are not watched.
         ratio: how many times what it should be a squared difference may be on average before the
             filter goes on from its reference, which then is as good as it; half of it is what is
             expected under a right assumption.
@@ -275,28 +275,36 @@ def guarded(
             or a parameter is not of its range; at `init`, the model has no sensor of such a name,
             or the state no such component.
     """
-    assumed = sensor_names("guarded assumption", assumption)
-    judging = sensor_names("guarded judges", judges)
-    both = sorted(set(assumed) & set(judging))
-    require(not both, f"guarded: {both} cannot judge, it belongs to the assumption")
+    assumed, judging = _two_sides(assumption, judges)
     named = groups is None or (len(groups) > 0 and all(len(one) > 0 for one in groups))
     require(named, "guarded groups must each name a component", groups)
-    times = number("guarded ratio must be at least 1", ratio, lambda x: x >= 1.0)
-    given = {"limit": limit, "patience": patience, "leap": leap}
-    positive = {
-        name: number(f"guarded {name} must be positive", x, lambda x: x > 0.0)
-        for name, x in given.items()
-    }
     return Guarded(
         filter=filter,
         reference=reference,
-        ratio=times,
-        **positive,
+        ratio=number("guarded ratio must be at least 1", ratio, lambda x: x >= 1.0),
+        limit=_positive("limit", limit),
+        patience=_positive("patience", patience),
+        leap=_positive("leap", leap),
         assumed=assumed,
         judging=judging,
         groups=None if groups is None else tuple(map(tuple, groups)),
         trusted=trusted,
     )
+
+
+def _positive(name: str, given: Number) -> Numbers:
+    return number(f"guarded {name} must be positive", given, lambda x: x > 0.0)
+
+
+def _two_sides(
+    assumption: str | Sequence[str], judges: str | Sequence[str]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the sensors of the assumption and of the judges; no sensor may be both."""
+    assumed = sensor_names("guarded assumption", assumption)
+    judging = sensor_names("guarded judges", judges)
+    both = sorted(set(assumed) & set(judging))
+    require(not both, f"guarded: {both} cannot judge, it belongs to the assumption")
+    return assumed, judging
 
 
 def _given_out(watch: Watch) -> FilterState:
