@@ -313,8 +313,7 @@ def federated(
         after_prediction: fusion-reset: predict what was fused, then share it out (True), or share
             it out and let all predict (False). By default True with root sharing, which is exact
             only so, and False else.
-        linearise: how the fused belief and the master's are predicted; `taylor()` by default. Give
-            that of the local filters.
+        linearise: how the fused belief is predicted, as in the local filters; default `taylor()`.
         timeout: fusion-reset: steps without a measurement that it used after which the share of a
             local filter goes to the others, until it uses one again; None never. With linear models
             it changes what is fused only where local filters have rules.
