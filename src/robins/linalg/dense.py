@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jax.scipy.linalg import expm, solve_triangular
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from robins import _float64  # noqa: F401
+from robins import _float64  # noqa: F401  # pyright: ignore[reportUnusedImport]  for its effect
 from robins.errors import require
 
 # What is below this share of a row's length is rounding: such a row depends on those above it.
