@@ -15,15 +15,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
-from robins.filters.belief import Belief, Code, StepInfo
-from robins.filters.kalman import WRONG, Filter, FilterState
+from robins.filters.belief import Belief, Code
+from robins.filters.kalman import WRONG, Filter, FilterState, Updated
 from robins.filters.model import Data, Model, Sensor
-from robins.filters.run import Step, check_names, everything, nothing, report_run
+from robins.filters.run import Keep, Step, check_names, everything, nothing, report_run
 from robins.filters.tally import Tally
 from robins.filters.values import as_data, is_known
 from robins.manifold import State
 
 T = TypeVar("T")
+_Carry = tuple[FilterState, Data, Tally]  # Data: the world
 
 
 class Reading(NamedTuple):
@@ -55,9 +56,7 @@ class Loop(NamedTuple):
     due: Mapping[str, ArrayLike] = {}
 
 
-def _without(
-    filter_: Filter, sensor: Sensor, state: FilterState, y: Data, aux: Data
-) -> tuple[FilterState, StepInfo]:
+def _without(filter_: Filter, sensor: Sensor, state: FilterState, y: Data, aux: Data) -> Updated:
     """The same state, and the information of an update without a measurement."""
     like = jax.eval_shape(lambda s, z, a: filter_.update(s, sensor, z, a)[1], state, y, aux)
     blank = jax.tree_util.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
@@ -72,8 +71,8 @@ def _without(
 
 
 @partial(jax.jit, static_argnames=("keep",))
-def _scan(filter_, model, state, loop: Loop, keep):
-    def body(carry, given):
+def _scan(filter_: Filter, model: Model, state: FilterState, loop: Loop, keep: Keep) -> Closed:
+    def body(carry: _Carry, given: tuple[Data, Data]) -> tuple[_Carry, tuple[Data, Reading]]:
         state, world, tally = carry
         row, due = given
         world, reading = loop.react(world, state.belief, row)
@@ -98,9 +97,7 @@ def _scan(filter_, model, state, loop: Loop, keep):
     return Closed(steps, readings, state, world, tally)
 
 
-def _update(
-    filter_: Filter, sensor: Sensor, state: FilterState, y: Data, aux: Data
-) -> tuple[FilterState, StepInfo]:
+def _update(filter_: Filter, sensor: Sensor, state: FilterState, y: Data, aux: Data) -> Updated:
     return _apart(filter_.update, state, sensor, y, aux)
 
 
@@ -129,7 +126,7 @@ def run_closed(
     model: Model,
     start: Belief | FilterState,
     loop: Loop,
-    keep: Callable[[Step], Data] = everything,
+    keep: Keep = everything,
     time_s: ArrayLike | None = None,
 ) -> Closed:
     """Run a filter in a loop: for each step the world reacts to the belief, then the filter

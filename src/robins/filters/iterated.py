@@ -35,7 +35,7 @@ class Iterated(Linearisation):
             return first
         by_slope = first.excess.shape[1] == 0  # Taylor, which does not depend on the covariance
 
-        def look(t, M):
+        def look(t: Array, M: Array) -> Observation:
             return self.look(prior, sensor, y, aux, t, M)
 
         t, M = jax.lax.fori_loop(
@@ -110,7 +110,7 @@ def _carried(prior: Belief, t: Array) -> tuple[State, Array]:
     if not any(manifold.is_element(leaf) for leaf in manifold.leaves(prior.mean)):
         return mean, S
 
-    def moved(shift):
+    def moved(shift: Array) -> Array:
         return manifold.local(mean, manifold.retract(prior.mean, S @ (t + shift)))
 
     return mean, jax.jacfwd(moved)(jnp.zeros_like(t))

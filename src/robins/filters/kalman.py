@@ -53,6 +53,8 @@ class Prediction(NamedTuple):
 
 WRONG = "imm.wrong"  # note of a bank: (names,) probability that each of `Filter.suspects` is wrong
 
+Advanced = tuple[FilterState, Prediction]  # result of `predict`
+Updated = tuple[FilterState, StepInfo]  # result of `update`
 Follow = Callable[[Sequence[Belief], Belief], FilterState]
 Again = Callable[["Filter"], FilterState]  # the same run with another filter, to its end
 
@@ -68,14 +70,10 @@ class Filter:
         """The state to begin with; dims maps sensor names to dimensions (`Model.dims`)."""
         raise NotImplementedError(f"{type(self).__name__} must have `init`")
 
-    def _predict(
-        self, state: FilterState, motion: Motion, u: Data
-    ) -> tuple[FilterState, Prediction]:
+    def _predict(self, state: FilterState, motion: Motion, u: Data) -> Advanced:
         raise NotImplementedError(f"{type(self).__name__} must have `_predict`")
 
-    def _update(
-        self, state: FilterState, sensor: Sensor, y: Data, aux: Data
-    ) -> tuple[FilterState, StepInfo]:
+    def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data) -> Updated:
         raise NotImplementedError(f"{type(self).__name__} must have `_update`")
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
@@ -374,9 +372,7 @@ class Kalman(Filter):
             code = jnp.where(code == int(Code.DONE), found, code)
         return state._replace(belief=belief, memory=tuple(memory)), code
 
-    def _predict(
-        self, state: FilterState, motion: Motion, u: Data
-    ) -> tuple[FilterState, Prediction]:
+    def _predict(self, state: FilterState, motion: Motion, u: Data) -> Advanced:
         begun, settled = self.settled(state) if self.settles else (state, None)
         transition = self.way.transition(begun.belief, motion, u)
         memory = []
@@ -411,9 +407,7 @@ class Kalman(Filter):
                 seen = again._replace(**{name: getattr(seen, name) for name in _OF_RULES})
         return memory, prior, seen._replace(accepted=seen.accepted & seen.present)
 
-    def _update(
-        self, state: FilterState, sensor: Sensor, y: Data, aux: Data
-    ) -> tuple[FilterState, StepInfo]:
+    def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data) -> Updated:
         memory, prior, seen = self.seen(state, sensor, y, aux)
         posterior, info = updated(prior, seen, self.form)
         # A contradiction alone has an infinite NIS that is no overflow.

@@ -20,7 +20,7 @@ deficit, and returns `Code.INDEFINITE` where no covariance is left.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import NamedTuple
 
 import jax
@@ -62,6 +62,9 @@ class Reuse(NamedTuple):
     observation: Callable[[Points, Belief, Sensor, Data, Data], Observation]
 
 
+Regressed = tuple[State, Array, Array, Array | None]  # mean, spread, excess, deficit
+
+
 class Linearisation:
     """A way to linearise: `taylor`, `unscented`, `cubature`, `iterated`.
 
@@ -92,7 +95,7 @@ class Linearisation:
         return self.reuse.observation(points, prior, sensor, y, aux)
 
 
-def _form(x: State) -> tuple:
+def _form(x: State) -> Hashable:
     """Structure and shapes, which compare without `__eq__` of an element."""
     leaves, tree = jax.tree_util.tree_flatten(x, is_leaf=lambda leaf: leaf is None)
     return tree, tuple(None if leaf is None else jnp.shape(leaf) for leaf in leaves)
@@ -101,7 +104,7 @@ def _form(x: State) -> tuple:
 def _magnitude(x: State) -> Array:
     """Size of the numbers behind each tangent component of a state: rounding is 1e-16 of it."""
 
-    def of(leaf):
+    def of(leaf: State) -> Array:
         if not manifold.is_element(leaf):
             return jnp.abs(leaf).reshape(-1)
         # tangent vector of one unit in the last place, in any representation
@@ -112,11 +115,12 @@ def _magnitude(x: State) -> Array:
 
 
 def _observe(
-    sensor: Sensor, prior: Belief, z: State, y: Data, aux: Data, spread, excess, size, deficit=None
+    sensor: Sensor, prior: Belief, y: Data, aux: Data, reading: Regressed, size: Array
 ) -> Observation:
     """Observation from a predicted measurement z and its linearisation."""
-    if (reads := _form(z)) != (given := _form(y)):
-        reads, given = (tree.unflatten(shapes) for tree, shapes in (reads, given))
+    z, spread, excess, deficit = reading
+    if _form(z) != _form(y):
+        reads, given = jax.tree_util.tree_map(jnp.shape, (z, y))
         raise ValueError(
             f"sensor '{sensor.name}' reads shape {reads}, but was given {given} to compare"
         )
@@ -150,7 +154,7 @@ def _jacobian(g: Callable[[State], State], x: State) -> tuple[State, Array]:
 class Taylor(Linearisation):
     """Value behind `taylor`."""
 
-    def transition(self, belief: Belief, motion: Motion, u) -> Transition:
+    def transition(self, belief: Belief, motion: Motion, u: Data) -> Transition:
         if motion.linear is not None:
             mean, F, given = motion.linear(belief.mean, u)
             noise = as_noise(given, F.shape[0], "the motion")
@@ -159,14 +163,14 @@ class Taylor(Linearisation):
             noise = motion.noise_factor(belief.mean, u)
         return Transition(mean, F @ belief.factor, jnp.zeros((F.shape[0], 0)), noise)
 
-    def observation(self, prior: Belief, sensor: Sensor, y, aux) -> Observation:
+    def observation(self, prior: Belief, sensor: Sensor, y: Data, aux: Data) -> Observation:
         if sensor.linear is not None:
             z, H = sensor.linear(prior.mean, aux)
         else:
             z, H = _jacobian(lambda x: sensor.reading(x, aux), prior.mean)
         size = jnp.abs(H) @ (prior.sigma + _magnitude(prior.mean))
         nothing = jnp.zeros((sensor.dim, 0))
-        return _observe(sensor, prior, z, y, aux, H @ prior.factor, nothing, size)
+        return _observe(sensor, prior, y, aux, (z, H @ prior.factor, nothing, None), size)
 
 
 def taylor() -> Linearisation:
@@ -218,15 +222,13 @@ def sigma_points(belief: Belief, reach: Number) -> State:
     return jax.vmap(lambda d: manifold.retract(belief.mean, d))(offsets)
 
 
-def _regress(
-    values: State, n: int, alpha: Number, beta: Number, kappa: Number
-) -> tuple[State, Array, Array, Array | None]:
+def _regress(values: State, n: int, alpha: Number, beta: Number, kappa: Number) -> Regressed:
     """Mean, spread, excess, deficit of function values at the sigma points (module docstring)."""
     w = sigma_weights(n, alpha, beta, kappa)
     ring = 1.0 / (2.0 * w.reach**2)
     centre = jax.tree_util.tree_map(lambda v: v[0], values)
 
-    def split(origin):
+    def split(origin: State) -> tuple[Array, Array, Array]:
         d = jax.vmap(lambda v: manifold.local(origin, v))(values)
         plus, minus = d[1 : n + 1], d[n + 1 :]
         even = 0.5 * (plus + minus) - d[:1]
@@ -268,7 +270,7 @@ class Unscented(Linearisation):
         """Distance c of the points, in columns of the factor."""
         return sigma_weights(n, *self.numbers).reach
 
-    def transition(self, belief: Belief, motion: Motion, u) -> Transition:
+    def transition(self, belief: Belief, motion: Motion, u: Data) -> Transition:
         n = belief.factor.shape[0]
         points = sigma_points(belief, self.reach(n))
         values = jax.vmap(lambda x: motion.moved(x, u))(points)
@@ -277,19 +279,21 @@ class Unscented(Linearisation):
         moved = None if self.redraw else Points(values, of_width(noise, n))
         return Transition(mean, spread, excess, noise, deficit, moved)
 
-    def observation(self, prior: Belief, sensor: Sensor, y, aux) -> Observation:
+    def observation(self, prior: Belief, sensor: Sensor, y: Data, aux: Data) -> Observation:
         n = prior.factor.shape[0]
         reach = self.reach(n)
         values = jax.vmap(lambda x: sensor.reading(x, aux))(sigma_points(prior, reach))
-        z, spread, excess, deficit = _regress(values, n, *self.numbers)
+        reading = _regress(values, n, *self.numbers)
         size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / reach
-        return _observe(sensor, prior, z, y, aux, spread, excess, size, deficit)
+        return _observe(sensor, prior, y, aux, reading, size)
 
     def draw(self, belief: Belief) -> Points:
         n = belief.factor.shape[0]
         return Points(sigma_points(belief, self.reach(n)), jnp.zeros((n, n)))
 
-    def observe_again(self, points: Points, prior: Belief, sensor: Sensor, y, aux) -> Observation:
+    def observe_again(
+        self, points: Points, prior: Belief, sensor: Sensor, y: Data, aux: Data
+    ) -> Observation:
         n = prior.factor.shape[0]
         values = jax.vmap(lambda x: sensor.reading(x, aux))(points.states)
         _, *state, lack = _regress(points.states, n, *self.numbers)
@@ -309,7 +313,7 @@ class Unscented(Linearisation):
         T = jnp.where(independent[:, None], linalg.solve_lower(solid, wide), 0.0)
         spread = deviation @ T.T
         size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / self.reach(n)
-        return _observe(sensor, prior, z, y, aux, spread, deviation - spread @ T, size)
+        return _observe(sensor, prior, y, aux, (z, spread, deviation - spread @ T, None), size)
 
 
 def unscented(

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 
 from robins.filters.belief import StepInfo
 from robins.filters.checks import one_of
-from robins.filters.kalman import Filter, FilterState, Prediction
-from robins.filters.model import Data, Model
-from robins.filters.run import Step, filter_step
+from robins.filters.kalman import Advanced, Filter, FilterState, Prediction, Updated
+from robins.filters.model import Data, Model, Motion, Sensor
+from robins.filters.run import Keep, Step, filter_step
 from robins.filters.values import Numbers, content, on_device
 
 T = TypeVar("T")
@@ -45,20 +45,24 @@ class CompiledState(Protocol):
 Machine = Callable[[FilterState, Hashable], CompiledState]
 
 
-def _predicted(filter_, motion, state, u):
+def _predicted(filter_: Filter, motion: Motion, state: FilterState, u: Data) -> Advanced:
     return filter_.predict(state, motion, u)
 
 
-def _updated(filter_, sensor, state, y, aux):
+def _updated(filter_: Filter, sensor: Sensor, state: FilterState, y: Data, aux: Data) -> Updated:
     return filter_.update(state, sensor, y, aux)
 
 
-def _stepped(filter_, model, state, u, y, aux, keep):
+def _stepped(
+    filter_: Filter, model: Model, state: FilterState, u: Data, y: Data, aux: Data, keep: Keep
+) -> tuple[FilterState, tuple[Data, Codes]]:
     state, step = filter_step(filter_, model, state, u, y, aux)
     return state, (keep(step), (step.prediction.code, {k: i.code for k, i in step.info.items()}))
 
 
-def _answer(filter_, model, state, args, question):
+def _answer(
+    filter_: Filter, model: Model, state: FilterState, args: Data, question: Callable[..., T]
+) -> T:
     return question(filter_, model, state, *args)
 
 

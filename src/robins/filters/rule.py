@@ -47,7 +47,7 @@ class Rule:
 
     name = "rule"
 
-    def __new__(cls, *args, **kw) -> Any:
+    def __new__(cls, *args: Any, **kw: Any) -> Any:
         """``Rule(before=f)`` is a rule of functions."""
         return object.__new__(Hooks if cls is Rule else cls)
 

@@ -52,6 +52,10 @@ class Solution(NamedTuple):
         return self.steps.posterior.sigma
 
 
+Rows = tuple[Data, dict[str, State], dict[str, Data]]  # u, y and aux, the last two by sensor
+Keep = Callable[[Step], Data]  # part of a step that is kept
+
+
 def everything(step: Step) -> Step:
     """Keep the whole step."""
     return step
@@ -110,8 +114,8 @@ def filter_step(
 
 
 @partial(jax.jit, static_argnames=("keep",))
-def _scan(filter_, model, state, u, y, aux, keep):
-    def body(carry, row):
+def _scan(filter_: Filter, model: Model, state: FilterState, rows: Rows, keep: Keep) -> Solution:
+    def body(carry: tuple[FilterState, Array, Tally], row: Rows):
         state, total, tally = carry
         state, step = filter_step(filter_, model, state, *row)
         gained = sum((i.log_likelihood for i in step.info.values()), jnp.zeros(()))
@@ -119,8 +123,8 @@ def _scan(filter_, model, state, u, y, aux, keep):
         total = total + jnp.where(moved, gained, -jnp.inf)
         return (state, total, tally.and_step(step.prediction.code, step.info)), keep(step)
 
-    begin = (state, jnp.zeros(()), Tally.blank(tuple(y)))
-    (state, total, tally), steps = jax.lax.scan(body, begin, (u, y, aux))
+    begin = (state, jnp.zeros(()), Tally.blank(tuple(rows[1])))
+    (state, total, tally), steps = jax.lax.scan(body, begin, rows)
     return Solution(steps, state, total, tally)
 
 
@@ -146,7 +150,7 @@ def run(
     y: Data,
     u: Data = None,
     aux: Mapping[str, Data] | None = None,
-    keep: Callable[[Step], Data] = everything,
+    keep: Keep = everything,
     time_s: ArrayLike | None = None,
 ) -> Solution:
     """Run a filter over measurements: for each step k predict, then update with row k of y.
@@ -180,11 +184,11 @@ def run(
     _check_lengths(measurements, u, extra)
     as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
-    state, u, extra = as_arrays(state), as_arrays(u), as_arrays(extra)
-    solution = _scan(filter_, model, state, u, measurements, extra, keep)
+    state, rows = as_arrays(state), (as_arrays(u), measurements, as_arrays(extra))
+    solution = _scan(filter_, model, state, rows, keep)
 
     def again(other: Filter) -> FilterState:
-        return _scan(other, model, state, u, measurements, extra, nothing).final
+        return _scan(other, model, state, rows, nothing).final
 
     report_run(filter_, state, solution.final, solution.tally, again, time_s)
     if keep is everything and is_known(solution.tally):

@@ -61,7 +61,7 @@ class Tally(NamedTuple):
         return Tally(predictions, self.updates | updates, self.nis | nis, self.dof | dof)
 
     def looking(
-        self, info: Mapping[str, tuple], readings: Mapping[str, State] | None = None
+        self, info: Mapping[str, tuple[State, ...]], readings: Mapping[str, State] | None = None
     ) -> Tally:
         """Add sums of innovations and readings over the steps, for `doubts`; not in `jit`.
 

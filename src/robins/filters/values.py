@@ -7,7 +7,7 @@ A field holds *data* (numbers, or values and tuples of them) unless it is a *kin
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from typing import TYPE_CHECKING, Any, TypeVar, dataclass_transform
 
 import jax
@@ -60,7 +60,7 @@ def value(cls: type[T]) -> type[T]:
         children, aux = flatten(x)
         return [(GetAttrKey(n), v) for n, v in zip(aux[0], children, strict=True)], aux
 
-    def unflatten(aux: Fields, children) -> T:
+    def unflatten(aux: Fields, children: Iterable[Any]) -> T:
         data, fixed = aux
         x = object.__new__(cls)
         for n, v in (*fixed, *zip(data, children, strict=True)):
@@ -130,7 +130,7 @@ def content(*trees: object) -> Hashable:
     Functions are compared by identity.
     """
 
-    def raw(x) -> np.ndarray:
+    def raw(x: Any) -> np.ndarray:
         is_key = jax.numpy.issubdtype(getattr(x, "dtype", float), jax.dtypes.prng_key)
         return np.asarray(jax.random.key_data(x) if is_key else x)
 

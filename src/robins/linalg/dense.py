@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jax.scipy.linalg import expm, solve_triangular
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from robins import _float64  # noqa: F401
+from robins import _float64  # noqa: F401  # pyright: ignore[reportUnusedImport]  for its effect
 from robins.errors import require
 
 # What is below this share of a row's length is rounding: such a row depends on those above it.
@@ -52,17 +52,17 @@ def tria(*blocks: Float[Array, "n _"]) -> Float[Array, "n n"]:
 
 
 @jax.custom_jvp
-def _triangle(wide):
+def _triangle(wide: Array) -> Array:
     upper = jnp.linalg.qr(wide.T, mode="r")
     return upper.T * _signs(upper)[None, :]
 
 
-def _signs(upper):
+def _signs(upper: Array) -> Array:
     return jnp.where(jnp.diagonal(upper) < 0.0, -1.0, 1.0)
 
 
 @_triangle.defjvp
-def _triangle_jvp(primals, tangents):
+def _triangle_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     # With A = L Q' the change is dL = dA Q + L W, W = Q' dQ skew and such that dL is lower
     # triangular. Pivots lost in rounding turn nothing, where JAX's own rule divides by them.
     (wide,), (slope,) = primals, tangents
@@ -78,7 +78,7 @@ def _triangle_jvp(primals, tangents):
     return L, jnp.tril(slide + L @ (turn.T - turn))
 
 
-def _with_diagonal(L, diagonal):
+def _with_diagonal(L: Array, diagonal: Array) -> Array:
     return jnp.where(jnp.eye(L.shape[0], dtype=bool), diagonal[:, None], L)
 
 
@@ -104,7 +104,7 @@ def independent_rows(
     if size is not None:
         floor = jnp.maximum(DEPENDENT, DEPENDENT * jax.lax.stop_gradient(size) / unit)
 
-    def orthogonalise(row, least, basis, weight):
+    def orthogonalise(row: Array, least: Array, basis: Array, weight: Array):
         rest = row
         for _ in range(2):
             rest = rest - (weight * (basis @ rest)) @ basis
@@ -114,7 +114,7 @@ def independent_rows(
 
     if m > UNROLLED:
 
-        def body(i, state):
+        def body(i: Array, state: tuple[Array, Array, Array]) -> tuple[Array, ...]:
             found = orthogonalise(rows[i], floor[i], *state[:2])
             return tuple(x.at[i].set(f) for x, f in zip(state, found, strict=True))
 
@@ -195,7 +195,7 @@ def cholesky(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 @cholesky.defjvp
-def _cholesky_jvp(primals, tangents):
+def _cholesky_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     # dL = L W, W the lower half of L^-1 dP L'^-1 (Murray 2016). A step that cannot be taken must
     # not make the gradients of the others NaN: there L is put aside before it is divided by.
     (P,), (slope,) = primals, tangents
@@ -395,7 +395,7 @@ def van_loan(
     Phi = G[n:, n:].T
     Qd = Phi @ G[:n, n:]
 
-    def double(i, pair):
+    def double(i: Array, pair: tuple[Array, Array]) -> tuple[Array, Array]:
         Phi, Qd = pair
         wanted = i < halvings
         longer = Qd + Phi @ Qd @ Phi.T

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from robins import _float64  # noqa: F401
+from robins import _float64  # noqa: F401  # pyright: ignore[reportUnusedImport]  for its effect
 
 Three = Sequence[Any]
 Matrix = Sequence[Sequence[Any]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ class NotWritten(RobinsError, RuntimeError):
 
 
 @contextmanager
-def keeping(tree: Any) -> Iterator[None]:
+def keeping(tree: Any) -> Generator[None, None, None]:
     """Let any error that leaves this block take along what was computed, for `rescued` to write.
 
     Args:
@@ -40,7 +40,7 @@ def keeping(tree: Any) -> Iterator[None]:
 
 
 @contextmanager
-def rescued(path: str | os.PathLike[str]) -> Iterator[None]:
+def rescued(path: str | os.PathLike[str]) -> Generator[None, None, None]:
     """Write what an error takes along (`keeping`) where no result folder can be made at `path`.
 
     The arrays go into a new folder beside the result, or among the temporary files where nothing

@@ -108,7 +108,7 @@ def linearised(
     )
     way, unit = taylor(), jnp.eye(manifold.dim(start.mean))
 
-    def at(row) -> Linearised:
+    def at(row: tuple[State, State, Data, dict[str, State], dict[str, Data]]) -> Linearised:
         before, now, u, y, aux = row
         moved = way.transition(Belief(before, unit), model.motion, u)
         sights = []

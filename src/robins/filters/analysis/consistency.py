@@ -108,7 +108,7 @@ def whitened_innovations(info: StepInfo) -> Float[Array, "t m"]:
     They are uncorrelated if the filter is consistent.
     """
 
-    def one(residual, factor, used):
+    def one(residual: Array, factor: Array, used: Array) -> Array:
         white = linalg.solve_lower(factor, jnp.where(used, residual, 0.0)[:, None])[:, 0]
         return jnp.where(used, white, jnp.nan)
 

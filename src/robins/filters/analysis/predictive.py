@@ -18,7 +18,7 @@ from scipy import integrate, optimize, special, stats
 
 from robins import linalg
 from robins.filters.belief import Belief
-from robins.filters.kalman import Around, Filter, FilterState, Follow
+from robins.filters.kalman import Advanced, Around, Filter, FilterState, Follow, Updated
 from robins.filters.linearise import taylor
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.observation import Normalised, normalised
@@ -88,11 +88,11 @@ class Scored(Around):
 
     # `Filter` wraps both for steps that are not taken; here the inner filter does so itself.
     @jax.jit
-    def predict(self, state: FilterState, motion: Motion, u: Data = None):
+    def predict(self, state: FilterState, motion: Motion, u: Data = None) -> Advanced:
         return self.inner.predict(state, motion, u)
 
     @jax.jit
-    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None):
+    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None) -> Updated:
         innovation = normalised(taylor().observation(state.belief, sensor, y, aux))
         there = innovation.dof > 0
         density = jnp.where(there, jnp.where(state.current, log_density(innovation), -jnp.inf), 0.0)

@@ -30,7 +30,7 @@ from robins.filters.kalman import kalman
 from robins.filters.linearise import Linearisation, taylor
 from robins.filters.model import Data, Model, Motion, Sensor
 from robins.filters.rules._inflation import Weight, as_weight, rows_of
-from robins.filters.rules.h_infinity import Estimate, h_infinity, least_gamma
+from robins.filters.rules.h_infinity import Estimate, HInfinity, h_infinity, least_gamma
 from robins.filters.run import Solution, Step, run
 from robins.manifold import State
 
@@ -89,7 +89,7 @@ def gamma_min(
         return jnp.where(counts, jnp.max(jnp.array(last), initial=0.0), 0.0)
 
     @jax.jit  # so that nothing is raised where the filter does not exist
-    def attempt(rule):
+    def attempt(rule: HInfinity):
         done = run(kalman(linearise, [rule]), model, start, y, u, aux, bounds)
         return done.final.memory[0], done.log_likelihood, done.steps
 

@@ -166,7 +166,8 @@ def adaptive(
     s = np.asarray(scales, float)
     rising = s.ndim == 1 and len(s) > 0 and s[0] > 0.0 and bool(np.all(np.diff(s) > 0.0))
     require(rising, "scales of adaptive must rise, from above zero", scales)
-    named = isinstance(parts, Mapping) and len(parts) > 0
+    # a user may give a list
+    named = isinstance(parts, Mapping) and len(parts) > 0  # pyright: ignore[reportUnnecessaryIsInstance]
     require(named, 'parts of adaptive must be named, as in {"gyros": [0, 1, 2]}', parts)
     quiet, names = np.full(len(parts), s[0]), tuple(off)
     own = zip(np.eye(len(parts)) > 0.0, parts, strict=True)

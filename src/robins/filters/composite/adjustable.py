@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from robins.filters.belief import Belief
-from robins.filters.kalman import Again, Around, Filter, FilterState
+from robins.filters.kalman import Advanced, Again, Around, Filter, FilterState, Updated
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.values import kind, number, value
 
@@ -52,12 +52,12 @@ class Adjustable(Around):
         return self.begun(self.inner.init(belief, dims))
 
     @jax.jit
-    def predict(self, state: FilterState, motion: Motion, u: Data = None):
+    def predict(self, state: FilterState, motion: Motion, u: Data = None) -> Advanced:
         new, prediction = self.filter_of(state).predict(self.parts(state)[0], motion, u)
         return self._with(new, state), prediction
 
     @jax.jit
-    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None):
+    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None) -> Updated:
         new, info = self.filter_of(state).update(self.parts(state)[0], sensor, y, aux)
         return self._with(new, state), info
 

@@ -20,12 +20,14 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.checks import sensor_names
 from robins.filters.composite.fusion import is_singular
 from robins.filters.kalman import (
+    Advanced,
     Again,
     Composite,
     Filter,
     FilterState,
     Follow,
     Prediction,
+    Updated,
     kalman,
     not_taken,
 )
@@ -193,10 +195,10 @@ class JoinedFilter(Composite):
         codes = tuple(prediction.code for _, prediction in done)
         return Moved(members, codes, self.fuse([m.belief for m in members]), shares)
 
-    def _predict(self, state: FilterState, motion: Motion, u: Data):
+    def _predict(self, state: FilterState, motion: Motion, u: Data) -> Advanced:
         return concluded(state, self.moved(state, motion, u))
 
-    def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data):
+    def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data) -> Updated:
         owner = owners(self.channels)
         if sensor.name not in owner:
             raise ValueError(f"no channel uses sensor '{sensor.name}'; there are {sorted(owner)}")
@@ -298,7 +300,7 @@ def followed_by(
     """A motion whose noise factor, new state and slope F are each put through a function."""
     known = motion.linear
 
-    def linear(x, u):
+    def linear(x: State, u: Data):
         assert known is not None
         mean, F, given = known(x, u)
         return state(mean), slope(F), noise(as_noise(given, F.shape[0], "the motion"))
@@ -359,12 +361,12 @@ class AtMaster(Composite):
                 f"{list(self.sensors)} last in the model"
             )
 
-    def _predict(self, state: FilterState, motion: Motion, u: Data):
+    def _predict(self, state: FilterState, motion: Motion, u: Data) -> Advanced:
         mastered: Mastered = state.memory
         joined, prediction = self.joined.predict(mastered.joined, motion, u)
         return FilterState(joined.belief, mastered._replace(joined=joined)), prediction
 
-    def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data):
+    def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data) -> Updated:
         mastered: Mastered = state.memory
         if sensor.name not in self.sensors:
             joined, info = self.joined.update(mastered.joined, sensor, y, aux)

@@ -10,7 +10,7 @@ and is exact where shortcuts that move the belief back in time are not (Bar-Shal
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from functools import partial
 from typing import NamedTuple, TypeVar
 
@@ -297,7 +297,7 @@ def _entered(
     """Enter a measurement in its own step; and in this one, where its sensor is asked for too."""
     now, at, which, used = place.now, place.at, place.which, place.used
 
-    def entered(rows, v, here):
+    def entered(rows: Array, v: Array, here: Array | bool) -> Array:
         rows = rows.at[now].set(jnp.where(here, v, rows[now]))
         return rows.at[at].set(jnp.where(used, v, rows[at]))
 
@@ -388,6 +388,6 @@ def _check_same(what: str, found: Data, known: Data) -> None:
         )
 
 
-def _form(tree: Data) -> tuple:
+def _form(tree: Data) -> Hashable:
     leaves, structure = jax.tree_util.tree_flatten(tree)
     return structure, tuple((jnp.shape(x), str(jnp.result_type(x))) for x in leaves)

@@ -33,7 +33,8 @@ from robins.filters.trees import equal, select
 from robins.filters.values import Numbers, is_known, kind, value
 
 T = TypeVar("T")
-Of = Callable[..., tuple[Data, Data, dict[str, Array]]]
+One = tuple[Data, Data, dict[str, Array]]  # state, what was found, and notes
+Of = Callable[..., One]
 Every = tuple[Data, Data, Sequence[dict[str, Array]]]
 
 
@@ -45,13 +46,13 @@ class Mode:
     motion: Motion | None = None
     sensors: tuple[Sensor, ...] = ()
 
-    def predict(self, state: FilterState, motion: Motion, u: Data):
+    def predict(self, state: FilterState, motion: Motion, u: Data) -> One:
         """State, code and no notes of a prediction, by the motion of this mode if it has one."""
         own = motion if self.motion is None else self.motion
         state, prediction = self.filter_.predict(state, own, u)
         return state, prediction.code, {}
 
-    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data):
+    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data) -> One:
         """State, information and notes of an update, by its own sensor of that name if any."""
         own = next((s for s in self.sensors if s.name == sensor.name), sensor)
         state, info = self.filter_.update(state, own, y, aux)
@@ -217,7 +218,7 @@ class Imm(Filter):
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
         own = set()
 
-        def begin(mode: Mode, _):
+        def begin(mode: Mode, _: Data) -> One:
             own.update(s.name for s in mode.sensors)
             return mode.filter_.init(belief, dims), None, {}
 
@@ -236,7 +237,7 @@ class Imm(Filter):
         # A mode that receives nothing goes on alone, as does one that mixes with none, bit for bit.
         alone = ~jnp.isfinite(log_next) | (jnp.diagonal(weight) == 1.0)
 
-        def restart(mode: Mode, state: FilterState, belief: Belief, alone: Array):
+        def restart(mode: Mode, state: FilterState, belief: Belief, alone: Array) -> One:
             return select(alone, state, mode.filter_.reset(state, belief)), None, {}
 
         return self.modes.every(restart, states, begun, alone)[0], log_next
@@ -275,7 +276,7 @@ class Imm(Filter):
         return one._replace(gain=info.gain, log_likelihood=info.log_likelihood)
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
-        def moved(mode: Mode, one: FilterState):
+        def moved(mode: Mode, one: FilterState) -> One:
             return mode.filter_.reset(one, belief), None, {}
 
         states, *_ = self.modes.every(moved, state.memory.states)

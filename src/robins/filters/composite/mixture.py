@@ -109,7 +109,7 @@ def innovation(seen: StepInfo, weight: Array, used: Array) -> Innovation:
 def _sound(states: State, weight: Array, instead: State) -> State:
     """The states, with another in the place of those that do not count."""
 
-    def pick(leaf, other):
+    def pick(leaf: Array, other: Array) -> Array:
         counts = (weight > 0.0).reshape(-1, *(1,) * jnp.ndim(other))
         return jnp.where(counts, leaf, other[None])
 

@@ -35,7 +35,7 @@ from jaxtyping import Array
 from robins import linalg, manifold
 from robins.filters.belief import Belief
 from robins.filters.composite.bank import EVERY, transitions
-from robins.filters.kalman import Around, Filter, FilterState, Prediction
+from robins.filters.kalman import Advanced, Around, Filter, FilterState, Prediction, Updated
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.values import Numbers, kind, value
 
@@ -162,7 +162,7 @@ class Supposing(Around):
     names: tuple[str, ...] = kind()
 
     @jax.jit
-    def predict(self, state: FilterState, motion: Motion, u: Data = None):
+    def predict(self, state: FilterState, motion: Motion, u: Data = None) -> Advanced:
         linear = None
         if motion.linear is not None:
             linear = Partial(_step_linear, motion, self.of, self.scaled)
@@ -170,7 +170,7 @@ class Supposing(Around):
         return self.inner.predict(state, Motion(Partial(_step, motion, self.of), noise, linear), u)
 
     @jax.jit
-    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None):
+    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None) -> Updated:
         return self.inner.update(state, _wide_sensor(sensor, self.names, self.of), y, aux)
 
 
@@ -215,13 +215,13 @@ class Narrowed(Around):
         return _narrow(self.inner.init(_widened(belief, offset, factor), dims))
 
     @jax.jit
-    def predict(self, state: FilterState, motion: Motion, u: Data = None):
+    def predict(self, state: FilterState, motion: Motion, u: Data = None) -> Advanced:
         wide, prediction = self.inner.predict(state.memory, motion, u)
         new = _narrow(wide)
         return new, Prediction(None, new.belief, prediction.code)
 
     @jax.jit
-    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None):
+    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None) -> Updated:
         wide, info = self.inner.update(state.memory, sensor, y, aux)
         new = _narrow(wide)
         return new, info._replace(gain=info.gain[: len(new.belief.factor)])

@@ -30,12 +30,13 @@ from jaxtyping import Array
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo
-from robins.filters.composite.mixture import innovation, log_normalised, matched
+from robins.filters.composite.mixture import Innovation, innovation, log_normalised, matched
 from robins.filters.kalman import Filter, FilterState, Prediction, predicted_factor, updated
 from robins.filters.linearise import Linearisation, taylor
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.trees import finite, select
 from robins.filters.values import Numbers, is_known, kind, number, value
+from robins.manifold import State
 
 _GENERATOR = "threefry2x32"  # named, so that a key gives the same draws under any setting of JAX
 
@@ -69,14 +70,14 @@ class Particle(Filter):
         """The logarithm of the weight of each, where all have the same."""
         return -jnp.log(float(self.count))
 
-    def drawn(self, key: Array, means: Any, factors: Array) -> Belief:
+    def drawn(self, key: Array, means: State, factors: Array) -> Belief:
         """Particles with the sampled components drawn and the rest conditioned on the draw."""
         n = factors.shape[1]
         order, k = self.order(n)
         back = np.argsort(order)
         xi = jax.random.normal(key, (self.count, k))
 
-        def one(xi, mean, S):
+        def one(xi: Array, mean: State, S: Array) -> Belief:
             S = S if np.all(order == np.arange(n)) else linalg.tria(S[order])
             left = jnp.where((jnp.arange(n) < k)[None], 0.0, S)
             return Belief(manifold.retract(mean, (S[:, :k] @ xi)[back]), left[back])
@@ -123,7 +124,7 @@ class Particle(Filter):
         L = linalg.tria(cloud.factor[some])
         keep, move = jnp.asarray(self.jitter)
 
-        def one(x, xi):
+        def one(x: State, xi: Array) -> State:
             d = manifold.local(cloud.mean, x)
             d = d.at[some].set(keep * d[some] + move * (L @ xi))
             return manifold.retract(cloud.mean, d)
@@ -320,7 +321,9 @@ def _told(
     )
 
 
-def _gain(prior: Belief, cloud: Belief, infos: StepInfo, weight, cross, expected) -> Array:
+def _gain(
+    prior: Belief, cloud: Belief, infos: StepInfo, weight: Array, cross: Array, expected: Innovation
+) -> Array:
     """Covariance of state and measurement over that of the measurement, in the whole cloud."""
     d = jax.vmap(lambda x: manifold.local(prior.mean, x))(cloud.mean)
     apart = jnp.where(jnp.isnan(expected.mean)[None], 0.0, expected.mean[None] - infos.innovation)
@@ -331,6 +334,6 @@ def _gain(prior: Belief, cloud: Belief, infos: StepInfo, weight, cross, expected
     return linalg.solve_spd(expected.factor, covariance.T).T
 
 
-def _each(condition: Array, new: Any, old: Any) -> Any:
+def _each(condition: Array, new: Belief, old: Belief) -> Belief:
     """Particle by particle."""
     return jax.vmap(select)(condition, new, old)

@@ -13,7 +13,7 @@ from robins import linalg, manifold
 from robins.filters.belief import Belief
 from robins.filters.limits.constrain import Function, Weight, as_sensor, metric_of, nearest
 from robins.filters.linearise import taylor
-from robins.filters.model import Given
+from robins.filters.model import Data, Given
 from robins.filters.observation import CONTRADICTS, Observation
 from robins.filters.trees import select
 
@@ -93,15 +93,15 @@ def _active(o: Observation, low: Array, high: Array) -> tuple[Array, Array, Arra
     rounding = 1e-12 * (1.0 + jnp.where(jnp.isfinite(b), jnp.abs(b), 0.0))
     no_row = jnp.full((), -1)
 
-    def slack(t):
+    def slack(t: Array) -> Array:
         return N @ t - b + rounding
 
-    def go_on(state):
+    def go_on(state: Data) -> Array:
         t, active, _, entering, infeasible, count = state
         violated = (entering >= 0) | jnp.any(jnp.where(active, 0.0, slack(t)) < 0.0)
         return violated & ~infeasible & (count < 20 * c)
 
-    def step(state):
+    def step(state: Data) -> Data:
         t, active, u, entering, _, count = state
         worst = jnp.argmin(jnp.where(active, jnp.inf, slack(t)))
         p = jnp.where(entering >= 0, entering, worst)
@@ -151,7 +151,7 @@ def truncate(belief: Belief, g: Function, lower: Given, upper: Given) -> Bounded
         finite = jnp.isfinite(bound)  # the derivative of inf / s is NaN
         return jnp.where(finite, (jnp.where(finite, bound, 0.0) - mean) / s, bound)
 
-    def cut(state, row):
+    def cut(state: tuple[Array, Array], row: tuple[Array, Array, Array, Array]):
         t, M = state
         reading, size, low, high = row
         a = reading @ M

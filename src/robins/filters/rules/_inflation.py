@@ -110,14 +110,14 @@ def _divided(factor: Array, M: Array) -> tuple[Array, Array]:
 
 
 @jax.custom_jvp
-def _root(M):
+def _root(M: Array) -> Array:
     """Cholesky factor, zero where there is none: derivatives must not meet NaN."""
     C = linalg.cholesky(M)
     return jnp.where(jnp.all(jnp.isfinite(C)), C, 0.0)
 
 
 @_root.defjvp
-def _root_jvp(primals, tangents):
+def _root_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     # C C' = M gives dC = C half(C^-1 dM C^-T), half being the lower triangle with half a diagonal.
     C = _root(*primals)
     solid = jnp.where(C[0, 0] > 0.0, C, jnp.eye(C.shape[0]))

@@ -83,17 +83,17 @@ def scale_to_quantile(o: Observation, limit: ArrayLike, seen: Normalised | None 
     unit = jnp.where(above, seen.white, 0.0) / jnp.sqrt(nis)
     B_, unit_, ratio_ = jax.lax.stop_gradient((B, unit, ratio))
 
-    def at(s):
+    def at(s: Array) -> tuple[Array, Array, Array]:
         """(I + (s-1) B)^-1 u, g and -g' of the unit innovation u."""
         L = linalg.cholesky(jnp.eye(len(unit_)) + (s - 1.0) * B_)
         v = linalg.solve_spd(L, unit_[:, None])[:, 0]
         return v, unit_ @ v, v @ (B_ @ v)
 
-    def unfinished(state):
+    def unfinished(state: tuple[Array, tuple[Array, Array, Array], Numbers]) -> Array:
         s, (_, g, _), count = state
         return (g * ratio_ > 1.0 + _CLOSE) & (s < MOST) & (count < _STEPS)
 
-    def newton(state):
+    def newton(state: tuple[Array, tuple[Array, Array, Array], Numbers]):
         s, (_, g, slope), count = state
         step = (g * ratio_ - 1.0) * g / jnp.where(slope > 0.0, slope, 1.0)
         s = jnp.minimum(jnp.where(slope > 0.0, s + step, MOST), MOST)

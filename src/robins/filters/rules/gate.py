@@ -82,7 +82,9 @@ class Gate(Rule):
         square = jnp.where(seen.used, o.residual, 0.0) ** 2
         return self.limit[1], square / variance / self.limit[1], seen.used, seen.used
 
-    def due(self, was: _Channel, over: Array, used: Array, o: Observation):
+    def due(
+        self, was: _Channel, over: Array, used: Array, o: Observation
+    ) -> tuple[Array, Array, Array]:
         """Recoveries that are due, and the refusals remembered."""
         due, scatter = over & (was.refused.astype(float) >= self.patience), self.scatter
         if scatter is None:
@@ -96,7 +98,9 @@ class Gate(Rule):
         )
         return due, residual, known
 
-    def recovered(self, due, chosen, ratio, q, prior: Belief, o: Observation) -> Belief:
+    def recovered(
+        self, due: Array, chosen: Array, ratio: Array, q: Numbers, prior: Belief, o: Observation
+    ) -> Belief:
         """Prior, widened where recovery is due."""
         jump = jnp.where(chosen, o.residual, 0.0)
         if not self.kept:

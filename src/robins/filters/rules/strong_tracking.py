@@ -148,7 +148,9 @@ def strong_tracking(
     )
 
 
-def _faded_outside(memory: _Memory, S: Array, white: _fading.White, N: Array, limit: Numbers):
+def _faded_outside(
+    memory: _Memory, S: Array, white: _fading.White, N: Array, limit: Numbers
+) -> tuple[Array, Array]:
     """P + (lambda - 1) F P F' = lambda F P F' + Q; after the first update lambda P."""
     n = len(S)
     whole = jnp.concatenate([S, jnp.zeros((n, memory.moved.shape[1] - n))], axis=1)

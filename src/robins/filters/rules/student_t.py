@@ -48,7 +48,7 @@ class StudentT(Rule):
         R = W @ W.T
         columns = jnp.concatenate([of.seen.white[:, None], W, one], axis=1)
 
-        def better(_, scale):
+        def better(_: Array, scale: tuple[Array, Array]) -> tuple[Array, Array]:
             b, c = scale
             root = linalg.cholesky(b * of.prior + c * R + of.idle)
             X = linalg.solve_lower(root, columns)

@@ -102,7 +102,7 @@ def packages() -> ModuleType:
         MissingExtra: it or Clarabel is not installed.
     """
     try:
-        import clarabel  # noqa: F401
+        import clarabel  # noqa: F401  # pyright: ignore[reportUnusedImport]
         import cvxpy
     except ImportError as error:
         raise MissingExtra(
