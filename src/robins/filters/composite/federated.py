@@ -64,6 +64,7 @@ from robins.filters.kalman import Filter, FilterState, kalman
 from robins.filters.linearise import Linearisation, taylor
 from robins.filters.model import Data, Model, Motion
 from robins.filters.values import Numbers, is_known, kind, number, value
+from robins.manifold import State
 
 # Without a floor a share of zero is an infinite covariance.
 FLOOR = 0.05
@@ -385,7 +386,7 @@ def _through(motion: Motion, common: Belief, mine: Belief) -> Motion:
     solid, _ = linalg.guard(common.factor)
     T = linalg.solve_lower_transposed(solid, mine.factor.T).T
 
-    def moved(x):
+    def moved(x: State) -> State:
         return manifold.retract(common.mean, T @ manifold.local(common.mean, x))
 
     return followed_by(motion, lambda noise: T @ noise, moved, lambda F: T @ F)

@@ -45,7 +45,14 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo, is_failure
 from robins.filters.checks import sensor_names
-from robins.filters.kalman import Composite, Filter, FilterState, Prediction
+from robins.filters.kalman import (
+    Advanced,
+    Composite,
+    Filter,
+    FilterState,
+    Prediction,
+    Updated,
+)
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.trees import select
 from robins.filters.values import Numbers, kind, number, value
@@ -189,7 +196,7 @@ class Guarded(Composite):
         share = jnp.clip(1.0 - _quotient(now**2, was**2), 0.0, 1.0)
         return jnp.where((dof > 0) & (was > 0.0), share, 0.0)
 
-    def _predict(self, state: FilterState, motion: Motion, u: Data):
+    def _predict(self, state: FilterState, motion: Motion, u: Data) -> Advanced:
         watch: Watch = state.memory
         mine, first = self.filter.predict(watch.filter, motion, u)
         other, second = self.reference.predict(watch.reference, motion, u)
@@ -199,7 +206,7 @@ class Guarded(Composite):
         new = _given_out(self.judged(moved, together & (first.code != int(Code.DONE)), 0.0))
         return new, Prediction(None, new.belief, second.code)
 
-    def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data):
+    def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data) -> Updated:
         watch: Watch = state.memory
         mine, info = self.filter.update(watch.filter, sensor, y, aux)
         notes, failed = dict(info.notes), is_failure(info.code)
