@@ -7,7 +7,7 @@ carried on, and a row of each array that is made. The body of a `scan` is one.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from importlib.resources import files
 from typing import Any, NamedTuple
 
@@ -22,6 +22,18 @@ from robins.program.trace import Leaf, Program, positive_zeros
 KINDS = {"f8": 0, "b1": 1, "i4": 2, "i8": 3, "u4": 4, "u8": 5}  # of arrays, as `scan.h` counts them
 
 
+# Behind the program, whose counts of numbers are NX, NK (taken) and NY, NM (given).
+SCAN = """
+extern "C" int robins_scan(const scan *s)
+{
+    real x[NX], y[NY];
+    whole k[NK], m[NM];
+    return scanned<LANES>(s, robins_step, x, k, y, m);
+}
+extern "C" int robins_lanes(void) { return LANES; }
+"""
+
+
 class Rows(ctypes.Structure):
     """An array of all runs, or of the first, as `scan.h` takes and gives it."""
 
@@ -32,6 +44,22 @@ class Rows(ctypes.Structure):
         ("round", ctypes.c_int64),
         ("size", ctypes.c_int32),
         ("kind", ctypes.c_int32),
+    )
+
+
+class Scan(ctypes.Structure):
+    """What a scan is told, as `scan.h` has it."""
+
+    _fields_ = (
+        ("runs", ctypes.c_int64),
+        ("rounds", ctypes.c_int64),
+        ("backwards", ctypes.c_int32),
+        ("carried", ctypes.c_int32),
+        ("fixed", ctypes.c_int32),
+        ("taken", ctypes.c_int32),
+        ("given", ctypes.c_int32),
+        ("in", ctypes.c_void_p),
+        ("out", ctypes.c_void_p),
     )
 
 
@@ -65,8 +93,13 @@ class Rounds:
         """
         self.program, self.length, self.backwards = program, length, backwards
         self.carried, self.stays = carried, stays
-        self._library = ctypes.CDLL(str(build(_text(program), LANE_FLAGS, CPP)))
-        self.lanes = self._library.robins_lanes()
+        self._scan = self._compiled(program)
+
+    def _compiled(self, program: Program) -> Callable[[Any], int]:
+        """The function of C that takes a `Scan`."""
+        library = ctypes.CDLL(str(build(_text(program), LANE_FLAGS, CPP)))
+        self.lanes = library.robins_lanes()
+        return library.robins_scan
 
     def holds_for(self, begin: Sequence[Given]) -> bool:
         """Whether runs begin with the zeros that the program takes for granted."""
@@ -111,14 +144,18 @@ class Rounds:
             _rows(a, True, k >= self.carried, leaf)
             for k, (a, leaf) in enumerate(zip(made, results, strict=True))
         ]
-        numbers = self.backwards, self.carried, self.stays, len(taken) - first
-        failed = self._library.robins_scan(
-            *map(ctypes.c_int64, (runs, self.length)),
-            *map(ctypes.c_int32, (*numbers, len(out) - self.carried)),
-            (Rows * max(len(taken), 1))(*taken),
-            (Rows * max(len(out), 1))(*out),
+        scan = Scan(
+            runs,
+            self.length,
+            self.backwards,
+            self.carried,
+            self.stays,
+            len(taken) - first,
+            len(out) - self.carried,
+            ctypes.cast((Rows * max(len(taken), 1))(*taken), ctypes.c_void_p),
+            ctypes.cast((Rows * max(len(out), 1))(*out), ctypes.c_void_p),
         )
-        if failed:
+        if self._scan(ctypes.byref(scan)):
             raise MemoryError(f"no memory for rounds of {runs} runs")
         return [
             array_of(a, leaf.dtype) if is_key(leaf.dtype) else a
@@ -158,4 +195,4 @@ def _text(program: Program) -> str:
     defined = "\n".join(f"#define {n} {size}" for n, size in zip(names, sizes, strict=True))
     rounds = (files("robins.program") / "scan.h").read_text("utf-8")
     step = function(program, linkage="static ")
-    return f"#include <stdlib.h>\n{header('lanes.h')}\n{step}\n{defined}\n{rounds}"
+    return f"#include <stdlib.h>\n{header('lanes.h')}\n{step}\n{defined}\n{rounds}\n{SCAN}"

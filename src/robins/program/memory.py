@@ -18,7 +18,8 @@ import numpy as np
 
 from robins.program.c import to_c
 from robins.program.kinds import kind_of
-from robins.program.native import FLAGS, build, compiler
+from robins.program.machine import machine
+from robins.program.native import FLAGS, build
 from robins.program.refusal import ProgramError
 from robins.program.trace import Leaf, Program, trace
 
@@ -29,11 +30,35 @@ _FLOAT = np.dtype(float)
 _PYTHON = {float: _FLOAT, int: np.dtype(np.int64), bool: np.dtype(bool)}
 
 
+Step = Callable[..., None]  # (x, k, y, m), as `robins.program.c.function` has them
+
+
 class Compiled(NamedTuple):
-    """A program and its function in C."""
+    """A program, and what makes its function: one for each memory that it works in."""
 
     program: Program
-    library: ctypes.CDLL
+    step: Callable[[], Step]
+
+
+Engine = Callable[[Program], Callable[[], Step]]
+
+
+def by_compiler(program: Program, flags: tuple[str, ...] = FLAGS) -> Callable[[], Step]:
+    """Steps of a program that the C compiler compiles.
+
+    Raises:
+        BuildError: there is no compiler, or it refuses the program.
+    """
+    step = ctypes.CDLL(str(build(to_c(program), flags))).robins_step
+    step.restype = None
+    return lambda: step
+
+
+def by_machine(program: Program) -> Callable[[], Step]:
+    """Steps of a program on the machine; each has registers of its own."""
+    one = machine("one")
+    tape = one.assemble(program)
+    return lambda: one.step(tape)
 
 
 class Slot(NamedTuple):
@@ -153,7 +178,7 @@ class NativeState:
         self,
         state: Any,
         content: Hashable,
-        flags: tuple[str, ...] = FLAGS,
+        engine: Engine = by_machine,
         unroll: int | None = LIVE_UNROLL,
     ):
         """Take a state.
@@ -162,15 +187,13 @@ class NativeState:
             state: a pytree of arrays.
             content: what the functions hold, by which those of equal names are told apart in this
                 process.
-            flags: for the compiler.
+            engine: what makes steps of programs, `by_machine` or `by_compiler`.
             unroll: as in `trace`.
 
         Raises:
-            BuildError: there is no compiler.
             ProgramError: the state holds numbers that have no place in a program.
         """
-        compiler()
-        self._content, self._how = content, (flags, unroll)
+        self._content, self._how = content, (engine, unroll)
         leaves, self._tree = jax.tree_util.tree_flatten(state)
         paths = jax.tree_util.tree_flatten_with_path(state)[0]
         self._forms = [form(x) for x in leaves]
@@ -282,7 +305,7 @@ class NativeState:
             tree,
             forms,
             [slot.view(self._x, self._k) for slot in given],
-            made.library.robins_step,
+            made.step(),
             (x, k, x, k),
             begin,
             (begin[0] + end[0], begin[1] + end[1]),
@@ -290,7 +313,7 @@ class NativeState:
         )
 
     def _compiled(self, function: Callable[..., Any], args: Any) -> Compiled:
-        flags, unroll = self._how
+        engine, unroll = self._how
         program = trace(function, self.state, *args, unroll=unroll)
         parts = jax.tree_util.treedef_children(program.structure[1])
         now = [(leaf.shape, leaf.kind) for leaf in program.results[: len(self._leaves)]]
@@ -302,6 +325,4 @@ class NativeState:
             raise ProgramError(
                 "a step gives a state of another form than it takes", fix="return (state, result)"
             )
-        library = ctypes.CDLL(str(build(to_c(program), flags)))
-        library.robins_step.restype = None
-        return Compiled(program, library)
+        return Compiled(program, engine(program))

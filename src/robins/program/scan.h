@@ -1,5 +1,5 @@
-/* A scan over lanes: the rounds of a program, for so many runs, LANES of them at a time. It stands
-   behind the program, whose counts of numbers are NX, NK (taken) and NY, NM (given). */
+/* Rounds of a program for some runs, RUNS of them at a time: a Real and a Whole are so many numbers,
+   one of each run. */
 
 typedef struct {
     char *data;      /* of the first run and round */
@@ -15,7 +15,7 @@ typedef struct {
 #define AHEAD 4096 /* numbers of a lane */
 
 #define MOVED(type)                                                                    \
-    for (int l = 0; l < LANES; ++l) { /* lanes without a run repeat the last */        \
+    for (int l = 0; l < RUNS; ++l) { /* lanes without a run repeat the last */        \
         const char *from = a->data + (run + (l < active ? l : active - 1)) * a->run;   \
         for (int64_t t = 0; t < count; ++t) {                                          \
             const type *at = (const type *)(from + (first + t * step) * a->round);     \
@@ -35,17 +35,18 @@ typedef struct {
     int64_t first, count, step; /* rounds */
 } span;
 
-static void take(const rows *a, int64_t run, int active, span s, real *x, int reals, whole *k,
+template <int RUNS, class Real, class Whole>
+static void take(const rows *a, int64_t run, int active, span s, Real *x, int reals, Whole *k,
                  int others)
 {
     const int64_t first = s.first, count = s.count, step = s.step;
     if (a->kind == 0) {
-        real *const to = x;
+        Real *const to = x;
         const int width = reals;
         MOVED(double)
         return;
     }
-    whole *const to = k;
+    Whole *const to = k;
     const int width = others;
     switch (a->kind) {
     case 1: MOVED(uint8_t) break;
@@ -56,17 +57,18 @@ static void take(const rows *a, int64_t run, int active, span s, real *x, int re
     }
 }
 
-static void give(const rows *a, int64_t run, int active, span s, const real *y, int reals,
-                 const whole *m, int others)
+template <int RUNS, class Real, class Whole>
+static void give(const rows *a, int64_t run, int active, span s, const Real *y, int reals,
+                 const Whole *m, int others)
 {
     const int64_t first = s.first, count = s.count, step = s.step;
     if (a->kind == 0) {
-        const real *const from = y;
+        const Real *const from = y;
         const int width = reals;
         GIVEN(double)
         return;
     }
-    const whole *const from = m;
+    const Whole *const from = m;
     const int width = others;
     switch (a->kind) {
     case 1: GIVEN(uint8_t) break;
@@ -78,9 +80,9 @@ static void give(const rows *a, int64_t run, int active, span s, const real *y, 
 }
 
 /* All of some arrays: each takes its place behind those before it. */
-#define EACH(what, count, arrays, s, x, reals, k, others)                                  \
+#define EACH_ARRAY(what, count, arrays, span, x, reals, k, others)                         \
     for (int j = 0, r = 0, o = 0; j < (count); ++j) {                                      \
-        what(&(arrays)[j], run, active, s, (x) + r, reals, (k) + o, others);               \
+        what<RUNS>(&(arrays)[j], run, active, span, (x) + r, reals, (k) + o, others);               \
         if ((arrays)[j].kind == 0) { r += (arrays)[j].size; } else { o += (arrays)[j].size; } \
     }
 
@@ -90,50 +92,54 @@ static void counted(const rows *a, int count, int *reals, int *others)
     for (int j = 0; j < count; ++j) { *(a[j].kind == 0 ? reals : others) += a[j].size; }
 }
 
-/* in: what is carried, what stays, the rows taken; out: what is carried, the rows given. Returns
-   0, or 1 where there is no memory. */
-extern "C" int robins_scan(int64_t runs, int64_t rounds, int32_t backwards, int32_t carried,
-                           int32_t fixed, int32_t taken, int32_t given, const rows *in,
-                           const rows *out)
+/* What a scan is told: arrays in and out (carried, fixed, taken; carried, given), and their counts. */
+typedef struct {
+    int64_t runs, rounds;
+    int32_t backwards, carried, fixed, taken, given;
+    const rows *in, *out;
+} scan;
+
+/* Step by step, `step(x, k, y, m)`: of reals and others in x and k those that are carried, those
+   that stay and a row; in y and m what is carried on, and a row. Returns 0, or 1 where there is no
+   memory. */
+template <int RUNS, class Real, class Whole, class Step>
+static int scanned(const scan *s, Step step, Real *x, Whole *k, Real *y, Whole *m)
 {
-    const rows *const row = in + carried + fixed;
+    const rows *const in = s->in, *const out = s->out, *const row = in + s->carried + s->fixed;
     int cr, co, fr, fo, tr, to, gr, go;
-    counted(in, carried, &cr, &co);
-    counted(in + carried, fixed, &fr, &fo);
-    counted(row, taken, &tr, &to);
-    counted(out + carried, given, &gr, &go);
+    counted(in, s->carried, &cr, &co);
+    counted(in + s->carried, s->fixed, &fr, &fo);
+    counted(row, s->taken, &tr, &to);
+    counted(out + s->carried, s->given, &gr, &go);
     const int widest = tr + to > gr + go ? tr + to : gr + go;
     const int64_t ahead = widest < AHEAD ? AHEAD / (widest > 0 ? widest : 1) : 1;
-    const size_t total = (size_t)(ahead * (tr + to + gr + go) + 8) * sizeof(real);
+    const size_t total = (size_t)(ahead * (tr + to + gr + go) + 8) * sizeof(Real);
     char *const memory = (char *)malloc(total);
     if (memory == NULL) { return 1; }
-    real *const xs = (real *)memory, *const ys = xs + ahead * tr;
-    whole *const ks = (whole *)(ys + ahead * gr), *const ms = ks + ahead * to;
+    Real *const xs = (Real *)memory, *const ys = xs + ahead * tr;
+    Whole *const ks = (Whole *)(ys + ahead * gr), *const ms = ks + ahead * to;
     const span once = {0, 1, 1};
-    for (int64_t run = 0; run < runs; run += LANES) {
-        const int active = run + LANES <= runs ? LANES : (int)(runs - run);
-        real x[NX], y[NY];
-        whole k[NK], m[NM];
-        EACH(take, carried + fixed, in, once, x, 0, k, 0)
-        for (int64_t begin = 0; begin < rounds; begin += ahead) {
-            const int64_t left = rounds - begin, count = left < ahead ? left : ahead;
-            const span s = {backwards ? rounds - 1 - begin : begin, count, backwards ? -1 : 1};
-            EACH(take, taken, row, s, xs, tr, ks, to)
+    for (int64_t run = 0; run < s->runs; run += RUNS) {
+        const int active = run + RUNS <= s->runs ? RUNS : (int)(s->runs - run);
+        EACH_ARRAY(take, s->carried + s->fixed, in, once, x, 0, k, 0)
+        for (int64_t begin = 0; begin < s->rounds; begin += ahead) {
+            const int64_t left = s->rounds - begin, count = left < ahead ? left : ahead;
+            const span now = {s->backwards ? s->rounds - 1 - begin : begin, count,
+                              s->backwards ? -1 : 1};
+            EACH_ARRAY(take, s->taken, row, now, xs, tr, ks, to)
             for (int64_t t = 0; t < count; ++t) {
-                memcpy(x + cr + fr, xs + t * tr, (size_t)tr * sizeof(real));
-                memcpy(k + co + fo, ks + t * to, (size_t)to * sizeof(whole));
-                robins_step(x, k, y, m);
-                memcpy(x, y, (size_t)cr * sizeof(real));
-                memcpy(k, m, (size_t)co * sizeof(whole));
-                memcpy(ys + t * gr, y + cr, (size_t)gr * sizeof(real));
-                memcpy(ms + t * go, m + co, (size_t)go * sizeof(whole));
+                memcpy(x + cr + fr, xs + t * tr, (size_t)tr * sizeof(Real));
+                memcpy(k + co + fo, ks + t * to, (size_t)to * sizeof(Whole));
+                step(x, k, y, m);
+                memcpy(x, y, (size_t)cr * sizeof(Real));
+                memcpy(k, m, (size_t)co * sizeof(Whole));
+                memcpy(ys + t * gr, y + cr, (size_t)gr * sizeof(Real));
+                memcpy(ms + t * go, m + co, (size_t)go * sizeof(Whole));
             }
-            EACH(give, given, out + carried, s, ys, gr, ms, go)
+            EACH_ARRAY(give, s->given, out + s->carried, now, ys, gr, ms, go)
         }
-        EACH(give, carried, out, once, x, 0, k, 0)
+        EACH_ARRAY(give, s->carried, out, once, x, 0, k, 0)
     }
     free(memory);
     return 0;
 }
-
-extern "C" int robins_lanes(void) { return LANES; }

@@ -1,0 +1,445 @@
+"""A program as a tape: the instructions of the machine (`machine.cc`), made without a compiler.
+
+An instruction is one operation, its result a register, and up to three arguments. Nodes become
+instructions in the order of computation, scope by scope; registers are given out by linear scan
+(Poletto & Sarkar 1999) and serve again when the last reader is done. A product that one sum alone
+reads is part of that instruction; both are rounded.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from robins.program.nodes import Loop, Node
+from robins.program.operations import KINDS
+from robins.program.trace import Leaf, Program
+
+class Tape(ctypes.Structure):
+    """A tape as `machine.cc` takes it."""
+
+    _fields_ = (
+        ("code", ctypes.c_void_p),
+        ("lists", ctypes.c_void_p),
+        ("constants", ctypes.c_void_p),
+        ("results", ctypes.c_void_p),
+        ("codes", ctypes.c_int64),
+        ("constant_count", ctypes.c_int64),
+        ("registers", ctypes.c_int64),
+        ("scratch", ctypes.c_int64),
+        ("nx", ctypes.c_int32),
+        ("nk", ctypes.c_int32),
+        ("ny", ctypes.c_int32),
+        ("nm", ctypes.c_int32),
+    )
+
+
+@dataclass
+class Instruction:
+    """An operation before its registers are known.
+
+    Attributes:
+        code: its name; empty where registers are only set aside.
+        result: a value.
+        args: values.
+        listed: values in a list, behind `numbers`.
+        numbers: as they are.
+        count: of results, in registers one after the other.
+    """
+
+    code: str
+    result: Any = None
+    args: tuple[Any, ...] = ()
+    listed: tuple[Any, ...] = ()
+    numbers: tuple[int, ...] = ()
+    count: int = 1
+
+    @property
+    def read(self) -> list[Any]:
+        """The values that have to be there when it is carried out."""
+        changed = [self.result] if self.code in ("keep", "move") else []
+        return [*self.args, *self.listed, *changed]
+
+
+@dataclass
+class _Loop:
+    """Where the instructions of a loop lie."""
+
+    parent: int
+    begin: int = 0
+    end: int = 0
+
+
+class Writer:
+    """Makes the instructions of one program."""
+
+    def __init__(self, program: Program):
+        self.program, self.graph = program, program.graph
+        self.written: list[Instruction] = []
+        self.loops: dict[int, _Loop] = {0: _Loop(-1)}
+        self.scope_of: dict[Any, int] = {}  # of a value, where it is written
+        live = program.live
+        self.results = [n for nodes in program.outputs for n in nodes.ravel().tolist()]
+        self.inner: dict[int, list[Node]] = defaultdict(list)
+        self.uses: Counter[Node] = Counter(self.results)
+        for node in live:
+            self.uses.update(self.graph.args[node])
+            if self.graph.op[node] == "loop":
+                self.uses.update(self.graph.value[node].roots)
+            self.inner[self.graph.scope[node]].append(node)
+        self.joined = dict(self._products(live))
+        self.done: set[Node] = set()
+        self._scope(0, set(live))
+        # A result that is not a real is given as a whole number.
+        self.given = [self._as_whole(n) for n in self.results]
+
+    def _products(self, live: list[Node]) -> list[tuple[Node, Node]]:
+        """Sums with the product that is part of them."""
+        graph, taken, found = self.graph, set(), []
+        for node in live:
+            if graph.op[node] not in ("add", "sub") or graph.kind[node] != "real":
+                continue
+            for arg in graph.args[node][::-1]:
+                alone = self.uses[arg] == 1 and graph.scope[arg] == graph.scope[node]
+                if alone and graph.op[arg] == "mul" and arg not in taken:
+                    taken.add(arg)
+                    found.append((node, arg))
+                    break
+        return found
+
+    # ------------------------------------------------------------------------------ instructions
+
+    def _write(self, code: str, result: Any, *args: Any, **more: Any) -> None:
+        self.written.append(Instruction(code, result, args, **more))
+
+    def _scope(self, scope: int, only: set[Node]) -> None:
+        products = set(self.joined.values())
+        for node in self.inner[scope]:
+            if node in only and node not in self.done and node not in products:
+                self.done.add(node)
+                self._node(node)
+
+    def _node(self, node: Node) -> None:
+        graph, op = self.graph, self.graph.op[node]
+        self.scope_of[node] = graph.scope[node]
+        args = graph.args[node]
+        kind = graph.kind[args[0]] if args else graph.kind[node]
+        match op:
+            case "constant" | "leaf" | "after" | "item" | "array":
+                return
+            case "input":
+                if graph.kind[node] not in ("real", "whole"):
+                    self._from_whole(node)
+            case "loop":
+                self._loop(node)
+            case "block":
+                routine, sizes, count = graph.value[node]
+                numbers = (*sizes, 0, 0, 0)[:3]
+                self._write(
+                    routine, node, listed=args, numbers=(*numbers, len(args)), count=count
+                )
+            case "pick":
+                self._write(f"{graph.kind[node]}_pick", node, args[1], listed=graph.args[args[0]])
+            case "select":
+                self._write(f"{graph.kind[node]}_select", node, *args)
+            case "convert":
+                self._write(f"{graph.kind[node]}_of_{kind}", node, *args)
+            case "bits":
+                self._write(f"{graph.kind[node]}_bits_{kind}", node, *args)
+            case _ if node in self.joined:
+                self._sum(node, self.joined[node])
+            case _:
+                self._write(f"{kind}_{op}", node, *args)
+
+    def _sum(self, node: Node, product: Node) -> None:
+        """A sum or difference with a product in it."""
+        first, second = self.graph.args[node]
+        other = second if first == product else first
+        if self.graph.op[node] == "add":
+            code = "multiply_add"
+        else:
+            code = "multiply_subtract" if second == product else "multiply_less"
+        self._write(code, node, *self.graph.args[product], other)
+
+    def _from_whole(self, node: Node) -> None:
+        """An argument that is handed over as a whole number."""
+        kind, raw = self.graph.kind[node], ("raw", self.graph.value[node])
+        if kind == "flag":
+            self._write("whole_ne", node, raw, ("constant", "whole", 0))
+        else:
+            self._write(f"{kind}_of_whole", node, raw)
+
+    def _as_whole(self, node: Node) -> Any:
+        kind = self.graph.kind[node]
+        if kind in ("real", "whole"):
+            return node
+        made = ("whole", node)
+        self.scope_of[made] = 0
+        self._write(f"whole_of_{kind}", made, node)
+        return made
+
+    # -------------------------------------------------------------------------------------- loops
+
+    def _loop(self, node: Node) -> None:
+        """Rounds: leaves begin, change at the end of a round, and stay after the last one."""
+        graph, loop = self.graph, self.graph.value[node]
+        s, around = loop.scope, self.graph.scope[node]
+        here = self.loops[s] = _Loop(around)
+        for k, n in enumerate(loop.begin):
+            self.scope_of[s, k] = around
+            self._write("move", (s, k), n)
+        for k in range(len(loop.kept)):
+            self.scope_of["kept", s, k] = around
+            self._write("", ("kept", s, k), count=loop.count or 0)
+        self._write("begin", None, numbers=(s,))
+        here.begin = len(self.written)
+        self.scope_of["round", s] = s
+        if any(graph.op[n] == "leaf" and graph.value[n] == (s, -1) for n in self.inner[s]):
+            self._write("round", ("round", s), numbers=(s,))
+        if loop.condition is not None:
+            self._scope(s, set(graph.live([loop.condition])))
+            self._write("leave_unless", None, loop.condition, numbers=(s,))
+        self._scope(s, set(self.inner[s]))
+        for k, n in enumerate(loop.kept):
+            self._write("keep", ("kept", s, k), n, numbers=(s,))
+        self._next(loop)
+        most = 2**31 - 1 if loop.count is None else loop.count
+        self._write("again", None, numbers=(s, most, here.begin))
+        here.end = len(self.written)
+
+    def _next(self, loop: Loop) -> None:
+        """The leaves of the next round, none written before it is read."""
+        s = loop.scope
+        changed = [k for k, n in enumerate(loop.next) if n != loop.leaves[k]]
+        new: dict[int, Any] = {}
+        for k in changed:
+            kind = self.graph.kind[loop.leaves[k]]
+            self.scope_of["next", s, k] = s
+            if loop.condition is None:
+                self._write("move", ("next", s, k), loop.next[k])
+            else:
+                self._write(
+                    f"{kind}_select", ("next", s, k), loop.condition, loop.next[k], (s, k)
+                )
+            new[k] = ("next", s, k)
+        for k, value in new.items():
+            self._write("move", (s, k), value)
+
+    # ---------------------------------------------------------------------------------- registers
+
+    def place(self, value: Any) -> tuple[Any, int]:
+        """The value that holds another, and how many registers behind its first."""
+        if isinstance(value, tuple):
+            return value, 0
+        graph = self.graph
+        match graph.op[value]:
+            case "constant":
+                return ("constant", graph.kind[value], graph.value[value]), 0
+            case "leaf":
+                s, k = graph.value[value]
+                return (("round", s) if k < 0 else (s, k)), 0
+            case "item":
+                return graph.args[value][0], graph.value[value]
+            case "after":
+                loop = graph.value[graph.args[value][0]]
+                k, row = graph.value[value]
+                return ((loop.scope, k), 0) if row is None else (("kept", loop.scope, k), row)
+            case "input" if graph.kind[value] == "real":
+                return ("x", graph.value[value]), 0
+            case "input" if graph.kind[value] == "whole":
+                return ("raw", graph.value[value]), 0
+        return value, 0
+
+    def last_uses(self) -> dict[Any, int]:
+        """Of each value, the instruction that reads it last; in a loop, the last of all rounds."""
+        last: dict[Any, int] = {}
+        scope = self._scopes()
+        for at, one in enumerate(self.written):
+            for value in one.read:
+                value, _ = self.place(value)
+                until, s = at, scope[at]
+                while s != self.scope_of.get(value, 0):
+                    until = max(until, self.loops[s].end - 1)
+                    s = self.loops[s].parent
+                last[value] = max(last.get(value, 0), until)
+        for value in self.given:
+            last[self.place(value)[0]] = len(self.written)
+        return last
+
+    def depth(self, scope: int) -> int:
+        """How many loops are around one: which counter of rounds it has."""
+        found = 0
+        while (scope := self.loops[scope].parent) > 0:
+            found += 1
+        return found
+
+    def _scopes(self) -> list[int]:
+        """The loop in which each instruction lies."""
+        found = [0] * len(self.written)
+        for s in sorted(self.loops):  # a later scope lies further in
+            if s:
+                here = self.loops[s]
+                found[here.begin : here.end] = [s] * (here.end - here.begin)
+        return found
+
+
+class _Registers:
+    """Registers, given out to values and taken back after their last use."""
+
+    def __init__(self, first: int):
+        self.count = first
+        self.of: dict[Any, int] = {}
+        self._free: dict[int, list[int]] = defaultdict(list)  # by how many lie together
+        self._ends: dict[int, list[tuple[Any, int]]] = defaultdict(list)
+
+    def take(self, value: Any, count: int, until: int) -> None:
+        """Registers of a value, its until an instruction is carried out."""
+        if self._free[count]:
+            self.of[value] = self._free[count].pop()
+        else:
+            self.of[value] = self.count
+            self.count += count
+        self._ends[until].append((value, count))
+
+    def free(self, at: int) -> None:
+        """Take back what an instruction is the last to need."""
+        for value, count in self._ends.pop(at, ()):
+            self._free[count].append(self.of.pop(value))
+
+
+class Assembled:
+    """A program as a tape.
+
+    Attributes:
+        program: of scalars.
+        tape: its instructions; points to arrays of this object.
+        instructions: how many.
+        bytes: of these arrays.
+    """
+
+    def __init__(self, program: Program, codes: Mapping[str, int], flag: int):
+        """Choose registers.
+
+        Args:
+            program: of scalars.
+            codes: the machine's instructions, by name.
+            flag: a flag that is set: 1, or -1 where flags are masks.
+        """
+        self.program, self._codes, self._flag = program, codes, flag
+        self._writer = writer = Writer(program)
+        (nx, nk), (ny, nm) = counts(program.inputs), counts(program.results)
+        self._nx = nx
+        self._constants: dict[int, int] = {}
+        wanted = [writer.place(v)[0] for one in writer.written for v in one.read]
+        for value in [*wanted, *(writer.place(v)[0] for v in writer.given)]:
+            if isinstance(value, tuple) and value[0] == "constant":
+                bits = self._bits(*value[1:])
+                self._constants.setdefault(bits, nx + nk + len(self._constants))
+        self._registers = _Registers(nx + nk + len(self._constants))
+        self._rows: list[tuple[int, ...]] = []
+        self._lists: list[int] = []
+        self._scratch = 0
+        self._assemble()
+        results = list(map(self._register, writer.given))
+        real = [writer.graph.kind[n] == "real" for n in writer.results]
+        ordered = [r for r, k in zip(results, real, strict=True) if k]
+        ordered += [r for r, k in zip(results, real, strict=True) if not k]
+        pairs = [(at, bits) for bits, at in self._constants.items()]
+        self._arrays = (
+            np.array(self._rows, np.int32).reshape(-1, 5),
+            np.array(self._lists, np.int32),
+            np.array(pairs, np.int64).reshape(-1, 2),
+            np.array(ordered, np.int32),
+        )
+        self.instructions = len(self._rows)
+        self.bytes = sum(a.nbytes for a in self._arrays)
+        self.tape = Tape(
+            *(ctypes.c_void_p(a.ctypes.data) for a in self._arrays),
+            len(self._rows),
+            len(pairs),
+            self._registers.count,
+            self._scratch,
+            *(nx, nk, ny, nm),
+        )
+        del self._writer, self._registers, self._rows, self._lists
+
+    def _bits(self, kind: str, value: Any) -> int:
+        """The 64 bits of a number in a register; a word fills both halves."""
+        number = np.zeros(1, np.int64)
+        if kind == "flag":
+            number[0] = self._flag * bool(value)
+        else:
+            number.view(KINDS[kind])[:] = value
+        return int(number[0])
+
+    def _register(self, value: Any) -> int:
+        value, behind = self._writer.place(value)
+        match value:
+            case ("x", int(k)):
+                return k
+            case ("raw", int(k)):
+                return self._nx + k
+            case ("constant", kind, number):
+                return self._constants[self._bits(kind, number)]
+        return self._registers.of[value] + behind
+
+    def _assemble(self) -> None:
+        """Write all instructions; where jumps go is known in the end."""
+        writer, registers = self._writer, self._registers
+        last, at_row = writer.last_uses(), [0] * (len(writer.written) + 1)
+        jumps: list[tuple[int, int, int]] = []  # a row, a number of it, and an instruction
+        for at, one in enumerate(writer.written):
+            at_row[at] = len(self._rows)
+            args = list(map(self._register, one.args))
+            listed = list(map(self._register, one.listed))
+            registers.free(at)
+            result = 0
+            if one.result is not None:
+                value, behind = writer.place(one.result)
+                if value not in registers.of:
+                    registers.take(value, one.count, max(last.get(value, 0), at + 1))
+                result = registers.of[value] + behind
+            if one.code == "again":
+                jumps.append((len(self._rows), 3, one.numbers[2]))
+            elif one.code == "leave_unless":
+                jumps.append((len(self._rows), 2, writer.loops[one.numbers[0]].end))
+            if one.code:
+                row = self._row(one, result, args, listed)
+                self._rows.append((self._codes[one.code], *(*row, 0, 0, 0)[:4]))
+        at_row[-1] = len(self._rows)
+        for row, k, to in jumps:
+            numbers = self._rows[row]
+            self._rows[row] = (*numbers[:k], at_row[to], *numbers[k + 1 :])
+
+    def _row(
+        self, one: Instruction, result: int, args: Sequence[int], listed: Sequence[int]
+    ) -> tuple[int, ...]:
+        """The numbers of an instruction behind its code."""
+        match one.code:
+            case "begin":
+                return (self._writer.depth(one.numbers[0]),)
+            case "round":
+                return result, self._writer.depth(one.numbers[0])
+            case "keep":
+                return result, args[0], self._writer.depth(one.numbers[0])
+            case "again":
+                return self._writer.depth(one.numbers[0]), one.numbers[1]
+        if not one.listed:
+            return (*args,) if one.result is None else (result, *args)
+        begin = len(self._lists)
+        self._lists += [*one.numbers, *listed]
+        if not one.numbers:
+            return result, begin, args[0]
+        self._scratch = max(self._scratch, len(listed) + one.count)
+        return result, begin, one.count
+
+
+def counts(leaves: Sequence[Leaf]) -> tuple[int, int]:
+    """Reals and others of some arrays."""
+    sizes = [(leaf.kind == "real", int(np.prod(leaf.shape))) for leaf in leaves]
+    return sum(n for real, n in sizes if real), sum(n for real, n in sizes if not real)
