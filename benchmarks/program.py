@@ -2,8 +2,8 @@
 
 Nine states, three measurements, ``A x + 0.01 sin x`` with a full A, square-root form, complete
 steps with checks, codes and NIS; the EKF of `ins-gnss/drive` with 15 states, a second of inertial
-samples and two fixes a step; strapdown mechanisation alone. JAX steps a batch of 256 runs; C steps
-one run, or as many as the processor has lanes. Beside them, for the filters that they have: C++
+samples and two fixes a step; strapdown mechanisation alone. JAX steps a batch of 256 runs, and so
+does the machine, an interpreter; C steps one run, or as many as the processor has lanes. Beside them, for the filters that they have: C++
 with Eigen's matrices of fixed size (`benchmarks/cpp`), and filterpy. All on one core of this
 machine, in one go, in turn: time of the processor, the best of some rounds.
 
@@ -38,6 +38,8 @@ from robins.ins.increments import from_imu
 from robins.ins.mechanise import Nav
 from robins.ins.mechanise import step as mechanise
 from robins.program import CPP, LANE_FLAGS, build, function, header, to_c, trace_step
+from robins.program.lanes import Rounds
+from robins.program.machine import many_of
 from robins.rotation import Rotation
 from robins.systems.ins_gnss import SYSTEM, Drive
 
@@ -231,6 +233,15 @@ def in_c(program, case: Case, runs: int) -> Callable[[], np.ndarray]:
     return go
 
 
+def by_machine(program, case: Case) -> Callable[[], list[np.ndarray]]:
+    """All runs by the interpreter; gives the leaves of the state in the end, for each run."""
+    states, rows = jax.tree.leaves(case.states), jax.tree.leaves(case.rows)
+    rounds = Rounds(program, case.steps, len(states), 0, engine=many_of)
+    given = [(np.asarray(x), True) for x in states]
+    given += [(np.ascontiguousarray(np.moveaxis(np.asarray(x), 0, 1)), True) for x in rows]
+    return lambda: rounds(BATCH, given)[: len(states)]
+
+
 def by_eigen(name, A, H, y, P0, end, log) -> Callable[[], np.ndarray]:
     """One run; checked on as many as there are lanes, NIS and codes on the first: to 1e-10."""
     text = (Path(__file__).parent / "cpp" / "filters.cc").read_text("utf-8")
@@ -272,7 +283,8 @@ def by_filterpy(A, H, y, P0) -> Callable[[], np.ndarray]:
 
 # -------------------------------------------------------------------------------------- the table
 
-HEAD = ("unroll", "nodes", "trace s", "C s", "C++ s", "off JAX", "C ns", "lanes ns", "JAX ns")
+HEAD = ("unroll", "nodes", "trace s", "tape s", "C s", "C++ s", "off JAX")
+TIMES = ("C ns", "machine ns", "lanes ns", "JAX ns", "machine/lanes")
 PEERS = (
     "JAX/lanes",
     "Eigen ns",
@@ -293,33 +305,40 @@ def row(case: Case, unroll: int) -> list[str]:
     first = jax.tree.map(lambda x: x[0], case.states)
     given = jax.tree.map(lambda x: x[0, 0], case.rows)
     program, traced = timed(lambda: trace_step(case.step, first, given, unroll=unroll))
+    machine, tape_s = timed(lambda: by_machine(program, case))
     one, c_s = timed(lambda: in_c(program, case, 1))
     lanes, cpp_s = timed(lambda: in_c(program, case, LANES))
     reference = by_jax(case)
     end = jax.block_until_ready(reference())
     assert np.array_equal(one()[:, 0], lanes()[:, 0], equal_nan=True)
     off, at = 0.0, 0
-    for leaf in map(np.asarray, jax.tree.leaves(end)):
+    for leaf, interpreted in zip(map(np.asarray, jax.tree.leaves(end)), machine(), strict=True):
         if leaf.dtype == float:
             want = leaf[:LANES].reshape(LANES, -1).T
             got = lanes()[at : at + len(want)]
+            same = interpreted[:LANES].reshape(LANES, -1).T
+            assert np.array_equal(got, same, equal_nan=True)
             at += len(want)
             off = max(off, np.max(np.abs(got - want)) / max(np.max(np.abs(want)), 1e-300))
     assert off < 1e-11, off
-    contenders = {"C": one, "lanes": lanes, "JAX": reference, **case.peers(end)}
+    contenders = {"C": one, "machine": machine, "lanes": lanes, "JAX": reference, **case.peers(end)}
     # C and its peers take milliseconds where JAX takes a second: many rounds cost nothing there.
     seconds = best_of(contenders, 2, time.process_time)
     quick = {k: v for k, v in contenders.items() if k not in ("JAX", "filterpy")}
     for name, best in best_of(quick, 20, time.process_time).items():
         seconds[name] = min(seconds[name], best)
-    runs = {"lanes": LANES, "JAX": BATCH}
+    runs = {"lanes": LANES, "machine": BATCH, "JAX": BATCH}
     ns = {
         name: best / runs.get(name, 1) / case.steps / case.unit * 1e9
         for name, best in seconds.items()
     }
-    made = [str(unroll), str(len(program.live)), *(f"{x:.1f}" for x in (traced, c_s, cpp_s))]
-    made += [f"{off:.0e}", *(f"{ns[name]:.0f}" for name in ("C", "lanes", "JAX"))]
-    made.append(f"{ns['JAX'] / ns['lanes']:.1f}")
+    made = [
+        str(unroll),
+        str(len(program.live)),
+        *(f"{x:.1f}" for x in (traced, tape_s, c_s, cpp_s)),
+    ]
+    made += [f"{off:.0e}", *(f"{ns[name]:.0f}" for name in ("C", "machine", "lanes", "JAX"))]
+    made += [f"{ns['machine'] / ns['lanes']:.2f}", f"{ns['JAX'] / ns['lanes']:.1f}"]
     made += (
         [f"{ns['Eigen']:.0f}", f"{ns['lanes'] / ns['Eigen']:.2f}"] if "Eigen" in ns else ["", ""]
     )
@@ -333,7 +352,7 @@ def main():
     if not (EIGEN / "Eigen").is_dir():
         print(f"no Eigen in {EIGEN}: `apt install libeigen3-dev`, or name its folder in EIGEN")
     print(f"load of the machine: {os.getloadavg()[0]:.1f}")
-    columns = HEAD + PEERS
+    columns = HEAD + TIMES + PEERS
     print(f"{'':14s}" + "".join(f"{name:>{max(9, len(name) + 2)}s}" for name in columns))
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as cache:
         warnings.simplefilter("ignore")

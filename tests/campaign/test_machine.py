@@ -38,6 +38,9 @@ def test_lanes_have_the_results_of_jax(problem):
     said = []
     mine = simulate(problem, RUNS, 16, machine="c", progress=lambda share, what: said.append(what))
     want = simulate(problem, RUNS, 16, machine="jax")
+    interpreted = simulate(problem, RUNS, 16, machine="vm")
+    assert interpreted.machine == "vm"
+    assert interpreted.solution.identical(mine.solution.assign_attrs(interpreted.solution.attrs))
     assert (mine.machine, want.machine) == ("c", "jax")
     assert mine.summary["machine"] == "c"
     assert mine.notes == want.notes
@@ -85,7 +88,7 @@ def test_lanes_are_chosen_where_they_pay(problem, monkeypatch):
 
 
 def test_a_machine_that_is_not_there_is_refused(problem):
-    with pytest.raises(RobinsError, match=r"no machine 'cuda'.*say jax or c"):
+    with pytest.raises(RobinsError, match=r"no machine 'cuda'.*say jax, vm or c"):
         machine_for(problem, 1, "cuda")
 
 

@@ -1,4 +1,4 @@
-"""Lanes: the same text, compiled for vectors of runs, gives each run the bits of its own."""
+"""Lanes, and the machine for one run and for many: each run has the bits of its own in C."""
 
 import ctypes
 import shutil
@@ -7,11 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from machines import QUICK, stepping
+from machines import quickly, stepping
 from rule_table import RULES, START, Y, line
 
 from robins.filters import kalman
-from robins.program import CPP, LANE_FLAGS, Native, build, function, header, trace
+from robins.program import CPP, LANE_FLAGS, Native, build, function, header, step_of_one, trace
+from robins.program.lanes import Rounds
+from robins.program.machine import many_of
 
 FOUND = any(map(shutil.which, CPP.names))
 pytestmark = pytest.mark.skipif(not FOUND, reason="lanes need a C++ compiler")
@@ -35,7 +37,7 @@ def flat(leaves):
 def check(step, cases, unroll=None):
     """That lanes give to the bit what one run after the other gives."""
     program = trace(step, *cases[0], unroll=unroll)
-    one = Native(program, QUICK)
+    one = Native(program, quickly)
     given = [flat(jax.tree.leaves(case)) for case in cases]
     want = [flat(jax.tree.leaves(one(*case))) for case in cases]
     x, k = (np.ascontiguousarray(np.stack(rows, axis=-1)) for rows in zip(*given, strict=True))
@@ -44,6 +46,19 @@ def check(step, cases, unroll=None):
     for lane, (reals, others) in enumerate(want):
         np.testing.assert_array_equal(y[:, lane], reals)
         np.testing.assert_array_equal(m[:, lane], others)
+    interpreted = Native(program, step_of_one)
+    many = in_one_round(program, cases)
+    for lane, (case, (reals, others)) in enumerate(zip(cases, want, strict=True)):
+        for got in (jax.tree.leaves(interpreted(*case)), [a[lane, 0] for a in many]):
+            np.testing.assert_array_equal(flat(got)[0], reals)
+            np.testing.assert_array_equal(flat(got)[1], others)
+
+
+def in_one_round(program, cases):
+    """The results of some runs at a time on the machine, with axes of runs and of one round."""
+    given = [np.stack(rows) for rows in zip(*map(jax.tree.leaves, cases), strict=True)]
+    rounds = Rounds(program, 1, 0, len(given), engine=many_of)
+    return rounds(len(cases), [(a, True) for a in given])
 
 
 @pytest.mark.parametrize(("lanes", "unroll"), [(8, None), (4, 200), (2, None), (1, None)])

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from machines import QUICK
+from machines import QUICK, quickly
 
 from robins.program import BuildError, ProgramError, build, native
 from robins.program.native import FASTER_IN_GCC
@@ -77,7 +77,7 @@ def test_trees_types_and_shapes_come_back_as_they_were_traced():
         return new, (jnp.zeros((0, 2)), y.astype(jnp.int32), None)
 
     state = {"x": np.ones((2, 3)), "count": np.int64(4), "ok": np.array([True, False])}
-    one = native(f, state, np.full(3, 2.5), flags=QUICK)
+    one = native(f, state, np.full(3, 2.5), engine=quickly)
     got, want = one(state, np.full(3, 2.5)), jax.jit(f)(state, np.full(3, 2.5))
     assert jax.tree.structure(got) == jax.tree.structure(want)
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
@@ -89,7 +89,7 @@ def test_trees_types_and_shapes_come_back_as_they_were_traced():
 
 
 def test_arguments_of_another_form_are_refused():
-    one = native(lambda a, b: a["x"] + b, {"x": np.ones(3)}, np.ones(3), flags=QUICK)
+    one = native(lambda a, b: a["x"] + b, {"x": np.ones(3)}, np.ones(3), engine=quickly)
     with pytest.raises(ProgramError, match=r"arguments\[1\]: \(2,\) was given where \(3,\)"):
         one({"x": np.ones(3)}, np.ones(2))
     with pytest.raises(ProgramError, match="another structure"):

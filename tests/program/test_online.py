@@ -1,12 +1,10 @@
 """A filter stepped live in C against the same by JAX: numbers, codes, errors, what is kept."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from machines import QUICK, apart
+from machines import apart
 from rule_table import ACTING, START, M, N, Y, line
 from two_sensors import SYSTEMS, split
 
@@ -25,7 +23,7 @@ from robins.filters.rules import Infeasible, gate, h_infinity, with_gamma
 from robins.program import BuildError, NativeState, ProgramError, trace
 
 # Compiled without optimisation, which is quicker for so few calls; the bits are the same.
-C = partial(NativeState, flags=QUICK)
+C = NativeState
 EKF, MODEL = kalman(), line()
 
 
@@ -244,7 +242,7 @@ def test_what_has_no_place_in_c_is_named_with_its_line():
 
 
 def test_machines_that_are_not_there(monkeypatch):
-    with pytest.raises(ValueError, match="machine must be 'jax' or 'c', got 'fpga'"):
+    with pytest.raises(ValueError, match="machine must be 'jax', 'vm' or 'c', got 'fpga'"):
         OnlineFilter(EKF, MODEL, START, "fpga")
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(BuildError, match="install one"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 from jax.extend.random import threefry_2x32
-from machines import QUICK, in_c, same_in_c
+from machines import in_c, quickly, same_in_c
 from test_lanes import FOUND, check
 
 from robins.program import Native, ProgramError, trace, trace_step
@@ -74,7 +74,7 @@ def test_keys_are_taken_and_given_as_keys():
 
     state = (jax.random.split(jax.random.key(3), 2)[1], 0.0)
     program = trace_step(step, state, 0)
-    one, by_jax, in_c_ = Native(program, QUICK), state, state
+    one, by_jax, in_c_ = Native(program, quickly), state, state
     for number in range(5):
         by_jax, want = jax.jit(step)(by_jax, number)
         in_c_, got = one(in_c_, number)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from machines import QUICK, apart, stepping
+from machines import apart, quickly, stepping
 from rule_table import START, Y, line
 
 from robins.filters import kalman, unscented
@@ -33,7 +33,7 @@ def test_zeros_that_depend_on_zeros_that_do_not_last_do_not_last_either():
 
     program = trace_step(lambda x, y: chain(x, y), np.zeros(5), 1.0)
     assert not program.zeros[0].any()
-    one = Native(program, QUICK)
+    one = Native(program, quickly)
     x = np.zeros(5)
     for k in range(5):
         (x,) = one(x, float(k + 1))
@@ -41,7 +41,7 @@ def test_zeros_that_depend_on_zeros_that_do_not_last_do_not_last_either():
 
 
 def test_a_state_that_has_not_these_zeros_is_refused():
-    one = Native(trace_step(rotate, STATE, np.ones(3)), QUICK)
+    one = Native(trace_step(rotate, STATE, np.ones(3)), quickly)
     other = (STATE[0] + np.eye(3, k=1), *STATE[1:])
     with pytest.raises(ProgramError, match=r"arguments\[0\]\[0\]: a number is not zero"):
         one(other, np.ones(3))
@@ -64,7 +64,7 @@ def test_a_filter_needs_less_and_says_the_same():
     factor = next(k for k, leaf in enumerate(less.inputs) if leaf.path.endswith(".factor"))
     assert less.zeros[factor].tolist() == (np.triu(np.ones((4, 4)), 1) > 0).tolist()
     assert len(less.live) < len(whole.live)
-    a, b = Native(whole, QUICK), Native(less, QUICK)
+    a, b = Native(whole, quickly), Native(less, quickly)
     s = t = state
     for y in Y:
         s, _ = a(s, None, {"y": y}, {})

@@ -1,8 +1,9 @@
-"""On what a campaign runs: batches of JAX, or programs in lanes on all cores.
+"""On what a campaign runs: batches of JAX, or programs on all cores, interpreted or compiled.
 
-Both have the same random numbers and, to rounding, the same results; JAX is the reference. Lanes
-are compiled for each problem, which takes from seconds to a minute and is kept on this machine:
-they are chosen where JAX would take longer than that.
+All have the same random numbers and, to rounding, the same results; JAX is the reference. The two
+kinds of programs have the same bits. The interpreter (`robins.program.machine`) begins at once;
+compiled lanes are twice as fast, and take from seconds to a minute for each problem, which is kept
+on this machine: they are chosen where JAX would take longer than that.
 """
 
 from __future__ import annotations
@@ -47,10 +48,12 @@ from robins.campaign.monte_carlo import (
 )
 from robins.errors import RobinsError
 from robins.program import CPP, BuildError, compiler
+from robins.program.lanes import lanes_of
+from robins.program.machine import machine_of_many, many_of
 from robins.program.stages import Staged
 from robins.systems.study import Problem
 
-MACHINES = ("jax", "c")
+MACHINES = ("jax", "vm", "c")
 PAYS = 60.0  # seconds of JAX on one core for which it pays to compile lanes
 FEWEST = 100  # runs of which this is asked
 NS = 0.5  # of JAX, for a scalar operation in a scan (measured: 0.4 to 0.8)
@@ -155,15 +158,15 @@ class InLanes:
     """Chunks as programs in lanes, one on each core.
 
     Attributes:
+        name: "c" where the programs are compiled, "vm" where they are interpreted.
         bytes_of_run: about the most memory that the histories of a run take at once.
     """
 
-    name = "c"
-
-    def __init__(self, problem: Problem):
-        self.problem = problem
+    def __init__(self, problem: Problem, name: str = "c"):
+        self.problem, self.name = problem, name
+        self._engine = many_of if name == "vm" else lanes_of
         number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
-        self._simulate = Staged(problem.simulate, number)
+        self._simulate = Staged(problem.simulate, number, engine=self._engine)
         self._world = jax.eval_shape(problem.simulate, number)
         self._filters = {name: self._staged(name, named=True) for name in problem.contenders}
         stages = (self._simulate, *self._filters.values())
@@ -174,7 +177,10 @@ class InLanes:
         problem = self.problem
         one = partial(one_record, blocks_of(problem), contender(problem, name), over=one_by_one)
         return Staged(
-            (lambda world: parted(one(world))) if named else one, self._world, named=named
+            (lambda world: parted(one(world))) if named else one,
+            self._world,
+            named=named,
+            engine=self._engine,
         )
 
     @property
@@ -320,9 +326,11 @@ def check_machine(name: str) -> None:
         RobinsError: there is no such machine, or no compiler for it.
     """
     if name and name not in MACHINES:
-        raise RobinsError(f"no machine '{name}'", "--machine", f"say {' or '.join(MACHINES)}")
+        raise RobinsError(f"no machine '{name}'", "--machine", "say jax, vm or c")
     if name == "c":
         compiler(CPP)
+    if name == "vm":
+        machine_of_many()
 
 
 def has_compiler() -> bool:
@@ -347,16 +355,16 @@ def machine_for(problem: Problem, runs: int, name: str = "") -> ByJax | InLanes:
     """
     check_machine(name)
     hosted = [(n, c.on_host) for n, c in problem.contenders.items() if c.on_host]
-    if name == "c" and hosted:
+    if name in ("vm", "c") and hosted:
         which, why = hosted[0]
         raise RobinsError(
             f"filter '{which}' cannot be a program: {why}",
-            "--machine c",
+            f"--machine {name}",
             "say jax, or choose other filters by --filters",
         )
     if name == "jax" or (not name and (runs < FEWEST or hosted or not has_compiler())):
         return ByJax(problem)
-    lanes = InLanes(problem)
+    lanes = InLanes(problem, name or "c")
     return lanes if name or lanes.seconds_by_jax(runs) > PAYS else ByJax(problem)
 
 

@@ -59,7 +59,8 @@ class Worker:
 
     def __init__(self, store: Store, plan: Plan, problem: Problem):
         self.store, self.plan, self.problem = store, plan, problem
-        self.machine = InLanes(problem) if plan.machine == "c" else ByJax(problem)
+        by_jax = plan.machine == "jax"
+        self.machine = ByJax(problem) if by_jax else InLanes(problem, plan.machine)
         self._shards = plan.shards
         self._stems = by_stem(self._shards)
         self._seen: dict[str, float] = {}  # when a claim was first seen

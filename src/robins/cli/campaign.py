@@ -72,7 +72,7 @@ def _held(_context: click.Context, _given: click.Parameter, held: bool) -> None:
 @option("--workers", type=click.IntRange(min=0), help="Processes. [default: one a core]")
 @option(
     "--machine",
-    type=click.Choice(["jax", "c"]),
+    type=click.Choice(["jax", "vm", "c"]),
     callback=lambda _context, _given, name: name or "",
     help="What computes. [default: c where that pays, else jax]",
 )
@@ -265,7 +265,7 @@ def report(where: str, out: Path | None, as_json: bool) -> None:
 @option("--out", required=True, metavar="DIR", help="Folder, or an address such as s3://name/dir.")
 @option("--runs", type=click.IntRange(min=1), help="At each point. [default: as given]")
 @option("--workers", type=click.IntRange(min=1), help="Processes. [default: one a core]")
-@option("--machine", type=click.Choice(["jax", "c"]), default="jax", show_default=True)
+@option("--machine", type=click.Choice(["jax", "vm", "c"]), default="jax", show_default=True)
 @choices
 @TRUST
 @answers

@@ -110,7 +110,7 @@ def demo(out: Path | None, **options: Any) -> None:
 @COLUMNS
 @option(
     "--machine",
-    type=click.Choice(["jax", "c"]),
+    type=click.Choice(["jax", "vm", "c"]),
     callback=lambda _context, _given, name: name or "",
     help="What computes. [default: c where that pays, else jax]",
 )

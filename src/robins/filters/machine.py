@@ -21,7 +21,7 @@ from robins.filters.run import Keep, Step, filter_step
 from robins.filters.values import Numbers, content, on_device
 
 T = TypeVar("T")
-Name = Literal["jax", "c"]
+Name = Literal["jax", "vm", "c"]
 Codes = tuple[Numbers, dict[str, Numbers]]  # of a step: of its prediction, and by sensor
 
 
@@ -142,7 +142,7 @@ class ProgramStepper:
 def on(
     machine: Machine | str, filter_: Filter, model: Model, state: FilterState
 ) -> JaxStepper | ProgramStepper:
-    """Place a state on a machine: "jax", "c", or a function that makes a memory.
+    """Place a state on a machine: "jax", "vm", "c", or a function that makes a `CompiledState`.
 
     Raises:
         ValueError: there is no machine of this name.
@@ -155,9 +155,13 @@ def on(
     if machine == "jax":
         return JaxStepper(filter_, model, state)
     # Imported here: a filter needs neither programs nor a compiler.
-    from robins.program import NativeState
+    from robins.program import NativeState, by_compiler, compiler, step_of_one
 
-    return ProgramStepper(filter_, model, state, NativeState)
+    engine = step_of_one
+    if machine == "c":
+        compiler()
+        engine = by_compiler
+    return ProgramStepper(filter_, model, state, partial(NativeState, engine=engine))
 
 
 def settled(state: FilterState) -> FilterState:

@@ -9,7 +9,7 @@ is left out. What remains is emitted as C99, compiled, and called from Python; o
     trace_steps  the same of several steps of one state
     to_c         `Program` -> text
     native       function -> the same function, compiled
-    NativeState  a state that stays in the memory of C, and compiled functions that step it
+    NativeState  a state that stays in the memory of C, and programs that step it
 
 `stages` makes of a function of one run one of many, its loops in lanes; `library` writes C for a
 board.
@@ -18,8 +18,18 @@ This room knows JAX and no filter: no filter, rule or system is written for it.
 """
 
 from robins.program.c import function, header, to_c
+from robins.program.machine import step_of_one
 from robins.program.memory import NativeState
-from robins.program.native import CPP, FLAGS, LANE_FLAGS, Native, build, compiler, native
+from robins.program.native import (
+    CPP,
+    FLAGS,
+    LANE_FLAGS,
+    Native,
+    build,
+    by_compiler,
+    compiler,
+    native,
+)
 from robins.program.nodes import Graph
 from robins.program.precision import DOUBLE, SINGLE, Precision
 from robins.program.refusal import BuildError, ProgramError
@@ -40,10 +50,12 @@ __all__ = [
     "Program",
     "ProgramError",
     "build",
+    "by_compiler",
     "compiler",
     "function",
     "header",
     "native",
+    "step_of_one",
     "to_c",
     "trace",
     "trace_step",

@@ -9,8 +9,9 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Collection, Sequence
 from importlib.resources import files
-from typing import Any, NamedTuple
+from typing import Any
 
+import jax
 import numpy as np
 
 from robins.program.c import function, header
@@ -34,52 +35,38 @@ extern "C" int robins_lanes(void) { return LANES; }
 """
 
 
-class Rows(ctypes.Structure):
-    """An array of all runs, or of the first, as `scan.h` takes and gives it."""
-
-    _fields_ = (
-        ("data", ctypes.c_void_p),
-        ("runs", ctypes.c_int64),
-        ("run", ctypes.c_int64),
-        ("round", ctypes.c_int64),
-        ("size", ctypes.c_int32),
-        ("kind", ctypes.c_int32),
-    )
+Given = tuple[np.ndarray | jax.Array, bool]  # an array, and whether it has a leading axis of runs
+Scan = Callable[[ctypes.c_void_p], int]  # a function of C that takes a `scan` of `scan.h`
 
 
-class Scan(ctypes.Structure):
-    """What a scan is told, as `scan.h` has it."""
+def lanes_of(program: Program) -> tuple[Scan, int]:
+    """Rounds of a program, compiled, and how many runs they take at a time.
 
-    _fields_ = (
-        ("runs", ctypes.c_int64),
-        ("rounds", ctypes.c_int64),
-        ("backwards", ctypes.c_int32),
-        ("carried", ctypes.c_int32),
-        ("fixed", ctypes.c_int32),
-        ("taken", ctypes.c_int32),
-        ("given", ctypes.c_int32),
-        ("in", ctypes.c_void_p),
-        ("out", ctypes.c_void_p),
-    )
-
-
-class Given(NamedTuple):
-    """What rounds are given."""
-
-    array: np.ndarray  # a leading axis of runs, if they differ in it; then, in rows, of rounds
-    batched: bool
+    Raises:
+        BuildError: there is no compiler, or it refuses the program.
+    """
+    library = ctypes.CDLL(str(build(_text(program), LANE_FLAGS, CPP)))
+    return library.robins_scan, library.robins_lanes()
 
 
 class Rounds:
-    """A program with rounds around it, compiled; called with arrays of all runs.
+    """A program with rounds around it, called with arrays of all runs.
 
     Attributes:
         program: of one round: carried, staying, a row; to carried and a row.
         lanes: how many runs at a time, as this machine's processor can.
     """
 
-    def __init__(self, program: Program, length: int, carried: int, stays: int, backwards=False):
-        """Compile.
+    def __init__(
+        self,
+        program: Program,
+        length: int,
+        carried: int,
+        stays: int,
+        backwards: bool = False,
+        engine: Callable[[Program], tuple[Scan, int]] = lanes_of,
+    ):
+        """Make them ready.
 
         Args:
             program: of one round.
@@ -87,19 +74,14 @@ class Rounds:
             carried: so many of its first arguments, and of its first results, are carried.
             stays: so many after these are the same in all rounds.
             backwards: from the last row to the first.
+            engine: `lanes_of`, or `many_of` of the machine.
 
         Raises:
             BuildError: there is no compiler, or it refuses the program.
         """
         self.program, self.length, self.backwards = program, length, backwards
         self.carried, self.stays = carried, stays
-        self._scan = self._compiled(program)
-
-    def _compiled(self, program: Program) -> Callable[[Any], int]:
-        """The function of C that takes a `Scan`."""
-        library = ctypes.CDLL(str(build(_text(program), LANE_FLAGS, CPP)))
-        self.lanes = library.robins_lanes()
-        return library.robins_scan
+        self._scan, self.lanes = engine(program)
 
     def holds_for(self, begin: Sequence[Given]) -> bool:
         """Whether runs begin with the zeros that the program takes for granted."""
@@ -121,8 +103,8 @@ class Rounds:
         """
         inputs, results = self.program.inputs, self.program.results
         arrays = [
-            np.ascontiguousarray(numbers_of(g.array), _dtype(leaf.dtype))
-            for g, leaf in zip(given, inputs, strict=True)
+            np.ascontiguousarray(numbers_of(array), _dtype(leaf.dtype))
+            for (array, _), leaf in zip(given, inputs, strict=True)
         ]
         made = [
             np.empty(
@@ -137,25 +119,18 @@ class Rounds:
         ]
         first = self.carried + self.stays
         taken = [
-            _rows(a, g.batched, k >= first, leaf)
-            for k, (a, g, leaf) in enumerate(zip(arrays, given, inputs, strict=True))
+            _rows(a, batched, k >= first, leaf)
+            for k, (a, (_, batched), leaf) in enumerate(zip(arrays, given, inputs, strict=True))
         ]
         out = [
             _rows(a, True, k >= self.carried, leaf)
             for k, (a, leaf) in enumerate(zip(made, results, strict=True))
         ]
-        scan = Scan(
-            runs,
-            self.length,
-            self.backwards,
-            self.carried,
-            self.stays,
-            len(taken) - first,
-            len(out) - self.carried,
-            ctypes.cast((Rows * max(len(taken), 1))(*taken), ctypes.c_void_p),
-            ctypes.cast((Rows * max(len(out), 1))(*out), ctypes.c_void_p),
-        )
-        if self._scan(ctypes.byref(scan)):
+        both = [np.array(some or [[0] * 6], np.int64) for some in (taken, out)]
+        counts = self.carried, self.stays, len(taken) - first, len(out) - self.carried
+        pointers = [a.ctypes.data for a in both]
+        scan = np.array([runs, self.length, self.backwards, *counts, *pointers], np.int64)
+        if self._scan(ctypes.c_void_p(scan.ctypes.data)):
             raise MemoryError(f"no memory for rounds of {runs} runs")
         return [
             array_of(a, leaf.dtype) if is_key(leaf.dtype) else a
@@ -165,8 +140,9 @@ class Rounds:
 
 def zero_in_all(given: Given) -> np.ndarray:
     """Which entries of an array are zero in all runs."""
-    zero = positive_zeros(numbers_of(given.array))
-    return np.asarray(np.all(zero, axis=0)) if given.batched else zero
+    array, batched = given
+    zero = positive_zeros(numbers_of(array))
+    return np.asarray(np.all(zero, axis=0)) if batched else zero
 
 
 def _dtype(dtype: Any) -> np.dtype:
@@ -174,18 +150,13 @@ def _dtype(dtype: Any) -> np.dtype:
     return np.dtype(np.uint64) if is_key(dtype) else np.dtype(dtype)
 
 
-def _rows(a: np.ndarray, batched: bool, by_round: bool, leaf: Leaf) -> Rows:
+def _rows(a: np.ndarray, batched: bool, by_round: bool, leaf: Leaf) -> tuple[int, ...]:
+    """An array of all runs, or of the first, as `rows` of `scan.h`."""
     size = int(np.prod(leaf.shape))
     run = a.strides[0] if batched and a.size else 0
     kind = KINDS[f"{a.dtype.kind}{a.dtype.itemsize}"]
-    return Rows(
-        a.ctypes.data,
-        len(a) if batched else 1,
-        run,
-        size * a.itemsize if by_round else 0,
-        size,
-        kind,
-    )
+    runs, by = len(a) if batched else 1, size * a.itemsize if by_round else 0
+    return a.ctypes.data, runs, run, by, size, kind
 
 
 def _text(program: Program) -> str:

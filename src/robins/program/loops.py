@@ -15,6 +15,7 @@ import numpy as np
 from jax.extend import core as jex
 
 from robins.program.kinds import is_key, kind_of
+from robins.program.liveness import variables
 from robins.program.nodes import Graph
 from robins.program.primitives.control import size_of
 from robins.program.primitives.random import bits_of, numbered
@@ -115,15 +116,8 @@ def operations(e: Any) -> int:
     return DRAW * entries if name == "random_bits" else 0
 
 
-class Uses(NamedTuple):
-    """What an equation needs of others: as a whole before its loop, or row by row."""
-
-    whole: list[Any]
-    rows: list[Any]
-
-
-def uses(e: Any, length: int) -> Uses:
-    """The variables that an equation of a loop needs, by how it needs them."""
+def uses(e: Any, length: int) -> tuple[list[Any], list[Any]]:
+    """Variables that an equation of a loop needs as a whole before it, and those row by row."""
     if e.primitive.name == "scan":
         before = e.params["num_consts"] + e.params["num_carry"]
         whole, rows = e.invars[:before], e.invars[before:]
@@ -132,7 +126,7 @@ def uses(e: Any, length: int) -> Uses:
         if e.primitive.name == "broadcast_in_dim" and 0 not in e.params["broadcast_dimensions"]:
             rows = []
         whole = [v for v in e.invars if v not in rows] if rows else e.invars
-    return Uses(*([v for v in some if not isinstance(v, jex.Literal)] for some in (whole, rows)))
+    return variables(whole), variables(rows)
 
 
 def makes_rows(e: Any) -> list[Any]:
@@ -251,7 +245,7 @@ class Body:
     ) -> list[Nodes]:
         """What an equation makes of rows: the same equation on arrays of one row."""
         name, p, length = e.primitive.name, dict(e.params), self.axis.length
-        by_row = uses(e, length).rows
+        by_row = uses(e, length)[1]
         if name == "iota":
             kind = kind_of(e.outvars[0].aval.dtype)
             at = walk.graph.convert(index.item(), kind)

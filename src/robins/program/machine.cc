@@ -53,6 +53,22 @@ extern "C" const char *robins_codes(void)
 }
 extern "C" int robins_width(void) { return WIDTH; }
 
+#ifdef ONE_RUN
+/* The generation of this processor: of x86-64 1, 3 or 4, of others 0. */
+extern "C" int robins_generation(void)
+{
+#ifdef __x86_64__
+#define HAS(what) __builtin_cpu_supports(what)
+    __builtin_cpu_init();
+    if (!(HAS("avx2") && HAS("bmi") && HAS("bmi2") && HAS("fma"))) { return 1; }
+    const int wide = HAS("avx512f") && HAS("avx512bw") && HAS("avx512cd");
+    return wide && HAS("avx512dq") && HAS("avx512vl") ? 4 : 3;
+#else
+    return 0;
+#endif
+}
+#endif
+
 #define VECTORS (WIDTH / LANES)
 #define ROW(kind, k) ((kind *)(registers + (size_t)(k) * WIDTH))
 #define EACH for (int v = 0; v < VECTORS; ++v)
@@ -164,7 +180,7 @@ typedef struct {
     const int32_t *results;     /* registers: NY reals, then NM others */
     int64_t codes, constant_count;
     int64_t registers, scratch; /* rows */
-    int32_t nx, nk, ny, nm;     /* reals and others that are taken, and given */
+    int64_t nx, nk, ny, nm;     /* reals and others that are taken, and given */
 } tape;
 
 extern "C" int64_t robins_bytes(const tape *t)

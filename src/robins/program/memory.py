@@ -1,4 +1,4 @@
-"""A state that stays in the memory of C from call to call, and compiled functions that step it.
+"""A state that stays in the memory of C from call to call, and programs that step it.
 
 `Native` takes a function's arguments apart and puts its results together at every call. Here the
 state is never taken apart: every program has it at the head of its arguments and of its results,
@@ -16,49 +16,19 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from robins.program.c import to_c
 from robins.program.kinds import kind_of
-from robins.program.machine import machine
-from robins.program.native import FLAGS, build
+from robins.program.machine import step_of_one
+from robins.program.native import Engine, Step
 from robins.program.refusal import ProgramError
 from robins.program.trace import Leaf, Program, trace
 
+Function = Callable[..., Any]  # of a state and arguments
+Made = tuple[Program, Callable[[], Step]]  # a program, and what makes steps of it
 LIVE_UNROLL = 300  # of 15 states as fast as written out, and compiled in two thirds of the time
 _MOST = 128  # programs remembered; the least recently used are forgotten
-_known: OrderedDict[Hashable, Compiled] = OrderedDict()
+_known: OrderedDict[Hashable, Made] = OrderedDict()
 _FLOAT = np.dtype(float)
 _PYTHON = {float: _FLOAT, int: np.dtype(np.int64), bool: np.dtype(bool)}
-
-
-Step = Callable[..., None]  # (x, k, y, m), as `robins.program.c.function` has them
-
-
-class Compiled(NamedTuple):
-    """A program, and what makes its function: one for each memory that it works in."""
-
-    program: Program
-    step: Callable[[], Step]
-
-
-Engine = Callable[[Program], Callable[[], Step]]
-
-
-def by_compiler(program: Program, flags: tuple[str, ...] = FLAGS) -> Callable[[], Step]:
-    """Steps of a program that the C compiler compiles.
-
-    Raises:
-        BuildError: there is no compiler, or it refuses the program.
-    """
-    step = ctypes.CDLL(str(build(to_c(program), flags))).robins_step
-    step.restype = None
-    return lambda: step
-
-
-def by_machine(program: Program) -> Callable[[], Step]:
-    """Steps of a program on the machine; each has registers of its own."""
-    one = machine("one")
-    tape = one.assemble(program)
-    return lambda: one.step(tape)
 
 
 class Slot(NamedTuple):
@@ -178,7 +148,7 @@ class NativeState:
         self,
         state: Any,
         content: Hashable,
-        engine: Engine = by_machine,
+        engine: Engine = step_of_one,
         unroll: int | None = LIVE_UNROLL,
     ):
         """Take a state.
@@ -187,7 +157,7 @@ class NativeState:
             state: a pytree of arrays.
             content: what the functions hold, by which those of equal names are told apart in this
                 process.
-            engine: what makes steps of programs, `by_machine` or `by_compiler`.
+            engine: what makes steps of programs: `step_of_one` of the machine, or `by_compiler`.
             unroll: as in `trace`.
 
         Raises:
@@ -286,11 +256,11 @@ class NativeState:
         key = (self._content, name, self._tree, tuple(self._forms), tree, tuple(forms), self._how)
         made = _known.get(key)
         if made is None:
-            made = _known[key] = self._compiled(function, args)
+            made = _known[key] = self._made(function, args)
             if len(_known) > _MOST:
                 _known.popitem(last=False)
         _known.move_to_end(key)
-        count, program = len(self._slots), made.program
+        count, (program, step) = len(self._slots), made
         begin = self._reals, self._others
         given, *after = slots(program.inputs[count:], begin)
         told, *end = slots(program.results[count:])
@@ -305,14 +275,14 @@ class NativeState:
             tree,
             forms,
             [slot.view(self._x, self._k) for slot in given],
-            made.step(),
+            step(),
             (x, k, x, k),
             begin,
             (begin[0] + end[0], begin[1] + end[1]),
             Reader(told, jax.tree_util.treedef_children(program.structure[1])[1]),
         )
 
-    def _compiled(self, function: Callable[..., Any], args: Any) -> Compiled:
+    def _made(self, function: Function, args: tuple) -> Made:
         engine, unroll = self._how
         program = trace(function, self.state, *args, unroll=unroll)
         parts = jax.tree_util.treedef_children(program.structure[1])
@@ -325,4 +295,4 @@ class NativeState:
             raise ProgramError(
                 "a step gives a state of another form than it takes", fix="return (state, result)"
             )
-        return Compiled(program, engine(program))
+        return program, engine(program)

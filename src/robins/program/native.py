@@ -1,4 +1,4 @@
-"""Programs compiled on this machine by its C compiler, kept by content, called from Python."""
+"""Programs as functions of Python, and C compiled on this computer, kept by content."""
 
 from __future__ import annotations
 
@@ -41,6 +41,8 @@ FASTER_IN_GCC = (
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", *FASTER)
 # Lanes are as wide as the processor that compiles them.
 LANE_FLAGS = ("-std=gnu++17", "-march=native", "-Wno-psabi", *FLAGS[1:])
+# The operators `and`, `or` and `not` are names of functions in the machine.
+MACHINE_FLAGS = ("-std=gnu++17", "-Wno-psabi", "-fno-operator-names", *FLAGS[1:])
 NO_COMPILER = (
     "install one (Debian: `apt install g++`; anywhere: `pip install 'robins[compiler]'`), "
     "or name it in CC (of C++: CXX)"
@@ -142,6 +144,21 @@ def build(text: str, flags: tuple[str, ...] = FLAGS, language: Language = C) -> 
     return library
 
 
+Step = Callable[..., Any]  # of addresses (x, k, y, m), as `robins.program.c.function` has them
+Engine = Callable[[Program], Callable[[], Step]]  # each step has memory of its own
+
+
+def by_compiler(program: Program, flags: tuple[str, ...] = FLAGS) -> Callable[[], Step]:
+    """Steps of a program as the C compiler compiles it.
+
+    Raises:
+        BuildError: there is no compiler, or it refuses the program.
+    """
+    step = ctypes.CDLL(str(build(to_c(program), flags))).robins_step
+    step.restype = None
+    return lambda: step
+
+
 class Native:
     """A program as a function of Python: takes and gives what the traced function did.
 
@@ -149,11 +166,9 @@ class Native:
     filter millions of times calls `address` from C.
     """
 
-    def __init__(self, program: Program, flags: tuple[str, ...] = FLAGS):
+    def __init__(self, program: Program, engine: Engine = by_compiler):
         self.program = program
-        self.library = ctypes.CDLL(str(build(to_c(program), flags)))
-        self._step = self.library.robins_step
-        self._step.restype = None
+        self._step = engine(program)()
         self._x, self._k, self._given = _laid_out(program.inputs)
         self._y, self._m, self._made = _laid_out(program.results)
         self._zeros = [
@@ -218,18 +233,18 @@ def native(
     function: Callable[..., Any],
     *args: Any,
     unroll: int | None = UNROLL,
-    flags: tuple[str, ...] = FLAGS,
+    engine: Engine = by_compiler,
 ) -> Native:
-    """Trace a function with arguments, compile its program, and give it back as a function.
+    """Trace a function with arguments, and give its program back as a function.
 
     Args:
         function: a pure function of JAX.
         args: arguments of the shapes and types that it will be given.
         unroll: as in `trace`.
-        flags: for the compiler.
+        engine: `by_compiler`, or `step_of_one` of the machine.
 
     Raises:
         ProgramError: the function does something that has no place in a program.
         BuildError: there is no compiler, or it refuses the program.
     """
-    return Native(trace(function, *args, unroll=unroll), flags)
+    return Native(trace(function, *args, unroll=unroll), engine)

@@ -6,8 +6,8 @@ typedef struct {
     int64_t runs;    /* how many are there: what others give is not kept */
     int64_t run;     /* bytes from one run to the next, 0 where all share one */
     int64_t round;   /* bytes from one round to the next */
-    int32_t size;    /* numbers in a round */
-    int32_t kind;    /* 0 double, 1 flag of a byte, 2 int32, 3 int64, 4 uint32, 5 uint64 */
+    int64_t size;    /* numbers in a round */
+    int64_t kind;    /* 0 double, 1 flag of a byte, 2 int32, 3 int64, 4 uint32, 5 uint64 */
 } rows;
 
 /* Rounds that are taken and given together: from the runs, which lie far from each other, into
@@ -83,19 +83,18 @@ static void give(const rows *a, int64_t run, int active, span s, const Real *y, 
 #define EACH_ARRAY(what, count, arrays, span, x, reals, k, others)                         \
     for (int j = 0, r = 0, o = 0; j < (count); ++j) {                                      \
         what<RUNS>(&(arrays)[j], run, active, span, (x) + r, reals, (k) + o, others);               \
-        if ((arrays)[j].kind == 0) { r += (arrays)[j].size; } else { o += (arrays)[j].size; } \
+        if ((arrays)[j].kind == 0) { r += (int)(arrays)[j].size; } else { o += (int)(arrays)[j].size; } \
     }
 
-static void counted(const rows *a, int count, int *reals, int *others)
+static void counted(const rows *a, int64_t count, int *reals, int *others)
 {
     *reals = *others = 0;
-    for (int j = 0; j < count; ++j) { *(a[j].kind == 0 ? reals : others) += a[j].size; }
+    for (int j = 0; j < count; ++j) { *(a[j].kind == 0 ? reals : others) += (int)a[j].size; }
 }
 
-/* What a scan is told: arrays in and out (carried, fixed, taken; carried, given), and their counts. */
+/* A scan: arrays in and out (carried, fixed, taken; carried, given), and their counts. */
 typedef struct {
-    int64_t runs, rounds;
-    int32_t backwards, carried, fixed, taken, given;
+    int64_t runs, rounds, backwards, carried, fixed, taken, given;
     const rows *in, *out;
 } scan;
 

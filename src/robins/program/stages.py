@@ -1,4 +1,4 @@
-"""A function of one run, for many: its loops in lanes, all else as batches of JAX.
+"""A function of one run, for many: its loops as programs, all else as batches of JAX.
 
 The jaxpr of the function is cut into *stages*: what goes along one axis is a loop
 (`robins.program.loops`), what lies between loops is a batch. What depends on no run is computed
@@ -18,7 +18,7 @@ from jax import lax
 from jax.extend import core as jex
 
 from robins.program.kinds import is_key
-from robins.program.lanes import Given, Rounds, zero_in_all
+from robins.program.lanes import Given, Rounds, Scan, lanes_of, zero_in_all
 from robins.program.liveness import (
     Touched,
     bytes_of,
@@ -39,8 +39,9 @@ from robins.program.loops import (
 )
 from robins.program.primitives.control import called
 from robins.program.refusal import BuildError, ProgramError
-from robins.program.trace import lasting
+from robins.program.trace import Program, lasting
 
+Engine = Callable[[Program], tuple[Scan, int]]
 WORTH = 5_000  # operations of a loop that is worth a program
 FEWEST = 8  # equations without a scan or random numbers that are
 FOLDED = 2_000  # numbers of a known array that becomes part of a program
@@ -170,15 +171,15 @@ class Batch:
 
 
 class Loop:
-    """Equations along one axis: rounds in lanes, or JAX if they have no place there.
+    """Equations along one axis: rounds of a program, or JAX if they have no place in one.
 
     Attributes:
         equations: in an order of computation.
-        refused: why they are not in lanes.
+        refused: why they are no program.
     """
 
-    def __init__(self, axis: Along):
-        self.axis = axis
+    def __init__(self, axis: Along, engine: Engine):
+        self.axis, self._engine = axis, engine
         self.equations: list[Any] = []
         self.refused: ProgramError | BuildError | None = None
         self.rounds: Rounds | None = None
@@ -204,15 +205,15 @@ class Loop:
 
         def given(v: Any) -> Given:
             if isinstance(v, jex.Literal):
-                return Given(number_of(v), False)
-            return Given(values[v], v in self._batched)
+                return number_of(v), False
+            return values[v], v in self._batched
 
         known = {
             v: np.asarray(values[v])
             for v in body.stays
             if v not in self._batched and foldable(values[v], FOLDED)
         }
-        begin = [Given(np.zeros((), np.int64), False), *map(given, body.begin)]
+        begin = [(np.zeros((), np.int64), False), *map(given, body.begin)]
         with self._lock:  # of the threads that come first, one compiles
             self._compile(known, begin)
             rounds = self.rounds
@@ -230,7 +231,9 @@ class Loop:
             (program,) = lasting(lambda some: [body.program(known, some, self._unroll)], zeros)
             stays = len(body.stays) - len(known)
             axis = self.axis
-            self.rounds = Rounds(program, axis.length, len(begin), stays, axis.backwards)
+            self.rounds = Rounds(
+                program, axis.length, len(begin), stays, axis.backwards, self._engine
+            )
         except (ProgramError, BuildError) as error:
             self.refused = error
             self._by_jax = Batch(self.equations)
@@ -253,6 +256,7 @@ class Staged:
         *shapes: Any,
         unroll: int | None = UNROLL,
         named: bool = False,
+        engine: Engine = lanes_of,
     ):
         """Cut a function into stages; they are compiled when it is called.
 
@@ -262,6 +266,7 @@ class Staged:
             unroll: as in `robins.program.trace`.
             named: the function returns a pair, and the second is kept of the first run only: its
                 leading axis is one.
+            engine: of the rounds of loops: `lanes_of`, or `many_of` of the machine.
         """
         self._flat = flat = Flat(function, *shapes)
         self._of_all = flat.tree.children()[0].num_leaves if named else flat.tree.num_leaves
@@ -296,7 +301,7 @@ class Staged:
             if axis is None:
                 batches.setdefault(here, Batch()).equations.append(e)
                 continue
-            loops.setdefault((here, axis), Loop(axis)).equations.append(e)
+            loops.setdefault((here, axis), Loop(axis, engine)).equations.append(e)
             made = makes_rows(e)
             source.update((v, axis) for v in made)
             after.update(v for v in e.outvars if v not in source)

@@ -12,7 +12,6 @@ import ctypes
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -20,23 +19,11 @@ from robins.program.nodes import Loop, Node
 from robins.program.operations import KINDS
 from robins.program.trace import Leaf, Program
 
-class Tape(ctypes.Structure):
-    """A tape as `machine.cc` takes it."""
+CHANGES = ("keep", "move")  # instructions that change what is there
 
-    _fields_ = (
-        ("code", ctypes.c_void_p),
-        ("lists", ctypes.c_void_p),
-        ("constants", ctypes.c_void_p),
-        ("results", ctypes.c_void_p),
-        ("codes", ctypes.c_int64),
-        ("constant_count", ctypes.c_int64),
-        ("registers", ctypes.c_int64),
-        ("scratch", ctypes.c_int64),
-        ("nx", ctypes.c_int32),
-        ("nk", ctypes.c_int32),
-        ("ny", ctypes.c_int32),
-        ("nm", ctypes.c_int32),
-    )
+# A value that an instruction makes or reads: a node; or by name an argument, a constant, or what a
+# loop carries from round to round.
+Value = int | tuple
 
 
 @dataclass
@@ -44,7 +31,7 @@ class Instruction:
     """An operation before its registers are known.
 
     Attributes:
-        code: its name; empty where registers are only set aside.
+        code: its name; empty if registers are only set aside.
         result: a value.
         args: values.
         listed: values in a list, behind `numbers`.
@@ -53,36 +40,40 @@ class Instruction:
     """
 
     code: str
-    result: Any = None
-    args: tuple[Any, ...] = ()
-    listed: tuple[Any, ...] = ()
+    result: Value | None = None
+    args: tuple[Value, ...] = ()
+    listed: tuple[Value, ...] = ()
     numbers: tuple[int, ...] = ()
     count: int = 1
 
     @property
-    def read(self) -> list[Any]:
-        """The values that have to be there when it is carried out."""
-        changed = [self.result] if self.code in ("keep", "move") else []
+    def widens(self) -> bool:
+        """True if it reads words: they are half as wide as what is made of them."""
+        return self.code.startswith("word_") or self.code.endswith("_of_word")
+
+    @property
+    def read(self) -> list[Value]:
+        """Values that have to be there when it is carried out."""
+        changed = [self.result] if self.result is not None and self.code in CHANGES else []
         return [*self.args, *self.listed, *changed]
 
 
-@dataclass
-class _Loop:
-    """Where the instructions of a loop lie."""
-
-    parent: int
-    begin: int = 0
-    end: int = 0
-
-
 class Writer:
-    """Makes the instructions of one program."""
+    """Instructions of one program, and the loops in which they lie.
+
+    Attributes:
+        written: instructions.
+        given: values that are the results.
+        around: of each loop, by its scope, that around it.
+        spans: of each loop, by its scope, the first of its instructions and the one behind it.
+    """
 
     def __init__(self, program: Program):
         self.program, self.graph = program, program.graph
         self.written: list[Instruction] = []
-        self.loops: dict[int, _Loop] = {0: _Loop(-1)}
-        self.scope_of: dict[Any, int] = {}  # of a value, where it is written
+        self.around: dict[int, int] = {0: -1}
+        self.spans: dict[int, tuple[int, int]] = {}
+        self.scope_of: dict[Value, int] = {}  # of a value, where it is written
         live = program.live
         self.results = [n for nodes in program.outputs for n in nodes.ravel().tolist()]
         self.inner: dict[int, list[Node]] = defaultdict(list)
@@ -114,8 +105,16 @@ class Writer:
 
     # ------------------------------------------------------------------------------ instructions
 
-    def _write(self, code: str, result: Any, *args: Any, **more: Any) -> None:
-        self.written.append(Instruction(code, result, args, **more))
+    def _write(
+        self,
+        code: str,
+        result: Value | None,
+        *args: Value,
+        listed: tuple[Value, ...] = (),
+        numbers: tuple[int, ...] = (),
+        count: int = 1,
+    ) -> None:
+        self.written.append(Instruction(code, result, args, listed, numbers, count))
 
     def _scope(self, scope: int, only: set[Node]) -> None:
         products = set(self.joined.values())
@@ -140,9 +139,7 @@ class Writer:
             case "block":
                 routine, sizes, count = graph.value[node]
                 numbers = (*sizes, 0, 0, 0)[:3]
-                self._write(
-                    routine, node, listed=args, numbers=(*numbers, len(args)), count=count
-                )
+                self._write(routine, node, listed=args, numbers=(*numbers, len(args)), count=count)
             case "pick":
                 self._write(f"{graph.kind[node]}_pick", node, args[1], listed=graph.args[args[0]])
             case "select":
@@ -174,7 +171,7 @@ class Writer:
         else:
             self._write(f"{kind}_of_whole", node, raw)
 
-    def _as_whole(self, node: Node) -> Any:
+    def _as_whole(self, node: Node) -> Value:
         kind = self.graph.kind[node]
         if kind in ("real", "whole"):
             return node
@@ -189,7 +186,7 @@ class Writer:
         """Rounds: leaves begin, change at the end of a round, and stay after the last one."""
         graph, loop = self.graph, self.graph.value[node]
         s, around = loop.scope, self.graph.scope[node]
-        here = self.loops[s] = _Loop(around)
+        self.around[s] = around
         for k, n in enumerate(loop.begin):
             self.scope_of[s, k] = around
             self._write("move", (s, k), n)
@@ -197,7 +194,7 @@ class Writer:
             self.scope_of["kept", s, k] = around
             self._write("", ("kept", s, k), count=loop.count or 0)
         self._write("begin", None, numbers=(s,))
-        here.begin = len(self.written)
+        begin = len(self.written)
         self.scope_of["round", s] = s
         if any(graph.op[n] == "leaf" and graph.value[n] == (s, -1) for n in self.inner[s]):
             self._write("round", ("round", s), numbers=(s,))
@@ -209,30 +206,28 @@ class Writer:
             self._write("keep", ("kept", s, k), n, numbers=(s,))
         self._next(loop)
         most = 2**31 - 1 if loop.count is None else loop.count
-        self._write("again", None, numbers=(s, most, here.begin))
-        here.end = len(self.written)
+        self._write("again", None, numbers=(s, most, begin))
+        self.spans[s] = begin, len(self.written)
 
     def _next(self, loop: Loop) -> None:
         """The leaves of the next round, none written before it is read."""
         s = loop.scope
         changed = [k for k, n in enumerate(loop.next) if n != loop.leaves[k]]
-        new: dict[int, Any] = {}
+        new: dict[int, Value] = {}
         for k in changed:
             kind = self.graph.kind[loop.leaves[k]]
             self.scope_of["next", s, k] = s
             if loop.condition is None:
                 self._write("move", ("next", s, k), loop.next[k])
             else:
-                self._write(
-                    f"{kind}_select", ("next", s, k), loop.condition, loop.next[k], (s, k)
-                )
+                self._write(f"{kind}_select", ("next", s, k), loop.condition, loop.next[k], (s, k))
             new[k] = ("next", s, k)
         for k, value in new.items():
             self._write("move", (s, k), value)
 
     # ---------------------------------------------------------------------------------- registers
 
-    def place(self, value: Any) -> tuple[Any, int]:
+    def place(self, value: Value) -> tuple[Value, int]:
         """The value that holds another, and how many registers behind its first."""
         if isinstance(value, tuple):
             return value, 0
@@ -255,17 +250,17 @@ class Writer:
                 return ("raw", graph.value[value]), 0
         return value, 0
 
-    def last_uses(self) -> dict[Any, int]:
-        """Of each value, the instruction that reads it last; in a loop, the last of all rounds."""
-        last: dict[Any, int] = {}
+    def last_uses(self) -> dict[Value, int]:
+        """Instruction that reads a value last; in a loop that of all rounds."""
+        last: dict[Value, int] = {}
         scope = self._scopes()
         for at, one in enumerate(self.written):
             for value in one.read:
                 value, _ = self.place(value)
                 until, s = at, scope[at]
                 while s != self.scope_of.get(value, 0):
-                    until = max(until, self.loops[s].end - 1)
-                    s = self.loops[s].parent
+                    until = max(until, self.spans[s][1] - 1)
+                    s = self.around[s]
                 last[value] = max(last.get(value, 0), until)
         for value in self.given:
             last[self.place(value)[0]] = len(self.written)
@@ -274,50 +269,24 @@ class Writer:
     def depth(self, scope: int) -> int:
         """How many loops are around one: which counter of rounds it has."""
         found = 0
-        while (scope := self.loops[scope].parent) > 0:
+        while (scope := self.around[scope]) > 0:
             found += 1
         return found
 
     def _scopes(self) -> list[int]:
         """The loop in which each instruction lies."""
         found = [0] * len(self.written)
-        for s in sorted(self.loops):  # a later scope lies further in
-            if s:
-                here = self.loops[s]
-                found[here.begin : here.end] = [s] * (here.end - here.begin)
+        for s, (begin, end) in sorted(self.spans.items()):  # a later scope lies further in
+            found[begin:end] = [s] * (end - begin)
         return found
 
 
-class _Registers:
-    """Registers, given out to values and taken back after their last use."""
-
-    def __init__(self, first: int):
-        self.count = first
-        self.of: dict[Any, int] = {}
-        self._free: dict[int, list[int]] = defaultdict(list)  # by how many lie together
-        self._ends: dict[int, list[tuple[Any, int]]] = defaultdict(list)
-
-    def take(self, value: Any, count: int, until: int) -> None:
-        """Registers of a value, its until an instruction is carried out."""
-        if self._free[count]:
-            self.of[value] = self._free[count].pop()
-        else:
-            self.of[value] = self.count
-            self.count += count
-        self._ends[until].append((value, count))
-
-    def free(self, at: int) -> None:
-        """Take back what an instruction is the last to need."""
-        for value, count in self._ends.pop(at, ()):
-            self._free[count].append(self.of.pop(value))
-
-
-class Assembled:
+class Tape:
     """A program as a tape.
 
     Attributes:
         program: of scalars.
-        tape: its instructions; points to arrays of this object.
+        address: its fields, as `machine.cc` has them.
         instructions: how many.
         bytes: of these arrays.
     """
@@ -340,7 +309,10 @@ class Assembled:
             if isinstance(value, tuple) and value[0] == "constant":
                 bits = self._bits(*value[1:])
                 self._constants.setdefault(bits, nx + nk + len(self._constants))
-        self._registers = _Registers(nx + nk + len(self._constants))
+        self._count = nx + nk + len(self._constants)  # registers
+        self._of: dict[Value, int] = {}
+        self._free: dict[int, list[int]] = defaultdict(list)  # by how many lie together
+        self._ends: dict[int, list[tuple[Value, int]]] = defaultdict(list)
         self._rows: list[tuple[int, ...]] = []
         self._lists: list[int] = []
         self._scratch = 0
@@ -358,17 +330,12 @@ class Assembled:
         )
         self.instructions = len(self._rows)
         self.bytes = sum(a.nbytes for a in self._arrays)
-        self.tape = Tape(
-            *(ctypes.c_void_p(a.ctypes.data) for a in self._arrays),
-            len(self._rows),
-            len(pairs),
-            self._registers.count,
-            self._scratch,
-            *(nx, nk, ny, nm),
-        )
-        del self._writer, self._registers, self._rows, self._lists
+        sizes = len(self._rows), len(pairs), self._count, self._scratch, nx, nk, ny, nm
+        self._fields = np.array([*(a.ctypes.data for a in self._arrays), *sizes], np.int64)
+        self.address = address(self._fields)
+        del self._writer, self._rows, self._lists, self._of, self._free, self._ends
 
-    def _bits(self, kind: str, value: Any) -> int:
+    def _bits(self, kind: str, value: np.generic | int) -> int:
         """The 64 bits of a number in a register; a word fills both halves."""
         number = np.zeros(1, np.int64)
         if kind == "flag":
@@ -377,7 +344,7 @@ class Assembled:
             number.view(KINDS[kind])[:] = value
         return int(number[0])
 
-    def _register(self, value: Any) -> int:
+    def _register(self, value: Value) -> int:
         value, behind = self._writer.place(value)
         match value:
             case ("x", int(k)):
@@ -386,28 +353,30 @@ class Assembled:
                 return self._nx + k
             case ("constant", kind, number):
                 return self._constants[self._bits(kind, number)]
-        return self._registers.of[value] + behind
+        return self._of[value] + behind
 
     def _assemble(self) -> None:
         """Write all instructions; where jumps go is known in the end."""
-        writer, registers = self._writer, self._registers
+        writer = self._writer
         last, at_row = writer.last_uses(), [0] * (len(writer.written) + 1)
         jumps: list[tuple[int, int, int]] = []  # a row, a number of it, and an instruction
         for at, one in enumerate(writer.written):
             at_row[at] = len(self._rows)
             args = list(map(self._register, one.args))
             listed = list(map(self._register, one.listed))
-            registers.free(at)
+            if not one.widens:
+                self._free_after(at)
             result = 0
             if one.result is not None:
                 value, behind = writer.place(one.result)
-                if value not in registers.of:
-                    registers.take(value, one.count, max(last.get(value, 0), at + 1))
-                result = registers.of[value] + behind
+                if value not in self._of:
+                    self._take(value, one.count, max(last.get(value, 0), at + 1))
+                result = self._of[value] + behind
+            self._free_after(at)
             if one.code == "again":
                 jumps.append((len(self._rows), 3, one.numbers[2]))
             elif one.code == "leave_unless":
-                jumps.append((len(self._rows), 2, writer.loops[one.numbers[0]].end))
+                jumps.append((len(self._rows), 2, writer.spans[one.numbers[0]][1]))
             if one.code:
                 row = self._row(one, result, args, listed)
                 self._rows.append((self._codes[one.code], *(*row, 0, 0, 0)[:4]))
@@ -415,6 +384,20 @@ class Assembled:
         for row, k, to in jumps:
             numbers = self._rows[row]
             self._rows[row] = (*numbers[:k], at_row[to], *numbers[k + 1 :])
+
+    def _take(self, value: Value, count: int, until: int) -> None:
+        """Give registers to a value, until an instruction is carried out."""
+        if self._free[count]:
+            self._of[value] = self._free[count].pop()
+        else:
+            self._of[value] = self._count
+            self._count += count
+        self._ends[until].append((value, count))
+
+    def _free_after(self, at: int) -> None:
+        """Take back the registers that an instruction is the last to need."""
+        for value, count in self._ends.pop(at, ()):
+            self._free[count].append(self._of.pop(value))
 
     def _row(
         self, one: Instruction, result: int, args: Sequence[int], listed: Sequence[int]
@@ -443,3 +426,8 @@ def counts(leaves: Sequence[Leaf]) -> tuple[int, int]:
     """Reals and others of some arrays."""
     sizes = [(leaf.kind == "real", int(np.prod(leaf.shape))) for leaf in leaves]
     return sum(n for real, n in sizes if real), sum(n for real, n in sizes if not real)
+
+
+def address(array: np.ndarray) -> ctypes.c_void_p:
+    """Address of an array, for C."""
+    return ctypes.c_void_p(array.ctypes.data)

@@ -61,7 +61,7 @@ RIG = Rig(
     scenarios=packaged(__file__),
     options=lambda: {
         "table": (named(f"{__name__}.setup:Carrier") | None, None),
-        "machine": (Literal["jax", "c"], "jax"),
+        "machine": (Literal["jax", "vm", "c"], "jax"),
     },
     said=later(f"{__name__}.faults:said"),
     view=lambda: named(f"{__name__}.view:VIEW"),

@@ -62,16 +62,18 @@ class Kit(NamedTuple):
 
 
 def compiled(kit: Kit, function: Callable) -> Callable:
-    """A pure function as the parts of a run compute it: by JAX, or by C from its first call on."""
+    """A pure function as the parts of a run compute it: by JAX, or as a program."""
     if kit.machine == "jax":
         return jax.jit(function)
-    from robins.program import native  # what runs by JAX does not need it
+    # what runs by JAX does not need it
+    from robins.program import by_compiler, native, step_of_one
 
+    engine = by_compiler if kit.machine == "c" else step_of_one
     made: list[Callable] = []
 
     def call(*args: Any) -> Any:
         if not made:
-            made.append(native(function, *args))
+            made.append(native(function, *args, engine=engine))
         return made[0](*args)
 
     return call

@@ -24,7 +24,7 @@ def prepare(setup: Any, given: AttitudeLoop) -> Kit:
     Raises:
         ScenarioError: the filter has no place in a program of C.
     """
-    if setup.machine == "c" and (why := FILTERS[setup.filter].on_host):
+    if setup.machine != "jax" and (why := FILTERS[setup.filter].on_host):
         what = f"filter '{setup.filter}' cannot be a program: {why}"
         raise ScenarioError([f'machine: {what}; leave machine = "c" out, or choose another filter'])
     table = None if setup.table is None else setup.table.table()
