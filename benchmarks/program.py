@@ -3,9 +3,9 @@
 Nine states, three measurements, ``A x + 0.01 sin x`` with a full A, square-root form, complete
 steps with checks, codes and NIS; the EKF of `ins-gnss/drive` with 15 states, a second of inertial
 samples and two fixes a step; strapdown mechanisation alone. JAX steps a batch of 256 runs, and so
-does the machine, an interpreter; C steps one run, or as many as the processor has lanes. Beside them, for the filters that they have: C++
-with Eigen's matrices of fixed size (`benchmarks/cpp`), and filterpy. All on one core of this
-machine, in one go, in turn: time of the processor, the best of some rounds.
+does the machine, an interpreter; C steps one run, or as many as the processor has lanes. Beside
+them, for the filters that they have: C++ with Eigen's matrices of fixed size (`benchmarks/cpp`),
+and filterpy. All on one core, in one go, in turn: time of the processor, the best of some rounds.
 
     python benchmarks/program.py [EKF-9] [UKF-9] [H-infinity-9] [INS/GNSS-15] [strapdown]
 
