@@ -33,7 +33,7 @@ RESET = 147  # by the operator, before this step
 
 @pytest.fixture(scope="module")
 def of():
-    return kit("satellite/s1", "mekf", *SETTINGS)
+    return kit("satellite/s1", "mekf", *SETTINGS)._replace(machine="vm")
 
 
 @pytest.fixture(scope="module")

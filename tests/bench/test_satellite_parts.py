@@ -22,8 +22,8 @@ SHORT = "duration=60 s", "counted_from=10 s"
 
 @pytest.fixture
 def of():
-    """The numbers of a short run; its parts are compiled once."""
-    return kit("satellite/s1", "mekf", *SHORT)
+    """The numbers of a short run; its parts are programs that are interpreted."""
+    return kit("satellite/s1", "mekf", *SHORT)._replace(machine="vm")
 
 
 def bit(flags, text):
@@ -134,7 +134,7 @@ def test_a_gyro_that_stays_away_leads_to_safe_mode_and_back(of):
 
 def test_a_bank_begins_anew_with_all_its_modes():
     """A mode that kept its attitude of the start would pull the mixture back to it."""
-    of = kit("satellite/s1", "adaptive", *SHORT)
+    of = kit("satellite/s1", "adaptive", *SHORT)._replace(machine="vm")
     loop = Loop(of, without("gyro", "adm acm", range(50, 60))).run(120)
     safe = np.flatnonzero(bit(loop.flags(), FLAGS[3]))
     again = int(safe[-1]) + 1
@@ -165,9 +165,9 @@ def test_by_c_the_loop_is_the_same_to_rounding_and_comes_back_from_safe_mode(nam
     np.testing.assert_allclose(by_c.all("estimate", "q_ib")[:50], wanted, atol=1e-13)
 
 
-def test_a_camera_is_played_by_jax_when_the_rest_is_by_c():
+def test_a_camera_is_played_by_jax_when_the_rest_is_interpreted():
     settings = "duration=30 s", "counted_from=10 s", "star.camera.magnitude=5.0"
-    of = kit("satellite/stars", "mekf", *settings)._replace(machine="c")
+    of = kit("satellite/stars", "mekf", *settings)._replace(machine="vm")
     inside = one_program("satellite/stars", "mekf", *settings)
     found = Loop(of).run(40).all("estimate", "q_ib")
     np.testing.assert_allclose(found, inside["estimate.q_ib"][:40], atol=1e-12)
