@@ -7,16 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins.filters import FilterState, filter_step
-from robins.program import FLAGS, by_compiler, native, step_of_one
+from robins.program import FLAGS, compiled_step, interpreted_step, native
 
 # Compiled without optimisation: most programs of the tests are called once. The bits are the same.
 QUICK = tuple("-O0" if flag == "-O2" else flag for flag in FLAGS)
-quickly = partial(by_compiler, flags=QUICK)
+quickly = partial(compiled_step, flags=QUICK)
 
 
 def in_c(function, *args, unroll=None):
     """A function as a program on the machine, for arguments like these: its bits are those of C."""
-    return native(function, *args, unroll=unroll, engine=step_of_one)
+    return native(function, *args, unroll=unroll, engine=interpreted_step)
 
 
 def apart(want, got, size=None):

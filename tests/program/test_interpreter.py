@@ -1,4 +1,4 @@
-"""The machine: instructions with the bits of compiled C, for one run and for many."""
+"""The interpreter: instructions with the bits of compiled C, for one run and for many."""
 
 import inspect
 import itertools
@@ -10,9 +10,8 @@ import pytest
 from machines import quickly
 from test_lanes import FOUND, check, flat, in_one_round
 
-from robins.program import BuildError, Graph, Native, Program, step_of_one
-from robins.program import machine as machines
-from robins.program.machine import machine_of_many, machine_of_one
+from robins.program import BuildError, Graph, Native, Program, interpreted_step, interpreter
+from robins.program.interpreter import interpreter_of_many, interpreter_of_one
 from robins.program.operations import KINDS, OPERATIONS
 from robins.program.trace import Leaf
 
@@ -62,7 +61,7 @@ def every_instruction():
         counted[pool] += 1
         leaves.append(Leaf((), np.dtype(KINDS[kind]), kind, kind))
     a, b = given
-    made = [made_by(graph, code, a, b) for code in machine_of_one().codes]
+    made = [made_by(graph, code, a, b) for code in interpreter_of_one().codes]
     product = graph.apply("mul", a["real"], b["real"])
     made += [graph.apply("add", product, a["real"]), graph.apply("sub", b["real"], product)]
     made += [graph.apply("sub", graph.apply("mul", a["real"], a["real"]), b["real"])]
@@ -83,7 +82,7 @@ def test_each_instruction_has_the_bits_of_c():
         tuple(KINDS[k](GIVEN[k][rng.integers(len(GIVEN[k]))]) for k in KINDS for _ in "ab")
         for _ in range(130)
     ]
-    compiled, one = Native(program, quickly), Native(program, step_of_one)
+    compiled, one = Native(program, quickly), Native(program, interpreted_step)
     many = in_one_round(program, cases)
     for k, case in enumerate(cases):
         want = bits(compiled(*case))
@@ -93,8 +92,8 @@ def test_each_instruction_has_the_bits_of_c():
 
 
 def test_every_operation_is_an_instruction():
-    codes = machine_of_one().codes
-    assert codes == machine_of_many().codes
+    codes = interpreter_of_one().codes
+    assert codes == interpreter_of_many().codes
     assert {op for op in OPERATIONS if not any(f"{kind}_{op}" in codes for kind in KINDS)} == set()
 
 
@@ -120,10 +119,8 @@ def test_loops(unroll):
     check(loops, [(rng.uniform(1.0, 9.0, 3), np.int64(k)) for k in range(8)], unroll)
 
 
-def test_without_a_machine_and_without_a_compiler_it_is_an_error(monkeypatch, tmp_path):
-    monkeypatch.setattr(machines, "FOLDER", tmp_path)
+def test_without_a_compiler_to_build_it_with_it_is_an_error(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
-    machines._machine.cache_clear()
+    monkeypatch.setattr(interpreter, "_loaded", interpreter._loaded.__wrapped__)  # forgets none
     with pytest.raises(BuildError, match="install one"):
-        machine_of_one()
-    machines._machine.cache_clear()
+        interpreter_of_one()

@@ -11,9 +11,9 @@ from machines import quickly, stepping
 from rule_table import RULES, START, Y, line
 
 from robins.filters import kalman
-from robins.program import CPP, LANE_FLAGS, Native, build, function, header, step_of_one, trace
+from robins.program import CPP, LANE_FLAGS, Native, build, function, header, interpreted_step, trace
+from robins.program.interpreter import interpreted_rounds
 from robins.program.lanes import Rounds
-from robins.program.machine import many_of
 
 FOUND = any(map(shutil.which, CPP.names))
 pytestmark = pytest.mark.skipif(not FOUND, reason="lanes need a C++ compiler")
@@ -46,7 +46,7 @@ def check(step, cases, unroll=None):
     for lane, (reals, others) in enumerate(want):
         np.testing.assert_array_equal(y[:, lane], reals)
         np.testing.assert_array_equal(m[:, lane], others)
-    interpreted = Native(program, step_of_one)
+    interpreted = Native(program, interpreted_step)
     many = in_one_round(program, cases)
     for lane, (case, (reals, others)) in enumerate(zip(cases, want, strict=True)):
         for got in (jax.tree.leaves(interpreted(*case)), [a[lane, 0] for a in many]):
@@ -57,7 +57,7 @@ def check(step, cases, unroll=None):
 def in_one_round(program, cases):
     """The results of some runs at a time on the machine, with axes of runs and of one round."""
     given = [np.stack(rows) for rows in zip(*map(jax.tree.leaves, cases), strict=True)]
-    rounds = Rounds(program, 1, 0, len(given), engine=many_of)
+    rounds = Rounds(program, 1, 0, len(given), engine=interpreted_rounds)
     return rounds(len(cases), [(a, True) for a in given])
 
 

@@ -1,7 +1,7 @@
 """On what a campaign runs: batches of JAX, or programs on all cores, interpreted or compiled.
 
 All have the same random numbers and, to rounding, the same results; JAX is the reference. The two
-kinds of programs have the same bits. The interpreter (`robins.program.machine`) begins at once;
+kinds of programs have the same bits. The interpreter (`robins.program.interpreter`) begins at once;
 compiled lanes are twice as fast, and take from seconds to a minute for each problem, which is kept
 on this machine: they are chosen where JAX would take longer than that.
 """
@@ -48,8 +48,8 @@ from robins.campaign.monte_carlo import (
 )
 from robins.errors import RobinsError
 from robins.program import CPP, BuildError, compiler
-from robins.program.lanes import lanes_of
-from robins.program.machine import machine_of_many, many_of
+from robins.program.interpreter import interpreted_rounds, interpreter_of_many
+from robins.program.lanes import compiled_rounds
 from robins.program.stages import Staged
 from robins.systems.study import Problem
 
@@ -164,7 +164,7 @@ class InLanes:
 
     def __init__(self, problem: Problem, name: str = "c"):
         self.problem, self.name = problem, name
-        self._engine = many_of if name == "vm" else lanes_of
+        self._engine = interpreted_rounds if name == "vm" else compiled_rounds
         number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
         self._simulate = Staged(problem.simulate, number, engine=self._engine)
         self._world = jax.eval_shape(problem.simulate, number)
@@ -330,7 +330,7 @@ def check_machine(name: str) -> None:
     if name == "c":
         compiler(CPP)
     if name == "vm":
-        machine_of_many()
+        interpreter_of_many()
 
 
 def has_compiler() -> bool:

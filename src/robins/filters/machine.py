@@ -146,7 +146,7 @@ def on(
 
     Raises:
         ValueError: there is no machine of this name.
-        robins.program.BuildError: there is no C compiler.
+        robins.program.BuildError: there is no compiler of C, or for "vm" of C++.
         robins.program.ProgramError: the state holds numbers that have no place in a program.
     """
     if callable(machine):
@@ -155,12 +155,15 @@ def on(
     if machine == "jax":
         return JaxStepper(filter_, model, state)
     # Imported here: a filter needs neither programs nor a compiler.
-    from robins.program import NativeState, by_compiler, compiler, step_of_one
+    from robins.program import NativeState, compiled_step, compiler, interpreted_step
+    from robins.program.interpreter import interpreter_of_one
 
-    engine = step_of_one
+    engine = compiled_step
     if machine == "c":
         compiler()
-        engine = by_compiler
+    else:
+        interpreter_of_one()
+        engine = interpreted_step
     return ProgramStepper(filter_, model, state, partial(NativeState, engine=engine))
 
 

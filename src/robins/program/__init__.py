@@ -18,7 +18,7 @@ This room knows JAX and no filter: no filter, rule or system is written for it.
 """
 
 from robins.program.c import function, header, to_c
-from robins.program.machine import step_of_one
+from robins.program.interpreter import interpreted_step
 from robins.program.memory import NativeState
 from robins.program.native import (
     CPP,
@@ -26,7 +26,7 @@ from robins.program.native import (
     LANE_FLAGS,
     Native,
     build,
-    by_compiler,
+    compiled_step,
     compiler,
     native,
 )
@@ -50,12 +50,12 @@ __all__ = [
     "Program",
     "ProgramError",
     "build",
-    "by_compiler",
+    "compiled_step",
     "compiler",
     "function",
     "header",
+    "interpreted_step",
     "native",
-    "step_of_one",
     "to_c",
     "trace",
     "trace_step",

@@ -16,7 +16,7 @@ import numpy as np
 
 from robins.program.c import function, header
 from robins.program.kinds import array_of, is_key, numbers_of
-from robins.program.library import counts
+from robins.program.library import lengths
 from robins.program.native import CPP, LANE_FLAGS, build
 from robins.program.trace import Leaf, Program, positive_zeros
 
@@ -39,7 +39,7 @@ Given = tuple[np.ndarray | jax.Array, bool]  # an array, and whether it has a le
 Scan = Callable[[ctypes.c_void_p], int]  # a function of C that takes a `scan` of `scan.h`
 
 
-def lanes_of(program: Program) -> tuple[Scan, int]:
+def compiled_rounds(program: Program) -> tuple[Scan, int]:
     """Rounds of a program, compiled, and how many runs they take at a time.
 
     Raises:
@@ -64,7 +64,7 @@ class Rounds:
         carried: int,
         stays: int,
         backwards: bool = False,
-        engine: Callable[[Program], tuple[Scan, int]] = lanes_of,
+        engine: Callable[[Program], tuple[Scan, int]] = compiled_rounds,
     ):
         """Make them ready.
 
@@ -74,7 +74,7 @@ class Rounds:
             carried: so many of its first arguments, and of its first results, are carried.
             stays: so many after these are the same in all rounds.
             backwards: from the last row to the first.
-            engine: `lanes_of`, or `many_of` of the machine.
+            engine: `compiled_rounds`, or `interpreted_rounds`.
 
         Raises:
             BuildError: there is no compiler, or it refuses the program.
@@ -161,7 +161,7 @@ def _rows(a: np.ndarray, batched: bool, by_round: bool, leaf: Leaf) -> tuple[int
 
 def _text(program: Program) -> str:
     """The program for lanes, and the rounds around it."""
-    sizes = *counts(program.inputs), *counts(program.results)
+    sizes = *lengths(program.inputs), *lengths(program.results)
     names = ("NX", "NK", "NY", "NM")
     defined = "\n".join(f"#define {n} {size}" for n, size in zip(names, sizes, strict=True))
     rounds = (files("robins.program") / "scan.h").read_text("utf-8")

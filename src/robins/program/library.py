@@ -16,7 +16,7 @@ import numpy as np
 
 from robins.program.c import function, header, part
 from robins.program.precision import DOUBLE, Precision
-from robins.program.trace import Leaf, Program
+from robins.program.trace import Leaf, Program, counts
 from robins.program.wrap import COLUMNS, wrapped
 
 EXTERN_C = '#ifdef __cplusplus\nextern "C" {\n#endif', "#ifdef __cplusplus\n}\n#endif"
@@ -238,7 +238,7 @@ class Library(NamedTuple):
     def _entry(self, entry: Entry) -> list[str]:
         program, lines = entry.program, [self.signature(entry), "{"]
         # The program writes its results last, so that they may lie where the arguments do.
-        sizes = zip(counts(program.inputs), counts(program.results), strict=True)
+        sizes = zip(lengths(program.inputs), lengths(program.results), strict=True)
         reals, others = (max(pair) for pair in sizes)
         lines += [f"    real x[{reals}];", f"    whole k[{others}];"]
         lines += _copied(self.state, "state", "x", "k", inwards=True)
@@ -266,12 +266,10 @@ def _within(comment: str) -> str:
     return comment.replace("*/", "* /").replace("/*", "/ *")
 
 
-def counts(leaves: Sequence[Leaf]) -> tuple[int, int]:
-    """How many reals, and how many other numbers; one at least of each, for an array in C."""
-    sizes = {True: 0, False: 0}
-    for leaf in leaves:
-        sizes[leaf.kind == "real"] += int(np.prod(leaf.shape))
-    return max(sizes[True], 1), max(sizes[False], 1)
+def lengths(leaves: Sequence[Leaf]) -> tuple[int, int]:
+    """Lengths of the arrays of C for reals and for all other numbers: one at least."""
+    reals, others = counts(leaves)
+    return max(reals, 1), max(others, 1)
 
 
 def number(value: Any, real: bool, precision: Precision = DOUBLE) -> str:

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from robins.program.interpreter import interpreted_step
 from robins.program.kinds import kind_of
-from robins.program.machine import step_of_one
 from robins.program.native import Engine, Step
 from robins.program.refusal import ProgramError
 from robins.program.trace import Leaf, Program, trace
@@ -148,7 +148,7 @@ class NativeState:
         self,
         state: Any,
         content: Hashable,
-        engine: Engine = step_of_one,
+        engine: Engine = interpreted_step,
         unroll: int | None = LIVE_UNROLL,
     ):
         """Take a state.
@@ -157,7 +157,7 @@ class NativeState:
             state: a pytree of arrays.
             content: what the functions hold, by which those of equal names are told apart in this
                 process.
-            engine: what makes steps of programs: `step_of_one` of the machine, or `by_compiler`.
+            engine: what makes steps of programs: `interpreted_step`, or `compiled_step`.
             unroll: as in `trace`.
 
         Raises:

@@ -41,8 +41,11 @@ FASTER_IN_GCC = (
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", *FASTER)
 # Lanes are as wide as the processor that compiles them.
 LANE_FLAGS = ("-std=gnu++17", "-march=native", "-Wno-psabi", *FLAGS[1:])
-# The operators `and`, `or` and `not` are names of functions in the machine.
-MACHINE_FLAGS = ("-std=gnu++17", "-Wno-psabi", "-fno-operator-names", *FLAGS[1:])
+# In the interpreter `and`, `or` and `not` are parts of names, and a register holds all kinds.
+INTERPRETER_FLAGS = (
+    *("-std=gnu++17", "-Wno-psabi", "-fno-operator-names", "-fno-strict-aliasing"),
+    *FLAGS[1:],
+)
 NO_COMPILER = (
     "install one (Debian: `apt install g++`; anywhere: `pip install 'robins[compiler]'`), "
     "or name it in CC (of C++: CXX)"
@@ -148,7 +151,7 @@ Step = Callable[..., Any]  # of addresses (x, k, y, m), as `robins.program.c.fun
 Engine = Callable[[Program], Callable[[], Step]]  # each step has memory of its own
 
 
-def by_compiler(program: Program, flags: tuple[str, ...] = FLAGS) -> Callable[[], Step]:
+def compiled_step(program: Program, flags: tuple[str, ...] = FLAGS) -> Callable[[], Step]:
     """Steps of a program as the C compiler compiles it.
 
     Raises:
@@ -166,7 +169,7 @@ class Native:
     filter millions of times calls `address` from C.
     """
 
-    def __init__(self, program: Program, engine: Engine = by_compiler):
+    def __init__(self, program: Program, engine: Engine = compiled_step):
         self.program = program
         self._step = engine(program)()
         self._x, self._k, self._given = _laid_out(program.inputs)
@@ -176,7 +179,7 @@ class Native:
             for k, mask in program.zeros.items()
             if mask.any()
         ]
-        self._buffers = [_pointer(a) for a in (self._x, self._k, self._y, self._m)]
+        self._buffers = [address(a) for a in (self._x, self._k, self._y, self._m)]
 
     def __call__(self, *args: Any) -> Any:
         """The function on pytrees of numbers.
@@ -211,7 +214,8 @@ class Native:
         return jax.tree_util.tree_unflatten(self.program.structure[1], made)
 
 
-def _pointer(array: np.ndarray) -> ctypes.c_void_p:
+def address(array: np.ndarray) -> ctypes.c_void_p:
+    """Address of an array, for C."""
     return ctypes.c_void_p(array.ctypes.data)
 
 
@@ -233,7 +237,7 @@ def native(
     function: Callable[..., Any],
     *args: Any,
     unroll: int | None = UNROLL,
-    engine: Engine = by_compiler,
+    engine: Engine = compiled_step,
 ) -> Native:
     """Trace a function with arguments, and give its program back as a function.
 
@@ -241,7 +245,7 @@ def native(
         function: a pure function of JAX.
         args: arguments of the shapes and types that it will be given.
         unroll: as in `trace`.
-        engine: `by_compiler`, or `step_of_one` of the machine.
+        engine: `compiled_step`, or `interpreted_step`.
 
     Raises:
         ProgramError: the function does something that has no place in a program.

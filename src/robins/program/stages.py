@@ -18,7 +18,7 @@ from jax import lax
 from jax.extend import core as jex
 
 from robins.program.kinds import is_key
-from robins.program.lanes import Given, Rounds, Scan, lanes_of, zero_in_all
+from robins.program.lanes import Given, Rounds, Scan, compiled_rounds, zero_in_all
 from robins.program.liveness import (
     Touched,
     bytes_of,
@@ -256,7 +256,7 @@ class Staged:
         *shapes: Any,
         unroll: int | None = UNROLL,
         named: bool = False,
-        engine: Engine = lanes_of,
+        engine: Engine = compiled_rounds,
     ):
         """Cut a function into stages; they are compiled when it is called.
 
@@ -266,7 +266,7 @@ class Staged:
             unroll: as in `robins.program.trace`.
             named: the function returns a pair, and the second is kept of the first run only: its
                 leading axis is one.
-            engine: of the rounds of loops: `lanes_of`, or `many_of` of the machine.
+            engine: of the rounds of loops: `compiled_rounds`, or `interpreted_rounds`.
         """
         self._flat = flat = Flat(function, *shapes)
         self._of_all = flat.tree.children()[0].num_leaves if named else flat.tree.num_leaves

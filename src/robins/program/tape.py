@@ -1,4 +1,4 @@
-"""A program as a tape: the instructions of the machine (`machine.cc`), made without a compiler.
+"""A program as a tape: the instructions of the interpreter (`interpreter.cc`).
 
 An instruction is one operation, its result a register, and up to three arguments. Nodes become
 instructions in the order of computation, scope by scope; registers are given out by linear scan
@@ -8,17 +8,19 @@ reads is part of that instruction; both are rounded.
 
 from __future__ import annotations
 
-import ctypes
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from robins.program.native import address
 from robins.program.nodes import Loop, Node
 from robins.program.operations import KINDS
-from robins.program.trace import Leaf, Program
+from robins.program.refusal import ProgramError
+from robins.program.trace import Program, counts
 
+DEEPEST = 16  # loops in each other: the interpreter has so many counters of rounds
 CHANGES = ("keep", "move")  # instructions that change what is there
 
 # A value that an instruction makes or reads: a node; or by name an argument, a constant, or what a
@@ -187,6 +189,8 @@ class Writer:
         graph, loop = self.graph, self.graph.value[node]
         s, around = loop.scope, self.graph.scope[node]
         self.around[s] = around
+        if self.depth(s) >= DEEPEST:
+            raise ProgramError(f"more than {DEEPEST} loops in each other", "", "use --machine c")
         for k, n in enumerate(loop.begin):
             self.scope_of[s, k] = around
             self._write("move", (s, k), n)
@@ -267,7 +271,7 @@ class Writer:
         return last
 
     def depth(self, scope: int) -> int:
-        """How many loops are around one: which counter of rounds it has."""
+        """Number of loops around one, and so of its counter of rounds."""
         found = 0
         while (scope := self.around[scope]) > 0:
             found += 1
@@ -285,10 +289,7 @@ class Tape:
     """A program as a tape.
 
     Attributes:
-        program: of scalars.
-        address: its fields, as `machine.cc` has them.
-        instructions: how many.
-        bytes: of these arrays.
+        address: its fields, as `interpreter.cc` has them.
     """
 
     def __init__(self, program: Program, codes: Mapping[str, int], flag: int):
@@ -296,10 +297,10 @@ class Tape:
 
         Args:
             program: of scalars.
-            codes: the machine's instructions, by name.
+            codes: numbers of the instructions, by name.
             flag: a flag that is set: 1, or -1 where flags are masks.
         """
-        self.program, self._codes, self._flag = program, codes, flag
+        self._codes, self._flag = codes, flag
         self._writer = writer = Writer(program)
         (nx, nk), (ny, nm) = counts(program.inputs), counts(program.results)
         self._nx = nx
@@ -328,8 +329,6 @@ class Tape:
             np.array(pairs, np.int64).reshape(-1, 2),
             np.array(ordered, np.int32),
         )
-        self.instructions = len(self._rows)
-        self.bytes = sum(a.nbytes for a in self._arrays)
         sizes = len(self._rows), len(pairs), self._count, self._scratch, nx, nk, ny, nm
         self._fields = np.array([*(a.ctypes.data for a in self._arrays), *sizes], np.int64)
         self.address = address(self._fields)
@@ -420,14 +419,3 @@ class Tape:
             return result, begin, args[0]
         self._scratch = max(self._scratch, len(listed) + one.count)
         return result, begin, one.count
-
-
-def counts(leaves: Sequence[Leaf]) -> tuple[int, int]:
-    """Reals and others of some arrays."""
-    sizes = [(leaf.kind == "real", int(np.prod(leaf.shape))) for leaf in leaves]
-    return sum(n for real, n in sizes if real), sum(n for real, n in sizes if not real)
-
-
-def address(array: np.ndarray) -> ctypes.c_void_p:
-    """Address of an array, for C."""
-    return ctypes.c_void_p(array.ctypes.data)

@@ -59,6 +59,14 @@ class Leaf:
     path: str
 
 
+def counts(leaves: Sequence[Leaf]) -> tuple[int, int]:
+    """Number of reals, and of all other numbers, of some arrays."""
+    sizes = {True: 0, False: 0}
+    for leaf in leaves:
+        sizes[leaf.kind == "real"] += int(np.prod(leaf.shape))
+    return sizes[True], sizes[False]
+
+
 @dataclass(frozen=True)
 class Program:
     """A function as scalars.

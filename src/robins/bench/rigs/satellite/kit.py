@@ -66,9 +66,9 @@ def compiled(kit: Kit, function: Callable) -> Callable:
     if kit.machine == "jax":
         return jax.jit(function)
     # what runs by JAX does not need it
-    from robins.program import by_compiler, native, step_of_one
+    from robins.program import compiled_step, interpreted_step, native
 
-    engine = by_compiler if kit.machine == "c" else step_of_one
+    engine = compiled_step if kit.machine == "c" else interpreted_step
     made: list[Callable] = []
 
     def call(*args: Any) -> Any:

@@ -26,7 +26,8 @@ def prepare(setup: Any, given: AttitudeLoop) -> Kit:
     """
     if setup.machine != "jax" and (why := FILTERS[setup.filter].on_host):
         what = f"filter '{setup.filter}' cannot be a program: {why}"
-        raise ScenarioError([f'machine: {what}; leave machine = "c" out, or choose another filter'])
+        fix = f'leave machine = "{setup.machine}" out, or choose another filter'
+        raise ScenarioError([f"machine: {what}; {fix}"])
     table = None if setup.table is None else setup.table.table()
     return kit_for(given, setup.filter, setup.seed, table=table)._replace(machine=setup.machine)
 

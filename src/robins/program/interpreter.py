@@ -1,0 +1,123 @@
+"""Programs of scalars carried out by an interpreter, without compiling them.
+
+The interpreter itself (`interpreter.cc`) is compiled once, when it is first used, which takes some
+seconds, and kept in the user's cache: for one run at a time, or for many on this processor.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from robins.program.c import part
+from robins.program.lanes import Scan
+from robins.program.native import CPP, INTERPRETER_FLAGS, Step, address, build
+from robins.program.tape import Tape
+from robins.program.trace import Program
+
+ONE = "one"  # for one run at a time
+# Flags for processors, by `robins_generation`.
+GENERATIONS = {0: (), 1: ("-march=x86-64",), 3: ("-march=x86-64-v3",), 4: ("-march=x86-64-v4",)}
+
+
+class Interpreter:
+    """An interpreter.
+
+    Attributes:
+        library: its functions.
+        width: runs at a time.
+        codes: numbers of instructions, by name.
+        flag: a flag that is set, which for many runs is a mask.
+    """
+
+    def __init__(self, path: Path):
+        """Load it from a library."""
+        self.library = ctypes.CDLL(str(path))
+        self.library.robins_codes.restype = ctypes.c_char_p
+        self.library.robins_bytes.restype = ctypes.c_int64
+        names = self.library.robins_codes().decode().rstrip(",").split(",")
+        self.codes = {name: code for code, name in enumerate(names)}
+        self.width = self.library.robins_width()
+        self.flag = 1 if self.width == 1 else -1
+
+    def tape(self, program: Program) -> Tape:
+        """Translate a program."""
+        return Tape(program, self.codes, self.flag)
+
+    def registers(self, tape: Tape) -> np.ndarray:
+        """Memory in which a tape computes, with its constants; one thread at a time may use it."""
+        size = self.library.robins_bytes(tape.address) // 8
+        memory = np.zeros(size + 8, np.int64)
+        aligned = memory[-memory.ctypes.data % 64 // 8 :]
+        self.library.robins_prepare(tape.address, address(aligned))
+        return aligned
+
+
+def interpreter_of_one() -> Interpreter:
+    """Load the interpreter of one run.
+
+    Raises:
+        BuildError: it is not in the cache, and there is no compiler to build it.
+    """
+    return _loaded(ONE)
+
+
+def interpreter_of_many() -> Interpreter:
+    """Load the interpreter of many runs at a time, for this processor.
+
+    Raises:
+        BuildError: it is not in the cache, and there is no compiler to build it.
+    """
+    return _loaded(str(interpreter_of_one().library.robins_generation()))
+
+
+@lru_cache
+def _loaded(kind: str) -> Interpreter:
+    flags = ("-DONE_RUN",) if kind == ONE else GENERATIONS[int(kind)]
+    return Interpreter(build(text("interpreter.cc"), (*INTERPRETER_FLAGS, *flags), CPP))
+
+
+def text(name: str) -> str:
+    """Text of a file of C of this room, with those that it includes."""
+    return re.sub(r'^#include "(.*)"$', lambda found: text(found[1]), part(name), flags=re.M)
+
+
+def interpreted_step(program: Program) -> Callable[[], Step]:
+    """Steps of a program by the interpreter; each has registers of its own.
+
+    Raises:
+        BuildError: as for `interpreter_of_one`.
+    """
+    interpreter = interpreter_of_one()
+    tape = interpreter.tape(program)
+
+    def step() -> Step:
+        registers = interpreter.registers(tape)
+
+        def call(*pointers: ctypes.c_void_p) -> None:
+            interpreter.library.robins_step(tape.address, address(registers), *pointers)
+
+        return call
+
+    return step
+
+
+def interpreted_rounds(program: Program) -> tuple[Scan, int]:
+    """Rounds of a program by the interpreter, and how many runs it takes at a time.
+
+    Raises:
+        BuildError: as for `interpreter_of_many`.
+    """
+    interpreter = interpreter_of_many()
+    tape = interpreter.tape(program)
+
+    def scan(rounds: ctypes.c_void_p) -> int:
+        registers = interpreter.registers(tape)
+        return interpreter.library.robins_scan(rounds, tape.address, address(registers))
+
+    return scan, interpreter.width
