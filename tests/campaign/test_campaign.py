@@ -277,7 +277,7 @@ def test_filters_that_differ_in_numbers_share_what_was_compiled(problem):
     models = [_model(sigma, move=moved) for sigma in (1.0, 2.0)]
     pair = replace(problem, contenders={str(i): Contender(step, m) for i, m in enumerate(models)})
     before = monte_carlo._records._cache_size()
-    simulate(pair, 3, chunk=4)
+    simulate(pair, 3, chunk=4, machine="jax")
     assert monte_carlo._records._cache_size() == before + 1
 
 

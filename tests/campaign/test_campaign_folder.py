@@ -14,7 +14,6 @@ import jax
 import numpy as np
 import pytest
 
-from robins.campaign import machine as machines
 from robins.campaign import plan as plans
 from robins.campaign import simulate
 from robins.campaign.gather import gather
@@ -28,7 +27,6 @@ from robins.cli import main
 from robins.errors import RobinsError
 from robins.program import CPP, LANE_FLAGS
 from robins.results import Outcome
-from robins.workbench import simulated
 from robins.workbench import workers as work
 from robins.workbench.campaigns import (
     campaign_report,
@@ -91,25 +89,6 @@ def test_any_number_of_workers_make_one_table(undisturbed, tmp_path, workers):
 def test_one_more_worker_finds_nothing_to_do(undisturbed, capsys):
     assert main(["campaign", "work", str(undisturbed), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["done"] == 14
-
-
-def test_a_long_run_by_jax_has_a_process_for_each_core(monkeypatch):
-    asked = {"runs": 100, "filters": ("kf",), "settings": SHORT, "machine": "jax"}
-    alone = simulated.run(BALLOON, **asked)
-    filled = []
-
-    def fill(where, campaigns, workers, progress):
-        filled.append(workers)
-        work_here(where)
-
-    monkeypatch.setattr(machines, "PAYS", -1.0)  # it is so small that it takes no time
-    monkeypatch.setattr(machines, "available_cores", lambda: 2)
-    monkeypatch.setattr(work, "fill", fill)
-    spread = simulated.run(BALLOON, **asked)
-    assert len(filled) == 1
-    assert spread.metrics == alone.metrics
-    assert spread.claims == alone.claims
-    assert (spread.scenario, spread.runs) == (alone.scenario, alone.runs)
 
 
 def test_what_was_claimed_by_the_dead_is_computed(undisturbed, tmp_path, monkeypatch):

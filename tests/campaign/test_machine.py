@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from test_campaign import problem as three  # noqa: F401 a fixture
 
+from robins.campaign import handover, simulate
 from robins.campaign import machine as machines
-from robins.campaign import simulate
 from robins.campaign.machine import ByJax, InLanes, machine_for
 from robins.errors import RobinsError
 from robins.filters import Belief
-from robins.program import CPP, LANE_FLAGS
+from robins.program import CPP, LANE_FLAGS, BuildError
 
 FOUND = any(map(shutil.which, CPP.names))
 needs_compiler = pytest.mark.skipif(not FOUND, reason="lanes need a C++ compiler")
@@ -73,23 +73,64 @@ def test_a_failure_in_a_chunk_comes_out(problem, monkeypatch):
         list(lanes.chunks(RUNS, 8))
 
 
-def test_lanes_are_chosen_where_they_pay(problem, monkeypatch):
-    assert isinstance(machine_for(problem, 50), ByJax)
-    monkeypatch.setattr(machines, "PAYS", 0.0)
-    assert isinstance(machine_for(problem, 50), ByJax)  # nobody asks
-    assert isinstance(machine_for(problem, 500), InLanes if FOUND else ByJax)
-    monkeypatch.setattr(machines, "PAYS", 1e3)
-    assert isinstance(machine_for(problem, 500), ByJax)
+def test_what_computes_is_the_interpreter_where_it_can_be(problem, monkeypatch):
+    assert machine_for(problem).name == ("vm" if FOUND else "jax")
+    for name in machines.MACHINES:
+        if FOUND or name == "jax":
+            assert machine_for(problem, name).name == name
+
+    def missing():
+        raise BuildError("there is no C compiler on this machine")
+
+    monkeypatch.setattr(machines, "interpreter_of_many", missing)
+    by = machine_for(problem)
+    assert isinstance(by, ByJax)
+    by.width(9)
+    (note,) = by.notes
+    assert "JAX computed" in note
+    assert "no C compiler" in note
+    with pytest.raises(RobinsError, match="no C compiler"):
+        machine_for(problem, "vm")
     monkeypatch.setenv("CXX", "no-such-compiler")
-    monkeypatch.setattr(machines, "PAYS", 0.0)
-    assert isinstance(machine_for(problem, 500), ByJax)
     with pytest.raises(RobinsError, match="no-such-compiler"):
-        machine_for(problem, 500, "c")
+        machine_for(problem, "c")
+
+
+@needs_compiler
+def test_a_long_campaign_goes_over_to_compiled_lanes_with_the_same_bits(problem, monkeypatch):
+    want = simulate(problem, 80, 8, machine="vm")
+    for name in ("LOOP_S", "NODE_S"):
+        monkeypatch.setattr(handover, name, 0.0)
+    monkeypatch.setattr(machines, "available_cores", lambda: 1)
+    lanes = InLanes(problem)
+    by, scans = lanes._hand_over, []
+    took = by.took
+
+    def taken(*of):
+        took(*of)
+        if by.compiling is not None:
+            by.compiling.join()
+        scans.append([loop.rounds.lanes for loop in by._loops])
+
+    monkeypatch.setattr(by, "took", taken)
+    found = simulate(problem, 80, 8, machine=lanes)
+    assert found.solution.identical(want.solution)
+    assert found.machine == "vm"
+    assert len(scans) == 9
+    assert scans[0] == [64] * len(scans[0])  # the first does not judge
+    assert all(lanes < 64 for lanes in scans[-1])
+
+
+def test_compiling_has_to_pay(problem):
+    by = InLanes(problem)._hand_over
+    for left in (10_000_000, 1, 0):  # the first may have traced, the others are too few
+        by.took(8, 1e-3, left)
+    assert by.compiling is None
 
 
 def test_a_machine_that_is_not_there_is_refused(problem):
-    with pytest.raises(RobinsError, match=r"no machine 'cuda'.*say jax, vm or c"):
-        machine_for(problem, 1, "cuda")
+    with pytest.raises(RobinsError, match=r"no machine 'cuda'.*say vm, c or jax"):
+        machine_for(problem, "cuda")
 
 
 @needs_compiler

@@ -29,7 +29,7 @@ def diverging():
     """Some runs diverge."""
     compute = ByJax.compute
 
-    def broken(self, part, names, taken=whole):
+    def broken(self, part, names, taken=whole, left=0):
         def taken_of(name, record):
             error = record["error"].copy()
             for lost in LOST:
@@ -37,7 +37,7 @@ def diverging():
                     error[lost - part.begin, 3:] = np.nan
             return taken(name, record | {"error": error})
 
-        return compute(self, part, names, taken_of)
+        return compute(self, part, names, taken_of, left)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ByJax, "compute", broken)

@@ -230,9 +230,9 @@ def test_in_a_batch_each_run_has_its_own_gain():
 
 def test_it_is_refused_where_no_python_is(tmp_path):
     p, c, (case, _) = prepared()
-    assert isinstance(machine_for(p, 1000), ByJax)
+    assert isinstance(machine_for(p), ByJax)
     with pytest.raises(RobinsError, match=rf"--machine c: filter '{NAME}' .* an LMI in Python"):
-        machine_for(p, 1, "c")
+        machine_for(p, "c")
     with pytest.raises(InputError, match=rf"filter '{NAME}' cannot be exported: it solves an LMI"):
         export_filter("satellite/s1", tmp_path / "out", filter_name=NAME, settings=SHORT)
     assert not (tmp_path / "out").exists()

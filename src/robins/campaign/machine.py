@@ -1,9 +1,9 @@
-"""On what a campaign runs: batches of JAX, or programs on all cores, interpreted or compiled.
+"""On what a campaign runs: programs on all cores, interpreted or compiled, or batches of JAX.
 
 All have the same random numbers and, to rounding, the same results; JAX is the reference. The two
-kinds of programs have the same bits. The interpreter (`robins.program.interpreter`) begins at once;
-compiled lanes are twice as fast, and take from seconds to a minute for each problem, which is kept
-on this machine: they are chosen where JAX would take longer than that.
+kinds of programs have the same bits. The interpreter (`robins.program.interpreter`) begins at once
+and gives way to compiled lanes where a campaign is long enough (`robins.campaign.handover`). JAX
+computes what has no place in a program, and where there is no interpreter.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import partial
-from time import monotonic
+from time import monotonic, thread_time
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from robins.campaign.handover import HandOver
 from robins.campaign.memory import (
     CHUNK_BYTES,
     LEAST,
@@ -53,10 +54,7 @@ from robins.program.lanes import compiled_rounds
 from robins.program.stages import Staged
 from robins.systems.study import Problem
 
-MACHINES = ("jax", "vm", "c")
-PAYS = 60.0  # seconds of JAX on one core for which it pays to compile lanes
-FEWEST = 100  # runs of which this is asked
-NS = 0.5  # of JAX, for a scalar operation in a scan (measured: 0.4 to 0.8)
+MACHINES = ("vm", "c", "jax")
 BETWEEN_S = 1.0  # between two times that memory is given back
 COMPILERS = 3  # at once, beside that of the worlds: some take a gigabyte
 STACK = 1 << 28  # bytes of a thread's stack, on which lanes hold all that a step computes
@@ -85,9 +83,10 @@ class ByJax:
 
     name = "jax"
 
-    def __init__(self, problem: Problem):
+    def __init__(self, problem: Problem, why: Sequence[str] = ()):
+        """Trace nothing yet; why: notes on the choice of this machine."""
         self.problem = problem
-        self.notes: list[str] = []
+        self.notes = self._why = list(why)
         self._batch = batch_of(problem)
         self._programs: dict[str, Future[Any]] = {}  # being compiled
 
@@ -96,7 +95,7 @@ class ByJax:
         width = filled(runs)
         each = -(-bytes_of_batch(self.problem, self._batch, width) // width)
         width = min(width, width_of(each, MEMORY))
-        self.notes = said(each, width)
+        self.notes = [*self._why, *said(each, width)]
         return width
 
     def chunks(self, runs: int, chunk: int = 0, taken: Taken = whole) -> Iterator[Chunk]:
@@ -144,8 +143,10 @@ class ByJax:
             self._programs[name].result()  # which serves the call
         return taken(name, record(self.problem, name, held[0], count))
 
-    def compute(self, part: Part, names: Sequence[str], taken: Taken = whole) -> dict[str, Any]:
-        """What is kept of some filters over one chunk."""
+    def compute(
+        self, part: Part, names: Sequence[str], taken: Taken = whole, left: int = 0
+    ) -> dict[str, Any]:
+        """What is kept of some filters over one chunk; left: runs after these."""
         batch, _ = next(worlds(self.problem, part.width, part.width, part.begin, self._batch))
         return {name: taken(name, record(self.problem, name, batch, part.runs)) for name in names}
 
@@ -158,11 +159,11 @@ class InLanes:
     """Chunks as programs in lanes, one on each core.
 
     Attributes:
-        name: "c" where the programs are compiled, "vm" where they are interpreted.
+        name: "c" where the programs are compiled, "vm" where they are interpreted first.
         bytes_of_run: about the most memory that the histories of a run take at once.
     """
 
-    def __init__(self, problem: Problem, name: str = "c"):
+    def __init__(self, problem: Problem, name: str = "vm"):
         self.problem, self.name = problem, name
         self._engine = interpreted_rounds if name == "vm" else compiled_rounds
         number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
@@ -171,6 +172,7 @@ class InLanes:
         self._filters = {name: self._staged(name, named=True) for name in problem.contenders}
         stages = (self._simulate, *self._filters.values())
         self.bytes_of_run = max(one.bytes_of_run for one in stages)
+        self._hand_over = HandOver(stages) if name == "vm" else None
 
     def _staged(self, name: str, named: bool = False) -> Staged:
         """The record of a filter; named: in two parts, of which the second is that of one run."""
@@ -182,15 +184,6 @@ class InLanes:
             named=named,
             engine=self._engine,
         )
-
-    @property
-    def operations(self) -> int:
-        """About how many scalar operations a run is, in what is worth a program."""
-        return sum(s.operations for s in (self._simulate, *self._filters.values()))
-
-    def seconds_by_jax(self, runs: int) -> float:
-        """About how long JAX would take for so many runs, on one core."""
-        return runs * self.operations * NS * 1e-9
 
     @property
     def notes(self) -> list[str]:
@@ -229,8 +222,7 @@ class InLanes:
             yield named, count, lambda name: first[name].result()
             wait(first.values())
             ahead = deque(
-                pool.submit(self._chunk, begin, width, min(width, runs - begin), taken)
-                for begin in begins[:ahead_by]
+                pool.submit(self._chunk, begin, width, runs, taken) for begin in begins[:ahead_by]
             )
             returned = monotonic()
             for k, begin in enumerate(begins):
@@ -239,16 +231,19 @@ class InLanes:
                     give_back()
                     returned = monotonic()
                 for later in begins[k + ahead_by : k + ahead_by + 1]:
-                    count = min(width, runs - later)
-                    ahead.append(pool.submit(self._chunk, later, width, count, taken))
+                    ahead.append(pool.submit(self._chunk, later, width, runs, taken))
                 yield None, min(width, runs - begin), found.__getitem__
 
-    def compute(self, part: Part, names: Sequence[str], taken: Taken = whole) -> dict[str, Any]:
-        """What is kept of some filters over one chunk, on one core."""
+    def compute(
+        self, part: Part, names: Sequence[str], taken: Taken = whole, left: int = 0
+    ) -> dict[str, Any]:
+        """What is kept of some filters over one chunk, on one core; left: runs after these."""
 
         def computed() -> dict[str, Any]:
-            world = self._worlds(part.begin, part.width)
-            return {name: self._of(name, world, part.runs, taken) for name in names}
+            begun, world = thread_time(), self._worlds(part.begin, part.width)
+            found = {name: self._of(name, world, part.runs, taken) for name in names}
+            self._took(part.width, begun, left)
+            return found
 
         return with_stack(computed)
 
@@ -269,9 +264,17 @@ class InLanes:
         """What is kept of a filter, without the runs that only fill a chunk."""
         return taken(name, joined(*cut(self._filters[name](world), count)))
 
-    def _chunk(self, begin: int, width: int, count: int, taken: Taken) -> dict[str, Any]:
-        world = self._worlds(begin, width)
-        return {name: self._of(name, world, count, taken) for name in self._filters}
+    def _chunk(self, begin: int, width: int, runs: int, taken: Taken) -> dict[str, Any]:
+        begun, world = thread_time(), self._worlds(begin, width)
+        count = min(width, runs - begin)
+        found = {name: self._of(name, world, count, taken) for name in self._filters}
+        self._took(width, begun, runs - begin - count)
+        return found
+
+    def _took(self, runs: int, begun: float, left: int) -> None:
+        """Note how long some runs took a thread that began then."""
+        if self._hand_over is not None:
+            self._hand_over.took(runs, thread_time() - begun, left)
 
 
 @contextmanager
@@ -326,50 +329,38 @@ def check_machine(name: str) -> None:
         RobinsError: there is no such machine, or no compiler for it.
     """
     if name and name not in MACHINES:
-        raise RobinsError(f"no machine '{name}'", "--machine", "say jax, vm or c")
+        raise RobinsError(f"no machine '{name}'", "--machine", "say vm, c or jax")
     if name == "c":
         compiler(CPP)
     if name == "vm":
         interpreter_of_many()
 
 
-def has_compiler() -> bool:
-    """Whether lanes can be compiled here."""
-    try:
-        compiler(CPP)
-    except BuildError:
-        return False
-    return True
-
-
-def machine_for(problem: Problem, runs: int, name: str = "") -> ByJax | InLanes:
+def machine_for(problem: Problem, name: str = "") -> ByJax | InLanes:
     """The machine of a campaign.
 
     Args:
         problem: to be simulated.
-        runs: how many.
-        name: one of `MACHINES`; not given, lanes where they pay and there is a compiler.
+        name: one of `MACHINES`; not given, the interpreter, or JAX where that cannot be.
 
     Raises:
         RobinsError: the machine asked for is not there, or a filter calls Python at its steps.
     """
     check_machine(name)
-    hosted = [(n, c.on_host) for n, c in problem.contenders.items() if c.on_host]
-    if name in ("vm", "c") and hosted:
-        which, why = hosted[0]
-        raise RobinsError(
-            f"filter '{which}' cannot be a program: {why}",
-            f"--machine {name}",
-            "say jax, or choose other filters by --filters",
-        )
-    if name == "jax" or (not name and (runs < FEWEST or hosted or not has_compiler())):
+    if name == "jax":
         return ByJax(problem)
-    lanes = InLanes(problem, name or "c")
-    return lanes if name or lanes.seconds_by_jax(runs) > PAYS else ByJax(problem)
-
-
-def pays_processes(problem: Problem, by: ByJax | InLanes, runs: int) -> bool:
-    """Whether several processes would compute a campaign sooner, each of which compiles it."""
-    if by.name != "jax" or runs < FEWEST or available_cores() < 2:
-        return False
-    return InLanes(problem).seconds_by_jax(runs) > 2.0 * PAYS
+    for which, contender_ in problem.contenders.items():
+        if why := contender_.on_host:
+            if not name:
+                return ByJax(problem)
+            raise RobinsError(
+                f"filter '{which}' cannot be a program: {why}",
+                f"--machine {name}",
+                "say jax, or choose other filters by --filters",
+            )
+    if not name:
+        try:
+            interpreter_of_many()
+        except BuildError as error:
+            return ByJax(problem, [f"JAX computed, as the interpreter cannot be built: {error}"])
+    return InLanes(problem, name or "vm")

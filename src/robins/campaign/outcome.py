@@ -35,7 +35,7 @@ def simulate(
         runs: how many runs of each filter.
         chunk: runs at a time; not given, by the memory that they need.
         progress: called with the share done in 0..1 and what is being done.
-        machine: one of `robins.campaign.MACHINES`, or made already; not given, what is faster.
+        machine: one of `robins.campaign.MACHINES`, or made already; not given, as `machine_for`.
 
     Raises:
         RobinsError: the machine asked for is not there.
@@ -46,7 +46,7 @@ def simulate(
     names = list(problem.contenders)
     found = {name: Statistics.of(problem) for name in names}
     done, bound = 0, None
-    by = machine_for(problem, runs, machine) if isinstance(machine, str) else machine
+    by = machine_for(problem, machine) if isinstance(machine, str) else machine
     chunk = chunk or by.width(runs)
 
     def taken(name: str, record: dict[str, Any]) -> Statistics:

@@ -58,7 +58,7 @@ class Plan:
         seed: of all noise.
         runs: how many.
         filters: their names.
-        machine: what computes it, "jax" or "c".
+        machine: what computes it, "vm", "c" or "jax".
         width: runs of a chunk; what JAX sums in batches depends on it.
         code: hash of robins, of a user's own system, and of the packages that compute.
     """

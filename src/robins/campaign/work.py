@@ -65,11 +65,13 @@ class Worker:
         self._stems = by_stem(self._shards)
         self._seen: dict[str, float] = {}  # when a claim was first seen
         self._took = 0.0
+        self._left = 0  # runs that nobody has computed yet
 
     def work(self) -> Iterator[int]:
         """Compute until nothing is missing; yields how many shards are, before each chunk."""
         while lack := missing(self.store, self._shards):
             yield sum(len(one.shards) for one in lack)
+            self._left = sum(one.chunk.runs for one in lack)
             taken = self._next(lack)
             if taken is None:
                 sleep(POLL_S)
@@ -100,7 +102,7 @@ class Worker:
             return of_chunk
 
         part = Part(chunk.begin, chunk.runs, self.plan.width)
-        return self.machine.compute(part, names, taken)
+        return self.machine.compute(part, names, taken, self._left)
 
     def runs_of(
         self, chunk: Chunk, names: list[str], runs: Sequence[int]

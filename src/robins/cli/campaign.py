@@ -13,7 +13,7 @@ from click import option
 
 from robins.cli import cache
 from robins.cli.frame import Status, command_line, only_json
-from robins.cli.options import OUT, TRUST, answers, choices, examples
+from robins.cli.options import MACHINE, OUT, TRUST, answers, choices, examples
 from robins.cli.progress import Progress
 from robins.cli.tell import carry_out, deliver, say
 
@@ -70,12 +70,7 @@ def _held(_context: click.Context, _given: click.Parameter, held: bool) -> None:
 @option("--out", required=True, metavar="DIR", help="Folder, or an address such as s3://name/dir.")
 @option("--runs", type=click.IntRange(min=1), help="How many. [default: as given]")
 @option("--workers", type=click.IntRange(min=0), help="Processes. [default: one a core]")
-@option(
-    "--machine",
-    type=click.Choice(["jax", "vm", "c"]),
-    callback=lambda _context, _given, name: name or "",
-    help="What computes. [default: c where that pays, else jax]",
-)
+@MACHINE
 @choices
 @TRUST
 @answers

@@ -18,6 +18,7 @@ from robins.cli.listing import listing
 from robins.cli.options import (
     COLUMNS,
     LOGS,
+    MACHINE,
     RESULTS,
     SETTINGS,
     TRUST,
@@ -108,12 +109,7 @@ def demo(out: Path | None, **options: Any) -> None:
 @option("--master", type=LOGS, metavar="LOG", help="What a master INS reported, with --slave.")
 @option("--slave", type=LOGS, metavar="LOG", help="Samples of the IMU to be aligned to it.")
 @COLUMNS
-@option(
-    "--machine",
-    type=click.Choice(["jax", "vm", "c"]),
-    callback=lambda _context, _given, name: name or "",
-    help="What computes. [default: c where that pays, else jax]",
-)
+@MACHINE
 @choices
 @TRUST
 @publishes

@@ -43,6 +43,12 @@ def _confirm(
     return files
 
 
+MACHINE = option(
+    "--machine",
+    type=click.Choice(["vm", "c", "jax"]),
+    callback=lambda _context, _given, name: name or "",
+    help="What computes: an interpreter at once, compiled C, or JAX. [default: vm]",
+)
 TRUST = option(
     "--trust",
     type=LOGS,

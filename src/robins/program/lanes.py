@@ -83,6 +83,10 @@ class Rounds:
         self.carried, self.stays = carried, stays
         self._scan, self.lanes = engine(program)
 
+    def hand_over(self, engine: Callable[[Program], tuple[Scan, int]]) -> None:
+        """Have another engine carry out the program; calls under way end as they began."""
+        self._scan, self.lanes = engine(self.program)
+
     def holds_for(self, begin: Sequence[Given]) -> bool:
         """Whether runs begin with the zeros that the program takes for granted."""
         zeros = self.program.zeros

@@ -223,6 +223,20 @@ class Loop:
         found = rounds(runs, [*begin, *map(given, free), *map(given, body.rows)], self._named)
         return dict(zip([*body.after, *body.made], found[1:], strict=True))
 
+    @property
+    def nodes(self) -> int:
+        """How many nodes its program has, once it was called."""
+        return len(self.rounds.program.live) if self.rounds else 0
+
+    def hand_over(self) -> None:
+        """Compile the rounds of a loop that was called; they have the same bits.
+
+        Raises:
+            BuildError: there is no compiler, or it refuses the program.
+        """
+        if self.rounds is not None:
+            self.rounds.hand_over(compiled_rounds)
+
     def _compile(self, known: dict[Any, np.ndarray], begin: Sequence[Given]) -> None:
         if self.refused or (self.rounds is not None and self.rounds.holds_for(begin)):
             return
@@ -339,11 +353,6 @@ class Staged:
     def loops(self) -> list[Loop]:
         """The loops, in an order of computation."""
         return [one for one in self._stages if isinstance(one, Loop)]
-
-    @property
-    def operations(self) -> int:
-        """About how many scalar operations of a scan the loops are worth to JAX, for a run."""
-        return sum(operations(e) for one in self.loops for e in one.equations)
 
     def __call__(self, *args: Any) -> Any:
         """The function on arguments with a leading axis of runs, as arrays of NumPy or JAX."""

@@ -39,7 +39,7 @@ from robins.campaign.store import Store, open_store
 from robins.campaign.work import Worker, missing
 from robins.foreign import decoding
 from robins.results import Outcome, Progress, silent
-from robins.systems.judgement import Judge, about
+from robins.systems.judgement import about
 from robins.systems.study import Problem
 from robins.workbench.errors import InputError
 from robins.workbench.scenarios import beside, check_filters, read_scenario
@@ -68,7 +68,7 @@ def plan_campaign(
         seed: of the random streams.
         filters: names; by default those of the scenario and the default of its system.
         settings: "path=value" texts that change the scenario.
-        machine: "jax" or "c"; not given, what is faster.
+        machine: "vm", "c" or "jax"; not given, the interpreter where it can be.
 
     Raises:
         InputError, robins.scenario.ScenarioError: what was asked for cannot be run, or another
@@ -84,7 +84,7 @@ def plan_campaign(
     wanted: int = one.parameters.runs
     before = read(store)
     if before is None:
-        by = machine_for(one.problem(chosen, seed), wanted, machine)
+        by = machine_for(one.problem(chosen, seed), machine)
         plan = Plan(
             asked=name,
             scenario=one.label,
@@ -252,19 +252,17 @@ def diverged_of(found: State, name: str) -> list[int]:
     return np.flatnonzero(one.lost).tolist()
 
 
-def campaign_report(where: Where, judge: Judge | None = None) -> Outcome:
+def campaign_report(where: Where) -> Outcome:
     """Outcome of all runs that are there; fewer than wanted are told.
 
     Args:
         where: folder or address.
-        judge: of its claims; by default that of its scenario.
 
     Raises:
         InputError: the first run of some filter is not there.
     """
     store, plan = ready(where)
     problem = problem_of(plan)
-    problem = problem if judge is None else replace(problem, claims=judge)
     found = gather(store, plan, problem)
     # the figures show the first run of each filter
     if any(one.example is None for one in found.found.values()):

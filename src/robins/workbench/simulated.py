@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from tempfile import TemporaryDirectory
 
 from robins import _float64, units
 from robins.campaign import check_machine, simulate
 from robins.campaign.bound import bound as bound_of
-from robins.campaign.machine import machine_for, pays_processes
+from robins.campaign.machine import machine_for
 from robins.report import bounds
 from robins.results import Outcome, Progress, silent
 from robins.systems.judgement import about
 from robins.workbench.errors import refusing
 from robins.workbench.scenarios import Simulated, asked, beside, check_filters, read_scenario
-from robins.workbench.workers import campaign_run
 
 
 def run(
@@ -37,7 +35,7 @@ def run(
         filters: names; by default those of the scenario, on which its claims are judged, and beside
             them the default of its system.
         settings: "path=value" texts that change the scenario.
-        machine: "jax" or "c"; not given, what is faster.
+        machine: "vm", "c" or "jax"; not given, the interpreter where it can be.
         progress: called with the share done and what is being done.
 
     Raises:
@@ -53,14 +51,7 @@ def run(
     if not filters:  # the default was not there when the claims were stated
         problem = replace(problem, claims=about(one.own, problem.claims))
     total = one.parameters.runs
-    by = machine_for(problem, total, machine)
-    if pays_processes(problem, by, total):
-        with TemporaryDirectory(prefix="robins-run-") as folder:
-            asked_for = {"runs": total, "seed": seed, "filters": chosen, "settings": settings}
-            asked_for |= {"machine": by.name, "judge": problem.claims}
-            found = campaign_run(folder, name, progress=progress, **asked_for)
-    else:
-        found = simulate(problem, total, progress=progress, machine=by)
+    found = simulate(problem, total, progress=progress, machine=machine_for(problem, machine))
     return replace(
         found,
         scenario=one.label,

@@ -19,7 +19,6 @@ from robins.campaign.work import missing
 from robins.errors import RobinsError
 from robins.results import Outcome, Progress, silent
 from robins.systems import trust
-from robins.systems.judgement import Judge
 from robins.workbench.campaigns import campaign_report, mend, plan_campaign
 
 POLL_S = 0.2
@@ -96,7 +95,6 @@ def campaign_run(
     *,
     workers: int | None = None,
     progress: Progress = silent,
-    judge: Judge | None = None,
     **options: Any,
 ) -> Outcome:
     """Begin a campaign or go on with it, until all its runs are there; see `plan_campaign`.
@@ -106,13 +104,12 @@ def campaign_run(
         name: of the scenario.
         workers: processes; by default one a core.
         progress: called with the share done and what is being done.
-        judge: of its claims; by default that of its scenario.
         **options: of `plan_campaign`.
     """
     progress(0.0, "looking what is there")
     plan = plan_campaign(where, name, **options)
     fill(where, [(str(where), plan)], workers or available_cores(), progress)
-    return campaign_report(where, judge)
+    return campaign_report(where)
 
 
 def fill(
