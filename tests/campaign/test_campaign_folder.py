@@ -17,7 +17,6 @@ import pytest
 from robins.campaign import plan as plans
 from robins.campaign import simulate
 from robins.campaign.gather import gather
-from robins.campaign.machine import Part
 from robins.campaign.plan import needed, write
 from robins.campaign.retention import content_of
 from robins.campaign.store import GOES_ON, open_store
@@ -208,8 +207,7 @@ def test_runs_that_diverge_are_named(tmp_path):
     store = open_store(tmp_path)
     worker = Worker(store, plan, problem_of(plan))
     chunk, (shard,) = next(iter(plan.shards.items()))
-    part = Part(chunk.begin, chunk.runs, plan.width)
-    record = worker.machine.histories(part, ["kf"])["kf"]
+    record = worker.machine.histories(chunk, plan.width, ["kf"])["kf"]
     record["error"] = record["error"].copy()
     record["error"][5, 3] = np.nan
     found = worker.found(chunk, ["kf"])["kf"].blank()

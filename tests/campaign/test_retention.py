@@ -29,15 +29,15 @@ def diverging():
     """Some runs diverge."""
     compute = ByJax.compute
 
-    def broken(self, part, names, taken=whole, left=0):
+    def broken(self, chunk, width, names, taken=whole, left=0):
         def taken_of(name, record):
             error = record["error"].copy()
             for lost in LOST:
-                if lost - part.begin in range(len(error)):
-                    error[lost - part.begin, 3:] = np.nan
+                if lost - chunk.begin in range(len(error)):
+                    error[lost - chunk.begin, 3:] = np.nan
             return taken(name, record | {"error": error})
 
-        return compute(self, part, names, taken_of, left)
+        return compute(self, chunk, width, names, taken_of, left)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ByJax, "compute", broken)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from robins.program.liveness import Touched, bytes_of_jaxpr, last_uses, most_bytes
-from robins.program.stages import Flat
+from robins.program.stages import flattened
 
 ROW = jax.ShapeDtypeStruct((1000,), float)  # 8000 bytes
 
@@ -16,21 +16,21 @@ def chain(x):
 
 
 def test_a_value_is_dropped_after_its_last_use():
-    flat = Flat(chain, ROW)
-    stages = [Touched(e.invars, e.outvars) for e in flat.equations]
-    y, z = (e.outvars[0] for e in flat.equations[:2])
-    dropped = last_uses(stages, {*flat.takes, *flat.makes})
+    flat = flattened(chain, ROW)[0].jaxpr
+    stages = [Touched(e.invars, e.outvars) for e in flat.eqns]
+    y, z = (e.outvars[0] for e in flat.eqns[:2])
+    dropped = last_uses(stages, {*flat.invars, *flat.outvars})
     assert dropped == [[], [y], [z]]
-    assert most_bytes(stages, flat.takes, flat.makes) == 3 * 8000  # x, y and z
-    assert most_bytes(stages, flat.takes, [y, *flat.makes]) == 3 * 8000 + 8  # y stays
+    assert most_bytes(stages, flat.invars, flat.outvars) == 3 * 8000  # x, y and z
+    assert most_bytes(stages, flat.invars, [y, *flat.outvars]) == 3 * 8000 + 8  # y stays
 
 
 def test_what_nothing_needs_is_dropped_where_it_is_made():
-    flat = Flat(lambda x: (jnp.sin(x), jnp.cos(x)), ROW)
-    stages = [Touched(e.invars, e.outvars) for e in flat.equations]
-    sine, cosine = flat.makes
-    assert last_uses(stages, {cosine}) == [[sine], [*flat.takes]]
-    assert most_bytes(stages, flat.takes, [cosine]) == 2 * 8000  # x and one of both
+    flat = flattened(lambda x: (jnp.sin(x), jnp.cos(x)), ROW)[0].jaxpr
+    stages = [Touched(e.invars, e.outvars) for e in flat.eqns]
+    sine, cosine = flat.outvars
+    assert last_uses(stages, {cosine}) == [[sine], [*flat.invars]]
+    assert most_bytes(stages, flat.invars, [cosine]) == 2 * 8000  # x and one of both
 
 
 def test_calls_and_keys_are_counted():

@@ -10,7 +10,7 @@ from jax import lax
 from machines import apart
 
 from robins.program import CPP, LANE_FLAGS
-from robins.program.stages import Flat, Staged
+from robins.program.stages import Staged, flattened
 
 FOUND = any(map(shutil.which, CPP.names))
 pytestmark = pytest.mark.skipif(not FOUND, reason="lanes need a C++ compiler")
@@ -85,8 +85,6 @@ def test_a_simulation(staged):
 
 def test_a_run_has_the_bits_of_a_run_alone(staged):
     many, alone = staged(jnp.arange(N)), staged(jnp.array([7]))
-    # A mean over the time is JAX's, whose order of a sum depends on the shape of the batch.
-    assert apart(many.pop("mean")[7], alone.pop("mean")[0]) <= 1e-15
     for a, b in zip(jax.tree.leaves(many), jax.tree.leaves(alone), strict=True):
         np.testing.assert_array_equal(np.asarray(a)[7], np.asarray(b)[0])
 
@@ -175,8 +173,8 @@ def test_what_has_no_place_stays_with_jax_and_says_why():
 
 
 def test_calls_are_written_out():
-    flat = Flat(jax.jit(lambda x: jax.jit(jnp.cos)(jax.jit(jnp.sin)(x))), NUMBER)
-    assert [e.primitive.name for e in flat.equations][-2:] == ["sin", "cos"]
+    flat, _ = flattened(jax.jit(lambda x: jax.jit(jnp.cos)(jax.jit(jnp.sin)(x))), NUMBER)
+    assert [e.primitive.name for e in flat.eqns][-2:] == ["sin", "cos"]
 
 
 @pytest.mark.parametrize("kind", ["float64", "int64", "int32", "uint32", "uint64", "bool"])

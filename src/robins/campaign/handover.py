@@ -23,7 +23,9 @@ class HandOver:
     """The loops of a campaign, interpreted until compiling them pays."""
 
     def __init__(self, stages: Sequence[Staged]):
-        self._loops: list[Loop] = [loop for staged in stages for loop in staged.loops]
+        self._loops: list[Loop] = [
+            loop for staged in stages for loop in staged.loops if loop.is_worth
+        ]
         self._each_s: float | None = None  # for a run, on one core
         self._compiler_s: float | None = None  # about, for all loops
         self._lock = threading.Lock()

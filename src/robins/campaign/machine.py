@@ -17,7 +17,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import partial
 from time import monotonic, thread_time
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -47,6 +47,7 @@ from robins.campaign.monte_carlo import (
     traced,
     worlds,
 )
+from robins.campaign.plan import Chunk
 from robins.errors import RobinsError
 from robins.program import CPP, BuildError, compiler
 from robins.program.interpreter import interpreted_rounds, interpreter_of_many
@@ -62,15 +63,7 @@ STACK = 1 << 28  # bytes of a thread's stack, on which lanes hold all that a ste
 Taken = Callable[[str, Any], Any]  # of a filter's name and its record of a chunk: what is kept
 
 # The world of the first run, with the first chunk; how many runs count; what is kept of a filter.
-Chunk = tuple[Any, int, Callable[[str], Any]]
-
-
-class Part(NamedTuple):
-    """A chunk of a campaign: some runs from `begin` on, filled up to its width."""
-
-    begin: int
-    runs: int
-    width: int
+Simulated = tuple[Any, int, Callable[[str], Any]]
 
 
 def whole(name: str, record: Any) -> Any:
@@ -98,7 +91,7 @@ class ByJax:
         self.notes = [*self._why, *said(each, width)]
         return width
 
-    def chunks(self, runs: int, chunk: int = 0, taken: Taken = whole) -> Iterator[Chunk]:
+    def chunks(self, runs: int, chunk: int = 0, taken: Taken = whole) -> Iterator[Simulated]:
         """Simulate a chunk; its filters run when they are asked for.
 
         Args:
@@ -144,15 +137,15 @@ class ByJax:
         return taken(name, record(self.problem, name, held[0], count))
 
     def compute(
-        self, part: Part, names: Sequence[str], taken: Taken = whole, left: int = 0
+        self, chunk: Chunk, width: int, names: Sequence[str], taken: Taken = whole, left: int = 0
     ) -> dict[str, Any]:
-        """What is kept of some filters over one chunk; left: runs after these."""
-        batch, _ = next(worlds(self.problem, part.width, part.width, part.begin, self._batch))
-        return {name: taken(name, record(self.problem, name, batch, part.runs)) for name in names}
+        """What is kept of some filters over one chunk, filled up to a width; left: those after."""
+        batch, _ = next(worlds(self.problem, width, width, chunk.begin, self._batch))
+        return {name: taken(name, record(self.problem, name, batch, chunk.runs)) for name in names}
 
-    def histories(self, part: Part, names: Sequence[str]) -> dict[str, Any]:
+    def histories(self, chunk: Chunk, width: int, names: Sequence[str]) -> dict[str, Any]:
         """All that was recorded of some filters over one chunk."""
-        return self.compute(part, names)
+        return self.compute(chunk, width, names)
 
 
 class InLanes:
@@ -190,17 +183,16 @@ class InLanes:
         """What JAX has to do, and why."""
         of = {"the simulation": self._simulate, **self._filters}
         return [
-            f"{name}: a loop stays with JAX, as {one.refused}"
+            f"{name}: a part stays with JAX, as {why}"
             for name, staged in of.items()
-            for one in staged.loops
-            if one.refused
+            for why in staged.refused
         ] + said(self.bytes_of_run, LEAST)
 
     def width(self, runs: int) -> int:
         """Runs of a chunk in a campaign of so many, by the memory that they need."""
         return min(width_of(self.bytes_of_run, CHUNK_BYTES), -(-runs // LEAST) * LEAST)
 
-    def chunks(self, runs: int, chunk: int = 0, taken: Taken = whole) -> Iterator[Chunk]:
+    def chunks(self, runs: int, chunk: int = 0, taken: Taken = whole) -> Iterator[Simulated]:
         """Simulate chunks and run their filters, on all cores, ahead of what is asked for.
 
         Args:
@@ -235,24 +227,24 @@ class InLanes:
                 yield None, min(width, runs - begin), found.__getitem__
 
     def compute(
-        self, part: Part, names: Sequence[str], taken: Taken = whole, left: int = 0
+        self, chunk: Chunk, width: int, names: Sequence[str], taken: Taken = whole, left: int = 0
     ) -> dict[str, Any]:
-        """What is kept of some filters over one chunk, on one core; left: runs after these."""
+        """What is kept of some filters over one chunk, filled up to a width; left: those after."""
 
         def computed() -> dict[str, Any]:
-            begun, world = thread_time(), self._worlds(part.begin, part.width)
-            found = {name: self._of(name, world, part.runs, taken) for name in names}
-            self._took(part.width, begun, left)
+            begun, world = thread_time(), self._worlds(chunk.begin, width)
+            found = {name: self._of(name, world, chunk.runs, taken) for name in names}
+            self._took(width, begun, left)
             return found
 
         return with_stack(computed)
 
-    def histories(self, part: Part, names: Sequence[str]) -> dict[str, Any]:
+    def histories(self, chunk: Chunk, width: int, names: Sequence[str]) -> dict[str, Any]:
         """All that was recorded of some filters over one chunk."""
 
         def computed() -> dict[str, Any]:
-            world = self._worlds(part.begin, part.width)
-            return {name: cut(self._staged(name)(world), part.runs) for name in names}
+            world = self._worlds(chunk.begin, width)
+            return {name: cut(self._staged(name)(world), chunk.runs) for name in names}
 
         return with_stack(computed)
 

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from robins.campaign.gather import blank
-from robins.campaign.machine import ByJax, InLanes, Part
+from robins.campaign.machine import ByJax, InLanes
 from robins.campaign.memory import give_back
 from robins.campaign.plan import Chunk, Plan, Shard
 from robins.campaign.retention import DIVERGED, NAMED, by_stem, histories, name_of, trim
@@ -101,8 +101,7 @@ class Worker:
                 of_chunk.example = None  # figures show the first run of all
             return of_chunk
 
-        part = Part(chunk.begin, chunk.runs, self.plan.width)
-        return self.machine.compute(part, names, taken, self._left)
+        return self.machine.compute(chunk, self.plan.width, names, taken, self._left)
 
     def runs_of(
         self, chunk: Chunk, names: list[str], runs: Sequence[int]
@@ -111,10 +110,9 @@ class Worker:
 
         The chunk is computed as it was, so that the runs have the same bits.
         """
-        part = Part(chunk.begin, chunk.runs, self.plan.width)
         return {
             name: {run: self._alone(record, run - chunk.begin) for run in runs}
-            for name, record in self.machine.histories(part, names).items()
+            for name, record in self.machine.histories(chunk, self.plan.width, names).items()
         }
 
     def _alone(self, record: dict[str, Any], index: int) -> Statistics:

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from robins.program.c import function, header
-from robins.program.kinds import array_of, is_key, numbers_of
+from robins.program.kinds import is_key, numbers_of
 from robins.program.library import lengths
 from robins.program.native import CPP, LANE_FLAGS, build
 from robins.program.trace import Leaf, Program, positive_zeros
@@ -97,6 +97,8 @@ class Rounds:
     ) -> list[np.ndarray]:
         """What is carried in the end, and the rows made, with a leading axis of runs.
 
+        A key is a whole number there, as `robins.program.kinds.numbers_of` makes it.
+
         Args:
             runs: how many.
             given: what is carried, what stays, rows.
@@ -136,10 +138,7 @@ class Rounds:
         scan = np.array([runs, self.length, self.backwards, *counts, *pointers], np.int64)
         if self._scan(ctypes.c_void_p(scan.ctypes.data)):
             raise MemoryError(f"no memory for rounds of {runs} runs")
-        return [
-            array_of(a, leaf.dtype) if is_key(leaf.dtype) else a
-            for a, leaf in zip(made, results, strict=True)
-        ]
+        return made
 
 
 def zero_in_all(given: Given) -> np.ndarray:

@@ -15,35 +15,41 @@ from jax.extend import core as jex
 from robins.program.kinds import is_key
 from robins.program.primitives.control import called
 
+# Of JAX's jaxprs, whose abstract values have neither shape nor type for a checker.
+Equation = Any
+Variable = Any  # or a literal
+
 KEY_BYTES = 8
 
 
 class Touched(NamedTuple):
     """What a stage takes and makes, and the bytes that it needs for itself beside these."""
 
-    takes: Sequence[Any]
-    makes: Sequence[Any]
+    takes: Sequence[Variable]
+    makes: Sequence[Variable]
     within: int = 0
 
 
-def last_uses(stages: Sequence[Touched], kept: Collection[Any]) -> list[list[Any]]:
+def last_uses(stages: Sequence[Touched], kept: Collection[Variable]) -> list[list[Variable]]:
     """By stage, the variables that nothing needs once it is done.
 
     Args:
         stages: in an order of computation.
         kept: what is needed in the end.
     """
-    last: dict[Any, int] = {}
+    last: dict[Variable, int] = {}
     for k, one in enumerate(stages):
         last.update(dict.fromkeys(variables([*one.takes, *one.makes]), k))
-    found: list[list[Any]] = [[] for _ in stages]
+    found: list[list[Variable]] = [[] for _ in stages]
     for v, k in last.items():
         if v not in kept:
             found[k].append(v)
     return found
 
 
-def most_bytes(stages: Sequence[Touched], given: Iterable[Any], kept: Collection[Any]) -> int:
+def most_bytes(
+    stages: Sequence[Touched], given: Iterable[Variable], kept: Collection[Variable]
+) -> int:
     """The most bytes that all values take at once, if each is dropped after its last use.
 
     Args:
@@ -66,7 +72,7 @@ def bytes_of_jaxpr(jaxpr: Any) -> int:
     Rather too much: XLA makes one of several equations, and what they hand on is never in memory.
     """
 
-    def touched(e: Any) -> Touched:
+    def touched(e: Equation) -> Touched:
         inner = called(e)
         if inner is None:
             return Touched(e.invars, e.outvars)
@@ -78,13 +84,13 @@ def bytes_of_jaxpr(jaxpr: Any) -> int:
     return most_bytes([touched(e) for e in jaxpr.eqns], given, jaxpr.outvars)
 
 
-def bytes_of(v: Any) -> int:
+def bytes_of(v: Variable) -> int:
     """The bytes of a variable of a jaxpr, or of the shape of an array."""
     aval = getattr(v, "aval", v)
     size = KEY_BYTES if is_key(aval.dtype) else np.dtype(aval.dtype).itemsize
     return int(np.prod(aval.shape)) * size
 
 
-def variables(some: Iterable[Any]) -> list[Any]:
+def variables(some: Iterable[Variable]) -> list[Variable]:
     """Those that are not literals."""
     return [v for v in some if not isinstance(v, jex.Literal)]

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax.extend import core as jex
 
-from robins.program.kinds import is_key, kind_of
-from robins.program.liveness import variables
+from robins.program.kinds import kind_of
+from robins.program.liveness import Equation, Variable, variables
 from robins.program.nodes import Graph
 from robins.program.primitives.control import size_of
 from robins.program.primitives.random import bits_of, numbered
@@ -43,6 +43,7 @@ AXES = {
     **dict.fromkeys(("concatenate", "sort"), "dimension"),
 }
 RANDOM = {"random_bits", "random_split"}
+Named = dict[Variable, Nodes]
 
 
 class Along(NamedTuple):
@@ -52,7 +53,7 @@ class Along(NamedTuple):
     backwards: bool = False
 
 
-def along(e: Any) -> Along | None:
+def along(e: Equation) -> Along | None:
     """The axis along which an equation goes, if it does and can be part of a loop."""
     name, p = e.primitive.name, e.params
     if name == "scan":
@@ -66,7 +67,7 @@ def along(e: Any) -> Along | None:
     return Along(length) if _by_rows(e, name, p, length) else None
 
 
-def _by_rows(e: Any, name: str, p: Any, length: int) -> bool:
+def _by_rows(e: Equation, name: str, p: Any, length: int) -> bool:
     """Whether an equation does to each row of its arrays the same."""
     given = [v.aval.shape for v in e.invars]
     rank = len(e.outvars[0].aval.shape)
@@ -107,7 +108,7 @@ def _by_rows(e: Any, name: str, p: Any, length: int) -> bool:
     return False
 
 
-def operations(e: Any) -> int:
+def operations(e: Equation) -> int:
     """About how many scalar operations of a scan an equation is worth to JAX."""
     name = e.primitive.name
     if name == "scan":
@@ -116,7 +117,7 @@ def operations(e: Any) -> int:
     return DRAW * entries if name == "random_bits" else 0
 
 
-def uses(e: Any, length: int) -> tuple[list[Any], list[Any]]:
+def uses(e: Equation, length: int) -> tuple[list[Variable], list[Variable]]:
     """Variables that an equation of a loop needs as a whole before it, and those row by row."""
     if e.primitive.name == "scan":
         before = e.params["num_consts"] + e.params["num_carry"]
@@ -129,7 +130,7 @@ def uses(e: Any, length: int) -> tuple[list[Any], list[Any]]:
     return variables(whole), variables(rows)
 
 
-def makes_rows(e: Any) -> list[Any]:
+def makes_rows(e: Equation) -> list[Variable]:
     """The variables that an equation makes row by row; a scan also leaves what it carried."""
     return e.outvars[e.params["num_carry"] :] if e.primitive.name == "scan" else e.outvars
 
@@ -145,7 +146,9 @@ class Body:
         made: variables of which each round gives a row.
     """
 
-    def __init__(self, equations: Sequence[Any], axis: Along, wanted: Callable[[Any], bool]):
+    def __init__(
+        self, equations: Sequence[Equation], axis: Along, wanted: Callable[[Variable], bool]
+    ):
         """Find what goes in and out.
 
         Args:
@@ -155,10 +158,10 @@ class Body:
         """
         self.equations, self.axis = equations, axis
         inside = {v for e in equations for v in makes_rows(e)}
-        stays: dict[Any, None] = {}
-        rows: dict[Any, None] = {}
-        self.begin: list[Any] = []
-        self.after: list[Any] = []
+        stays: dict[Variable, None] = {}
+        rows: dict[Variable, None] = {}
+        self.begin: list[Variable] = []
+        self.after: list[Variable] = []
         for e in equations:
             whole, by_row = uses(e, axis.length)
             if e.primitive.name == "scan":
@@ -172,7 +175,7 @@ class Body:
         self.made = [v for e in equations for v in makes_rows(e) if wanted(v)]
 
     def program(
-        self, known: dict[Any, np.ndarray], zeros: dict[int, np.ndarray], unroll: int | None
+        self, known: dict[Variable, np.ndarray], zeros: dict[int, np.ndarray], unroll: int | None
     ) -> Program:
         """One round as a program: number of the round, carried, staying, rows; to carried and rows.
 
@@ -186,19 +189,9 @@ class Body:
         """
         graph = Graph()
         walk = Walk(graph, unroll)
-        inputs: list[Leaf] = []
-        counted = {"real": 0, "other": 0}
 
         def taken(shape: tuple[int, ...], dtype: Any) -> Nodes:
-            kind = kind_of(dtype)
-            pool = "real" if kind == "real" else "other"
-            size = int(np.prod(shape))
-            ids = [graph.input(counted[pool] + k, kind) for k in range(size)]
-            counted[pool] += size
-            inputs.append(Leaf(shape, dtype, kind, f"arguments[{len(inputs)}]"))
-            nodes = np.array(ids, dtype=np.int64).reshape(shape)
-            zero = zeros.get(len(inputs) - 1)
-            return nodes if zero is None else np.where(zero, graph.constant(0, "real"), nodes)
+            return walk.taken(shape, dtype, zero=zeros.get(len(walk.inputs)))
 
         index = taken((), np.dtype(np.int64))
         begin = [taken(v.aval.shape, v.aval.dtype) for v in self.begin]
@@ -223,15 +216,20 @@ class Body:
         for v in self.made:
             results.append(Leaf(v.aval.shape[1:], v.aval.dtype, kind_of(v.aval.dtype), "row"))
         return Program(
-            graph, inputs, outputs, results, (None, None), walk.alike, unroll, dict(zeros)
+            graph, walk.inputs, outputs, results, (None, None), walk.alike, unroll, dict(zeros)
         )
 
     def _scanned(
-        self, walk: Walk, e: Any, now: list[Nodes], whole: dict[Any, Nodes], rows: dict[Any, Nodes]
+        self,
+        walk: Walk,
+        e: Equation,
+        now: list[Nodes],
+        whole: dict[Variable, Nodes],
+        rows: dict[Variable, Nodes],
     ) -> list[Nodes]:
         fixed, carried = e.params["num_consts"], e.params["num_carry"]
 
-        def read(v: Any, of: dict[Any, Nodes]) -> Nodes:
+        def read(v: Variable, of: Named) -> Nodes:
             if isinstance(v, jex.Literal):
                 return walk.constants(number_of(v))
             return of[v]
@@ -241,7 +239,12 @@ class Body:
         return walk.closed(e.params["jaxpr"], *consts, *now, *taken)
 
     def _row(
-        self, walk: Walk, e: Any, whole: dict[Any, Nodes], rows: dict[Any, Nodes], index: Nodes
+        self,
+        walk: Walk,
+        e: Equation,
+        whole: dict[Variable, Nodes],
+        rows: dict[Variable, Nodes],
+        index: Nodes,
     ) -> list[Nodes]:
         """What an equation makes of rows: the same equation on arrays of one row."""
         name, p, length = e.primitive.name, dict(e.params), self.axis.length
@@ -264,7 +267,7 @@ class Body:
         elif name == "slice":
             p["limit_indices"] = (1, *p["limit_indices"][1:])
 
-        def one(v: Any, row: bool) -> Any:
+        def one(v: Variable, row: bool) -> Variable:
             if not row:
                 return v
             return jex.Var(v.aval.update(shape=(1, *v.aval.shape[1:])))
@@ -276,7 +279,7 @@ class Body:
             outvars=[one(v, True) for v in e.outvars],
         )
 
-        def read(v: Any, row: bool) -> Nodes:
+        def read(v: Variable, row: bool) -> Nodes:
             if isinstance(v, jex.Literal):
                 return walk.constants(number_of(v))
             return rows[v][None] if row else whole[v]
@@ -285,11 +288,6 @@ class Body:
         return [np.asarray(np.asarray(a)[0]) for a in found]
 
 
-def number_of(literal: Any) -> np.ndarray:
+def number_of(literal: Variable) -> np.ndarray:
     """The number of a literal, in its type."""
     return np.asarray(literal.val, literal.aval.dtype)
-
-
-def foldable(value: Any, most: int) -> bool:
-    """Whether a known array may become part of a program."""
-    return not is_key(value.dtype) and value.size <= most

@@ -1,8 +1,8 @@
-"""A function of one run, for many: its loops as programs, all else as batches of JAX.
+"""A function of one run, for many: its loops as programs, and arrays between them.
 
 The jaxpr of the function is cut into *stages*: what goes along one axis is a loop
-(`robins.program.loops`), what lies between loops is a batch. What depends on no run is computed
-once. What has no place in a program stays with JAX, which is said.
+(`robins.program.loops`), what lies between loops are arrays (`robins.program.arrays`). What depends
+on no run is computed once. What has no place in a program stays with JAX, which is said.
 """
 
 from __future__ import annotations
@@ -17,21 +17,26 @@ import numpy as np
 from jax import lax
 from jax.extend import core as jex
 
-from robins.program.kinds import is_key
-from robins.program.lanes import Given, Rounds, Scan, compiled_rounds, zero_in_all
-from robins.program.liveness import (
-    Touched,
-    bytes_of,
-    bytes_of_jaxpr,
-    last_uses,
-    most_bytes,
-    variables,
+from robins.program.arrays import (
+    LARGE,
+    UNROLL,
+    Arrays,
+    Values,
+    by_jax,
+    jaxpr_of,
+    made_by,
+    size_of,
+    taken_by,
 )
+from robins.program.interpreter import interpreted_rounds
+from robins.program.kinds import array_of, is_key, numbers_of
+from robins.program.lanes import Given, Rounds, Scan, compiled_rounds, zero_in_all
+from robins.program.liveness import Equation, Touched, Variable, last_uses, most_bytes, variables
 from robins.program.loops import (
+    SHORTEST,
     Along,
     Body,
     along,
-    foldable,
     makes_rows,
     number_of,
     operations,
@@ -42,13 +47,9 @@ from robins.program.refusal import BuildError, ProgramError
 from robins.program.trace import Program, lasting
 
 Engine = Callable[[Program], tuple[Scan, int]]
-WORTH = 5_000  # operations of a loop that is worth a program
+WORTH = 5_000  # operations of a loop that is worth a compiler; others are interpreted
 FEWEST = 8  # equations without a scan or random numbers that are
 FOLDED = 2_000  # numbers of a known array that becomes part of a program
-UNROLL = 3_000
-# Of these XLA must not run two batches at once (`docs/performance.md`).
-FACTORISED = ("qr[", "lu[", "eigh[", "svd[", "cholesky[", "triangular_solve[")
-_one_at_a_time = threading.Lock()
 CUMULATED = {
     "cumsum": (lax.add, lambda dtype: 0),
     "cumprod": (lax.mul, lambda dtype: 1),
@@ -57,49 +58,43 @@ CUMULATED = {
 }
 
 
-class Flat:
-    """A jaxpr with all calls written out, and sums along the first axis as scans.
+def flattened(function: Callable[..., Any], *shapes: Any) -> tuple[jex.ClosedJaxpr, Any]:
+    """A function of these shapes as one jaxpr, and the structure of its results.
 
-    Attributes:
-        equations: of variables of their own.
-        known: the numbers of constants, by variable.
-        takes: variables of the arguments.
-        makes: variables or literals of the results.
-        tree: the results' structure.
+    All calls are written out, and sums along the first axis are scans; variables occur once.
     """
+    closed, results = jax.make_jaxpr(function, return_shape=True)(*shapes)
+    equations: list[Equation] = []
+    known: dict[Variable, Any] = {}
 
-    def __init__(self, function: Callable[..., Any], *shapes: Any):
-        """Trace a function of arguments of these shapes."""
-        closed, results = jax.make_jaxpr(function, return_shape=True)(*shapes)
-        self.tree = jax.tree_util.tree_structure(results)
-        self.equations: list[Any] = []
-        self.known: dict[Any, Any] = {}
-        self.takes = [jex.Var(v.aval) for v in closed.jaxpr.invars]
-        self.makes = self._write(closed, self.takes)
-
-    def _write(self, closed: Any, args: Sequence[Any]) -> list[Any]:
+    def write(closed: Any, args: Sequence[Variable]) -> list[Variable]:
         jaxpr = closed.jaxpr
-        now: dict[Any, Any] = dict(zip(jaxpr.invars, args, strict=True))
+        now: dict[Variable, Variable] = dict(zip(jaxpr.invars, args, strict=True))
         for v, value in zip(jaxpr.constvars, closed.consts, strict=True):
             now[v] = jex.Var(v.aval)
-            self.known[now[v]] = value
+            known[now[v]] = value
 
-        def read(v: Any) -> Any:
+        def read(v: Variable) -> Variable:
             return v if isinstance(v, jex.Literal) else now[v]
 
         for e in jaxpr.eqns:
             given = list(map(read, e.invars))
-            inner = called(e) or cumulated(e)
+            inner = called(e) or cumulated(e) or written_out(e)
             if inner is not None:
-                found = self._write(inner, given)
+                found = write(inner, given)
             else:
                 found = [jex.Var(v.aval) for v in e.outvars]
-                self.equations.append(e.replace(invars=given, outvars=found))
+                equations.append(e.replace(invars=given, outvars=found))
             now.update(zip(e.outvars, found, strict=True))
         return list(map(read, jaxpr.outvars))
 
+    takes = [jex.Var(v.aval) for v in closed.jaxpr.invars]
+    makes = write(closed, takes)
+    jaxpr = jaxpr_of(equations, takes, makes, list(known))
+    return jex.ClosedJaxpr(jaxpr, list(known.values())), jax.tree_util.tree_structure(results)
 
-def cumulated(e: Any) -> Any:
+
+def cumulated(e: Equation) -> Any:
     """A sum, product or extreme along the first axis as the closed jaxpr of a scan."""
     name, p = e.primitive.name, e.params
     if name not in CUMULATED or p["axis"] != 0:
@@ -118,6 +113,28 @@ def cumulated(e: Any) -> Any:
     return jax.make_jaxpr(scanned)(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
 
 
+def written_out(e: Equation) -> Any:
+    """A short scan over large arrays as a closed jaxpr without it: its rounds one after another."""
+    p = e.params
+    if e.primitive.name != "scan" or p["length"] >= SHORTEST:
+        return None
+    if all(size_of(v) <= LARGE for v in [*e.invars, *e.outvars]):
+        return None
+    body, fixed, carried = jex.jaxpr_as_fun(p["jaxpr"]), p["num_consts"], p["num_carry"]
+
+    def rounds(*given: Any) -> tuple[Any, ...]:
+        now, rows = given[fixed : fixed + carried], given[fixed + carried :]
+        made: list[Any] = [None] * p["length"]
+        for k in sorted(range(p["length"]), reverse=p["reverse"]):
+            row = [lax.index_in_dim(a, k, keepdims=False) for a in rows]
+            found = body(*given[:fixed], *now, *row)
+            now, made[k] = found[:carried], found[carried:]
+        return (*now, *map(jax.numpy.stack, zip(*made, strict=True)))
+
+    shapes = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in e.invars]
+    return jax.make_jaxpr(rounds)(*shapes)
+
+
 def _extreme(dtype: Any, sign: int) -> Any:
     """The least or greatest number of a type."""
     if np.issubdtype(dtype, np.floating):
@@ -125,71 +142,28 @@ def _extreme(dtype: Any, sign: int) -> Any:
     return np.iinfo(dtype).max if sign > 0 else np.iinfo(dtype).min
 
 
-class Batch:
-    """Equations that JAX computes for all runs at once.
-
-    Attributes:
-        takes, makes: variables.
-    """
-
-    def __init__(self, equations: Sequence[Any] = ()) -> None:
-        self.equations = list(equations)
-        self.takes: list[Any] = []
-        self.makes: list[Any] = []
-        self._compiled: Callable[..., Any] | None = None
-        self._alone = False
-        self._most = 0
-
-    @property
-    def touched(self) -> Touched:
-        """What goes in and out, and what it needs in between."""
-        outside = sum(map(bytes_of, {*self.takes, *self.makes}))
-        return Touched(self.takes, self.makes, max(self._most - outside, 0))
-
-    def compile(self, batched: set[Any], wanted: Callable[[Any], bool]) -> None:
-        """Find what goes in and out, and let JAX compile it."""
-        self.takes = list(dict.fromkeys(taken(self)))
-        self.makes = [v for e in self.equations for v in e.outvars if wanted(v)]
-        about = jex.DebugInfo("jit", "stage", None, None)
-        jaxpr = jex.Jaxpr([], self.takes, self.makes, self.equations, debug_info=about)
-        function = jex.jaxpr_as_fun(jex.ClosedJaxpr(jaxpr, []))
-        axes = tuple(0 if v in batched else None for v in self.takes)
-        self._most = bytes_of_jaxpr(jaxpr)
-        self._alone = any(name in str(jaxpr) for name in FACTORISED)
-        self._compiled = jax.jit(jax.vmap(function, axes) if 0 in axes else function)
-
-    def __call__(self, runs: int, values: dict[Any, Any]) -> dict[Any, Any]:
-        """What it makes of what is there."""
-        assert self._compiled is not None
-        given = [values[v] for v in self.takes]
-        if self._alone:
-            with _one_at_a_time:
-                found = jax.block_until_ready(self._compiled(*given)) if self.makes else []
-        else:
-            found = self._compiled(*given) if self.makes else []
-        return dict(zip(self.makes, found, strict=True))
-
-
 class Loop:
     """Equations along one axis: rounds of a program, or JAX if they have no place in one.
 
     Attributes:
         equations: in an order of computation.
+        is_worth: of the time that a compiler takes for it.
         refused: why they are no program.
     """
 
-    def __init__(self, axis: Along, engine: Engine):
-        self.axis, self._engine = axis, engine
-        self.equations: list[Any] = []
+    def __init__(self, axis: Along, engine: Engine, is_worth: bool):
+        self.axis, self.is_worth = axis, is_worth
+        self._engine = engine if is_worth else interpreted_rounds
+        self.equations: list[Equation] = []
         self.refused: ProgramError | BuildError | None = None
         self.rounds: Rounds | None = None
         self._lock = threading.Lock()
 
     def connect(
         self,
-        batched: set[Any],
-        wanted: Callable[[Any], bool],
-        named: Collection[Any],
+        batched: set[Variable],
+        wanted: Callable[[Variable], bool],
+        named: Collection[Variable],
         unroll: int | None,
     ) -> None:
         """Find what goes in and out; of some variables that are made the first run is enough."""
@@ -199,11 +173,11 @@ class Loop:
         self._named = {k for k, v in enumerate(made, 1) if v in named}
         self.touched = Touched([*body.begin, *body.stays, *body.rows], made)
 
-    def __call__(self, runs: int, values: dict[Any, Any]) -> dict[Any, Any]:
+    def __call__(self, runs: int, values: Values) -> Values:
         """What it makes of what is there."""
         body = self.body
 
-        def given(v: Any) -> Given:
+        def given(v: Variable) -> Given:
             if isinstance(v, jex.Literal):
                 return number_of(v), False
             return values[v], v in self._batched
@@ -211,14 +185,14 @@ class Loop:
         known = {
             v: np.asarray(values[v])
             for v in body.stays
-            if v not in self._batched and foldable(values[v], FOLDED)
+            if v not in self._batched and size_of(v) <= FOLDED and not is_key(v.aval.dtype)
         }
         begin = [(np.zeros((), np.int64), False), *map(given, body.begin)]
         with self._lock:  # of the threads that come first, one compiles
             self._compile(known, begin)
             rounds = self.rounds
         if rounds is None:
-            return self._by_jax(runs, values)
+            return dict(zip(self._makes, self._by_jax(runs, values), strict=True))
         free = [v for v in body.stays if v not in known]
         found = rounds(runs, [*begin, *map(given, free), *map(given, body.rows)], self._named)
         return dict(zip([*body.after, *body.made], found[1:], strict=True))
@@ -237,7 +211,7 @@ class Loop:
         if self.rounds is not None:
             self.rounds.hand_over(compiled_rounds)
 
-    def _compile(self, known: dict[Any, np.ndarray], begin: Sequence[Given]) -> None:
+    def _compile(self, known: Values, begin: Sequence[Given]) -> None:
         if self.refused or (self.rounds is not None and self.rounds.holds_for(begin)):
             return
         body, zeros = self.body, {k: zero_in_all(g) for k, g in enumerate(begin) if k}
@@ -250,17 +224,17 @@ class Loop:
             )
         except (ProgramError, BuildError) as error:
             self.refused = error
-            self._by_jax = Batch(self.equations)
-            self._by_jax.compile(self._batched, self._wanted)
+            takes, makes = taken_by(self.equations), made_by(self.equations, self._wanted)
+            self._makes = makes
+            self._by_jax = by_jax(self.equations, makes, [v in self._batched for v in takes])
 
 
 class Staged:
     """A function of one run as a function of a batch of them.
 
-    What loops make of a run has the same bits in any batch; what JAX makes has them to rounding.
+    What is made of a run has the same bits in any batch, but to rounding what stays with JAX.
 
     Attributes:
-        loops: that are worth a program.
         bytes_of_run: about the most that the values of a run take at once, its arguments included.
     """
 
@@ -282,22 +256,25 @@ class Staged:
                 leading axis is one.
             engine: of the rounds of loops: `compiled_rounds`, or `interpreted_rounds`.
         """
-        self._flat = flat = Flat(function, *shapes)
-        self._of_all = flat.tree.children()[0].num_leaves if named else flat.tree.num_leaves
-        axes = {id(e): axis for e in flat.equations if (axis := along(e)) is not None}
+        closed, self._tree = flattened(function, *shapes)
+        flat = closed.jaxpr
+        self._takes: list[Variable] = list(flat.invars)
+        self._makes: list[Variable] = list(flat.outvars)
+        of_all = self._tree.children()[0] if named else self._tree
+        self._of_all: int = of_all.num_leaves
+        axes = {id(e): axis for e in flat.eqns if (axis := along(e)) is not None}
         worth: Counter[Along] = Counter()
-        for e in flat.equations:
+        for e in flat.eqns:
             if (axis := axes.get(id(e))) is not None:
                 worth[axis] += operations(e) + WORTH // FEWEST
-        level: dict[Any, int] = dict.fromkeys(flat.takes, 0)
-        source: dict[Any, Along] = {}  # of what a loop makes, row by row
-        after: set[Any] = set()  # what a loop leaves
-        known = Batch()
-        batches: dict[int, Batch] = {}
+        level: dict[Variable, int] = dict.fromkeys(self._takes, 0)
+        source: dict[Variable, Along] = {}  # of what a loop makes, row by row
+        after: set[Variable] = set()  # what a loop leaves
+        known = Arrays()
+        batches: dict[int, Arrays] = {}
         loops: dict[tuple[int, Along], Loop] = {}
-        for e in flat.equations:
+        for e in flat.eqns:
             axis = axes.get(id(e))
-            axis = axis if axis is not None and worth[axis] >= WORTH else None
             if axis is None:
                 whole, rows = [v for v in e.invars if not isinstance(v, jex.Literal)], []
             else:
@@ -313,40 +290,43 @@ class Staged:
             here = max(of)
             level.update((v, here) for v in e.outvars)
             if axis is None:
-                batches.setdefault(here, Batch()).equations.append(e)
+                batches.setdefault(here, Arrays()).equations.append(e)
                 continue
-            loops.setdefault((here, axis), Loop(axis, engine)).equations.append(e)
+            of_axis = Loop(axis, engine, worth[axis] >= WORTH)
+            loops.setdefault((here, axis), of_axis).equations.append(e)
             made = makes_rows(e)
             source.update((v, axis) for v in made)
             after.update(v for v in e.outvars if v not in source)
         batched = self._batched = set(level)
         parts = [known, *batches.values(), *loops.values()]
         wanted = self._wanted(parts)
-        self._named = set(variables(flat.makes)) - set(variables(flat.makes[: self._of_all]))
-        between = {v for p in parts for v in taken(p)}
+        self._named = set(variables(self._makes)) - set(variables(self._makes[: self._of_all]))
+        between = {v for p in parts for v in taken_by(p.equations)}
         for one in (known, *batches.values()):
-            one.compile(batched, wanted)
+            one.connect(batched, wanted)
         for one in loops.values():
             one.connect(batched, wanted, self._named - between, unroll)
-        self._stages: list[Batch | Loop] = []
+        self._stages: list[Arrays | Loop] = []
         for k in range(max(level.values(), default=0) + 1):
             self._stages += [batches[k]] if k in batches else []
             self._stages += [one for (at, _), one in loops.items() if at == k]
-        self._known = flat.known | known(1, flat.known)
+        given = dict(zip(flat.constvars, map(numbers_of, closed.consts), strict=True))
+        self._known = given | known(1, given)
+        self._known_refused = known.refused
         touched = [self._of_runs(one.touched, between) for one in self._stages]
-        kept = set(variables(flat.makes)) - self._named
-        self._dropped = last_uses(touched, kept | set(flat.takes))
-        self.bytes_of_run = most_bytes(touched, flat.takes, kept)
+        kept = set(variables(self._makes)) - self._named
+        self._dropped = last_uses(touched, kept | set(self._takes))
+        self.bytes_of_run = most_bytes(touched, self._takes, kept)
 
-    def _of_runs(self, one: Touched, between: set[Any]) -> Touched:
+    def _of_runs(self, one: Touched, between: set[Variable]) -> Touched:
         """What a stage takes and makes by run: not of what is known or of the first run alone."""
         here = self._batched - (self._named - between)
         takes, makes = ([v for v in variables(some) if v in here] for some in one[:2])
         return Touched(takes, makes, one.within)
 
-    def _wanted(self, parts: Sequence[Batch | Loop]) -> Callable[[Any], bool]:
+    def _wanted(self, parts: Sequence[Arrays | Loop]) -> Callable[[Variable], bool]:
         """Whether a variable is needed outside of the part that makes it."""
-        out = {*variables(self._flat.makes), *(v for p in parts for v in taken(p))}
+        out = {*variables(self._makes), *(v for p in parts for v in taken_by(p.equations))}
         return out.__contains__
 
     @property
@@ -354,12 +334,19 @@ class Staged:
         """The loops, in an order of computation."""
         return [one for one in self._stages if isinstance(one, Loop)]
 
+    @property
+    def refused(self) -> list[ProgramError | BuildError]:
+        """Reasons for which some of it stays with JAX, once it was called."""
+        arrays = (one for one in self._stages if isinstance(one, Arrays))
+        loops = [loop.refused for loop in self.loops if loop.refused]
+        return [*self._known_refused, *(why for one in arrays for why in one.refused), *loops]
+
     def __call__(self, *args: Any) -> Any:
         """The function on arguments with a leading axis of runs, as arrays of NumPy or JAX."""
         leaves = jax.tree_util.tree_leaves(args)
         runs = leaves[0].shape[0]
         values = dict(self._known)
-        values.update(zip(self._flat.takes, leaves, strict=True))
+        values.update(zip(self._takes, map(numbers_of, leaves), strict=True))
         for stage, dropped in zip(self._stages, self._dropped, strict=True):
             values.update(stage(runs, values))
             for v in dropped:
@@ -368,25 +355,20 @@ class Staged:
                     values[v] = first_of(value)
                 del value
 
-        def found(v: Any, count: int) -> Any:
-            if not isinstance(v, jex.Literal) and v in self._batched:
-                return values[v] if count > 1 else first_of(values[v])
-            alone = np.asarray(v.val if isinstance(v, jex.Literal) else values[v])
-            return np.broadcast_to(alone, (count, *alone.shape))
+        def found(v: Variable, count: int) -> Any:
+            if isinstance(v, jex.Literal) or v not in self._batched:
+                alone = number_of(v) if isinstance(v, jex.Literal) else values[v]
+                value = np.broadcast_to(alone, (count, *alone.shape))
+            else:
+                value = values[v] if count > 1 else first_of(values[v])
+            dtype: Any = getattr(v.aval, "dtype")  # noqa: B009 pyright knows no such attribute
+            return array_of(value, dtype) if is_key(dtype) else value
 
-        many, few = self._flat.makes[: self._of_all], self._flat.makes[self._of_all :]
+        many, few = self._makes[: self._of_all], self._makes[self._of_all :]
         leaves = [*(found(v, runs) for v in many), *(found(v, 1) for v in few)]
-        return jax.tree_util.tree_unflatten(self._flat.tree, leaves)
+        return jax.tree_util.tree_unflatten(self._tree, leaves)
 
 
-def first_of(value: Any) -> Any:
+def first_of(value: np.ndarray) -> np.ndarray:
     """The first run of an array of runs, without holding the others."""
-    if value.shape[0] == 1:
-        return value
-    return value[:1] if is_key(value.dtype) else np.array(np.asarray(value)[:1])
-
-
-def taken(part: Batch | Loop) -> list[Any]:
-    """The variables that a part takes from others."""
-    made = {v for e in part.equations for v in e.outvars}
-    return [v for e in part.equations for v in variables(e.invars) if v not in made]
+    return value if value.shape[0] == 1 else value[:1].copy()

@@ -107,11 +107,27 @@ def line_of(equation: Any) -> str:
 
 
 class Walk:
-    """A walk through jaxprs that writes into one graph."""
+    """A walk through jaxprs that writes into one graph.
+
+    Attributes:
+        graph: of nodes.
+        inputs: arguments so far; reals count by themselves, all else too.
+        unroll: as in `trace`.
+    """
 
     def __init__(self, graph: Graph, unroll: int | None = None):
         self.graph, self.unroll = graph, unroll
+        self.inputs: list[Leaf] = []
         self.alike: list[tuple[Node, ...]] = []  # rows of arrays, which may be computed in a loop
+
+    def taken(self, shape: tuple[int, ...], dtype: Any, path: str = "", zero: Any = None) -> Nodes:
+        """Nodes of one more argument; zero: (shape) which of its entries are known to be zero."""
+        leaf = Leaf(shape, dtype, kind_of(dtype, path), path or f"arguments[{len(self.inputs)}]")
+        count = counts(self.inputs)[leaf.kind != "real"]
+        self.inputs.append(leaf)
+        ids = [self.graph.input(count + k, leaf.kind) for k in range(int(np.prod(shape)))]
+        nodes = np.array(ids, dtype=np.int64).reshape(shape)
+        return nodes if zero is None else np.where(zero, self.graph.constant(0, "real"), nodes)
 
     def stays_whole(self, size: int) -> bool:
         """Whether what is so many scalar operations is not written out, but a loop or a call."""
@@ -334,21 +350,14 @@ def _program(
     """The program of a jaxpr, some entries of its arguments known to be zero."""
     import robins.program.primitives  # noqa: F401
 
-    graph = Graph()
-    walk = Walk(graph, unroll)
-    counted = {"real": 0, "other": 0}
-    nodes = []
-    inputs = _leaves(given, "arguments")
-    for index, leaf in enumerate(inputs):
-        pool = "real" if leaf.kind == "real" else "other"
-        size = int(np.prod(leaf.shape))
-        ids = [graph.input(counted[pool] + k, leaf.kind) for k in range(size)]
-        counted[pool] += size
-        array = np.array(ids, dtype=np.int64).reshape(leaf.shape)
-        if index in zeros:
-            array = np.where(zeros[index], graph.constant(0, "real"), array)
-        nodes.append(array)
+    walk = Walk(Graph(), unroll)
+    nodes = [
+        walk.taken(leaf.shape, leaf.dtype, leaf.path, zeros.get(index))
+        for index, leaf in enumerate(_leaves(given, "arguments"))
+    ]
     outputs = walk.closed(jaxpr, *nodes)
     structures = tuple(jax.tree_util.tree_structure(tree) for tree in (given, results))
     leaves = _leaves(results, "results")
-    return Program(graph, inputs, outputs, leaves, structures, walk.alike, unroll, zeros)
+    return Program(
+        *(walk.graph, walk.inputs, outputs, leaves, structures, walk.alike, unroll, zeros)
+    )

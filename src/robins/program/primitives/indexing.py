@@ -108,15 +108,79 @@ def _starts(
     return start
 
 
+def _windows(
+    shape: SIZES, sizes: SIZES, indices: np.ndarray, axes: Any, along: Any, by: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places of the entries of windows (batch..., *sizes) in an array, for indices that are known.
+
+    Windows are moved inside; also, which (batch...) lay inside before.
+    """
+    start = np.zeros((*indices.shape[:-1], len(shape)), np.int64)
+    start[..., list(axes)] = indices
+    for axis, dim in zip(along, by, strict=True):
+        lengths = [-1 if k == dim else 1 for k in range(indices.ndim - 1)]
+        start[..., axis] = np.arange(indices.shape[dim]).reshape(lengths)
+    most = np.subtract(shape, sizes)
+    inside = np.asarray(np.all((start >= 0) & (start <= most), axis=-1))
+    strides = np.cumprod([1, *shape[:0:-1]])[::-1]
+    begin = np.clip(start, 0, most) @ strides
+    within = np.tensordot(strides, np.indices(sizes), 1)
+    return begin.reshape(*begin.shape, *[1] * len(sizes)) + within, inside
+
+
+def gathered(equation: Any, indices: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Places that a gather takes at indices that are known; -1 is what it gives outside."""
+    p, d = equation.params, equation.params["dimension_numbers"]
+    sizes = tuple(int(n) for n in p["slice_sizes"])
+    found, inside = _windows(
+        *(places.shape, sizes, indices, d.start_index_map),
+        *(d.operand_batching_dims, d.start_indices_batching_dims),
+    )
+    if _drops(equation):
+        found = np.where(inside.reshape(*inside.shape, *[1] * len(sizes)), found, -1)
+    gone = {*d.collapsed_slice_dims, *d.operand_batching_dims}
+    batches = inside.ndim
+    found = found.squeeze(tuple(batches + axis for axis in gone))
+    offsets = [int(k) for k in d.offset_dims]
+    others = [k for k in range(found.ndim) if k not in offsets]
+    return np.moveaxis(found, range(found.ndim), [*others, *offsets])
+
+
+def scattered(
+    equation: Any, indices: np.ndarray, places: np.ndarray, new: np.ndarray
+) -> np.ndarray:
+    """Places of an array, those of what is scattered into it at indices that are known put in."""
+    d = equation.params["dimension_numbers"]
+    windows = [int(k) for k in d.update_window_dims]
+    rows = new.transpose([*(k for k in range(new.ndim) if k not in windows), *windows])
+    gone = {*d.inserted_window_dims, *d.operand_batching_dims}
+    kept = iter(new.shape[k] for k in windows)
+    sizes = tuple(1 if axis in gone else next(kept) for axis in range(places.ndim))
+    at, inside = _windows(
+        *(places.shape, sizes, indices, d.scatter_dims_to_operand_dims),
+        *(d.operand_batching_dims, d.scatter_indices_batching_dims),
+    )
+    rows = rows.reshape(at.shape)
+    if _drops(equation):
+        at, rows = at[inside], rows[inside]
+    found = places.copy()
+    found.reshape(-1)[at.ravel()] = rows.ravel()
+    return found
+
+
 @rule("gather")
 def _gather(walk: Walk, equation: Any, a: Nodes, indices: Nodes) -> Nodes:
+    known = walk.known(indices)
+    if known is not None:
+        at = gathered(equation, known, np.arange(a.size).reshape(a.shape))
+        return np.append(a, walk.constants(filling(equation)))[at]
     p, d = equation.params, equation.params["dimension_numbers"]
     sizes = tuple(int(n) for n in p["slice_sizes"])
     gone = {*d.collapsed_slice_dims, *d.operand_batching_dims}
     kept = tuple(n for axis, n in enumerate(sizes) if axis not in gone)
     batches = indices.shape[:-1]
     found = np.zeros((*batches, *kept), dtype=np.int64)
-    dtype = equation.outvars[0].aval.dtype
+    outside = walk.constants(filling(equation)).item()
     for batch in np.ndindex(*batches):
         start = _starts(
             *(walk, indices, batch, a.ndim, d.start_index_map),
@@ -125,7 +189,7 @@ def _gather(walk: Walk, equation: Any, a: Nodes, indices: Nodes) -> Nodes:
         one = window(walk, a, start, sizes).reshape(kept)
         if _drops(equation):
             inside = _inside(walk, start, a.shape, sizes)
-            one = walk.select(np.full(kept, inside), one, np.full(kept, _filling(walk, p, dtype)))
+            one = walk.select(np.full(kept, inside), one, np.full(kept, outside))
         found[batch] = one
     # The axes of a window go where the primitive says, those of the indices to the other places.
     offsets = [int(k) for k in d.offset_dims]
@@ -133,14 +197,14 @@ def _gather(walk: Walk, equation: Any, a: Nodes, indices: Nodes) -> Nodes:
     return np.moveaxis(found, range(found.ndim), [*others, *offsets])
 
 
-def _filling(walk: Walk, p: Any, dtype: Any) -> Node:
-    value = p["fill_value"]
+def filling(equation: Any) -> np.ndarray:
+    """The number that a gather gives outside of its array."""
+    dtype, value = np.dtype(equation.outvars[0].aval.dtype), equation.params["fill_value"]
     if value is None:
-        kind = np.dtype(dtype).kind
-        value = {"f": np.nan, "b": True}.get(kind)
-        if value is None:
-            value = np.iinfo(dtype).min if kind == "i" else np.iinfo(dtype).max
-    return walk.constants(np.asarray(value, dtype)).item()
+        value = {"f": np.nan, "b": True}.get(dtype.kind)
+    if value is None:
+        value = np.iinfo(dtype).min if dtype.kind == "i" else np.iinfo(dtype).max
+    return np.asarray(value, dtype)
 
 
 JOINED = {

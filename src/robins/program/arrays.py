@@ -1,0 +1,372 @@
+"""Equations on arrays of all runs: NumPy moves large ones, programs compute numbers.
+
+Between the loops of a function lie a few numbers of each run, which are a program of one round
+(`Written`), and long histories that are cut, joined and gathered (`moved`) or computed entry by
+entry. Programs are interpreted: nothing is compiled. What has no place in a program stays with JAX
+(`by_jax`).
+
+Arrays are those of NumPy, with a leading axis of runs where they depend on the run; a key of random
+numbers is a whole number (`robins.program.kinds.numbers_of`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Collection, Sequence
+
+import jax
+import numpy as np
+from jax.extend import core as jex
+
+from robins.program.interpreter import interpreted_rounds
+from robins.program.kinds import array_of, numbers_of
+from robins.program.lanes import Given, Rounds
+from robins.program.liveness import (
+    Equation,
+    Touched,
+    Variable,
+    bytes_of,
+    bytes_of_jaxpr,
+    last_uses,
+    variables,
+)
+from robins.program.loops import ENTRYWISE, number_of
+from robins.program.nodes import Graph
+from robins.program.primitives.indexing import filling, gathered, scattered
+from robins.program.refusal import BuildError, ProgramError
+from robins.program.trace import RULES, Leaf, Program, Walk, kind_of
+
+Values = dict[Variable, np.ndarray]
+
+LARGE = 200  # entries of an array beyond which it is moved as a whole
+FOLDED = 2_000  # indices or flags that become part of a program
+MOST = 200_000  # about as many nodes of one equation are written out
+DRAW = 150  # nodes of a random number
+UNROLL = 3_000
+MOVES = {
+    *("broadcast_in_dim", "reshape", "transpose", "squeeze", "expand_dims", "slice", "pad", "rev"),
+    *("concatenate", "stack", "tile", "split", "unstack", "iota"),
+}
+INDEXED = {"gather": gathered, "scatter": scattered}
+# Of these XLA must not run two batches at once (`docs/performance.md`).
+FACTORISED = ("qr[", "lu[", "eigh[", "svd[", "cholesky[", "triangular_solve[")
+_one_at_a_time = threading.Lock()
+
+
+# Variables that are taken, those that are made, and how: of the number of runs and of values.
+Compute = Callable[[int, Values], Sequence[np.ndarray]]
+Step = tuple[list[Variable], list[Variable], Compute]
+
+
+def size_of(v: Variable) -> int:
+    """Number of entries of a variable or literal."""
+    return int(np.prod(v.aval.shape))
+
+
+def taken_by(equations: Sequence[Equation]) -> list[Variable]:
+    """The variables that equations take from others, each once."""
+    made = {v for e in equations for v in e.outvars}
+    every = (v for e in equations for v in variables(e.invars))
+    return list(dict.fromkeys(v for v in every if v not in made))
+
+
+def made_by(equations: Sequence[Equation], wanted: Callable[[Variable], bool]) -> list[Variable]:
+    """The variables that equations make for others."""
+    return [v for e in equations for v in e.outvars if wanted(v)]
+
+
+class Written:
+    """Equations as a program of one round, for all runs; or for all entries of arrays.
+
+    Attributes:
+        takes, makes: variables.
+        refused: the reason if they are no program.
+    """
+
+    def __init__(
+        self,
+        equations: Sequence[Equation],
+        makes: list[Variable],
+        batched: Collection[Variable],
+        entries: tuple[int, ...] = (),
+    ):
+        """Write the program when it is called first.
+
+        Args:
+            equations: in an order of computation.
+            makes: variables that are wanted.
+            batched: variables that depend on the run.
+            entries: the shape of all large arrays; given, the equations are those of one entry.
+        """
+        self.takes, self.makes, self._entries = taken_by(equations), makes, entries
+        self.refused: ProgramError | BuildError | None = None
+        self._equations, self._batched = equations, [v in batched for v in self.takes]
+        self._compute: Compute | None = None
+        self._lock = threading.Lock()
+
+    def __call__(self, runs: int, values: Values) -> Sequence[np.ndarray]:
+        """Compute the equations, for one run where they depend on none."""
+        with self._lock:  # of the threads that come first, one writes the program
+            if self._compute is None:
+                self._compute = self._made(values)
+        return self._compute(runs, values)
+
+    def _made(self, values: Values) -> Compute:
+        known = {v: values[v] for v, b in zip(self.takes, self._batched, strict=True) if not b}
+        known = {v: a for v, a in known.items() if a.dtype.kind in "bi" and a.size <= FOLDED}
+        self._free = [k for k, v in enumerate(self.takes) if v not in known]
+        try:
+            program = self._program({} if self._entries else known)
+            self._rounds = Rounds(program, 1, 0, len(program.inputs), engine=interpreted_rounds)
+        except (ProgramError, BuildError) as error:
+            self.refused = error
+            return by_jax(self._equations, self.makes, self._batched)
+        return self._of_entries if self._entries else self._of_runs
+
+    def _program(self, known: Values) -> Program:
+        """Write the program; known: indices and flags, which are the same in all calls."""
+        if nodes_of(self._equations) > MOST and not self._entries:
+            raise ProgramError("it has too many numbers to be written out")
+        walk = Walk(Graph(), UNROLL)
+        shape = (lambda v: ()) if self._entries else (lambda v: v.aval.shape)
+        nodes = [
+            walk.constants(known[v]) if v in known else walk.taken(shape(v), v.aval.dtype)
+            for v in self.takes
+        ]
+        jaxpr = jaxpr_of(self._equations, self.takes, self.makes)
+        outputs = walk.open(jaxpr, (), nodes)
+        results = [Leaf(shape(v), v.aval.dtype, kind_of(v.aval.dtype), "") for v in self.makes]
+        return Program(
+            *(walk.graph, walk.inputs, outputs, results, (None, None), walk.alike, UNROLL)
+        )
+
+    def _of_runs(self, runs: int, values: Values) -> Sequence[np.ndarray]:
+        given = [(values[self.takes[k]], self._batched[k]) for k in self._free]
+        if not any(self._batched):
+            return [np.asarray(a[0, 0]) for a in self._rounds(1, given)]
+        return [a[:, 0] for a in self._rounds(runs, given)]
+
+    def _of_entries(self, runs: int, values: Values) -> Sequence[np.ndarray]:
+        """Compute all entries of all runs; of arrays that depend on no run once."""
+        lead = (runs,) if any(self._batched) else ()
+        shape = *lead, *self._entries
+        given: list[Given] = []
+        for v, batched in zip(self.takes, self._batched, strict=True):
+            array = values[v]
+            if v.aval.shape:
+                array = np.broadcast_to(array, shape).reshape(-1)
+            elif batched:  # a number of each run, for all its entries
+                array = np.repeat(array, int(np.prod(self._entries)))
+            given.append((array, batched or bool(v.aval.shape)))
+        return [a.reshape(shape) for a in self._rounds(int(np.prod(shape)), given)]
+
+
+def by_jax(
+    equations: Sequence[Equation], makes: list[Variable], batched: Sequence[bool]
+) -> Compute:
+    """Equations that JAX computes for all runs at once; batched: by variable that they take."""
+    takes = taken_by(equations)
+    jaxpr = jaxpr_of(equations, takes, makes)
+    function = jex.jaxpr_as_fun(jex.ClosedJaxpr(jaxpr, []))
+    axes = tuple(0 if b else None for b in batched)
+    compiled = jax.jit(jax.vmap(function, axes) if any(batched) else function)
+    alone = any(name in str(jaxpr) for name in FACTORISED)
+
+    def compute(runs: int, values: Values) -> Sequence[np.ndarray]:
+        given = [array_of(values[v], v.aval.dtype) for v in takes]
+        with _one_at_a_time if alone else contextlib.nullcontext():
+            return list(map(numbers_of, compiled(*given)))
+
+    return compute
+
+
+def moved(e: Equation, batched: Collection[Variable]) -> Compute:
+    """An equation that moves or counts the entries of arrays, at places that all runs share."""
+    name = e.primitive.name
+    index = e.invars[1] if name in INDEXED else None
+    data = [v for v in e.invars if v is not index]
+    found: list[np.ndarray] = []  # for each entry of the results its place among those of all data
+    of_runs = [v in batched for v in variables(e.invars)]
+
+    def flat(v: Variable, runs: int, values: Values) -> np.ndarray:
+        depends = not isinstance(v, jex.Literal) and v in batched
+        return _value(v, values).reshape(runs if depends else 1, -1)
+
+    def compute(runs: int, values: Values) -> Sequence[np.ndarray]:
+        if not found:
+            known = [] if index is None else [_value(index, values)]
+            found.extend(_places(e, known, data))
+        parts = [flat(v, runs, values) for v in data]
+        if name == "gather":
+            parts.append(np.full((1, 1), filling(e)))
+        if name == "iota":
+            parts.append(np.arange(found[0].max(initial=0) + 1, dtype=e.params["dtype"])[None])
+        wide = max(map(len, parts))
+        if len(parts) > 1:
+            parts = [
+                np.concatenate([np.broadcast_to(a, (wide, a.shape[1])) for a in parts], axis=1)
+            ]
+        made = [_at(parts[0], places) for places in found]
+        return made if any(of_runs) else [np.asarray(a[0]) for a in made]
+
+    return compute
+
+
+def _places(e: Equation, known: list[np.ndarray], data: list[Variable]) -> list[np.ndarray]:
+    name, p = e.primitive.name, e.params
+    if name == "iota":
+        along = [-1 if k == p["dimension"] else 1 for k in range(len(p["shape"]))]
+        return [np.broadcast_to(np.arange(p["shape"][p["dimension"]]).reshape(along), p["shape"])]
+    places, begin = [], 0
+    for v in data:
+        places.append(np.arange(begin, begin + size_of(v)).reshape(v.aval.shape))
+        begin += size_of(v)
+    if name in INDEXED:
+        return [INDEXED[name](e, *known, *places)]
+    made = RULES[name](Walk(Graph()), e, *places)
+    return list(made) if isinstance(made, (list, tuple)) else [made]
+
+
+class Arrays:
+    """Equations outside of loops, in an order of computation.
+
+    Attributes:
+        equations: all.
+        takes, makes: variables.
+    """
+
+    def __init__(self, equations: Sequence[Equation] = ()) -> None:
+        self.equations = list(equations)
+        self.takes: list[Variable] = []
+        self.makes: list[Variable] = []
+        self._steps: list[Step] = []
+        self._dropped: list[list[Equation]] = []
+        self._most = 0
+
+    @property
+    def touched(self) -> Touched:
+        """Variables in and out, and the bytes needed in between."""
+        outside = sum(map(bytes_of, {*self.takes, *self.makes}))
+        return Touched(self.takes, self.makes, max(self._most - outside, 0))
+
+    @property
+    def refused(self) -> list[ProgramError | BuildError]:
+        """Reasons for which some of it stays with JAX, once it was called."""
+        every = (step for _, _, step in self._steps if isinstance(step, Written))
+        return [step.refused for step in every if step.refused is not None]
+
+    def connect(self, batched: Collection[Variable], wanted: Callable[[Variable], bool]) -> None:
+        """Find what goes in and out, and part it into steps."""
+        self.takes, self.makes = taken_by(self.equations), made_by(self.equations, wanted)
+        self._most = bytes_of_jaxpr(jaxpr_of(self.equations, self.takes, self.makes))
+        self._steps = parted(self.equations, self.makes, batched)
+        touched = [Touched(takes, makes) for takes, makes, _ in self._steps]
+        self._dropped = last_uses(touched, {*self.takes, *self.makes})
+
+    def __call__(self, runs: int, values: Values) -> Values:
+        """Compute what is made of what is there."""
+        here = {v: values[v] for v in self.takes}
+        for (_, makes, step), dropped in zip(self._steps, self._dropped, strict=True):
+            here.update(zip(makes, step(runs, here), strict=True))
+            for v in dropped:
+                here.pop(v, None)
+        return {v: here[v] for v in self.makes}
+
+
+def parted(
+    equations: Sequence[Equation], makes: list[Variable], batched: Collection[Variable]
+) -> list[Step]:
+    """Equations as steps: what is small at each level together, then what is large."""
+    level: dict[
+        Variable, tuple[int, bool]
+    ] = {}  # of what is made, and whether it is made last there
+    small: dict[int, list[Equation]] = {}
+    large: dict[int, list[Equation]] = {}
+    for e in equations:
+        whole = is_large(e, batched)
+        of = [level[v] for v in variables(e.invars) if v in level]
+        here = max((k + (last and not whole) for k, last in of), default=0)
+        (large if whole else small).setdefault(here, []).append(e)
+        level.update((v, (here, whole)) for v in e.outvars)
+    groups = [
+        group
+        for k in sorted({*small, *large})
+        for group in ([small[k]] if k in small else []) + together(large.get(k, []))
+    ]
+    needed = {*makes, *(v for group in groups for v in taken_by(group))}
+    return [_step(group, made_by(group, needed.__contains__), batched) for group in groups]
+
+
+def together(equations: Sequence[Equation]) -> list[list[Equation]]:
+    """Large equations: those that follow each other and go entry by entry are one group."""
+    groups: list[list[Equation]] = []
+    kinds: list[tuple[int, ...] | None] = []
+    for e in equations:
+        kind = e.outvars[0].aval.shape if e.primitive.name in ENTRYWISE else None
+        if kind is not None and kinds and kinds[-1] == kind:
+            groups[-1].append(e)
+        else:
+            groups.append([e])
+            kinds.append(kind)
+    return groups
+
+
+def nodes_of(equations: Sequence[Equation]) -> int:
+    """About how many nodes the longest of some equations is."""
+    return max(
+        max(map(size_of, [*e.invars, *e.outvars]), default=0)
+        * (DRAW if e.primitive.name == "random_bits" else 1)
+        for e in equations
+    )
+
+
+def is_moved(e: Equation, batched: Collection[Variable]) -> bool:
+    """Whether an equation moves entries, to places that all runs share."""
+    name = e.primitive.name
+    if name in INDEXED:
+        return not set(variables([e.invars[1]])) & set(batched)
+    return name in MOVES
+
+
+def is_large(e: Equation, batched: Collection[Variable]) -> bool:
+    """Whether an equation is a step of its own: of large arrays, or none for a program."""
+    name, most = e.primitive.name, nodes_of([e])
+    if name not in RULES or most > MOST:
+        return True
+    return most > LARGE and (name in ENTRYWISE or is_moved(e, batched))
+
+
+def _step(equations: list[Equation], makes: list[Variable], batched: Collection[Variable]) -> Step:
+    e = equations[0]
+    large = is_large(e, batched)
+    if large and is_moved(e, batched):
+        return variables(e.invars), list(e.outvars), moved(e, batched)
+    entries = e.outvars[0].aval.shape if large and e.primitive.name in ENTRYWISE else ()
+    one = Written(equations, makes, batched, entries)
+    return one.takes, one.makes, one
+
+
+def jaxpr_of(
+    equations: Sequence[Equation],
+    takes: Sequence[Variable],
+    makes: Sequence[Variable],
+    known: Sequence[Variable] = (),
+) -> jex.Jaxpr:
+    """Equations as a jaxpr; known: variables of its constants."""
+    about = jex.DebugInfo("jit", "stage", None, None)
+    return jex.Jaxpr(list(known), list(takes), list(makes), list(equations), debug_info=about)
+
+
+def _value(v: Variable, values: Values) -> np.ndarray:
+    return number_of(v) if isinstance(v, jex.Literal) else np.asarray(values[v])
+
+
+def _at(entries: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Entries (runs, n) at places, without copying where these are in a row."""
+    flat = places.ravel()
+    if flat.size and flat[0] >= 0 and np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size)):
+        found = entries[:, flat[0] : flat[0] + flat.size]
+    else:
+        found = entries[:, flat]
+    return found.reshape(len(entries), *places.shape)
