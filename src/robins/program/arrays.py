@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from jax.extend import core as jex
 
-from robins.program.interpreter import interpreted_rounds
+from robins.program.kept import kept
 from robins.program.kinds import array_of, numbers_of
 from robins.program.lanes import Given, Rounds
 from robins.program.liveness import (
@@ -28,6 +28,7 @@ from robins.program.liveness import (
     Variable,
     bytes_of,
     bytes_of_jaxpr,
+    jaxpr_of,
     last_uses,
     variables,
 )
@@ -116,9 +117,12 @@ class Written:
         known = {v: values[v] for v, b in zip(self.takes, self._batched, strict=True) if not b}
         known = {v: a for v, a in known.items() if a.dtype.kind in "bi" and a.size <= FOLDED}
         self._free = [k for k, v in enumerate(self.takes) if v not in known]
+        known = {} if self._entries else known
         try:
-            program = self._program({} if self._entries else known)
-            self._rounds = Rounds(program, 1, 0, len(program.inputs), engine=interpreted_rounds)
+            jaxpr = jaxpr_of(self._equations, self.takes, self.makes)
+            parts = [jaxpr, self._entries, [known.get(v) for v in self.takes]]
+            program, engine, _ = kept(parts, lambda: self._program(known))
+            self._rounds = Rounds(program, 1, 0, len(program.inputs), engine=engine)
         except (ProgramError, BuildError) as error:
             self.refused = error
             return by_jax(self._equations, self.makes, self._batched)
@@ -345,17 +349,6 @@ def _step(equations: list[Equation], makes: list[Variable], batched: Collection[
     entries = e.outvars[0].aval.shape if large and e.primitive.name in ENTRYWISE else ()
     one = Written(equations, makes, batched, entries)
     return one.takes, one.makes, one
-
-
-def jaxpr_of(
-    equations: Sequence[Equation],
-    takes: Sequence[Variable],
-    makes: Sequence[Variable],
-    known: Sequence[Variable] = (),
-) -> jex.Jaxpr:
-    """Equations as a jaxpr; known: variables of its constants."""
-    about = jex.DebugInfo("jit", "stage", None, None)
-    return jex.Jaxpr(list(known), list(takes), list(makes), list(equations), debug_info=about)
 
 
 def _value(v: Variable, values: Values) -> np.ndarray:

@@ -49,6 +49,15 @@ class Interpreter:
         """Translate a program."""
         return Tape(program, self.codes, self.flag)
 
+    def rounds(self, tape: Tape) -> tuple[Scan, int]:
+        """Rounds of a tape, and how many runs they take at a time."""
+
+        def scan(rounds: ctypes.c_void_p) -> int:
+            registers = self.registers(tape)
+            return self.library.robins_scan(rounds, tape.address, address(registers))
+
+        return scan, self.width
+
     def registers(self, tape: Tape) -> np.ndarray:
         """Memory in which a tape computes, with its constants; one thread at a time may use it."""
         size = self.library.robins_bytes(tape.address) // 8
@@ -114,10 +123,4 @@ def interpreted_rounds(program: Program) -> tuple[Scan, int]:
         BuildError: as for `interpreter_of_many`.
     """
     interpreter = interpreter_of_many()
-    tape = interpreter.tape(program)
-
-    def scan(rounds: ctypes.c_void_p) -> int:
-        registers = interpreter.registers(tape)
-        return interpreter.library.robins_scan(rounds, tape.address, address(registers))
-
-    return scan, interpreter.width
+    return interpreter.rounds(interpreter.tape(program))

@@ -94,3 +94,14 @@ def bytes_of(v: Variable) -> int:
 def variables(some: Iterable[Variable]) -> list[Variable]:
     """Those that are not literals."""
     return [v for v in some if not isinstance(v, jex.Literal)]
+
+
+def jaxpr_of(
+    equations: Sequence[Equation],
+    takes: Sequence[Variable],
+    makes: Sequence[Variable],
+    known: Sequence[Variable] = (),
+) -> jex.Jaxpr:
+    """Equations as a jaxpr; known: variables of its constants."""
+    about = jex.DebugInfo("jit", "stage", None, None)
+    return jex.Jaxpr(list(known), list(takes), list(makes), list(equations), debug_info=about)

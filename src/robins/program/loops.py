@@ -8,14 +8,14 @@ written to memory. What a round leaves for the next is carried.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jax.extend import core as jex
 
 from robins.program.kinds import kind_of
-from robins.program.liveness import Equation, Variable, variables
+from robins.program.liveness import Equation, Variable, jaxpr_of, variables
 from robins.program.nodes import Graph
 from robins.program.primitives.control import size_of
 from robins.program.primitives.random import bits_of, numbered
@@ -173,6 +173,16 @@ class Body:
             rows.update(dict.fromkeys(v for v in by_row if v not in inside))
         self.stays, self.rows = list(stays), list(rows)
         self.made = [v for e in equations for v in makes_rows(e) if wanted(v)]
+
+    @property
+    def jaxpr(self) -> jex.Jaxpr:
+        """The equations, on all rows."""
+        takes = [*variables(self.begin), *self.stays, *self.rows]
+        return jaxpr_of(self.equations, list(dict.fromkeys(takes)), [*self.after, *self.made])
+
+    def known(self, known: Mapping[Variable, np.ndarray]) -> list[np.ndarray | None]:
+        """What is known of those that stay, in their order."""
+        return [known.get(v) for v in self.stays]
 
     def program(
         self, known: dict[Variable, np.ndarray], zeros: dict[int, np.ndarray], unroll: int | None

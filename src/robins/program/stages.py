@@ -29,6 +29,7 @@ from robins.program.arrays import (
     taken_by,
 )
 from robins.program.interpreter import interpreted_rounds
+from robins.program.kept import kept
 from robins.program.kinds import array_of, is_key, numbers_of
 from robins.program.lanes import Given, Rounds, Scan, compiled_rounds, zero_in_all
 from robins.program.liveness import Equation, Touched, Variable, last_uses, most_bytes, variables
@@ -149,6 +150,7 @@ class Loop:
         equations: in an order of computation.
         is_worth: of the time that a compiler takes for it.
         refused: why they are no program.
+        nodes: of its program, where it is interpreted.
     """
 
     def __init__(self, axis: Along, engine: Engine, is_worth: bool):
@@ -157,6 +159,7 @@ class Loop:
         self.equations: list[Equation] = []
         self.refused: ProgramError | BuildError | None = None
         self.rounds: Rounds | None = None
+        self.nodes = 0
         self._lock = threading.Lock()
 
     def connect(
@@ -197,11 +200,6 @@ class Loop:
         found = rounds(runs, [*begin, *map(given, free), *map(given, body.rows)], self._named)
         return dict(zip([*body.after, *body.made], found[1:], strict=True))
 
-    @property
-    def nodes(self) -> int:
-        """How many nodes its program has, once it was called."""
-        return len(self.rounds.program.live) if self.rounds else 0
-
     def hand_over(self) -> None:
         """Compile the rounds of a loop that was called; they have the same bits.
 
@@ -209,19 +207,26 @@ class Loop:
             BuildError: there is no compiler, or it refuses the program.
         """
         if self.rounds is not None:
+            if not self.rounds.program.outputs:  # from the cache
+                self.rounds.program = self._write()
             self.rounds.hand_over(compiled_rounds)
 
     def _compile(self, known: Values, begin: Sequence[Given]) -> None:
         if self.refused or (self.rounds is not None and self.rounds.holds_for(begin)):
             return
         body, zeros = self.body, {k: zero_in_all(g) for k, g in enumerate(begin) if k}
+        self._write = lambda: lasting(
+            lambda some: [body.program(known, some, self._unroll)], zeros
+        )[0]
         try:
-            (program,) = lasting(lambda some: [body.program(known, some, self._unroll)], zeros)
+            if self._engine is interpreted_rounds:
+                parts = [body.jaxpr, self.axis, self._unroll, body.known(known), zeros]
+                program, engine, self.nodes = kept(parts, self._write)
+            else:
+                program, engine = self._write(), self._engine
             stays = len(body.stays) - len(known)
             axis = self.axis
-            self.rounds = Rounds(
-                program, axis.length, len(begin), stays, axis.backwards, self._engine
-            )
+            self.rounds = Rounds(program, axis.length, len(begin), stays, axis.backwards, engine)
         except (ProgramError, BuildError) as error:
             self.refused = error
             takes, makes = taken_by(self.equations), made_by(self.equations, self._wanted)

@@ -289,7 +289,9 @@ class Tape:
     """A program as a tape.
 
     Attributes:
-        address: its fields, as `interpreter.cc` has them.
+        arrays: instructions, lists, constants with their registers, registers of the results.
+        sizes: counts of instructions, constants, registers, scratch, and of what goes in and out.
+        address: of these, as `interpreter.cc` has them.
     """
 
     def __init__(self, program: Program, codes: Mapping[str, int], flag: int):
@@ -323,16 +325,27 @@ class Tape:
         ordered = [r for r, k in zip(results, real, strict=True) if k]
         ordered += [r for r, k in zip(results, real, strict=True) if not k]
         pairs = [(at, bits) for bits, at in self._constants.items()]
-        self._arrays = (
+        arrays = (
             np.array(self._rows, np.int32).reshape(-1, 5),
             np.array(self._lists, np.int32),
             np.array(pairs, np.int64).reshape(-1, 2),
             np.array(ordered, np.int32),
         )
         sizes = len(self._rows), len(pairs), self._count, self._scratch, nx, nk, ny, nm
-        self._fields = np.array([*(a.ctypes.data for a in self._arrays), *sizes], np.int64)
-        self.address = address(self._fields)
+        self._hold(arrays, np.array(sizes, np.int64))
         del self._writer, self._rows, self._lists, self._of, self._free, self._ends
+
+    @classmethod
+    def of(cls, arrays: Sequence[np.ndarray], sizes: np.ndarray) -> Tape:
+        """Tape of what another one holds."""
+        made = object.__new__(cls)
+        made._hold(arrays, sizes)
+        return made
+
+    def _hold(self, arrays: Sequence[np.ndarray], sizes: np.ndarray) -> None:
+        self.arrays, self.sizes = arrays, sizes
+        self._fields = np.array([*(a.ctypes.data for a in arrays), *sizes], np.int64)
+        self.address = address(self._fields)
 
     def _bits(self, kind: str, value: np.generic | int) -> int:
         """The 64 bits of a number in a register; a word fills both halves."""
