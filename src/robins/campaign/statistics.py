@@ -13,7 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from robins.campaign.histogram import counted, joined, percentiles
 from robins.filters import Tally
@@ -445,7 +445,7 @@ def mean_with_bounds(values: np.ndarray, level: float = 0.95) -> tuple[Numbers, 
     mean, count = np.mean(values, axis=0), len(values)
     if count < 2:
         return mean, mean * np.nan, mean * np.nan
-    quantile = stats.t.ppf(0.5 + level / 2.0, count - 1)
+    quantile = stdtrit(count - 1, 0.5 + level / 2.0)
     half = quantile * np.std(values, axis=0, ddof=1) / np.sqrt(count)
     return mean, mean - half, mean + half
 

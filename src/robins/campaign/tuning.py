@@ -17,7 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy import optimize, stats
+from scipy import optimize
+from scipy.special import ndtri, stdtrit
 
 from robins.errors import RobinsError
 from robins.filters.values import as_data
@@ -283,7 +284,7 @@ def _sigma(slopes: Slopes, x: np.ndarray, names: Sequence[str]) -> np.ndarray:
     lost = np.isnan(scale)
     spread = np.where(np.outer(lost, lost), np.inf, np.nan_to_num(turned))
     sigma = np.array([_along(row, spread) for row in axes])
-    z = stats.norm.ppf(0.975)
+    z = ndtri(0.975)
     wide = [
         f"{name} is known to a factor of {_times(math.exp(min(z * s, 700.0)))} either way"
         for name, s in zip(names, sigma, strict=True)
@@ -329,4 +330,4 @@ def _gain(
     # jackknife (Efron & Tibshirani 1993, ch. 11)
     without = np.array([fell(every != k) for k in every])
     sigma = math.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2))
-    return gain, gain - float(stats.t.ppf(0.95, n - 1)) * sigma
+    return gain, gain - float(stdtrit(n - 1, 0.95)) * sigma

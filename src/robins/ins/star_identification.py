@@ -32,7 +32,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from robins import _float64  # noqa: F401
 from robins.earth.stars import StarIndex, Stars, near
@@ -187,7 +187,7 @@ def identify(
             others = len(there) - 3
             p = -np.expm1(-density * np.pi * np.mean(tolerance**2))
             agreed = int(np.sum(star >= 0)) - 3
-            chance = float(asked * binom.sf(agreed - 1, others, p)) if agreed > 0 else 1.0
+            chance = float(asked * bdtrc(agreed - 1, others, p)) if agreed > 0 else 1.0
             best = min(best, chance)
             if chance < most_chance:
                 return _named(index, len(b), there, star, rotation, chance, tried)

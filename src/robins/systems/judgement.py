@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy.special import ndtri, stdtrit
 
 from robins import units
 from robins.errors import require, require_known
@@ -169,7 +169,7 @@ def interval_of(
     if not math.isclose(again[0], value, rel_tol=1e-9, abs_tol=1e-12):
         return None
     runs = _runs_of(drawn)
-    wider = math.sqrt(runs / (runs - 1)) * stats.t.ppf(0.975, runs - 1) / stats.norm.ppf(0.975)
+    wider = math.sqrt(runs / (runs - 1)) * stdtrit(runs - 1, 0.975) / ndtri(0.975)
     low, high = np.percentile(again[1:], [2.5, 97.5], method="inverted_cdf") - value
     if not np.isfinite(low + high) or low == high == 0.0:
         return None

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from scipy import stats
+from scipy.special import ndtri
 
 from robins import _float64, scenario, units
 from robins.campaign.tuning import Tuned, choose
@@ -102,7 +102,7 @@ def _outcome(of: Asked, found: Tuned, seed: int) -> Outcome:
     with refusing(of.label):
         of.checked(now)
     text = scenario.text_of(overridden(of.text, (*of.settings, *now)))
-    z = float(stats.norm.ppf(0.975))
+    z = float(ndtri(0.975))
     bands = [
         (math.exp(a), math.exp(a - z * s), math.exp(a + z * s))
         for a, s in zip(found.x, found.sigma, strict=True)
