@@ -331,7 +331,8 @@ def test_every_make_command_that_is_named_exists():
 
 def test_types_are_shipped():
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]
-    assert wheel["targets"]["wheel"] == {"packages": ["src/robins"]}  # all of it, nothing left out
+    hooks = {"custom": {"path": "hatch_build.py"}}  # adds the interpreters
+    assert wheel["targets"]["wheel"] == {"packages": ["src/robins"], "hooks": hooks}
     assert (SOURCE / "py.typed").is_file()
 
 

@@ -10,7 +10,17 @@ import pytest
 from machines import quickly
 from test_lanes import FOUND, check, flat, in_one_round
 
-from robins.program import BuildError, Graph, Native, Program, interpreted_step, interpreter
+from robins.program import (
+    CPP,
+    BuildError,
+    Graph,
+    Native,
+    Program,
+    compiler,
+    flags,
+    interpreted_step,
+    interpreter,
+)
 from robins.program.interpreter import interpreter_of_many, interpreter_of_one
 from robins.program.operations import KINDS, OPERATIONS
 from robins.program.trace import Leaf
@@ -124,3 +134,18 @@ def test_without_a_compiler_to_build_it_with_it_is_an_error(monkeypatch):
     monkeypatch.setattr(interpreter, "_loaded", interpreter._loaded.__wrapped__)  # forgets none
     with pytest.raises(BuildError, match="install one"):
         interpreter_of_one()
+
+
+def test_a_wheel_carries_what_is_compiled_else(tmp_path, monkeypatch):
+    quick = tuple("-O0" if flag == "-O2" else flag for flag in flags.INTERPRETER_FLAGS)
+    monkeypatch.setattr(flags, "INTERPRETER_FLAGS", quick)
+    (tmp_path / "built").mkdir()
+    made = flags.compile_interpreters(compiler(CPP), tmp_path / "built")
+    kind = str(interpreter_of_one().library.robins_generation())
+    assert {one.stem for one in made} >= {flags.ONE, kind}
+    monkeypatch.setattr(interpreter, "files", lambda room: tmp_path)
+    for of, width in ((flags.ONE, 1), (kind, interpreter_of_many().width)):
+        found = interpreter._loaded.__wrapped__(of)
+        assert found.library._name == str(tmp_path / "built" / f"{of}.so")
+        assert found.width == width
+        assert found.codes == interpreter_of_one().codes

@@ -18,12 +18,11 @@ This room knows JAX and no filter: no filter, rule or system is written for it.
 """
 
 from robins.program.c import function, header, to_c
+from robins.program.flags import FLAGS, LANE_FLAGS
 from robins.program.interpreter import interpreted_step
 from robins.program.memory import NativeState
 from robins.program.native import (
     CPP,
-    FLAGS,
-    LANE_FLAGS,
     Native,
     build,
     compiled_step,

@@ -1,7 +1,8 @@
 """Programs of scalars carried out by an interpreter, without compiling them.
 
-The interpreter itself (`interpreter.cc`) is compiled once, when it is first used, which takes some
-seconds, and kept in the user's cache: for one run at a time, or for many on this processor.
+The interpreter itself (`interpreter.cc`), for one run at a time or for many on this processor, lies
+in the wheel; else it is compiled when it is first used, in some seconds, and kept in the user's
+cache.
 """
 
 from __future__ import annotations
@@ -10,19 +11,17 @@ import ctypes
 import re
 from collections.abc import Callable
 from functools import lru_cache
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 
 from robins.program.c import part
+from robins.program.flags import INTERPRETER_FLAGS, OF_KIND, ONE
 from robins.program.lanes import Scan
-from robins.program.native import CPP, INTERPRETER_FLAGS, Step, address, build
+from robins.program.native import CPP, Step, address, build
 from robins.program.tape import Tape
 from robins.program.trace import Program
-
-ONE = "one"  # for one run at a time
-# Flags for processors, by `robins_generation`.
-GENERATIONS = {0: (), 1: ("-march=x86-64",), 3: ("-march=x86-64-v3",), 4: ("-march=x86-64-v4",)}
 
 
 class Interpreter:
@@ -87,8 +86,11 @@ def interpreter_of_many() -> Interpreter:
 
 @lru_cache
 def _loaded(kind: str) -> Interpreter:
-    flags = ("-DONE_RUN",) if kind == ONE else GENERATIONS[int(kind)]
-    return Interpreter(build(text("interpreter.cc"), (*INTERPRETER_FLAGS, *flags), CPP))
+    shipped = Path(str(files("robins.program"))) / "built" / f"{kind}.so"
+    if shipped.is_file():  # in a wheel
+        return Interpreter(shipped)
+    flags = (*INTERPRETER_FLAGS, *OF_KIND[kind])
+    return Interpreter(build(text("interpreter.cc"), flags, CPP))
 
 
 def text(name: str) -> str:

@@ -22,30 +22,11 @@ import jax
 import numpy as np
 
 from robins.program.c import to_c
+from robins.program.flags import FASTER, FASTER_IN_GCC, FLAGS, SHARED
 from robins.program.kinds import array_of, numbers_of
 from robins.program.refusal import BuildError, ProgramError
 from robins.program.trace import UNROLL, Leaf, Program, trace
 
-# Passes that look for what is computed twice: there is nothing left to find, and it takes half of
-# the time of the compiler. Compilers that do not know them say nothing.
-FASTER = ("-fno-gcse", "-fno-tree-pre")
-# Beside these for gcc, which others may refuse: no search for what is stored twice or side by side,
-# and a limit to how many writes it looks at behind a read. Half of the time that is left; the code
-# is as fast.
-FASTER_IN_GCC = (
-    *("-fno-code-hoisting", "-fno-tree-slp-vectorize", "-fno-tree-dse", "-fno-dse"),
-    "--param=sccvn-max-alias-queries-per-access=30",
-    "--param=max-cselib-memory-locations=30",
-)
-# Contraction would join a product and a sum into one rounding: other bits on other machines.
-FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", *FASTER)
-# Lanes are as wide as the processor that compiles them.
-LANE_FLAGS = ("-std=gnu++17", "-march=native", "-Wno-psabi", *FLAGS[1:])
-# In the interpreter `and`, `or` and `not` are parts of names, and a register holds all kinds.
-INTERPRETER_FLAGS = (
-    *("-std=gnu++17", "-Wno-psabi", "-fno-operator-names", "-fno-strict-aliasing"),
-    *FLAGS[1:],
-)
 NO_COMPILER = (
     "install one (Debian: `apt install g++`; anywhere: `pip install 'robins[compiler]'`), "
     "or name it in CC (of C++: CXX)"
@@ -138,7 +119,7 @@ def build(text: str, flags: tuple[str, ...] = FLAGS, language: Language = C) -> 
     with tempfile.TemporaryDirectory(dir=folder) as own:
         source, made = Path(own) / f"program{language.suffix}", Path(own) / library.name
         source.write_text(text, "utf-8")
-        line = [*command, *flags, "-shared", "-fPIC", str(source), "-o", str(made), "-lm"]
+        line = [*command, *flags, *SHARED, str(source), "-o", str(made), "-lm"]
         done = subprocess.run(line, capture_output=True, text=True)
         if done.returncode:
             said = "\n".join(done.stderr.strip().splitlines()[:5])
