@@ -24,6 +24,7 @@ from shown_files import write_files
 from robins import results, scenario
 from robins.campaign.monte_carlo import _each, _records, contender
 from robins.cli import Status, app, main
+from robins.program import BuildError
 from robins.report import numbers
 from robins.systems import SYSTEMS
 from robins.workbench.scenarios import beside, read_scenario
@@ -381,6 +382,10 @@ def computes(folder, sketched, unchecked, monkeypatch, capsys):
     return to_the_end
 
 
+def no_interpreter():
+    raise BuildError("there is none")
+
+
 @pytest.mark.parametrize("words", SHOWN, ids=SHOWN.values())
 def test_a_command_line_shown_runs(words, folder, computes, monkeypatch):
     kind = kind_of(words)
@@ -391,8 +396,8 @@ def test_a_command_line_shown_runs(words, folder, computes, monkeypatch):
     else:
         monkeypatch.chdir(folder)
         monkeypatch.setattr(BEGINS[kind], begins)
-        # Whether programs would be faster is found by tracing all once more: here are no programs.
-        monkeypatch.setattr("robins.campaign.machine.has_compiler", lambda: False)
+        # Programs are traced before they begin, batches of JAX are not.
+        monkeypatch.setattr("robins.campaign.machine.interpreter_of_many", no_interpreter)
         monkeypatch.setattr("robins.campaign.machine.available_cores", lambda: 1)
         with pytest.raises(BeginsError):
             main(words)
