@@ -12,7 +12,7 @@ from robins.program import CPP
 def test_a_machine_that_is_not_there_is_refused(robins):
     answer = robins("run", "transfer-alignment/s1", "--machine", "cuda")
     assert answer.status == 2
-    assert "'cuda' is not one of 'jax', 'vm', 'c'" in answer.err
+    assert "'cuda' is not one of 'vm', 'c', 'jax'" in answer.err
 
 
 @pytest.mark.skipif(not any(map(shutil.which, CPP.names)), reason="lanes need a C++ compiler")

@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable, Collection, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -119,6 +120,8 @@ class Written:
         self._free = [k for k, v in enumerate(self.takes) if v not in known]
         known = {} if self._entries else known
         try:
+            if not self._entries and max(map(nodes_of, self._equations)) > MOST:
+                return by_jax(self._equations, self.makes, self._batched)
             jaxpr = jaxpr_of(self._equations, self.takes, self.makes)
             parts = [jaxpr, self._entries, [known.get(v) for v in self.takes]]
             program, engine, _ = kept(parts, lambda: self._program(known))
@@ -130,8 +133,6 @@ class Written:
 
     def _program(self, known: Values) -> Program:
         """Write the program; known: indices and flags, which are the same in all calls."""
-        if nodes_of(self._equations) > MOST and not self._entries:
-            raise ProgramError("it has too many numbers to be written out")
         walk = Walk(Graph(), UNROLL)
         shape = (lambda v: ()) if self._entries else (lambda v: v.aval.shape)
         nodes = [
@@ -316,15 +317,6 @@ def together(equations: Sequence[Equation]) -> list[list[Equation]]:
     return groups
 
 
-def nodes_of(equations: Sequence[Equation]) -> int:
-    """About how many nodes the longest of some equations is."""
-    return max(
-        max(map(size_of, [*e.invars, *e.outvars]), default=0)
-        * (DRAW if e.primitive.name == "random_bits" else 1)
-        for e in equations
-    )
-
-
 def is_moved(e: Equation, batched: Collection[Variable]) -> bool:
     """Whether an equation moves entries, to places that all runs share."""
     name = e.primitive.name
@@ -335,10 +327,37 @@ def is_moved(e: Equation, batched: Collection[Variable]) -> bool:
 
 def is_large(e: Equation, batched: Collection[Variable]) -> bool:
     """Whether an equation is a step of its own: of large arrays, or none for a program."""
-    name, most = e.primitive.name, nodes_of([e])
-    if name not in RULES or most > MOST:
-        return True
-    return most > LARGE and (name in ENTRYWISE or is_moved(e, batched))
+    name = e.primitive.name
+    if is_moved(e, batched) or name in ENTRYWISE:
+        return max(map(size_of, [*e.invars, *e.outvars])) > LARGE
+    return name not in RULES or nodes_of(e) > MOST
+
+
+def nodes_of(e: Equation) -> int:
+    """About how many nodes an equation becomes if it is written out."""
+    name, p, most = e.primitive.name, e.params, max(map(size_of, [*e.invars, *e.outvars]))
+    made = size_of(e.outvars[0])
+    if jaxprs := [
+        x for value in p.values() for x in _each(value) if isinstance(x, jex.ClosedJaxpr)
+    ]:
+        inside = sum(nodes_of(inner) for one in jaxprs for inner in one.jaxpr.eqns)
+        rounds = p.get("length", 1)
+        return most + inside * (rounds if inside * rounds <= UNROLL else 1)
+    match name:
+        case "random_bits":
+            return DRAW * made
+        case "gather" | "dynamic_slice":  # a choice among all that it may be
+            return made * max(e.invars[0].aval.shape, default=1)
+        case "dot_general":
+            ((left, _), _) = p["dimension_numbers"]
+            return 2 * made * int(np.prod([e.invars[0].aval.shape[k] for k in left]))
+    if name.startswith("scatter") or name == "dynamic_update_slice":
+        return most * size_of(e.invars[-1])
+    return most
+
+
+def _each(value: Any) -> Sequence[Any]:
+    return value if isinstance(value, (list, tuple)) else [value]
 
 
 def _step(equations: list[Equation], makes: list[Variable], batched: Collection[Variable]) -> Step:
