@@ -206,8 +206,8 @@ class InLanes:
         begins, ahead_by = range(width, runs, width), workers + 1
         with _threads(workers) as pool:
             # The first chunk compiles: each filter on a core of its own.
-            world = pool.submit(self._worlds, 0, width).result()
             count = min(width, runs)
+            world = pool.submit(self._worlds, 0, width, count).result()
             first = {n: pool.submit(self._of, n, world, count, taken) for n in self._filters}
             named = first_run(world)
             del world
@@ -232,7 +232,7 @@ class InLanes:
         """What is kept of some filters over one chunk, filled up to a width; left: those after."""
 
         def computed() -> dict[str, Any]:
-            begun, world = thread_time(), self._worlds(chunk.begin, width)
+            begun, world = thread_time(), self._worlds(chunk.begin, width, chunk.runs)
             found = {name: self._of(name, world, chunk.runs, taken) for name in names}
             self._took(width, begun, left)
             return found
@@ -243,13 +243,13 @@ class InLanes:
         """All that was recorded of some filters over one chunk."""
 
         def computed() -> dict[str, Any]:
-            world = self._worlds(chunk.begin, width)
+            world = self._worlds(chunk.begin, width, chunk.runs)
             return {name: cut(self._staged(name)(world), chunk.runs) for name in names}
 
         return with_stack(computed)
 
-    def _worlds(self, begin: int, width: int) -> Any:
-        sys.audit("robins.simulate", width)  # counted by tests
+    def _worlds(self, begin: int, width: int, runs: int) -> Any:
+        sys.audit("robins.simulate", runs)  # counted by tests
         return self._simulate(jnp.arange(begin, begin + width))
 
     def _of(self, name: str, world: Any, count: int, taken: Taken) -> Any:
@@ -257,8 +257,8 @@ class InLanes:
         return taken(name, joined(*cut(self._filters[name](world), count)))
 
     def _chunk(self, begin: int, width: int, runs: int, taken: Taken) -> dict[str, Any]:
-        begun, world = thread_time(), self._worlds(begin, width)
-        count = min(width, runs - begin)
+        begun, count = thread_time(), min(width, runs - begin)
+        world = self._worlds(begin, width, count)
         found = {name: self._of(name, world, count, taken) for name in self._filters}
         self._took(width, begun, runs - begin - count)
         return found

@@ -90,7 +90,7 @@ def _loaded(kind: str) -> Interpreter:
     if shipped.is_file():  # in a wheel
         return Interpreter(shipped)
     flags = (*INTERPRETER_FLAGS, *OF_KIND[kind])
-    return Interpreter(build(text("interpreter.cc"), flags, CPP))
+    return Interpreter(build(text("interpreter.cc"), flags, CPP, once=True))
 
 
 def text(name: str) -> str:
