@@ -58,6 +58,8 @@ class Counts(Counter[str]):
                 self["processes"] += 1
             elif not any(Path(os.fsdecode(word)).name in self.libraries for word in words):
                 self["builds"] += 1
+        elif event == "robins.build_once":  # on a machine; in a wheel not at all
+            self.libraries.add(given[0])
         elif event == "robins.build":
             self["builds"] += given[0] not in self.libraries
             self.libraries.add(given[0])

@@ -129,7 +129,8 @@ def test_loops(unroll):
     check(loops, [(rng.uniform(1.0, 9.0, 3), np.int64(k)) for k in range(8)], unroll)
 
 
-def test_without_a_compiler_to_build_it_with_it_is_an_error(monkeypatch):
+def test_without_a_compiler_to_build_it_with_it_is_an_error(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("CXX", "no-such-compiler")
     monkeypatch.setattr(interpreter, "_loaded", interpreter._loaded.__wrapped__)  # forgets none
     with pytest.raises(BuildError, match="install one"):

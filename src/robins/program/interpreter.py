@@ -19,7 +19,7 @@ import numpy as np
 from robins.program.c import part
 from robins.program.flags import INTERPRETER_FLAGS, OF_KIND, ONE
 from robins.program.lanes import Scan
-from robins.program.native import CPP, Step, address, build
+from robins.program.native import CPP, Step, address, build_once
 from robins.program.tape import Tape
 from robins.program.trace import Program
 
@@ -90,7 +90,7 @@ def _loaded(kind: str) -> Interpreter:
     if shipped.is_file():  # in a wheel
         return Interpreter(shipped)
     flags = (*INTERPRETER_FLAGS, *OF_KIND[kind])
-    return Interpreter(build(text("interpreter.cc"), flags, CPP, once=True))
+    return Interpreter(build_once(text("interpreter.cc"), flags, CPP))
 
 
 def text(name: str) -> str:

@@ -98,18 +98,10 @@ def _own_folder() -> Path:
     return Path(tempfile.mkdtemp(prefix="robins-native-"))
 
 
-def build(
-    text: str, flags: tuple[str, ...] = FLAGS, language: Language = C, once: bool = False
-) -> Path:
+def build(text: str, flags: tuple[str, ...] = FLAGS, language: Language = C) -> Path:
     """A shared library of a text: the one there is if text, compiler, flags are equal.
 
     Where the flags hold `FASTER`, gcc is given `FASTER_IN_GCC` too.
-
-    Args:
-        text: of the program.
-        flags: of the compiler.
-        language: of the text.
-        once: on a machine, whatever is computed there: tests do not count it.
 
     Raises:
         BuildError: there is no compiler, or it refuses the text; it says what was said.
@@ -118,14 +110,37 @@ def build(
     if set(FASTER) <= set(flags) and is_gcc(command):
         flags = (*flags, *FASTER_IN_GCC)
     made_for = _processor() if "-march=native" in flags else ""
-    told = "\0".join([text, *command, _version(command), *flags, made_for])
-    folder, name = cache_folder(), hashlib.sha256(told.encode()).hexdigest()[:24]
-    library = folder / f"{name}.so"
-    if not once:
-        sys.audit("robins.build", library.name)
+    library = _named(text, *command, _version(command), *flags, made_for)
+    sys.audit("robins.build", library.name)
+    return library if library.exists() else _compiled(library, command, text, flags, language)
+
+
+def build_once(text: str, flags: tuple[str, ...], language: Language) -> Path:
+    """A shared library of a text: the one there is, whatever compiled it.
+
+    Raises:
+        BuildError: it is not there, and there is no compiler, or it refuses the text.
+    """
+    library = _named(text, platform.machine(), *flags)
+    sys.audit("robins.build_once", library.name)
     if library.exists():
         return library
-    with tempfile.TemporaryDirectory(dir=folder) as own:
+    return _compiled(library, compiler(language), text, flags, language)
+
+
+def _named(*told: str) -> Path:
+    name = hashlib.sha256("\0".join(told).encode()).hexdigest()[:24]
+    return cache_folder() / f"{name}.so"
+
+
+def _compiled(
+    library: Path,
+    command: tuple[str, ...],
+    text: str,
+    flags: tuple[str, ...],
+    language: Language,
+) -> Path:
+    with tempfile.TemporaryDirectory(dir=library.parent) as own:
         source, made = Path(own) / f"program{language.suffix}", Path(own) / library.name
         source.write_text(text, "utf-8")
         line = [*command, *flags, *SHARED, str(source), "-o", str(made), "-lm"]
