@@ -6,10 +6,12 @@ says how long compiling took, how far their RMS errors are apart, and the most m
     python benchmarks/campaigns.py [RUNS [SYSTEM ...]]
     python benchmarks/campaigns.py --memory
     python benchmarks/campaigns.py --linear
+    python benchmarks/campaigns.py --compile
 
 The second measures the most memory in use by a campaign of an alignment, over truth steps and
 runs, and of the drive, each in a process of its own: of its set-up, and of all. The third times an
-alignment over truth steps and over runs, after it has compiled.
+alignment over truth steps and over runs, after it has compiled. The fourth compiles each loop of
+some campaigns, in seconds of the compiler by node, for `robins.campaign.handover`.
 """
 
 import resource
@@ -23,6 +25,7 @@ import numpy as np
 
 from robins import scenario
 from robins.campaign import Statistics, simulate
+from robins.campaign.handover import LOOP_S
 from robins.campaign.machine import ByJax, InLanes, available_cores
 from robins.systems.finding import find_system
 
@@ -32,6 +35,7 @@ CAMPAIGNS = (
     ("ins-gnss", "drive", "ekf"),
 )
 WARM = 64  # runs that compile
+in_c = partial(InLanes, name="c")
 
 
 ALIGNMENT, DRIVE = CAMPAIGNS[0], CAMPAIGNS[2]
@@ -104,17 +108,35 @@ def linear():
     print(
         f"{'machine':>8s}{'steps':>8s}{'runs':>8s}{'time [s]':>12s}{'a step [us]':>14s}{'MB':>8s}"
     )
-    for made, sizes in ((InLanes, LINEAR), (ByJax, LINEAR_BY_JAX)):
+    for made, sizes in ((in_c, LINEAR), (ByJax, LINEAR_BY_JAX)):
         for steps, runs in sizes:
             duration = f"manoeuvre.duration={0.01 * steps} s"
             problem = problem_of(*ALIGNMENT, duration, "settle=5 s")
-            _, spent, _ = timed(made(problem), runs)
+            machine = made(problem)
+            _, spent, _ = timed(machine, runs)
             each = spent / (steps * runs) * 1e6
-            row = f"{made.name:>8s}{steps:8d}{runs:8d}{spent:12.2f}{each:14.3f}{used():8.0f}"
+            row = f"{machine.name:>8s}{steps:8d}{runs:8d}{spent:12.2f}{each:14.3f}{used():8.0f}"
             print(row, flush=True)
 
 
+def compile_loops():
+    """Seconds of the compiler for each loop, and milliseconds for a node beside `LOOP_S`."""
+    print(f"{'campaign':34s}{'nodes':>8s}{'compiler [s]':>14s}{'a node [ms]':>14s}")
+    for campaign in (*CAMPAIGNS, ("rocket", "a1", "ukf")):
+        machine = InLanes(problem_of(*campaign))
+        simulate(machine.problem, 8, machine=machine)
+        for loop in machine._hand_over._loops:
+            before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+            loop.hand_over()
+            took = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
+            node = (took - LOOP_S) / loop.nodes * 1e3
+            row = f"{'/'.join(campaign):34s}{loop.nodes:8d}{took:14.2f}{node:14.2f}"
+            print(row if took else f"{row}  from the cache", flush=True)
+
+
 def main():
+    if sys.argv[1:] == ["--compile"]:
+        return compile_loops()
     if sys.argv[1:] == ["--linear"]:
         return linear()
     if sys.argv[1:2] == ["--one"]:
@@ -128,7 +150,7 @@ def main():
     for campaign in (c for c in CAMPAIGNS if c[0] in (sys.argv[2:] or c[0])):
         problem = problem_of(*campaign)
         slow_first, slow, want = timed(ByJax(problem), runs)
-        fast_first, fast, got = timed(InLanes(problem), runs)
+        fast_first, fast, got = timed(in_c(problem), runs)
         size = np.max(np.abs(want), axis=0)
         apart = np.max(np.abs(got - want) / np.where(size > 0.0, size, 1.0))
         numbers = (slow / runs * 1e3, fast / runs * 1e3, slow / fast, slow_first, fast_first)

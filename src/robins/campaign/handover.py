@@ -15,8 +15,8 @@ from robins.errors import RobinsError
 from robins.program.stages import Loop, Staged
 
 LOOP_S = 0.5  # of the compiler, for any loop
-NODE_S = 4e-4  # and for a node of its program (measured: 1e-4 to 4.2e-4, in 24 loops)
-SAVED = 0.4  # of the interpreter's time, by compiled lanes (measured: 0.4 to 0.6)
+NODE_S = 4e-4  # and for a node of its program (`benchmarks/campaigns.py --compile`)
+SAVED = 0.4  # of the interpreter's time, by compiled lanes (`benchmarks/program.py`)
 
 
 class HandOver:
@@ -34,7 +34,7 @@ class HandOver:
     def took(self, runs: int, seconds: float, left: int) -> None:
         """Note the time of some runs, and compile the loops if that pays for those that are left.
 
-        The first call is not judged by: it may have traced the loops.
+        The first call only starts the record, as it may have traced the loops.
 
         Args:
             runs: how many were computed, by one thread.

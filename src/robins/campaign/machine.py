@@ -139,7 +139,15 @@ class ByJax:
     def compute(
         self, chunk: Chunk, width: int, names: Sequence[str], taken: Taken = whole, left: int = 0
     ) -> dict[str, Any]:
-        """What is kept of some filters over one chunk, filled up to a width; left: those after."""
+        """Compute a chunk, filled up to a width, and keep what is `taken` of each filter.
+
+        Args:
+            chunk: of runs.
+            width: of all chunks.
+            names: of filters.
+            taken: from the record of a filter.
+            left: runs that are still to be computed after these.
+        """
         batch, _ = next(worlds(self.problem, width, width, chunk.begin, self._batch))
         return {name: taken(name, record(self.problem, name, batch, chunk.runs)) for name in names}
 
@@ -180,7 +188,7 @@ class InLanes:
 
     @property
     def notes(self) -> list[str]:
-        """What JAX has to do, and why."""
+        """Parts that JAX computes, with the reason."""
         of = {"the simulation": self._simulate, **self._filters}
         return [
             f"{name}: a part stays with JAX, as {why}"
@@ -229,7 +237,15 @@ class InLanes:
     def compute(
         self, chunk: Chunk, width: int, names: Sequence[str], taken: Taken = whole, left: int = 0
     ) -> dict[str, Any]:
-        """What is kept of some filters over one chunk, filled up to a width; left: those after."""
+        """Compute a chunk, filled up to a width, and keep what is `taken` of each filter.
+
+        Args:
+            chunk: of runs.
+            width: of all chunks.
+            names: of filters.
+            taken: from the record of a filter.
+            left: runs that are still to be computed after these.
+        """
 
         def computed() -> dict[str, Any]:
             begun, world = thread_time(), self._worlds(chunk.begin, width, chunk.runs)
@@ -250,10 +266,10 @@ class InLanes:
 
     def _worlds(self, begin: int, width: int, runs: int) -> Any:
         sys.audit("robins.simulate", runs)  # counted by tests
-        return self._simulate(jnp.arange(begin, begin + width))
+        return self._simulate(np.arange(begin, begin + width))
 
     def _of(self, name: str, world: Any, count: int, taken: Taken) -> Any:
-        """What is kept of a filter, without the runs that only fill a chunk."""
+        """Run a filter, and keep what is `taken` of its record without the runs that fill up."""
         return taken(name, joined(*cut(self._filters[name](world), count)))
 
     def _chunk(self, begin: int, width: int, runs: int, taken: Taken) -> dict[str, Any]:
@@ -308,7 +324,7 @@ def one_by_one(function: Callable[..., Any], rows: Any) -> Any:
 
 
 def available_cores() -> int:
-    """How many cores this process may use."""
+    """Number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -322,10 +338,14 @@ def check_machine(name: str) -> None:
     """
     if name and name not in MACHINES:
         raise RobinsError(f"no machine '{name}'", "--machine", "say vm, c or jax")
-    if name == "c":
-        compiler(CPP)
-    if name == "vm":
-        interpreter_of_many()
+    try:
+        if name == "c":
+            compiler(CPP)
+        if name == "vm":
+            interpreter_of_many()
+    except BuildError as error:
+        where = f"--machine {name}: {error.where}" if error.where else f"--machine {name}"
+        raise RobinsError(error.what, where, f"{error.fix}, or take --machine jax") from error
 
 
 def machine_for(problem: Problem, name: str = "") -> ByJax | InLanes:

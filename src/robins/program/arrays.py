@@ -45,7 +45,7 @@ LARGE = 200  # entries of an array beyond which it is moved as a whole
 FOLDED = 2_000  # indices or flags that become part of a program
 MOST = 200_000  # about as many nodes of one equation are written out
 DRAW = 150  # nodes of a random number
-UNROLL = 3_000
+UNROLL = 3_000  # operations up to which a loop is written out
 MOVES = {
     *("broadcast_in_dim", "reshape", "transpose", "squeeze", "expand_dims", "slice", "pad", "rev"),
     *("concatenate", "stack", "tile", "split", "unstack", "iota"),
@@ -54,8 +54,6 @@ INDEXED = {"gather": gathered, "scatter": scattered}
 # Of these XLA must not run two batches at once (`docs/performance.md`).
 FACTORISED = ("qr[", "lu[", "eigh[", "svd[", "cholesky[", "triangular_solve[")
 _one_at_a_time = threading.Lock()
-
-
 # Variables that are taken, those that are made, and how: of the number of runs and of values.
 Compute = Callable[[int, Values], Sequence[np.ndarray]]
 Step = tuple[list[Variable], list[Variable], Compute]
@@ -201,7 +199,7 @@ def moved(e: Equation, batched: Collection[Variable]) -> Compute:
     def compute(runs: int, values: Values) -> Sequence[np.ndarray]:
         if not found:
             known = [] if index is None else [_value(index, values)]
-            found.extend(_places(e, known, data))
+            found[:] = _places(e, known, data)  # the same, if two threads come first
         parts = [flat(v, runs, values) for v in data]
         if name == "gather":
             parts.append(np.full((1, 1), filling(e)))
@@ -246,7 +244,7 @@ class Arrays:
         self.takes: list[Variable] = []
         self.makes: list[Variable] = []
         self._steps: list[Step] = []
-        self._dropped: list[list[Equation]] = []
+        self._dropped: list[list[Variable]] = []
         self._most = 0
 
     @property
@@ -262,7 +260,7 @@ class Arrays:
         return [step.refused for step in every if step.refused is not None]
 
     def connect(self, batched: Collection[Variable], wanted: Callable[[Variable], bool]) -> None:
-        """Find what goes in and out, and part it into steps."""
+        """Find the variables in and out, and cut the equations into steps."""
         self.takes, self.makes = taken_by(self.equations), made_by(self.equations, wanted)
         self._most = bytes_of_jaxpr(jaxpr_of(self.equations, self.takes, self.makes))
         self._steps = parted(self.equations, self.makes, batched)
@@ -270,7 +268,7 @@ class Arrays:
         self._dropped = last_uses(touched, {*self.takes, *self.makes})
 
     def __call__(self, runs: int, values: Values) -> Values:
-        """Compute what is made of what is there."""
+        """Compute the variables in `makes` from those that are there."""
         here = {v: values[v] for v in self.takes}
         for (_, makes, step), dropped in zip(self._steps, self._dropped, strict=True):
             here.update(zip(makes, step(runs, here), strict=True))
@@ -283,9 +281,7 @@ def parted(
     equations: Sequence[Equation], makes: list[Variable], batched: Collection[Variable]
 ) -> list[Step]:
     """Equations as steps: what is small at each level together, then what is large."""
-    level: dict[
-        Variable, tuple[int, bool]
-    ] = {}  # of what is made, and whether it is made last there
+    level: dict[Variable, tuple[int, bool]] = {}  # of a result, and whether it is made last there
     small: dict[int, list[Equation]] = {}
     large: dict[int, list[Equation]] = {}
     for e in equations:
@@ -318,7 +314,7 @@ def together(equations: Sequence[Equation]) -> list[list[Equation]]:
 
 
 def is_moved(e: Equation, batched: Collection[Variable]) -> bool:
-    """Whether an equation moves entries, to places that all runs share."""
+    """True for an equation that moves entries, to places that all runs share."""
     name = e.primitive.name
     if name in INDEXED:
         return not set(variables([e.invars[1]])) & set(batched)
@@ -326,7 +322,7 @@ def is_moved(e: Equation, batched: Collection[Variable]) -> bool:
 
 
 def is_large(e: Equation, batched: Collection[Variable]) -> bool:
-    """Whether an equation is a step of its own: of large arrays, or none for a program."""
+    """True for an equation that is a step of its own: of large arrays, or none for a program."""
     name = e.primitive.name
     if is_moved(e, batched) or name in ENTRYWISE:
         return max(map(size_of, [*e.invars, *e.outvars])) > LARGE
@@ -334,12 +330,11 @@ def is_large(e: Equation, batched: Collection[Variable]) -> bool:
 
 
 def nodes_of(e: Equation) -> int:
-    """About how many nodes an equation becomes if it is written out."""
+    """Estimate the number of nodes of an equation that is written out."""
     name, p, most = e.primitive.name, e.params, max(map(size_of, [*e.invars, *e.outvars]))
     made = size_of(e.outvars[0])
-    if jaxprs := [
-        x for value in p.values() for x in _each(value) if isinstance(x, jex.ClosedJaxpr)
-    ]:
+    every = (x for value in p.values() for x in _each(value))
+    if jaxprs := [x for x in every if isinstance(x, jex.ClosedJaxpr)]:
         inside = sum(nodes_of(inner) for one in jaxprs for inner in one.jaxpr.eqns)
         rounds = p.get("length", 1)
         return most + inside * (rounds if inside * rounds <= UNROLL else 1)

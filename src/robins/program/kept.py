@@ -27,7 +27,7 @@ from jax.extend import core as jex
 
 from robins.program.interpreter import interpreter_of_many
 from robins.program.kinds import is_key, numbers_of
-from robins.program.lanes import Scan
+from robins.program.lanes import RoundsEngine
 from robins.program.native import cache_folder
 from robins.program.nodes import Graph
 from robins.program.primitives.control import called
@@ -36,10 +36,9 @@ from robins.program.trace import Leaf, Program
 
 WORTH = 1_000  # nodes of a program that is kept
 DAMAGED = OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error
-Rounding = Callable[[Program], tuple[Scan, int]]
 
 
-def kept(parts: Iterable[Any], write: Callable[[], Program]) -> tuple[Program, Rounding, int]:
+def kept(parts: Iterable[Any], write: Callable[[], Program]) -> tuple[Program, RoundsEngine, int]:
     """A program, its rounds by the interpreter, and how many nodes it has; from the cache or made.
 
     A program from the cache has its arguments, results and zeros, but neither nodes nor outputs.
@@ -103,7 +102,7 @@ def _version() -> str:
         for file in sorted((files("robins.program") / folder).iterdir(), key=lambda f: f.name):
             if file.name.endswith((".py", ".h", ".cc")):
                 found.update(file.read_bytes())
-    for package in ("jax", "numpy"):
+    for package in ("jax", "numpy", "scipy"):  # the last two fold constants
         found.update(metadata.version(package).encode())
     return found.hexdigest()
 

@@ -38,6 +38,7 @@ extern "C" int robins_lanes(void) { return LANES; }
 
 Given = tuple[np.ndarray | jax.Array, bool]  # an array, and whether it has a leading axis of runs
 Scan = Callable[[ctypes.c_void_p], int]  # a function of C that takes a `scan` of `scan.h`
+RoundsEngine = Callable[[Program], tuple[Scan, int]]  # rounds, and how many runs at a time
 
 
 def compiled_rounds(program: Program) -> tuple[Scan, int]:
@@ -65,7 +66,7 @@ class Rounds:
         carried: int,
         stays: int,
         backwards: bool = False,
-        engine: Callable[[Program], tuple[Scan, int]] = compiled_rounds,
+        engine: RoundsEngine = compiled_rounds,
     ):
         """Make them ready.
 
@@ -84,7 +85,7 @@ class Rounds:
         self.carried, self.stays = carried, stays
         self._scan, self.lanes = engine(program)
 
-    def hand_over(self, engine: Callable[[Program], tuple[Scan, int]]) -> None:
+    def hand_over(self, engine: RoundsEngine) -> None:
         """Have another engine carry out the program; calls under way end as they began."""
         self._scan, self.lanes = engine(self.program)
 

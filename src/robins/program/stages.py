@@ -31,7 +31,7 @@ from robins.program.arrays import (
 from robins.program.interpreter import interpreted_rounds
 from robins.program.kept import kept
 from robins.program.kinds import array_of, is_key, numbers_of
-from robins.program.lanes import Given, Rounds, Scan, compiled_rounds, zero_in_all
+from robins.program.lanes import Given, Rounds, RoundsEngine, compiled_rounds, zero_in_all
 from robins.program.liveness import Equation, Touched, Variable, last_uses, most_bytes, variables
 from robins.program.loops import (
     SHORTEST,
@@ -45,9 +45,8 @@ from robins.program.loops import (
 )
 from robins.program.primitives.control import called
 from robins.program.refusal import BuildError, ProgramError
-from robins.program.trace import Program, lasting
+from robins.program.trace import lasting
 
-Engine = Callable[[Program], tuple[Scan, int]]
 WORTH = 5_000  # operations of a loop that is worth a compiler; others are interpreted
 FEWEST = 8  # equations without a scan or random numbers that are
 FOLDED = 2_000  # numbers of a known array that becomes part of a program
@@ -148,12 +147,12 @@ class Loop:
 
     Attributes:
         equations: in an order of computation.
-        is_worth: of the time that a compiler takes for it.
-        refused: why they are no program.
-        nodes: of its program, where it is interpreted.
+        is_worth: whether it is worth the time of a compiler.
+        refused: the reason if they are no program.
+        nodes: number of nodes of its program, if it is interpreted.
     """
 
-    def __init__(self, axis: Along, engine: Engine, is_worth: bool):
+    def __init__(self, axis: Along, engine: RoundsEngine, is_worth: bool):
         self.axis, self.is_worth = axis, is_worth
         self._engine = engine if is_worth else interpreted_rounds
         self.equations: list[Equation] = []
@@ -177,7 +176,7 @@ class Loop:
         self.touched = Touched([*body.begin, *body.stays, *body.rows], made)
 
     def __call__(self, runs: int, values: Values) -> Values:
-        """What it makes of what is there."""
+        """Compute the variables that it makes from those that are there."""
         body = self.body
 
         def given(v: Variable) -> Given:
@@ -234,6 +233,60 @@ class Loop:
             self._by_jax = by_jax(self.equations, makes, [v in self._batched for v in takes])
 
 
+def cut(
+    equations: Sequence[Equation], takes: Sequence[Variable], engine: RoundsEngine
+) -> tuple[Arrays, dict[int, Arrays], dict[tuple[int, Along], Loop], dict[Variable, int]]:
+    """Equations as stages.
+
+    Args:
+        equations: in an order of computation.
+        takes: variables that depend on the run.
+        engine: of loops that are worth a compiler.
+
+    Returns:
+        Arrays that depend on no run; arrays, and loops by axis, of each level; and the levels of
+        all variables that depend on the run. What a loop makes is there for arrays, and for loops
+        along other axes, one level later.
+    """
+    axes = {id(e): axis for e in equations if (axis := along(e)) is not None}
+    worth: Counter[Along] = Counter()
+    for e in equations:
+        if (axis := axes.get(id(e))) is not None:
+            worth[axis] += operations(e) + WORTH // FEWEST
+    level: dict[Variable, int] = dict.fromkeys(takes, 0)
+    source: dict[Variable, Along] = {}  # of what a loop makes, row by row
+    after: set[Variable] = set()  # what a loop leaves
+    known = Arrays()
+    batches: dict[int, Arrays] = {}
+    loops: dict[tuple[int, Along], Loop] = {}
+    for e in equations:
+        axis = axes.get(id(e))
+        if axis is None:
+            whole, rows = [v for v in e.invars if not isinstance(v, jex.Literal)], []
+        else:
+            whole, rows = uses(e, axis.length)
+        of = [level[v] + (v in source or v in after) for v in whole if v in level]
+        for v in rows:
+            if v in level:
+                same = v in source and source[v] == axis
+                of.append(level[v] + (not same and (v in source or v in after)))
+        if not of:
+            known.equations.append(e)
+            continue
+        here = max(of)
+        level.update((v, here) for v in e.outvars)
+        if axis is None:
+            batches.setdefault(here, Arrays()).equations.append(e)
+            continue
+        if (here, axis) not in loops:
+            loops[here, axis] = Loop(axis, engine, worth[axis] >= WORTH)
+        loops[here, axis].equations.append(e)
+        made = makes_rows(e)
+        source.update((v, axis) for v in made)
+        after.update(v for v in e.outvars if v not in source)
+    return known, batches, loops, level
+
+
 class Staged:
     """A function of one run as a function of a batch of them.
 
@@ -249,7 +302,7 @@ class Staged:
         *shapes: Any,
         unroll: int | None = UNROLL,
         named: bool = False,
-        engine: Engine = compiled_rounds,
+        engine: RoundsEngine = compiled_rounds,
     ):
         """Cut a function into stages; they are compiled when it is called.
 
@@ -267,41 +320,7 @@ class Staged:
         self._makes: list[Variable] = list(flat.outvars)
         of_all = self._tree.children()[0] if named else self._tree
         self._of_all: int = of_all.num_leaves
-        axes = {id(e): axis for e in flat.eqns if (axis := along(e)) is not None}
-        worth: Counter[Along] = Counter()
-        for e in flat.eqns:
-            if (axis := axes.get(id(e))) is not None:
-                worth[axis] += operations(e) + WORTH // FEWEST
-        level: dict[Variable, int] = dict.fromkeys(self._takes, 0)
-        source: dict[Variable, Along] = {}  # of what a loop makes, row by row
-        after: set[Variable] = set()  # what a loop leaves
-        known = Arrays()
-        batches: dict[int, Arrays] = {}
-        loops: dict[tuple[int, Along], Loop] = {}
-        for e in flat.eqns:
-            axis = axes.get(id(e))
-            if axis is None:
-                whole, rows = [v for v in e.invars if not isinstance(v, jex.Literal)], []
-            else:
-                whole, rows = uses(e, axis.length)
-            of = [level[v] + (v in source or v in after) for v in whole if v in level]
-            for v in rows:
-                if v in level:
-                    same = v in source and source[v] == axis
-                    of.append(level[v] + (not same and (v in source or v in after)))
-            if not of:
-                known.equations.append(e)
-                continue
-            here = max(of)
-            level.update((v, here) for v in e.outvars)
-            if axis is None:
-                batches.setdefault(here, Arrays()).equations.append(e)
-                continue
-            of_axis = Loop(axis, engine, worth[axis] >= WORTH)
-            loops.setdefault((here, axis), of_axis).equations.append(e)
-            made = makes_rows(e)
-            source.update((v, axis) for v in made)
-            after.update(v for v in e.outvars if v not in source)
+        known, batches, loops, level = cut(flat.eqns, self._takes, engine)
         batched = self._batched = set(level)
         parts = [known, *batches.values(), *loops.values()]
         wanted = self._wanted(parts)
@@ -324,7 +343,7 @@ class Staged:
         self.bytes_of_run = most_bytes(touched, self._takes, kept)
 
     def _of_runs(self, one: Touched, between: set[Variable]) -> Touched:
-        """What a stage takes and makes by run: not of what is known or of the first run alone."""
+        """Variables of a stage by run: none that is known or kept of the first run alone."""
         here = self._batched - (self._named - between)
         takes, makes = ([v for v in variables(some) if v in here] for some in one[:2])
         return Touched(takes, makes, one.within)

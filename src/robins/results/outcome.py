@@ -38,7 +38,7 @@ class Outcome:
     runs: int = 1
     parameters: str = ""  # TOML, with what the command line changed
     device: str = "cpu"
-    machine: str = ""  # of a campaign: batches of JAX ("jax"), or programs in lanes ("c")
+    machine: str = ""  # of a campaign: programs, interpreted ("vm") or compiled ("c"), or "jax"
 
     # how it is told
     title: str = ""
