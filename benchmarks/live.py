@@ -3,10 +3,10 @@
 The sample in the middle, the mean, and the slowest of a hundred, after the start, in wall time and,
 in brackets, in time of all processors, which other programs disturb less; samples at the end of a
 block or with a fix take a step of the filter. Nothing is compiled meanwhile. First what a call of
-an `OnlineFilter` of fifteen states takes; then the live objects, with their filters by JAX and in
-C, whose programs are compiled for minutes where they were not yet.
+an `OnlineFilter` of fifteen states takes; then the live objects, with their filters on each
+machine, and how long they took to be made.
 
-    python benchmarks/live.py [calls] [marg] [ekf] [robust]
+    python benchmarks/live.py [calls] [marg] [ekf] [robust] [vm] [jax] [c]
 """
 
 import sys
@@ -28,7 +28,7 @@ from robins.systems.streaming import Flag
 SAMPLES = 6_000
 LATE_S = 0.1
 N, M = 15, 3
-MACHINES = ("jax", "c")
+MACHINES = ("vm", "jax", "c")  # the last is compiled for minutes where it was not yet
 
 
 def told(name: str, rows: list[tuple[float, float, bool]], period_s: float = 0.0) -> None:
@@ -82,6 +82,15 @@ def calls() -> None:
                 told(f"{kind}, {machine}: {name}", [called(call) for _ in range(SAMPLES)])
 
 
+def made(what: Any, *arguments: Any, machine: str, **named: Any) -> Any:
+    """A live object, and a line of the seconds that it took to be made."""
+    begin, used = time.perf_counter(), time.process_time()
+    live = what(*arguments, machine=machine, **named)
+    spent = time.perf_counter() - begin, time.process_time() - used
+    print(f"{what.__name__}, {machine}: made in {spent[0]:.1f} s ({spent[1]:.1f})", flush=True)
+    return live
+
+
 def called(call: Any) -> tuple[float, float, bool]:
     """Seconds of a call, by both clocks; the first one compiles."""
     begin, used = time.perf_counter(), time.process_time()
@@ -91,7 +100,7 @@ def called(call: Any) -> tuple[float, float, bool]:
 
 def orientation(machine: str) -> None:
     """Nine axes at 286 Hz."""
-    log, live = made_log(), LiveMarg(Replay(), RATE_HZ, machine=machine)
+    log, live = made_log(), made(LiveMarg, Replay(), RATE_HZ, machine=machine)
     assert log.mag is not None
     stamps, imu, field = log.imu.time_ns.tolist(), log.imu, log.mag.field_t
     rows = [
@@ -110,7 +119,8 @@ def navigation(name: str, machine: str) -> None:
     assert g is not None
     assert g.v_n is not None
     assert g.sigma_v is not None
-    live = LiveInsGnss(Navigated(), drive.imu_rate, drive.gnss.rate, name, machine=machine)
+    rates = drive.imu_rate, drive.gnss.rate
+    live = made(LiveInsGnss, Navigated(), *rates, filter=name, machine=machine)
     comes = [(int(t), 0, k) for k, t in enumerate(imu.time_ns[:SAMPLES])]
     comes += [(int(t + 1e9 * LATE_S), 1, k) for k, t in enumerate(g.time_ns)]
     samples, fixes = [], []
@@ -127,10 +137,10 @@ def navigation(name: str, machine: str) -> None:
 
 
 if __name__ == "__main__":
-    asked = sys.argv[1:] or ["calls", "marg", "ekf", "robust"]
+    asked = [a for a in sys.argv[1:] if a not in MACHINES] or ["calls", "marg", "ekf", "robust"]
     if "calls" in asked:
         calls()
-    for machine in MACHINES:
+    for machine in [m for m in MACHINES if m in sys.argv[1:]] or MACHINES:
         if "marg" in asked:
             orientation(machine)
         for name in ("ekf", "robust"):

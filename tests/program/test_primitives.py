@@ -12,6 +12,7 @@ from jax.extend.random import threefry_2x32
 from machines import in_c, same_in_c
 
 import robins.program.primitives  # noqa: F401
+from robins.linalg.rows import each_row
 from robins.program import ProgramError, trace
 from robins.program.refused import REFUSED
 from robins.program.trace import RULES
@@ -281,6 +282,17 @@ EXACT = {
     "scan": (
         lambda a: lax.scan(lambda c, row: ((c[1], c[0] + row[0]), (c[0], row[1:])), (0.0, 1.0), a),
         WIDE[0],
+    ),
+    "each row": (
+        lambda a, b: each_row(lambda x, y: {"s": jnp.sum(x * y) * V, "y": y, "z": b[0, 0]}, a, b),
+        A,
+        A + 1.0,
+    ),
+    "each row in a loop, of each row": (
+        lambda a: lax.fori_loop(
+            0, 3, lambda k, a: each_row(lambda x: each_row(lambda y: y * y + a[k, 0], x), a), a
+        ),
+        0.1 * A,
     ),
     "scan, backwards": (
         lambda a: lax.scan(lambda c, row: (c + row, c), jnp.zeros(4), a, reverse=True),

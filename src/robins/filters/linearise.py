@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -32,6 +33,7 @@ from robins.filters.belief import Belief, Number
 from robins.filters.model import Data, Motion, Sensor, as_noise
 from robins.filters.observation import Observation, innovation
 from robins.filters.values import kind, value
+from robins.linalg.rows import each_row
 from robins.manifold import State
 
 NARROWEST = 1e3 * float(jnp.finfo(float).eps)  # (n + lambda) / n of sigma points
@@ -219,7 +221,7 @@ def sigma_points(belief: Belief, reach: Number) -> State:
     n = belief.factor.shape[0]
     ring = reach * belief.factor.T
     offsets = jnp.concatenate([jnp.zeros((1, n)), ring, -ring])
-    return jax.vmap(lambda d: manifold.retract(belief.mean, d))(offsets)
+    return each_row(partial(manifold.retract, belief.mean), offsets)
 
 
 def _regress(values: State, n: int, alpha: Number, beta: Number, kappa: Number) -> Regressed:
@@ -229,7 +231,7 @@ def _regress(values: State, n: int, alpha: Number, beta: Number, kappa: Number) 
     centre = jax.tree_util.tree_map(lambda v: v[0], values)
 
     def split(origin: State) -> tuple[Array, Array, Array]:
-        d = jax.vmap(lambda v: manifold.local(origin, v))(values)
+        d = each_row(partial(manifold.local, origin), values)
         plus, minus = d[1 : n + 1], d[n + 1 :]
         even = 0.5 * (plus + minus) - d[:1]
         return d[0], even, (plus - minus) / (2.0 * w.reach)
@@ -273,7 +275,7 @@ class Unscented(Linearisation):
     def transition(self, belief: Belief, motion: Motion, u: Data) -> Transition:
         n = belief.factor.shape[0]
         points = sigma_points(belief, self.reach(n))
-        values = jax.vmap(lambda x: motion.moved(x, u))(points)
+        values = each_row(lambda x: motion.moved(x, u), points)
         mean, spread, excess, deficit = _regress(values, n, *self.numbers)
         noise = motion.noise_factor(belief.mean, u)
         moved = None if self.redraw else Points(values, of_width(noise, n))
@@ -282,7 +284,7 @@ class Unscented(Linearisation):
     def observation(self, prior: Belief, sensor: Sensor, y: Data, aux: Data) -> Observation:
         n = prior.factor.shape[0]
         reach = self.reach(n)
-        values = jax.vmap(lambda x: sensor.reading(x, aux))(sigma_points(prior, reach))
+        values = each_row(lambda x: sensor.reading(x, aux), sigma_points(prior, reach))
         reading = _regress(values, n, *self.numbers)
         size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / reach
         return _observe(sensor, prior, y, aux, reading, size)
@@ -295,7 +297,7 @@ class Unscented(Linearisation):
         self, points: Points, prior: Belief, sensor: Sensor, y: Data, aux: Data
     ) -> Observation:
         n = prior.factor.shape[0]
-        values = jax.vmap(lambda x: sensor.reading(x, aux))(points.states)
+        values = each_row(lambda x: sensor.reading(x, aux), points.states)
         _, *state, lack = _regress(points.states, n, *self.numbers)
         z, *reading, deficit = _regress(values, n, *self.numbers)
         if lack is not None or deficit is not None:
@@ -358,7 +360,7 @@ def unscented_transform(
 ) -> Belief:
     """Propagate a belief through a function by sigma points, without noise."""
     n = belief.factor.shape[0]
-    values = jax.vmap(g)(sigma_points(belief, sigma_weights(n, alpha, beta, kappa).reach))
+    values = each_row(g, sigma_points(belief, sigma_weights(n, alpha, beta, kappa).reach))
     mean, spread, excess, deficit = _regress(values, n, alpha, beta, kappa)
     factor = linalg.tria(spread, excess)
     return Belief(mean, factor if deficit is None else linalg.downdate(factor, deficit))

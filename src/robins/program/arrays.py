@@ -20,7 +20,7 @@ import jax
 import numpy as np
 from jax.extend import core as jex
 
-from robins.program.kept import kept
+from robins.program.kept import kept_rounds
 from robins.program.kinds import array_of, numbers_of
 from robins.program.lanes import Given, Rounds
 from robins.program.liveness import (
@@ -122,7 +122,7 @@ class Written:
                 return by_jax(self._equations, self.makes, self._batched)
             jaxpr = jaxpr_of(self._equations, self.takes, self.makes)
             parts = [jaxpr, self._entries, [known.get(v) for v in self.takes]]
-            program, engine, _ = kept(parts, lambda: self._program(known))
+            program, engine, _ = kept_rounds(parts, lambda: self._program(known))
             self._rounds = Rounds(program, 1, 0, len(program.inputs), engine=engine)
         except (ProgramError, BuildError) as error:
             self.refused = error

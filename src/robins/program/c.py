@@ -67,16 +67,14 @@ class _Writer:
         roots = [*self.results]
         users: dict[Node, list[Node]] = defaultdict(list)
         self.uses: Counter[Node] = Counter()
-        self.looked_at = set()  # what loops keep of all rounds, where something reads it
+        self.kept = self.graph.kept(live)
         for node in live:
-            if self.graph.op[node] == "after" and self.graph.value[node][1] is not None:
-                loop: Loop = self.graph.value[self.graph.args[node][0]]
-                self.looked_at.add((loop.scope, self.graph.value[node][0]))
             for arg in self.graph.args[node]:
                 self.uses[arg] += 1
                 users[arg].append(node)
             if self.graph.op[node] == "loop":
-                roots += self.graph.value[node].roots
+                roots += self.graph.value[node].changes
+        roots += self.kept.values()
         self.user = {n: u[0] for n, u in users.items() if len(u) == 1}
         self.roots = set(roots)
         self.schedule: dict[int, list[Node | Roll]] = defaultdict(list)
@@ -254,7 +252,7 @@ class _Writer:
         self.names[node] = ""
         for k, n in enumerate(loop.begin):
             self.lines.append(f"{pad}{graph.kind[n]} l{s}_{k} = {self._read(n)};")
-        kept = {k: n for k, n in enumerate(loop.kept) if (s, k) in self.looked_at}
+        kept = {k: n for k, n in enumerate(loop.kept) if (s, k) in self.kept}
         for k, n in kept.items():
             self.lines.append(f"{pad}{graph.kind[n]} k{s}_{k}[{loop.count}];")
         inner = f"{pad}    "

@@ -57,6 +57,19 @@ class Interpreter:
 
         return scan, self.width
 
+    def steps(self, tape: Tape) -> Callable[[], Step]:
+        """Steps of a tape; each has registers of its own."""
+
+        def step() -> Step:
+            registers = self.registers(tape)
+
+            def call(*pointers: ctypes.c_void_p) -> None:
+                self.library.robins_step(tape.address, address(registers), *pointers)
+
+            return call
+
+        return step
+
     def registers(self, tape: Tape) -> np.ndarray:
         """Memory in which a tape computes, with its constants; one thread at a time may use it."""
         size = self.library.robins_bytes(tape.address) // 8
@@ -105,17 +118,7 @@ def interpreted_step(program: Program) -> Callable[[], Step]:
         BuildError: as for `interpreter_of_one`.
     """
     interpreter = interpreter_of_one()
-    tape = interpreter.tape(program)
-
-    def step() -> Step:
-        registers = interpreter.registers(tape)
-
-        def call(*pointers: ctypes.c_void_p) -> None:
-            interpreter.library.robins_step(tape.address, address(registers), *pointers)
-
-        return call
-
-    return step
+    return interpreter.steps(interpreter.tape(program))
 
 
 def interpreted_rounds(program: Program) -> tuple[Scan, int]:

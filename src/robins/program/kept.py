@@ -1,7 +1,9 @@
-"""Tapes kept in the user's cache, by the structure of the equations that they were made of.
+"""Tapes kept in the user's cache, by what they were made of.
 
-A digest is of primitives, parameters, shapes and numbers, not of names or of where code stands, and
-of the files of this room, which decide what a tape is.
+That is the structure of equations (primitives, parameters, shapes and numbers, not names or where
+code stands); or, before anything is traced, the names of functions of robins and the numbers that
+they are given (`by_name`). A digest is of that, of robins' own code, and of the versions of JAX,
+NumPy and SciPy.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import re
 import tempfile
 import zipfile
 import zlib
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 from importlib import metadata
@@ -25,42 +28,59 @@ import jax
 import numpy as np
 from jax.extend import core as jex
 
-from robins.program.interpreter import interpreter_of_many
+from robins.program.interpreter import Interpreter, interpreter_of_many
 from robins.program.kinds import is_key, numbers_of
-from robins.program.lanes import RoundsEngine
 from robins.program.native import cache_folder
+from robins.program.lanes import RoundsEngine
 from robins.program.nodes import Graph
 from robins.program.primitives.control import called
 from robins.program.tape import Tape
 from robins.program.trace import Leaf, Program
 
+NAMED = {"robins", "builtins", "jax"}  # packages whose versions a digest has
+ARRAY, OTHER = "array", "other"  # in the structure of results
 WORTH = 1_000  # nodes of a program that is kept
 DAMAGED = OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error
 
 
-def kept(parts: Iterable[Any], write: Callable[[], Program]) -> tuple[Program, RoundsEngine, int]:
-    """A program, its rounds by the interpreter, and how many nodes it has; from the cache or made.
+def kept(
+    parts: Iterable[Any], write: Callable[[], Program], interpreter: Interpreter
+) -> tuple[Program, Tape, int]:
+    """A program, its tape, and how many nodes it has; from the cache or made.
 
-    A program from the cache has its arguments, results and zeros, but neither nodes nor outputs.
+    A program from the cache has its arguments, results and zeros, but neither nodes nor outputs,
+    and of its structure what `results_of` gives.
 
     Args:
         parts: all that the program is made of: jaxprs, arrays, numbers, texts.
         write: makes it.
+        interpreter: that carries out the tape.
+
+    Raises:
+        ProgramError: it cannot be made.
+    """
+    path = cache_folder() / f"{digest([*parts, list(interpreter.codes), interpreter.flag])}.npz"
+    with contextlib.suppress(*DAMAGED):
+        return _read(path)
+    program = write()
+    tape, nodes = interpreter.tape(program), len(program.live)
+    if nodes >= WORTH:
+        with contextlib.suppress(OSError):  # a full disk, a folder that is gone
+            _write(path, program, tape, nodes)
+    return program, tape, nodes
+
+
+def kept_rounds(
+    parts: Iterable[Any], write: Callable[[], Program]
+) -> tuple[Program, RoundsEngine, int]:
+    """A program as `kept`, its rounds by the interpreter of many runs, and its number of nodes.
 
     Raises:
         ProgramError: it cannot be made.
         BuildError: there is no interpreter.
     """
     interpreter = interpreter_of_many()
-    path = cache_folder() / f"{digest([*parts, list(interpreter.codes), interpreter.flag])}.npz"
-    with contextlib.suppress(*DAMAGED):
-        program, tape, nodes = _read(path)
-        return program, lambda _: interpreter.rounds(tape), nodes
-    program = write()
-    tape, nodes = interpreter.tape(program), len(program.live)
-    if nodes >= WORTH:
-        with contextlib.suppress(OSError):  # a full disk, a folder that is gone
-            _write(path, program, tape, nodes)
+    program, tape, nodes = kept(parts, write, interpreter)
     return program, lambda _: interpreter.rounds(tape), nodes
 
 
@@ -71,7 +91,8 @@ def _write(path: Path, program: Program, tape: Tape, nodes: int) -> None:
     ]
     arrays: dict[str, Any] = {f"array{k}": a for k, a in enumerate(tape.arrays)}
     arrays |= {f"zero{k}": mask for k, mask in program.zeros.items()}
-    arrays["about"] = json.dumps({"leaves": leaves, "nodes": nodes})
+    about = {"leaves": leaves, "nodes": nodes, "tree": _as_json(program.structure[1])}
+    arrays["about"] = json.dumps(about)
     with tempfile.TemporaryDirectory(dir=path.parent) as own:
         made = Path(own) / path.name
         np.savez_compressed(made, sizes=tape.sizes, **arrays)
@@ -90,18 +111,44 @@ def _read(path: Path) -> tuple[Program, Tape, int]:
         ]
         for some in about["leaves"]
     )
-    program = Program(Graph(), inputs, [], results, (None, None), zeros=zeros)
+    program = Program(Graph(), inputs, [], results, (None, about["tree"]), zeros=zeros)
     return program, tape, about["nodes"]
+
+
+def results_of(program: Program) -> list[jax.tree_util.PyTreeDef | None]:
+    """Structures of the results of a program that gives a tuple.
+
+    Those of a program from the cache are known where they are tuples, dicts and arrays.
+    """
+    tree = program.structure[1]
+    if isinstance(tree, jax.tree_util.PyTreeDef):
+        return tree.children()
+    return [None if OTHER in str(one) else jax.tree_util.tree_structure(_of_json(one)) for one in tree]
+
+
+def _as_json(tree: jax.tree_util.PyTreeDef | None) -> Any:
+    if tree is None or (node := tree.node_data()) is None:
+        return ARRAY
+    kind, names = node
+    inner = list(map(_as_json, tree.children()))
+    if kind is dict:
+        return dict(zip(names, inner, strict=True))
+    return inner if kind is tuple else OTHER
+
+
+def _of_json(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        return {name: _of_json(one) for name, one in tree.items()}
+    return tuple(map(_of_json, tree)) if isinstance(tree, list) else 0
 
 
 @lru_cache
 def _version() -> str:
-    """A digest of the code that makes tapes."""
+    """A digest of the code that decides what a tape is."""
     found = hashlib.sha256()
-    for folder in ("", "primitives"):
-        for file in sorted((files("robins.program") / folder).iterdir(), key=lambda f: f.name):
-            if file.name.endswith((".py", ".h", ".cc")):
-                found.update(file.read_bytes())
+    for file in sorted(Path(str(files("robins"))).rglob("*.*")):
+        if file.suffix in (".py", ".h", ".cc"):
+            found.update(file.read_bytes())
     for package in ("jax", "numpy", "scipy"):  # the last two fold constants
         found.update(metadata.version(package).encode())
     return found.hexdigest()
@@ -112,6 +159,42 @@ def digest(parts: Iterable[Any]) -> str:
     found = hashlib.sha256(_version().encode())
     _feed(found, list(parts), {})
     return found.hexdigest()[:32]
+
+
+class UnnamedError(LookupError):
+    """A value has no name by which another process would know it."""
+
+
+def by_name(value: Any) -> str:
+    """A text that is equal, in any process of this version of robins, for equal values only.
+
+    Args:
+        value: numbers, texts, pytree structures, functions and classes, nested in tuples and lists.
+
+    Raises:
+        UnnamedError: a function or class that is not of a module of robins or of Python, such as
+            one of a user's file, which may change, or one made in a function; or anything else.
+    """
+    if value is type(None):  # has a module that does not have it
+        return "NoneType"
+    match value:
+        case None | bool() | int() | float() | str() | bytes():
+            return repr(value)
+        case np.dtype():
+            return value.str
+        case enum.Enum():
+            return f"{by_name(type(value))}.{value.name}"
+        case tuple() | list():
+            return f"({','.join(map(by_name, value))})"
+        case jax.tree_util.PyTreeDef():
+            return f"{by_name(value.node_data())}{by_name(value.children())}"
+    module, name = getattr(value, "__module__", ""), getattr(value, "__qualname__", "")
+    found = sys.modules.get(module or "")
+    for part in name.split("."):
+        found = getattr(found, part, None)
+    if found is not value or module.split(".")[0] not in NAMED:
+        raise UnnamedError(repr(value))
+    return f"{module}:{name}"
 
 
 def _feed(to: Any, value: Any, names: dict[Any, int]) -> None:

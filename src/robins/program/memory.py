@@ -8,22 +8,25 @@ Programs are kept for the process, so that a filter made again is not traced aga
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from robins.program.interpreter import interpreted_step
+from robins.program.interpreter import interpreted_step, interpreter_of_one
+from robins.program.kept import UnnamedError, by_name, kept, results_of
 from robins.program.kinds import kind_of
 from robins.program.native import Engine, Step
 from robins.program.refusal import ProgramError
 from robins.program.trace import Leaf, Program, trace
 
 Function = Callable[..., Any]  # of a state and arguments
-Made = tuple[Program, Callable[[], Step]]  # a program, and what makes steps of it
+Made = tuple[Program, Any, Callable[[], Step]]  # the tree of what it tells; what makes steps of it
 LIVE_UNROLL = 300  # of 15 states as fast as written out, and compiled in two thirds of the time
 _MOST = 128  # programs remembered; the least recently used are forgotten
 _known: OrderedDict[Hashable, Made] = OrderedDict()
@@ -256,11 +259,11 @@ class NativeState:
         key = (self._content, name, self._tree, tuple(self._forms), tree, tuple(forms), self._how)
         made = _known.get(key)
         if made is None:
-            made = _known[key] = self._made(function, args)
+            made = _known[key] = self._made(key[:-1], function, args)
             if len(_known) > _MOST:
                 _known.popitem(last=False)
         _known.move_to_end(key)
-        count, (program, step) = len(self._slots), made
+        count, (program, told_tree, step) = len(self._slots), made
         begin = self._reals, self._others
         given, *after = slots(program.inputs[count:], begin)
         told, *end = slots(program.results[count:])
@@ -279,12 +282,37 @@ class NativeState:
             (x, k, x, k),
             begin,
             (begin[0] + end[0], begin[1] + end[1]),
-            Reader(told, jax.tree_util.treedef_children(program.structure[1])[1]),
+            Reader(told, told_tree),
         )
 
-    def _made(self, function: Function, args: tuple) -> Made:
+    def _made(self, key: Hashable, function: Function, args: tuple) -> Made:
+        """A program of a function; that of the interpreter from the user's cache, if it is there.
+
+        Args:
+            key: what the program depends on.
+            function: as in `step`.
+            args: likewise.
+        """
         engine, unroll = self._how
-        program = trace(function, self.state, *args, unroll=unroll)
+        if engine is interpreted_step:
+            with contextlib.suppress(UnnamedError):
+                parts, interpreter = [by_name((key, unroll))], interpreter_of_one()
+                write = partial(self._traced, function, args)
+                program, tape, _ = kept(parts, write, interpreter)
+                return program, self._told(program, function, args), interpreter.steps(tape)
+        program = self._traced(function, args)
+        return program, self._told(program, function, args), engine(program)
+
+    def _told(self, program: Program, function: Function, args: tuple) -> Any:
+        """The structure of what a program tells."""
+        _, told = results_of(program)
+        if told is None:
+            results = jax.eval_shape(function, self.state, *args)
+            told = jax.tree_util.tree_structure(results[1])
+        return told
+
+    def _traced(self, function: Function, args: tuple) -> Program:
+        program = trace(function, self.state, *args, unroll=self._how[1])
         parts = jax.tree_util.treedef_children(program.structure[1])
         now = [(leaf.shape, leaf.kind) for leaf in program.results[: len(self._leaves)]]
         if (
@@ -295,4 +323,4 @@ class NativeState:
             raise ProgramError(
                 "a step gives a state of another form than it takes", fix="return (state, result)"
             )
-        return program, engine(program)
+        return program

@@ -50,9 +50,14 @@ class Loop:
     kept: list[Node] = field(default_factory=list)
 
     @property
+    def changes(self) -> list[Node]:
+        """What is to be computed inside for the next round."""
+        return [*self.next, *([] if self.condition is None else [self.condition])]
+
+    @property
     def roots(self) -> list[Node]:
-        """What is to be computed inside."""
-        return [*self.next, *self.kept, *([] if self.condition is None else [self.condition])]
+        """What may have to be computed inside."""
+        return [*self.changes, *self.kept]
 
 
 class Graph:
@@ -248,8 +253,18 @@ class Graph:
                 seen.add(node)
                 ahead += self.args[node]
                 if self.op[node] == "loop":
-                    ahead += self.value[node].roots
+                    ahead += self.value[node].changes
+                ahead += self.kept([node]).values()
         return sorted(seen)
+
+    def kept(self, nodes: Sequence[Node]) -> dict[tuple[int, int], Node]:
+        """What loops keep of all rounds and some nodes read, by scope and number."""
+        read: dict[tuple[int, int], Node] = {}
+        for node in nodes:
+            if self.op[node] == "after" and self.value[node][1] is not None:
+                loop, k = self.value[self.args[node][0]], self.value[node][0]
+                read[loop.scope, k] = loop.kept[k]
+        return read
 
     # ------------------------------------------------------------------------------ folding
 

@@ -29,7 +29,7 @@ from robins.program.arrays import (
     taken_by,
 )
 from robins.program.interpreter import interpreted_rounds
-from robins.program.kept import kept
+from robins.program.kept import kept_rounds
 from robins.program.kinds import array_of, is_key, numbers_of
 from robins.program.lanes import Given, Rounds, RoundsEngine, compiled_rounds, zero_in_all
 from robins.program.liveness import Equation, Touched, Variable, last_uses, most_bytes, variables
@@ -220,7 +220,7 @@ class Loop:
         try:
             if self._engine is interpreted_rounds:
                 parts = [body.jaxpr, self.axis, self._unroll, body.known(known), zeros]
-                program, engine, self.nodes = kept(parts, self._write)
+                program, engine, self.nodes = kept_rounds(parts, self._write)
             else:
                 program, engine = self._write(), self._engine
             stays = len(body.stays) - len(known)

@@ -83,8 +83,10 @@ class Writer:
         for node in live:
             self.uses.update(self.graph.args[node])
             if self.graph.op[node] == "loop":
-                self.uses.update(self.graph.value[node].roots)
+                self.uses.update(self.graph.value[node].changes)
             self.inner[self.graph.scope[node]].append(node)
+        self.kept = self.graph.kept(live)
+        self.uses.update(self.kept.values())
         self.joined = dict(self._products(live))
         self.done: set[Node] = set()
         self._scope(0, set(live))
@@ -194,7 +196,8 @@ class Writer:
         for k, n in enumerate(loop.begin):
             self.scope_of[s, k] = around
             self._write("move", (s, k), n)
-        for k in range(len(loop.kept)):
+        kept = {k: n for k, n in enumerate(loop.kept) if (s, k) in self.kept}
+        for k in kept:
             self.scope_of["kept", s, k] = around
             self._write("", ("kept", s, k), count=loop.count or 0)
         self._write("begin", None, numbers=(s,))
@@ -206,7 +209,7 @@ class Writer:
             self._scope(s, set(graph.live([loop.condition])))
             self._write("leave_unless", None, loop.condition, numbers=(s,))
         self._scope(s, set(self.inner[s]))
-        for k, n in enumerate(loop.kept):
+        for k, n in kept.items():
             self._write("keep", ("kept", s, k), n, numbers=(s,))
         self._next(loop)
         most = 2**31 - 1 if loop.count is None else loop.count

@@ -31,6 +31,7 @@ from robins.filters.kalman import WRONG, Again, Filter, FilterState, Prediction
 from robins.filters.model import Data, Given, Motion, Sensor
 from robins.filters.trees import equal, select
 from robins.filters.values import Numbers, is_known, kind, value
+from robins.linalg.rows import each_row
 
 T = TypeVar("T")
 One = tuple[Data, Data, dict[str, Array]]  # state, what was found, and notes
@@ -142,8 +143,9 @@ class Family:
     def every(self, of: Of, states: Data, *rows: Data) -> Every:
         """As `Several.every`; one mode is traced, for all, and states have a leading axis."""
         numbers = jax.tree_util.tree_map(jnp.asarray, self.numbers)
-        one = jax.vmap(lambda row, *part: of(self.of(row), *part))
-        after, found, notes = one(numbers, states, *rows)
+        after, found, notes = each_row(
+            lambda row, *part: of(self.of(row), *part), numbers, states, *rows
+        )
         return after, found, [_at(notes, i) for i in range(self.size)]
 
     def beliefs(self, states: Data) -> Belief:
@@ -233,7 +235,7 @@ class Imm(Filter):
         log_weight, log_next = jax.vmap(log_normalised, in_axes=1)(joint)
         weight = jnp.exp(log_weight)  # (to, from)
         beliefs = self.modes.beliefs(states)
-        begun = jax.vmap(matched, in_axes=(None, 0, 0))(beliefs, weight, beliefs.mean)
+        begun = each_row(partial(matched, beliefs), weight, beliefs.mean)
         # A mode that receives nothing goes on alone, as does one that mixes with none, bit for bit.
         alone = ~jnp.isfinite(log_next) | (jnp.diagonal(weight) == 1.0)
 
@@ -264,7 +266,8 @@ class Imm(Filter):
         info = self.told(seen, log_prior, log_post, used)._replace(notes=notes)
         # Where no mode has moved the mixture stands bit for bit.
         was, now = self.modes.beliefs(states), self.modes.beliefs(after)
-        belief = select(equal(now, was), state.belief, _mixture(now, log_post))
+        same = jnp.all(each_row(equal, now, was))
+        belief = select(same, state.belief, _mixture(now, log_post))
         return FilterState(belief, Interaction(after, log_post)), info
 
     def told(self, seen: StepInfo, log_prior: Array, log_post: Array, used: Array) -> StepInfo:

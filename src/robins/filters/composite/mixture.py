@@ -10,6 +10,8 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief, StepInfo
+from robins.filters.trees import select
+from robins.linalg.rows import each_row
 from robins.manifold import State
 
 _ROUNDS = 6  # of the mean on a curved space: it comes nearer by about the square of the spread
@@ -61,12 +63,17 @@ def deviations(states: State, factors: Array, weight: Array, mean: State) -> Arr
     Returns:
         (r, n, k + 1).
     """
-    d = _offsets(states, weight, mean)
-    share = root(weight)[:, None, None]
-    kept = jnp.where(share > 0.0, factors, 0.0)
-    if factors.shape[2] and any(manifold.is_element(leaf) for leaf in manifold.leaves(mean)):
-        kept = jax.vmap(lambda x, S: _transport(mean, x) @ S)(_sound(states, weight, mean), kept)
-    return share * jnp.concatenate([kept, d[:, :, None]], axis=2)
+    curved = any(manifold.is_element(leaf) for leaf in manifold.leaves(mean))
+
+    def block(x: State, S: Array, w: Array) -> Array:
+        x = select(w > 0.0, x, mean)  # what does not count may not be finite
+        share = root(w)
+        kept = jnp.where(share > 0.0, S, 0.0)
+        if S.shape[1] and curved:
+            kept = _transport(mean, x) @ kept
+        return share * jnp.concatenate([kept, manifold.local(mean, x)[:, None]], axis=1)
+
+    return each_row(block, states, factors, weight)
 
 
 def matched(beliefs: Belief, weight: Array, about: State) -> Belief:
@@ -106,18 +113,13 @@ def innovation(seen: StepInfo, weight: Array, used: Array) -> Innovation:
     return Innovation(mean, expected, factor, jnp.sum(white**2), jnp.sum(used))
 
 
-def _sound(states: State, weight: Array, instead: State) -> State:
-    """The states, with another in the place of those that do not count."""
-
-    def pick(leaf: Array, other: Array) -> Array:
-        counts = (weight > 0.0).reshape(-1, *(1,) * jnp.ndim(other))
-        return jnp.where(counts, leaf, other[None])
-
-    return jax.tree_util.tree_map(pick, states, instead)
-
-
 def _offsets(states: State, weight: Array, about: State) -> Array:
-    return jax.vmap(lambda x: manifold.local(about, x))(_sound(states, weight, about))
+    """(r, n) from a state to others; zero for those that do not count."""
+
+    def offset(x: State, w: Array) -> Array:
+        return manifold.local(about, select(w > 0.0, x, about))
+
+    return each_row(offset, states, weight)
 
 
 def _transport(mean: State, x: State) -> Array:

@@ -36,6 +36,7 @@ from robins.filters.linearise import Linearisation, taylor
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.trees import finite, select
 from robins.filters.values import Numbers, is_known, kind, number, value
+from robins.linalg.rows import each_row
 from robins.manifold import State
 
 _GENERATOR = "threefry2x32"  # named, so that a key gives the same draws under any setting of JAX
@@ -82,7 +83,7 @@ class Particle(Filter):
             left = jnp.where((jnp.arange(n) < k)[None], 0.0, S)
             return Belief(manifold.retract(mean, (S[:, :k] @ xi)[back]), left[back])
 
-        return jax.vmap(one)(xi, means, factors)
+        return each_row(one, xi, means, factors)
 
     def spread(self, belief: Belief, key: Array) -> FilterState:
         """A new cloud from a Gaussian belief."""
@@ -130,7 +131,7 @@ class Particle(Filter):
             return manifold.retract(cloud.mean, d)
 
         xi = jax.random.normal(key, (self.count, k))
-        return particles._replace(mean=jax.vmap(one)(particles.mean, xi))
+        return particles._replace(mean=each_row(one, particles.mean, xi))
 
     def _predict(
         self, state: FilterState, motion: Motion, u: Data
@@ -142,7 +143,7 @@ class Particle(Filter):
             t = self.way.transition(b, motion, u)
             return t.mean, predicted_factor(t, "sqrt")
 
-        after = self.drawn(draw, *jax.vmap(ahead)(before))
+        after = self.drawn(draw, *each_row(ahead, before))
         sound = jax.vmap(finite)(after)
         log_weight, total = log_normalised(jnp.where(sound, log_weight, -jnp.inf))
         taken = jnp.isfinite(total)
@@ -162,7 +163,7 @@ class Particle(Filter):
             posterior, info = updated(b, o, "sqrt")
             return posterior, info, b.factor @ jnp.where(info.used[:, None], o.spread, 0.0).T
 
-        after, infos, cross = jax.vmap(one)(before)
+        after, infos, cross = each_row(one, before)
         sound = jax.vmap(finite)((after, infos.log_likelihood))
         gained = jnp.where(sound, infos.log_likelihood, -jnp.inf)
         log_post, total = log_normalised(log_prior + gained)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -95,52 +96,79 @@ def _converted(walk: Walk, arrays: list[Nodes], like: list[Nodes]) -> list[Nodes
 @rule("scan")
 def _scan(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
     p = equation.params
-    consts, carry = args[: p["num_consts"]], list(args[p["num_consts"] :][: p["num_carry"]])
-    rows = args[p["num_consts"] + p["num_carry"] :]
-    length, body = p["length"], p["jaxpr"]
-    if length > 1 and walk.stays_whole(length * size_of(body.jaxpr)):
-        return _rolled_scan(walk, equation, consts, carry, rows)
-    kept: list[list[Nodes]] = []
-    order = range(length)
-    for k in reversed(order) if p["reverse"] else order:
-        found = walk.closed(body, *consts, *carry, *(np.asarray(row[k]) for row in rows))
-        carry = found[: p["num_carry"]]
-        kept.append(found[p["num_carry"] :])
-    if p["reverse"]:
-        kept.reverse()
-    shapes = [v.aval.shape for v in equation.outvars[p["num_carry"] :]]
-    stacked = [
-        np.stack([found[j] for found in kept]) if kept else np.zeros(shape, dtype=np.int64)
-        for j, shape in enumerate(shapes)
-    ]
-    return [*carry, *stacked]
+    fixed, carried = p["num_consts"], p["num_carry"]
+    consts, carry, rows = args[:fixed], list(args[fixed:][:carried]), args[fixed + carried :]
+    rounds = Rounds(p["jaxpr"], p["length"], p["reverse"])
+    return rounds.of(walk, consts, carry, rows)
 
 
-def _rolled_scan(
-    walk: Walk, equation: Any, consts: Any, carry: list[Nodes], rows: Any
-) -> list[Nodes]:
-    """A loop of C; the rows of its inputs are arrays, of which each round picks one."""
-    graph, p = walk.graph, equation.params
-    length = p["length"]
-    loop = graph.open(_flat(carry), length)
-    index = loop.index
+@rule("each_row")
+def _each_row(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
+    """A scan that carries nothing (`robins.linalg.rows`)."""
+    p = equation.params
+    return Rounds(p["jaxpr"], p["count"]).of(walk, args[: p["shared"]], [], args[p["shared"] :])
 
-    def row(a: Nodes) -> Nodes:
-        columns = a[::-1] if p["reverse"] else a
-        return walk.each(lambda *nodes: graph.pick(nodes, index), *map(np.asarray, columns))
 
-    now = _shaped(loop.leaves, carry)
-    found = walk.closed(p["jaxpr"], *consts, *now, *map(row, rows))
-    new, kept = found[: len(carry)], found[len(carry) :]
-    loop.next, loop.kept = _flat(_converted(walk, new, now)), _flat(kept)
-    after, rounds = graph.close(loop)
-    out, at = _shaped(after, carry), 0
-    for a in kept:
-        columns = np.array(rounds[at : at + a.size], dtype=np.int64).reshape(a.size, length)
-        stacked = columns.T.reshape(length, *a.shape)
-        out.append(stacked[::-1] if p["reverse"] else stacked)
-        at += a.size
-    return out
+class Rounds(NamedTuple):
+    """A body, closed, that is carried out for each row of some arrays."""
+
+    body: Any
+    length: int
+    reverse: bool = False
+
+    def of(
+        self, walk: Walk, consts: Sequence[Nodes], carry: list[Nodes], rows: Sequence[Nodes]
+    ) -> list[Nodes]:
+        """What is carried after the last round, and arrays of what each gives."""
+        large = self.length > 1 and walk.stays_whole(self.length * size_of(self.body.jaxpr))
+        return (self._rolled if large else self._written)(walk, consts, carry, rows)
+
+    def _written(
+        self, walk: Walk, consts: Sequence[Nodes], carry: list[Nodes], rows: Sequence[Nodes]
+    ) -> list[Nodes]:
+        """One round behind the other."""
+        kept: list[list[Nodes]] = []
+        carried, order = len(carry), range(self.length)
+        for k in reversed(order) if self.reverse else order:
+            found = walk.closed(self.body, *consts, *carry, *(np.asarray(row[k]) for row in rows))
+            carry = found[:carried]
+            kept.append(found[carried:])
+        if self.reverse:
+            kept.reverse()
+        return [
+            *carry,
+            *(
+                np.stack([found[j] for found in kept])
+                if kept
+                else np.zeros((0, *v.shape), dtype=np.int64)
+                for j, v in enumerate(self.body.out_avals[carried:])
+            ),
+        ]
+
+    def _rolled(
+        self, walk: Walk, consts: Sequence[Nodes], carry: list[Nodes], rows: Sequence[Nodes]
+    ) -> list[Nodes]:
+        """A loop of C; the rows of its inputs are arrays, of which each round picks one."""
+        graph, length = walk.graph, self.length
+        loop = graph.open(_flat(carry), length)
+        index = loop.index
+
+        def row(a: Nodes) -> Nodes:
+            columns = a[::-1] if self.reverse else a
+            return walk.each(lambda *nodes: graph.pick(nodes, index), *map(np.asarray, columns))
+
+        now = _shaped(loop.leaves, carry)
+        found = walk.closed(self.body, *consts, *now, *map(row, rows))
+        new, kept = found[: len(carry)], found[len(carry) :]
+        loop.next, loop.kept = _flat(_converted(walk, new, now)), _flat(kept)
+        after, rounds = graph.close(loop)
+        out, at = _shaped(after, carry), 0
+        for a in kept:
+            columns = np.array(rounds[at : at + a.size], dtype=np.int64).reshape(a.size, length)
+            stacked = columns.T.reshape(length, *a.shape)
+            out.append(stacked[::-1] if self.reverse else stacked)
+            at += a.size
+        return out
 
 
 @rule("while")
@@ -201,7 +229,7 @@ def size_of(jaxpr: Any) -> int:
             if hasattr(getattr(x, "jaxpr", x), "eqns")
         ]
         if inner:
-            total += p.get("length", 1) * sum(map(size_of, inner))
+            total += p.get("length", p.get("count", 1)) * sum(map(size_of, inner))
         elif name == "dot_general":
             ((axes, _), _) = p["dimension_numbers"]
             shape = equation.invars[0].aval.shape

@@ -1,0 +1,88 @@
+"""A function of one row, on all rows of some arrays: batched by JAX, a loop in a program.
+
+`jax.vmap` leaves no trace of the function of one row: in a program of scalars (`robins.program`)
+each row would be written out, nine times a filter for nine modes of it. The primitive ``each_row``
+keeps that function; all that JAX does with it (compile, batch, differentiate) it does with
+`jax.vmap` of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, TypeVar
+
+import jax
+from jax.extend import core as jex
+from jax.interpreters import ad, batching, mlir
+
+T = TypeVar("T")
+
+_each_row = jex.Primitive("each_row")
+_each_row.multiple_results = True
+
+
+def each_row(function: Callable[..., T], *args: Any) -> T:
+    """Return ``jax.vmap(function)(*args)``.
+
+    Args:
+        function: of one row of each of the arguments; what else it needs it may close over.
+        args: pytrees of arrays with an equal leading axis.
+    """
+    leaves, tree = jax.tree_util.tree_flatten(args)
+    rows = [jax.typeof(leaf) for leaf in map(jax.numpy.asarray, leaves)]
+    rows = [jax.ShapeDtypeStruct(a.shape[1:], a.dtype, weak_type=a.weak_type) for a in rows]
+
+    def flat(*row: Any) -> T:
+        return function(*jax.tree_util.tree_unflatten(tree, row))
+
+    closed, shapes = jax.make_jaxpr(flat, return_shape=True)(*rows)
+    # What the function closes over are further arguments, the same for each row.
+    inner = closed.jaxpr
+    jaxpr = jex.Jaxpr(
+        [],
+        [*inner.constvars, *inner.invars],
+        inner.outvars,
+        inner.eqns,
+        inner.effects,
+        debug_info=jex.DebugInfo("each_row", "row", None, None),
+    )
+    found = _each_row.bind(
+        *closed.consts,
+        *leaves,
+        jaxpr=jex.ClosedJaxpr(jaxpr, ()),
+        shared=len(closed.consts),
+        count=leaves[0].shape[0],
+    )
+    return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(shapes), found)
+
+
+def _batched(*args: Any, jaxpr: jex.ClosedJaxpr, shared: int, count: int) -> Sequence[Any]:
+    axes = [None] * shared + [0] * (len(args) - shared)
+    return jax.vmap(jex.jaxpr_as_fun(jaxpr), axes, axis_size=count)(*args)
+
+
+@_each_row.def_abstract_eval
+def _shapes(*args: Any, jaxpr: jex.ClosedJaxpr, shared: int, count: int) -> list[Any]:
+    return [aval.update(shape=(count, *aval.shape)) for aval in jaxpr.out_avals]
+
+
+def _by_vmap(args: Any, dims: Any, **params: Any) -> tuple[Sequence[Any], list[int]]:
+    found = jax.vmap(partial(_batched, **params), dims)(*args)
+    return found, [0] * len(found)
+
+
+def _jvp(primals: Any, tangents: Any, **params: Any) -> tuple[Sequence[Any], list[Any]]:
+    known = [ad.instantiate_zeros(t) for t in tangents]
+    found, slopes = jax.jvp(partial(_batched, **params), tuple(primals), tuple(known))
+    whole = jax.dtypes.float0  # of what is no real
+    zeros = [
+        ad.Zero(jax.core.ShapedArray(s.shape, whole)) if s.dtype == whole else s for s in slopes
+    ]
+    return found, zeros
+
+
+_each_row.def_impl(_batched)
+mlir.register_lowering(_each_row, mlir.lower_fun(_batched, multiple_results=True))
+batching.primitive_batchers[_each_row] = _by_vmap
+ad.primitive_jvps[_each_row] = _jvp
