@@ -11,7 +11,6 @@ from functools import partial
 from typing import Literal, Protocol, TypeVar
 
 import jax
-import jax.numpy as jnp
 
 from robins.filters.belief import StepInfo
 from robins.filters.checks import one_of
@@ -139,6 +138,18 @@ class ProgramStepper:
         return self._memory.look(question, partial(question, self._filter, self._model), *args)
 
 
+def usual() -> Name:
+    """Machine that begins at once: "vm"; "jax" where there is no interpreter, nor a way to it."""
+    from robins.program import BuildError
+    from robins.program.interpreter import interpreter_of_one
+
+    try:
+        interpreter_of_one()
+    except BuildError:
+        return "jax"
+    return "vm"
+
+
 def on(
     machine: Machine | str, filter_: Filter, model: Model, state: FilterState
 ) -> JaxStepper | ProgramStepper:
@@ -165,10 +176,3 @@ def on(
         interpreter_of_one()
         engine = interpreted_step
     return ProgramStepper(filter_, model, state, partial(NativeState, engine=engine))
-
-
-def settled(state: FilterState) -> FilterState:
-    """State without weak types, which would compile everything again after the first step."""
-    if not any(getattr(x, "weak_type", False) for x in jax.tree_util.tree_leaves(state)):
-        return state
-    return jax.tree_util.tree_map(lambda x: jnp.asarray(x, jnp.asarray(x).dtype), state)

@@ -12,12 +12,12 @@ from jax.tree_util import tree_map
 from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
-from robins.filters.machine import Machine, on, settled
+from robins.filters.machine import Machine, on
 from robins.filters.model import Data, Model
 from robins.filters.observation import as_measurement, as_real
 from robins.filters.run import Step, everything
 from robins.filters.tally import Tally, doubts
-from robins.filters.values import Numbers
+from robins.filters.values import Numbers, settled
 from robins.manifold import State
 
 T = TypeVar("T")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from robins.filters.kalman import Again, Filter, FilterState, Prediction
 from robins.filters.model import Data, Model
 from robins.filters.observation import as_measurement
 from robins.filters.tally import Tally, warn_not_taken
-from robins.filters.values import is_known
+from robins.filters.values import content, is_known, settled
 from robins.manifold import State
 
 
@@ -113,18 +113,37 @@ def filter_step(
     return state, Step(prediction, state.belief, info)
 
 
+Carry = tuple[FilterState, Array, Tally]
+
+
+def _body(filter_: Filter, model: Model, keep: Keep, carry: Carry, row: Rows) -> tuple[Carry, Data]:
+    state, total, tally = carry
+    state, step = filter_step(filter_, model, state, *row)
+    gained = sum((i.log_likelihood for i in step.info.values()), jnp.zeros(()))
+    moved = step.prediction.code == int(Code.DONE)
+    total = total + jnp.where(moved, gained, -jnp.inf)
+    return (state, total, tally.and_step(step.prediction.code, step.info)), keep(step)
+
+
+def _begun(state: FilterState, rows: Rows) -> Carry:
+    return state, jnp.zeros(()), Tally.blank(tuple(rows[1]))
+
+
 @partial(jax.jit, static_argnames=("keep",))
 def _scan(filter_: Filter, model: Model, state: FilterState, rows: Rows, keep: Keep) -> Solution:
-    def body(carry: tuple[FilterState, Array, Tally], row: Rows):
-        state, total, tally = carry
-        state, step = filter_step(filter_, model, state, *row)
-        gained = sum((i.log_likelihood for i in step.info.values()), jnp.zeros(()))
-        moved = step.prediction.code == int(Code.DONE)
-        total = total + jnp.where(moved, gained, -jnp.inf)
-        return (state, total, tally.and_step(step.prediction.code, step.info)), keep(step)
+    body = partial(_body, filter_, model, keep)
+    (state, total, tally), steps = jax.lax.scan(body, _begun(state, rows), rows)
+    return Solution(steps, state, total, tally)
 
-    begin = (state, jnp.zeros(()), Tally.blank(tuple(rows[1])))
-    (state, total, tally), steps = jax.lax.scan(body, begin, rows)
+
+def _interpreted(
+    filter_: Filter, model: Model, state: FilterState, rows: Rows, keep: Keep
+) -> Solution:
+    # Imported here: a filter needs no programs.
+    from robins.program.scanned import scan
+
+    body, holds = partial(_body, filter_, model, keep), (content(filter_, model), keep)
+    (state, total, tally), steps = scan(body, holds, _begun(settled(state), rows), rows)
     return Solution(steps, state, total, tally)
 
 
@@ -152,6 +171,7 @@ def run(
     aux: Mapping[str, Data] | None = None,
     keep: Keep = everything,
     time_s: ArrayLike | None = None,
+    machine: Literal["jax", "vm"] = "jax",
 ) -> Solution:
     """Run a filter over measurements: for each step k predict, then update with row k of y.
 
@@ -168,9 +188,13 @@ def run(
         aux: further inputs of sensors, by sensor name, leading axis T.
         keep: part of each `Step` to keep; long campaigns keep little.
         time_s: (T,) time of each step [s], which errors then name.
+        machine: "vm" for the interpreter, which compiles nothing; its results are arrays of NumPy,
+            and equal to rounding.
 
     Raises:
         Exception: report of the filter (`Filter.report`); in transformed code see the codes.
+        robins.program.ProgramError: for "vm": filter or model do what has no place in a program.
+        robins.program.BuildError: for "vm": there is no interpreter, and no compiler of C++.
         TypeError: a measurement is not a real number.
         ValueError: lengths differ, or a measurement names no sensor or has another shape than it.
 
@@ -185,7 +209,8 @@ def run(
     as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
     state, rows = as_arrays(state), (as_arrays(u), measurements, as_arrays(extra))
-    solution = _scan(filter_, model, state, rows, keep)
+    scan = _scan if machine == "jax" else _interpreted
+    solution = scan(filter_, model, state, rows, keep)
 
     def again(other: Filter) -> FilterState:
         return _scan(other, model, state, rows, nothing).final

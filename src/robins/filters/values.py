@@ -136,3 +136,10 @@ def content(*trees: object) -> Hashable:
 
     leaves, structure = jax.tree_util.tree_flatten(trees)
     return structure, tuple((a.dtype.str, a.shape, a.tobytes()) for a in map(raw, leaves))
+
+
+def settled(state: T) -> T:
+    """State without weak types, which would compile everything again after the first step."""
+    if not any(getattr(x, "weak_type", False) for x in jax.tree_util.tree_leaves(state)):
+        return state
+    return jax.tree_util.tree_map(lambda x: jax.numpy.asarray(x, jax.numpy.asarray(x).dtype), state)

@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 import jax
+from jax.core import ShapedArray
 from jax.extend import core as jex
 from jax.interpreters import ad, batching, mlir
 
@@ -76,9 +77,7 @@ def _jvp(primals: Any, tangents: Any, **params: Any) -> tuple[Sequence[Any], lis
     known = [ad.instantiate_zeros(t) for t in tangents]
     found, slopes = jax.jvp(partial(_batched, **params), tuple(primals), tuple(known))
     whole = jax.dtypes.float0  # of what is no real
-    zeros = [
-        ad.Zero(jax.core.ShapedArray(s.shape, whole)) if s.dtype == whole else s for s in slopes
-    ]
+    zeros = [ad.Zero(ShapedArray(s.shape, whole)) if s.dtype == whole else s for s in slopes]
     return found, zeros
 
 

@@ -17,9 +17,7 @@
 #include "routines.h"
 #include "operations.h"
 #include <stdlib.h>
-#ifndef ONE_RUN
 #include "scan.h"
-#endif
 
 /* Operators of C in a compiled program. */
 #define OPERATOR(kind, name, sign) \
@@ -210,7 +208,7 @@ extern "C" void robins_step(const tape *t, int64_t *registers, const double *x, 
     for (int i = 0; i < t->ny; ++i) { y[i] = *ROW(double, *from++); }
     for (int i = 0; i < t->nm; ++i) { m[i] = *ROW(int64_t, *from++); }
 }
-#else
+#endif
 
 struct reals {
     double at[WIDTH];
@@ -241,4 +239,3 @@ extern "C" int robins_scan(const scan *s, const tape *t, int64_t *registers)
     free(found);
     return failed;
 }
-#endif

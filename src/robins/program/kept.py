@@ -13,10 +13,10 @@ import enum
 import hashlib
 import json
 import re
+import sys
 import tempfile
 import zipfile
 import zlib
-import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 from importlib import metadata
@@ -30,15 +30,16 @@ from jax.extend import core as jex
 
 from robins.program.interpreter import Interpreter, interpreter_of_many
 from robins.program.kinds import is_key, numbers_of
-from robins.program.native import cache_folder
 from robins.program.lanes import RoundsEngine
+from robins.program.native import cache_folder
 from robins.program.nodes import Graph
 from robins.program.primitives.control import called
 from robins.program.tape import Tape
 from robins.program.trace import Leaf, Program
 
+Tree = Any  # a structure of JAX, which to a checker is no class
 NAMED = {"robins", "builtins", "jax"}  # packages whose versions a digest has
-ARRAY, OTHER = "array", "other"  # in the structure of results
+NONE = "builtins:NoneType"
 WORTH = 1_000  # nodes of a program that is kept
 DAMAGED = OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error
 
@@ -115,31 +116,45 @@ def _read(path: Path) -> tuple[Program, Tape, int]:
     return program, tape, about["nodes"]
 
 
-def results_of(program: Program) -> list[jax.tree_util.PyTreeDef | None]:
+def results_of(program: Program) -> list[Tree | None]:
     """Structures of the results of a program that gives a tuple.
 
-    Those of a program from the cache are known where they are tuples, dicts and arrays.
+    One of a program from the cache is None if it holds a class that is not of robins.
     """
     tree = program.structure[1]
     if isinstance(tree, jax.tree_util.PyTreeDef):
         return tree.children()
-    return [None if OTHER in str(one) else jax.tree_util.tree_structure(_of_json(one)) for one in tree]
+    return list(map(_of_json, tree[2]))
 
 
-def _as_json(tree: jax.tree_util.PyTreeDef | None) -> Any:
-    if tree is None or (node := tree.node_data()) is None:
-        return ARRAY
-    kind, names = node
-    inner = list(map(_as_json, tree.children()))
-    if kind is dict:
-        return dict(zip(names, inner, strict=True))
-    return inner if kind is tuple else OTHER
+def _as_json(tree: Tree | None) -> Any:
+    """A structure as class, what it says of its fields, and structures inside."""
+    node = None if tree is None else tree.node_data()
+    if tree is None or node is None:
+        return None
+    try:
+        json.dumps(node[1])  # numbers and names alone
+        return [by_name(node[0]), node[1], list(map(_as_json, tree.children()))]
+    except (UnnamedError, TypeError):
+        return ["", None, []]
 
 
-def _of_json(tree: Any) -> Any:
-    if isinstance(tree, dict):
-        return {name: _of_json(one) for name, one in tree.items()}
-    return tuple(map(_of_json, tree)) if isinstance(tree, list) else 0
+def _of_json(tree: Any) -> Tree | None:
+    """The structure, or None if it is not all known; its modules are those that are loaded."""
+    if tree is None:
+        return jax.tree_util.tree_structure(0)
+    kind, about, inner = tree
+    inside = list(map(_of_json, inner))
+    try:
+        made = jax.tree_util.PyTreeDef.from_node_data_and_children
+        about = about if kind == by_name(dict) else _tuples(about)
+        return made(jax.tree_util.default_registry, (_named(kind), about), inside)
+    except (AttributeError, LookupError, TypeError, ValueError):  # or an older version of JAX
+        return None
+
+
+def _tuples(x: Any) -> Any:
+    return tuple(map(_tuples, x)) if isinstance(x, list) else x
 
 
 @lru_cache
@@ -175,8 +190,6 @@ def by_name(value: Any) -> str:
         UnnamedError: a function or class that is not of a module of robins or of Python, such as
             one of a user's file, which may change, or one made in a function; or anything else.
     """
-    if value is type(None):  # has a module that does not have it
-        return "NoneType"
     match value:
         case None | bool() | int() | float() | str() | bytes():
             return repr(value)
@@ -188,13 +201,27 @@ def by_name(value: Any) -> str:
             return f"({','.join(map(by_name, value))})"
         case jax.tree_util.PyTreeDef():
             return f"{by_name(value.node_data())}{by_name(value.children())}"
-    module, name = getattr(value, "__module__", ""), getattr(value, "__qualname__", "")
-    found = sys.modules.get(module or "")
-    for part in name.split("."):
-        found = getattr(found, part, None)
-    if found is not value or module.split(".")[0] not in NAMED:
+    name = f"{getattr(value, '__module__', '')}:{getattr(value, '__qualname__', '')}"
+    if _named(name) is not value:
         raise UnnamedError(repr(value))
-    return f"{module}:{name}"
+    return name
+
+
+def _named(name: str) -> Any:
+    """What has a name, in a module that is loaded.
+
+    Raises:
+        UnnamedError: nothing has, or it is of another package than those of `NAMED`.
+    """
+    module, _, path = name.partition(":")
+    if name == NONE:  # which its module does not have
+        return type(None)
+    found: Any = sys.modules.get(module) if module.split(".")[0] in NAMED else None
+    for part in path.split("."):
+        found = getattr(found, part, None)
+    if found is None:
+        raise UnnamedError(name)
+    return found
 
 
 def _feed(to: Any, value: Any, names: dict[Any, int]) -> None:
@@ -206,14 +233,14 @@ def _feed(to: Any, value: Any, names: dict[Any, int]) -> None:
         case jex.Jaxpr():
             inner: dict[Any, int] = {}
             for v in (*value.constvars, *value.invars):
-                _named(to, v, inner)
+                _number(to, v, inner)
             for e in value.eqns:
                 call = called(e)
                 to.update(f"{'call' if call else e.primitive.name}(".encode())
                 _feed(to, call or e.params, {})
                 _feed(to, e.invars, inner)
                 for v in e.outvars:
-                    _named(to, v, inner)
+                    _number(to, v, inner)
             _feed(to, value.outvars, inner)
         case jex.Literal():
             _feed(to, numbers_of(value.val), names)
@@ -241,6 +268,6 @@ def _feed(to: Any, value: Any, names: dict[Any, int]) -> None:
             to.update(f"{type(value).__name__} {text};".encode())
 
 
-def _named(to: Any, v: Any, names: dict[Any, int]) -> None:
+def _number(to: Any, v: Any, names: dict[Any, int]) -> None:
     names[v] = len(names)
     to.update(f"v{names[v]}:{v.aval};".encode())

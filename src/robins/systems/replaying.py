@@ -22,10 +22,11 @@ from robins import rotation
 from robins.filters import Belief, Code, StepWarning, Tally, doubts, rts_smoother, run
 from robins.filters.analysis.consistency import grand_mean_nis
 from robins.filters.kalman import WRONG
-from robins.filters.run import Step
+from robins.filters.run import Keep, Solution, Step, everything
 from robins.filters.whiteness import joined
 from robins.ins.blocks import Blocks
 from robins.ins.increments import after_gap
+from robins.program import BuildError, ProgramError
 from robins.results import Outcome, Progress, silent, variable
 from robins.systems.study import Contender, SensorAxes, StateBlock
 from robins.systems.suspects import probabilities, sentences, tables
@@ -201,12 +202,8 @@ def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answe
     with warnings.catch_warnings():
         # what would be said here is among the warnings of the outcome
         warnings.simplefilter("ignore", StepWarning)
-        if smoothed:
-            found = run(*arguments, time_s=piece.epoch_s)
-            of_steps = _kept_of(found.steps)
-        else:
-            found = run(*arguments, keep=kept, time_s=piece.epoch_s)
-            of_steps = found.steps
+        found = _ran(arguments, everything if smoothed else kept, piece.epoch_s)
+        of_steps = _kept_of(found.steps) if smoothed else found.steps
     mean, sigma, seen = of_steps
     likelihood, bounds = float(found.log_likelihood), contender.bounds
     tally = found.tally.looking(seen, case.y)
@@ -216,6 +213,14 @@ def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answe
         return answer, answer
     belief = rts_smoother(found)
     return answer, answer._replace(mean=belief.mean, sigma=belief.sigma, updates={}, wrong={})
+
+
+def _ran(arguments: tuple[Any, ...], keep: Keep, time_s: np.ndarray) -> Solution:
+    """A run by the interpreter; by JAX where that cannot carry it out."""
+    try:
+        return run(*arguments, keep=keep, time_s=time_s, machine="vm")
+    except (BuildError, ProgramError):
+        return run(*arguments, keep=keep, time_s=time_s)
 
 
 def _joined(parts: Sequence[Answer]) -> Answer:

@@ -36,6 +36,7 @@ import numpy as np
 from robins.dataset import ImuTable
 from robins.errors import require
 from robins.filters import OnlineFilter
+from robins.filters.machine import usual
 from robins.ins.blocks import cut, rate_about, reach_of_rate, usual_width
 from robins.ins.increments import Increments, from_imu
 from robins.systems import replaying
@@ -104,7 +105,7 @@ class LiveInsGnss(Live):
         fix_rate_hz: float = 1.0,
         filter: str = "robust",
         longest_delay_s: float = 1.0,
-        machine: str = "jax",
+        machine: str = "",
     ):
         """Begin; everything is compiled before the first sample.
 
@@ -114,7 +115,8 @@ class LiveInsGnss(Live):
             fix_rate_hz: of the receiver.
             filter: a causal one of the replays.
             longest_delay_s: how late a fix may come.
-            machine: that steps the filter, as of `OnlineFilter`; "c" is compiled for minutes once.
+            machine: that steps the filter, as of `OnlineFilter`, by default `usual`; programs of
+                "vm" are kept in the user's cache, "c" is compiled for minutes once.
 
         Raises:
             ValueError: a rate or delay is not positive, or there is no such machine or no causal
@@ -138,7 +140,7 @@ class LiveInsGnss(Live):
         back = max(self._window_s, 2.0 * p.aids.window, 1.5, 4.0 * self._usual.fix_s)
         self._back_s = longest_delay_s + 2.0 * self._reach_s + back
         asked = contender(p, self._usual.fix_s, filter)
-        self._on = partial(OnlineFilter, asked.filter, asked.model, machine=machine)
+        self._on = partial(OnlineFilter, asked.filter, asked.model, machine=machine or usual())
         self._case, self._suspects = asked.case, asked.filter.suspects
         self._C_bs = axes_of(p.imu.orientation) if any(p.imu.orientation) else None
         self._patience = max(3, round(_PATIENCE_S * rate_hz))

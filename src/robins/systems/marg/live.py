@@ -33,6 +33,7 @@ import numpy as np
 from robins.dataset import ImuTable
 from robins.errors import require
 from robins.filters import Belief, Code, OnlineFilter
+from robins.filters.machine import usual
 from robins.filters.run import Step
 from robins.ins.increments import Increments, from_imu
 from robins.linalg.scalars import product
@@ -157,7 +158,7 @@ class LiveMarg(Live):
         parameters: Replay,
         rate_hz: float,
         declination_rad: float = 0.0,
-        machine: str = "jax",
+        machine: str = "",
     ):
         """Begin; everything is compiled before the first sample.
 
@@ -165,7 +166,8 @@ class LiveMarg(Live):
             parameters: as of a replay.
             rate_hz: of the samples, as the data sheet says; lost ones are told by it.
             declination_rad: of the Earth's field here, clockwise from true north.
-            machine: that steps the filter, as of `OnlineFilter`; "c" is compiled for minutes once.
+            machine: that steps the filter, as of `OnlineFilter`, by default `usual`; programs of
+                "vm" are kept in the user's cache, "c" is compiled for minutes once.
 
         Raises:
             ValueError: the rate is not positive, or there is no such machine.
@@ -179,7 +181,9 @@ class LiveMarg(Live):
         self._most_context = math.ceil(LONGEST_S * rate_hz) + 2 * _FLANK
         half = 0.5 * declination_rad
         self._turn_north = (math.cos(half), 0.0, 0.0, math.sin(half))
-        self._on = partial(OnlineFilter, filter_of(p), model.model_of(p), machine=machine)
+        self._on = partial(
+            OnlineFilter, filter_of(p), model.model_of(p), machine=machine or usual()
+        )
         self._online: OnlineFilter | None = None
         self._door = Door(_LONGEST_GAP_S, max(3, round(_PATIENCE_S * rate_hz)))
         self._begin_anew()

@@ -1,0 +1,145 @@
+"""A scan by the interpreter, and programs that the cache knows by the names of functions."""
+
+import enum
+import shutil
+from collections import OrderedDict
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
+from robins.filters.rules import huber
+from robins.filters.run import Solution, everything, nothing
+from robins.program import CPP, NativeState, ProgramError, kept
+from robins.program.kept import UnnamedError, by_name
+from robins.program.scanned import scan
+from robins.rotation import Rotation
+
+pytestmark = pytest.mark.skipif(
+    not any(map(shutil.which, CPP.names)), reason="the interpreter needs a C++ compiler"
+)
+RNG = np.random.default_rng(0)
+ROWS = {"x": RNG.normal(size=(40, 3)), "n": RNG.integers(0, 9, 40)}
+CARRY = (np.zeros(3), np.array(0), np.array(False), np.array([1.0, 0.0, 0.0, 0.0]))
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    """A cache of its own, of programs of any size."""
+    for name, value in (("WORTH", 0), ("cache_folder", lambda: tmp_path)):
+        monkeypatch.setattr(kept, name, value)
+    return tmp_path
+
+
+def body(carry, row):
+    total, count, odd, q = carry
+    turned = Rotation(q).retract(1e-2 * row["x"])
+    now = total + row["x"], count + row["n"], odd ^ (row["n"] % 2 == 1), turned.wxyz
+    return now, {"turned": turned, "both": (jnp.sum(total), count)}
+
+
+def test_it_gives_what_jax_gives():
+    found, want = (
+        scan(body, "walk", CARRY, ROWS),
+        lax.scan(body, jax.tree.map(jnp.asarray, CARRY), ROWS),
+    )
+    assert jax.tree.structure(found) == jax.tree.structure(want)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-15)
+
+
+def test_a_round_that_leaves_another_form_is_refused():
+    with pytest.raises(ProgramError, match="another form"):
+        scan(lambda c, r: (c[:2], r["x"]), "shorter", CARRY, ROWS)
+
+
+def never(*_args, **_named):
+    raise AssertionError("traced")
+
+
+def test_the_second_time_nothing_is_traced(monkeypatch):
+    want = scan(body, "walk", CARRY, ROWS)
+    monkeypatch.setattr("robins.program.scanned.trace", never)
+    monkeypatch.setattr("jax.eval_shape", never)
+    found = scan(body, "walk", CARRY, ROWS)
+    assert jax.tree.structure(found) == jax.tree.structure(want)
+    jax.tree.map(np.testing.assert_array_equal, found, want)
+    with pytest.raises(AssertionError, match="traced"):
+        scan(body, "another", CARRY, ROWS)
+    with pytest.raises(AssertionError, match="traced"):
+        scan(body, "walk", CARRY, ROWS | {"n": ROWS["n"].astype(np.int32)})
+
+
+def constant(x, u):
+    return x + u
+
+
+def test_a_run_by_the_interpreter_is_the_run_by_jax():
+    model = Model(
+        Motion(constant, noise=0.1 * np.eye(2)),
+        (
+            Sensor(
+                lambda x, _: jnp.hypot(x[0], x[1])[None], noise=np.array([[0.2]]), dim=1, name="r"
+            ),
+        ),
+    )
+    y = 5.0 + RNG.normal(size=(60, 1))
+    y[7] = np.nan
+    start, u = Belief(np.array([3.0, 4.0]), np.eye(2)), 0.01 * RNG.normal(size=(60, 2))
+    filter_ = kalman(unscented(), rules=(huber(),))
+    for keep in (everything, nothing):
+        found, want = (
+            run(filter_, model, start, y, u, keep=keep, machine=m) for m in ("vm", "jax")
+        )
+        assert isinstance(found, Solution)
+        assert jax.tree.structure(found) == jax.tree.structure(want)
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-13)
+
+
+def test_a_state_steps_without_tracing_once_the_cache_knows_its_program(monkeypatch):
+    def stepped():
+        monkeypatch.setattr("robins.program.memory._known", OrderedDict())
+        memory = NativeState(np.array([1.0, 2.0]), "adder")
+        told = memory.step(
+            "add", lambda s, u: (s + u, Belief(s * u, (s - u)[None])), np.array([3.0, 0.5])
+        )
+        return memory.state, told, memory.look("sum", jnp.sum)
+
+    want = stepped()
+    monkeypatch.setattr("robins.program.memory.trace", never)
+    found = stepped()
+    assert isinstance(found[1], Belief)
+    jax.tree.map(np.testing.assert_array_equal, found, want)
+    np.testing.assert_array_equal(found[0], [4.0, 2.5])
+
+
+class Colour(enum.Enum):
+    RED = 1
+
+
+def test_names_are_of_robins_and_tell_values_apart():
+    some = [
+        1,
+        1.0,
+        True,
+        "1",
+        b"1",
+        None,
+        (1,),
+        ((1,),),
+        np.dtype(int),
+        np.dtype(float),
+        run,
+        Belief,
+    ]
+    trees = [jax.tree.structure(t) for t in (1, (1,), [1], {"a": 1}, {"b": 1}, None, Belief(1, 1))]
+    texts = list(map(by_name, [*some, *trees]))
+    assert len(set(texts)) == len(texts)
+    for stranger in (lambda: 0, constant, Colour.RED, Colour, object(), np.zeros(2), CARRY[0].sum):
+        with pytest.raises(UnnamedError):
+            by_name((1, stranger))
