@@ -9,7 +9,6 @@ smooth motion at constant speed from rest; `confirmed` asks fixes of it, too.
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import lfilter
 
 from robins.ins.increments import Increments
 
@@ -191,5 +190,8 @@ def still_samples(
 
 def _running_mean(values: np.ndarray, step: float) -> np.ndarray:
     """First-order low-pass, begun at the first sample."""
+    # Imported here: it takes most of a second, and a simulation needs none of it.
+    from scipy.signal import lfilter
+
     share = -np.expm1(-step / _MEMORY_S)
     return np.asarray(lfilter([share], [1.0, share - 1.0], values - values[0], axis=0)) + values[0]

@@ -2,16 +2,18 @@
 
    An instruction is one operation on WIDTH runs; a register is a row of as many numbers, 8 bytes
    each. One text makes two machines: for one run, with the scalars of `scalars.h` (-DONE_RUN), and
-   for many, with those of `lanes.h`. Operations and routines are the functions that compiled
+   for a FEW or MANY, with those of `lanes.h`. Operations and routines are the functions that compiled
    programs call, so that results have the same bits. */
 #include "finite.h"
 #ifdef ONE_RUN
 #include "scalars.h"
-#define WIDTH 1
+#define FEW 1
+#define MANY 1
 #define LANES 1
 #else
 #include "lanes.h"
-#define WIDTH 64
+#define FEW 8
+#define MANY 64
 #endif
 #include "sine.h"
 #include "routines.h"
@@ -49,7 +51,7 @@ extern "C" const char *robins_codes(void)
 {
     return FOR_EACH_OPERATION(NAME1, NAME1) FOR_EACH_CONTROL(NAME);
 }
-extern "C" int robins_width(void) { return WIDTH; }
+extern "C" int robins_width(void) { return MANY; }
 
 #ifdef ONE_RUN
 /* The generation of this processor: of x86-64 1, 3 or 4, of others 0. */
@@ -89,6 +91,7 @@ extern "C" int robins_generation(void)
     break;
 
 /* Instructions are five numbers: operation, result, and three arguments. */
+template <int WIDTH>
 static void execute(const int32_t *code, int64_t count, const int32_t *lists, int64_t *registers,
                     char *scratch)
 {
@@ -183,13 +186,13 @@ typedef struct {
 
 extern "C" int64_t robins_bytes(const tape *t)
 {
-    return (t->registers + t->scratch + 1) * (int64_t)(8 * WIDTH);
+    return (t->registers + t->scratch + 1) * (int64_t)(8 * MANY);
 }
 
 /* Registers with their constants, in memory of `robins_bytes`, aligned. */
-extern "C" void robins_prepare(const tape *t, int64_t *registers)
+template <int WIDTH> static void prepare(const tape *t, int64_t *registers)
 {
-    memset(registers, 0, (size_t)robins_bytes(t));
+    memset(registers, 0, (size_t)(t->registers + t->scratch + 1) * 8 * WIDTH);
     for (int64_t k = 0; k < t->constant_count; ++k) {
         int64_t *const row = ROW(int64_t, t->constants[2 * k]);
         for (int i = 0; i < WIDTH; ++i) { row[i] = t->constants[2 * k + 1]; }
@@ -197,38 +200,38 @@ extern "C" void robins_prepare(const tape *t, int64_t *registers)
 }
 
 #ifdef ONE_RUN
+extern "C" void robins_prepare(const tape *t, int64_t *registers) { prepare<1>(t, registers); }
 
+/* A step in registers that are prepared. */
 extern "C" void robins_step(const tape *t, int64_t *registers, const double *x, const int64_t *k,
                             double *y, int64_t *m)
 {
     memcpy(registers, x, (size_t)t->nx * 8);
     memcpy(registers + t->nx, k, (size_t)t->nk * 8);
-    execute(t->code, t->codes, t->lists, registers, (char *)(registers + t->registers));
+    execute<1>(t->code, t->codes, t->lists, registers, (char *)(registers + t->registers));
     const int32_t *from = t->results;
-    for (int i = 0; i < t->ny; ++i) { y[i] = *ROW(double, *from++); }
-    for (int i = 0; i < t->nm; ++i) { m[i] = *ROW(int64_t, *from++); }
+    for (int i = 0; i < t->ny; ++i) { y[i] = ((double *)registers)[*from++]; }
+    for (int i = 0; i < t->nm; ++i) { m[i] = registers[*from++]; }
 }
 #endif
 
-struct reals {
-    double at[WIDTH];
-    double &operator[](int i) { return at[i]; }
-    double operator[](int i) const { return at[i]; }
-};
-struct wholes {
-    int64_t at[WIDTH];
-    int64_t &operator[](int i) { return at[i]; }
-    int64_t operator[](int i) const { return at[i]; }
+template <class Number, int WIDTH> struct row_of {
+    Number at[WIDTH];
+    Number &operator[](int i) { return at[i]; }
+    Number operator[](int i) const { return at[i]; }
 };
 
 /* Rounds of a program; the carried arrays, those that stay and a row are its first registers. */
-extern "C" int robins_scan(const scan *s, const tape *t, int64_t *registers)
+template <int WIDTH> static int rounds_of(const scan *s, const tape *t, int64_t *registers)
 {
+    typedef row_of<double, WIDTH> reals;
+    typedef row_of<int64_t, WIDTH> wholes;
     int64_t *const found = (int64_t *)malloc((size_t)(t->ny + t->nm + 1) * 8 * WIDTH);
     if (found == NULL) { return 1; }
+    prepare<WIDTH>(t, registers);
     const auto step = [t, registers](reals *, wholes *, reals *y, wholes *m) {
-        execute(t->code, t->codes, t->lists, registers,
-                (char *)(registers + t->registers * WIDTH));
+        execute<WIDTH>(t->code, t->codes, t->lists, registers,
+                       (char *)(registers + t->registers * WIDTH));
         const int32_t *from = t->results;
         for (int i = 0; i < t->ny; ++i) { memcpy(y + i, ROW(double, *from++), sizeof *y); }
         for (int i = 0; i < t->nm; ++i) { memcpy(m + i, ROW(int64_t, *from++), sizeof *m); }
@@ -238,4 +241,10 @@ extern "C" int robins_scan(const scan *s, const tape *t, int64_t *registers)
                        (reals *)found, (wholes *)(found + t->ny * WIDTH));
     free(found);
     return failed;
+}
+
+/* MANY runs take about as long as three times a FEW. */
+extern "C" int robins_scan(const scan *s, const tape *t, int64_t *registers)
+{
+    return (s->runs <= 3 * FEW ? rounds_of<FEW> : rounds_of<MANY>)(s, t, registers);
 }

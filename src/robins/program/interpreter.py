@@ -52,7 +52,7 @@ class Interpreter:
         """Rounds of a tape, and how many runs they take at a time."""
 
         def scan(rounds: ctypes.c_void_p) -> int:
-            registers = self.registers(tape)
+            registers = self._memory(tape)
             return self.library.robins_scan(rounds, tape.address, address(registers))
 
         return scan, self.width
@@ -71,12 +71,15 @@ class Interpreter:
         return step
 
     def registers(self, tape: Tape) -> np.ndarray:
-        """Memory in which a tape computes, with its constants; one thread at a time may use it."""
+        """Memory for steps of a tape, with its constants; one thread at a time may use it."""
+        memory = self._memory(tape)
+        self.library.robins_prepare(tape.address, address(memory))
+        return memory
+
+    def _memory(self, tape: Tape) -> np.ndarray:
         size = self.library.robins_bytes(tape.address) // 8
-        memory = np.zeros(size + 8, np.int64)
-        aligned = memory[-memory.ctypes.data % 64 // 8 :]
-        self.library.robins_prepare(tape.address, address(aligned))
-        return aligned
+        memory = np.empty(size + 8, np.int64)
+        return memory[-memory.ctypes.data % 64 // 8 :]
 
 
 def interpreter_of_one() -> Interpreter:
