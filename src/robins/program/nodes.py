@@ -223,10 +223,14 @@ class Graph:
         after = [
             self.add("after", (node,), self.kind[n], (k, None)) for k, n in enumerate(loop.begin)
         ]
-        kept = [
-            [self.add("after", (node,), self.kind[n], (k, i)) for i in range(loop.count or 0)]
-            for k, n in enumerate(loop.kept)
-        ]
+
+        def of_round(k: int, n: Node, i: int) -> Node:
+            if self.scope[n] < loop.scope:  # the same in all rounds, such as a zero
+                return n
+            return self.add("after", (node,), self.kind[n], (k, i))
+
+        rounds = range(loop.count or 0)
+        kept = [[of_round(k, n, i) for i in rounds] for k, n in enumerate(loop.kept)]
         return after, kept
 
     def _needed_by(self, loop: Loop) -> list[Node]:

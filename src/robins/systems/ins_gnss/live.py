@@ -105,7 +105,7 @@ class LiveInsGnss(Live):
         fix_rate_hz: float = 1.0,
         filter: str = "robust",
         longest_delay_s: float = 1.0,
-        machine: str = "",
+        machine: str | None = None,
     ):
         """Begin; everything is compiled before the first sample.
 

@@ -158,7 +158,7 @@ class LiveMarg(Live):
         parameters: Replay,
         rate_hz: float,
         declination_rad: float = 0.0,
-        machine: str = "",
+        machine: str | None = None,
     ):
         """Begin; everything is compiled before the first sample.
 

@@ -76,7 +76,7 @@ class Kit(NamedTuple):
     step_ns: int
     given: Replay
     filter: str
-    machine: str
+    machine: str | None  # that steps the filter; None: as `LiveInsGnss` chooses
     rates_hz: tuple[float, float]  # of samples and fixes
     dataset: Dataset | None  # rates along the unit's axes and fixes in NED; None: boards speak
     frames: tuple[int, ...] = (0,)  # all steps are computed alike
