@@ -33,6 +33,7 @@ from robins import _float64, linalg  # noqa: F401
 from robins.ins.errors import decay_rates, frame_dynamics, scale_of
 from robins.ins.increments import Increments
 from robins.ins.mechanise import unpacked
+from robins.linalg.rows import each_row
 from robins.rotation import skew
 
 _GAUSS = 0.5 + np.array([-1.0, 1.0]) * np.sqrt(3.0) / 6.0  # points of the unit interval
@@ -58,8 +59,10 @@ def linearise(
         padding = [(0, segments * each - count)] + [(0, 0)] * (a.ndim - 1)
         return jnp.pad(a, padding, mode).reshape(segments, each, *a.shape[1:])
 
-    parts = jax.vmap(lambda inc, at: _segment(x, inc, at, noise))(
-        jax.tree.map(lambda a: cut(a, "constant"), true), cut(starts, "edge")
+    parts = each_row(
+        lambda inc, at: _segment(x, inc, at, noise),
+        jax.tree.map(lambda a: cut(a, "constant"), true),
+        cut(starts, "edge"),
     )
     Phi, M = parts[0][0], parts[1][0]
     for Phi_next, M_next in zip(parts[0][1:], parts[1][1:], strict=True):
