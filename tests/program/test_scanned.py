@@ -14,7 +14,7 @@ from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
 from robins.filters.rules import huber
 from robins.filters.run import Solution, everything, nothing
 from robins.program import CPP, NativeState, ProgramError, kept
-from robins.program.kept import UnnamedError, by_name
+from robins.program.kept import by_name
 from robins.program.scanned import scan
 from robins.rotation import Rotation
 
@@ -141,5 +141,5 @@ def test_names_are_of_robins_and_tell_values_apart():
     texts = list(map(by_name, [*some, *trees]))
     assert len(set(texts)) == len(texts)
     for stranger in (lambda: 0, constant, Colour.RED, Colour, object(), np.zeros(2), CARRY[0].sum):
-        with pytest.raises(UnnamedError):
+        with pytest.raises(LookupError):
             by_name((1, stranger))

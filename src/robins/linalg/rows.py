@@ -16,14 +16,17 @@ import jax
 from jax.core import ShapedArray
 from jax.extend import core as jex
 from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, ArrayLike
 
 T = TypeVar("T")
+Tree = Any  # of arrays
+Param = Any  # a parameter of the primitive
 
 _each_row = jex.Primitive("each_row")
 _each_row.multiple_results = True
 
 
-def each_row(function: Callable[..., T], *args: Any) -> T:
+def each_row(function: Callable[..., T], *args: Tree) -> T:
     """Return ``jax.vmap(function)(*args)``.
 
     Args:
@@ -34,7 +37,7 @@ def each_row(function: Callable[..., T], *args: Any) -> T:
     rows = [jax.typeof(leaf) for leaf in map(jax.numpy.asarray, leaves)]
     rows = [jax.ShapeDtypeStruct(a.shape[1:], a.dtype, weak_type=a.weak_type) for a in rows]
 
-    def flat(*row: Any) -> T:
+    def flat(*row: Array) -> T:
         return function(*jax.tree_util.tree_unflatten(tree, row))
 
     closed, shapes = jax.make_jaxpr(flat, return_shape=True)(*rows)
@@ -58,22 +61,28 @@ def each_row(function: Callable[..., T], *args: Any) -> T:
     return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(shapes), found)
 
 
-def _batched(*args: Any, jaxpr: jex.ClosedJaxpr, shared: int, count: int) -> Sequence[Any]:
+def _batched(*args: ArrayLike, jaxpr: jex.ClosedJaxpr, shared: int, count: int) -> list[Array]:
     axes = [None] * shared + [0] * (len(args) - shared)
     return jax.vmap(jex.jaxpr_as_fun(jaxpr), axes, axis_size=count)(*args)
 
 
 @_each_row.def_abstract_eval
-def _shapes(*args: Any, jaxpr: jex.ClosedJaxpr, shared: int, count: int) -> list[Any]:
+def _shapes(
+    *args: ShapedArray, jaxpr: jex.ClosedJaxpr, shared: int, count: int
+) -> list[ShapedArray]:
     return [aval.update(shape=(count, *aval.shape)) for aval in jaxpr.out_avals]
 
 
-def _by_vmap(args: Any, dims: Any, **params: Any) -> tuple[Sequence[Any], list[int]]:
+def _by_vmap(
+    args: Sequence[ArrayLike], dims: Sequence[int | None], **params: Param
+) -> tuple[list[Array], list[int]]:
     found = jax.vmap(partial(_batched, **params), dims)(*args)
     return found, [0] * len(found)
 
 
-def _jvp(primals: Any, tangents: Any, **params: Any) -> tuple[Sequence[Any], list[Any]]:
+def _jvp(
+    primals: Sequence[ArrayLike], tangents: Sequence[ArrayLike | ad.Zero], **params: Param
+) -> tuple[list[Array], list[Array | ad.Zero]]:
     known = [ad.instantiate_zeros(t) for t in tangents]
     found, slopes = jax.jvp(partial(_batched, **params), tuple(primals), tuple(known))
     whole = jax.dtypes.float0  # of what is no real

@@ -38,6 +38,7 @@ from robins.program.tape import Tape
 from robins.program.trace import Leaf, Program
 
 Tree = Any  # a structure of JAX, which to a checker is no class
+Json = Any
 NAMED = {"robins", "builtins", "jax"}  # packages whose versions a digest has
 NONE = "builtins:NoneType"
 WORTH = 1_000  # nodes of a program that is kept
@@ -127,7 +128,7 @@ def results_of(program: Program) -> list[Tree | None]:
     return list(map(_of_json, tree[2]))
 
 
-def _as_json(tree: Tree | None) -> Any:
+def _as_json(tree: Tree | None) -> Json:
     """A structure as class, what it says of its fields, and structures inside."""
     node = None if tree is None else tree.node_data()
     if tree is None or node is None:
@@ -135,11 +136,11 @@ def _as_json(tree: Tree | None) -> Any:
     try:
         json.dumps(node[1])  # numbers and names alone
         return [by_name(node[0]), node[1], list(map(_as_json, tree.children()))]
-    except (UnnamedError, TypeError):
+    except (LookupError, TypeError):
         return ["", None, []]
 
 
-def _of_json(tree: Any) -> Tree | None:
+def _of_json(tree: Json) -> Tree | None:
     """The structure, or None if it is not all known; its modules are those that are loaded."""
     if tree is None:
         return jax.tree_util.tree_structure(0)
@@ -153,7 +154,7 @@ def _of_json(tree: Any) -> Tree | None:
         return None
 
 
-def _tuples(x: Any) -> Any:
+def _tuples(x: Json) -> Json:
     return tuple(map(_tuples, x)) if isinstance(x, list) else x
 
 
@@ -176,10 +177,6 @@ def digest(parts: Iterable[Any]) -> str:
     return found.hexdigest()[:32]
 
 
-class UnnamedError(LookupError):
-    """A value has no name by which another process would know it."""
-
-
 def by_name(value: Any) -> str:
     """A text that is equal, in any process of this version of robins, for equal values only.
 
@@ -187,7 +184,7 @@ def by_name(value: Any) -> str:
         value: numbers, texts, pytree structures, functions and classes, nested in tuples and lists.
 
     Raises:
-        UnnamedError: a function or class that is not of a module of robins or of Python, such as
+        LookupError: a function or class that is not of a module of robins or of Python, such as
             one of a user's file, which may change, or one made in a function; or anything else.
     """
     match value:
@@ -203,15 +200,15 @@ def by_name(value: Any) -> str:
             return f"{by_name(value.node_data())}{by_name(value.children())}"
     name = f"{getattr(value, '__module__', '')}:{getattr(value, '__qualname__', '')}"
     if _named(name) is not value:
-        raise UnnamedError(repr(value))
+        raise LookupError(repr(value))
     return name
 
 
 def _named(name: str) -> Any:
-    """What has a name, in a module that is loaded.
+    """Function or class of a name, in a module that is loaded.
 
     Raises:
-        UnnamedError: nothing has, or it is of another package than those of `NAMED`.
+        LookupError: there is none, or it is of another package than those of `NAMED`.
     """
     module, _, path = name.partition(":")
     if name == NONE:  # which its module does not have
@@ -220,7 +217,7 @@ def _named(name: str) -> Any:
     for part in path.split("."):
         found = getattr(found, part, None)
     if found is None:
-        raise UnnamedError(name)
+        raise LookupError(name)
     return found
 
 

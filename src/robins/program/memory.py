@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from robins.program.interpreter import interpreted_step, interpreter_of_one
-from robins.program.kept import UnnamedError, by_name, kept, results_of
+from robins.program.kept import by_name, kept, results_of
 from robins.program.kinds import kind_of
 from robins.program.native import Engine, Step
 from robins.program.refusal import ProgramError
@@ -295,7 +295,7 @@ class NativeState:
         """
         engine, unroll = self._how
         if engine is interpreted_step:
-            with contextlib.suppress(UnnamedError):
+            with contextlib.suppress(LookupError):
                 parts, interpreter = [by_name((key, unroll))], interpreter_of_one()
                 write = partial(self._traced, function, args)
                 program, tape, _ = kept(parts, write, interpreter)

@@ -51,12 +51,12 @@ class Loop:
 
     @property
     def changes(self) -> list[Node]:
-        """What is to be computed inside for the next round."""
+        """Nodes to be computed inside for the next round."""
         return [*self.next, *([] if self.condition is None else [self.condition])]
 
     @property
     def roots(self) -> list[Node]:
-        """What may have to be computed inside."""
+        """Nodes that may have to be computed inside."""
         return [*self.changes, *self.kept]
 
 
@@ -262,7 +262,7 @@ class Graph:
         return sorted(seen)
 
     def kept(self, nodes: Sequence[Node]) -> dict[tuple[int, int], Node]:
-        """What loops keep of all rounds and some nodes read, by scope and number."""
+        """Nodes that loops keep of all rounds and some nodes read, by scope and number."""
         read: dict[tuple[int, int], Node] = {}
         for node in nodes:
             if self.op[node] == "after" and self.value[node][1] is not None:

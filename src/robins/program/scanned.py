@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from robins.program.interpreter import interpreter_of_one
-from robins.program.kept import UnnamedError, by_name, kept, results_of
+from robins.program.kept import by_name, kept, results_of
 from robins.program.lanes import Rounds
 from robins.program.memory import LIVE_UNROLL, form
 from robins.program.refusal import ProgramError
@@ -54,7 +54,7 @@ def scan(body: Body, content: Hashable, carry: Any, rows: Any) -> tuple[Any, Any
     try:
         key = content, tree, tuple(map(form, first))
         program, tape, _ = kept(["scan", by_name(key)], write, interpreter)
-    except UnnamedError:
+    except LookupError:
         program = write()
         tape = interpreter.tape(program)
     _, told = results_of(program)

@@ -28,7 +28,7 @@ from robins.ins.blocks import Blocks
 from robins.ins.increments import after_gap
 from robins.program import BuildError, ProgramError
 from robins.results import Outcome, Progress, silent, variable
-from robins.systems.study import Contender, SensorAxes, StateBlock
+from robins.systems.study import Case, Contender, SensorAxes, StateBlock
 from robins.systems.suspects import probabilities, sentences, tables
 from robins.systems.tables import (
     EULER,
@@ -197,12 +197,11 @@ def navigated(
 
 def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answer, Answer]:
     """What a filter says of a piece, and its smoother if that is asked for."""
-    filter_, model, case = contender.filter, contender.model, contender.case(piece.world)
-    arguments = filter_, model, case.start, case.y, case.u, case.aux
+    filter_, case = contender.filter, contender.case(piece.world)
     with warnings.catch_warnings():
         # what would be said here is among the warnings of the outcome
         warnings.simplefilter("ignore", StepWarning)
-        found = _ran(arguments, everything if smoothed else kept, piece.epoch_s)
+        found = _ran(contender, case, everything if smoothed else kept, piece.epoch_s)
         of_steps = _kept_of(found.steps) if smoothed else found.steps
     mean, sigma, seen = of_steps
     likelihood, bounds = float(found.log_likelihood), contender.bounds
@@ -215,8 +214,9 @@ def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answe
     return answer, answer._replace(mean=belief.mean, sigma=belief.sigma, updates={}, wrong={})
 
 
-def _ran(arguments: tuple[Any, ...], keep: Keep, time_s: np.ndarray) -> Solution:
+def _ran(contender: Contender, case: Case, keep: Keep, time_s: np.ndarray) -> Solution:
     """A run by the interpreter; by JAX where that cannot carry it out."""
+    arguments = contender.filter, contender.model, case.start, case.y, case.u, case.aux
     try:
         return run(*arguments, keep=keep, time_s=time_s, machine="vm")
     except (BuildError, ProgramError):

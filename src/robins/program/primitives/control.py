@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from jax.extend import core as jex
 
 from robins.program.nodes import Node
 from robins.program.primitives.reductions import fold
 from robins.program.trace import Nodes, Walk, rule
 
+Equation = Any  # whose abstract values have neither shape nor type for a checker
 LONGEST = 100_000  # rounds of a loop that are written out
 
 
 CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call"}
 
 
-def called(equation: Any) -> Any:
+def called(equation: Equation) -> Any:
     """The closed jaxpr that an equation calls, if it is a plain call."""
     if equation.primitive.name not in CALLS:
         return None
@@ -28,7 +30,7 @@ def called(equation: Any) -> Any:
 
 @rule("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat")
 @rule("checkpoint", "custom_vjp_call_jaxpr", "custom_vmap_call", "custom_lin", "remat2")
-def _call(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
+def _call(walk: Walk, equation: Equation, *args: Nodes) -> list[Nodes]:
     """A function called is a function written in its place."""
     p = equation.params
     inner = next(p[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr", "call") if k in p)
@@ -36,7 +38,7 @@ def _call(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
 
 
 @rule("custom_linear_solve")
-def _linear_solve(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
+def _linear_solve(walk: Walk, equation: Equation, *args: Nodes) -> list[Nodes]:
     lengths, jaxprs = equation.params["const_lengths"], equation.params["jaxprs"]
     begin = lengths.matvec + lengths.vecmat
     consts = args[begin : begin + lengths.solve]
@@ -44,7 +46,7 @@ def _linear_solve(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
 
 
 @rule("platform_index")
-def _platform(walk: Walk, equation: Any) -> Nodes:
+def _platform(walk: Walk, equation: Equation) -> Nodes:
     """The branch of a function written for several platforms that is meant for processors."""
     platforms = equation.params["platforms"]
     default = next((k for k, names in enumerate(platforms) if names is None), len(platforms) - 1)
@@ -53,7 +55,7 @@ def _platform(walk: Walk, equation: Any) -> Nodes:
 
 
 @rule("cond")
-def _cond(walk: Walk, equation: Any, index: Nodes, *args: Nodes) -> list[Nodes]:
+def _cond(walk: Walk, equation: Equation, index: Nodes, *args: Nodes) -> list[Nodes]:
     """Its branch where the index is known; else all of them, and a choice of their results."""
     branches, graph = equation.params["branches"], walk.graph
     last = len(branches) - 1
@@ -94,85 +96,75 @@ def _converted(walk: Walk, arrays: list[Nodes], like: list[Nodes]) -> list[Nodes
 
 
 @rule("scan")
-def _scan(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
+def _scan(walk: Walk, equation: Equation, *args: Nodes) -> list[Nodes]:
     p = equation.params
     fixed, carried = p["num_consts"], p["num_carry"]
     consts, carry, rows = args[:fixed], list(args[fixed:][:carried]), args[fixed + carried :]
-    rounds = Rounds(p["jaxpr"], p["length"], p["reverse"])
-    return rounds.of(walk, consts, carry, rows)
+    order = range(p["length"])
+    return _rounds(walk, p["jaxpr"], order[::-1] if p["reverse"] else order, consts, carry, rows)
 
 
 @rule("each_row")
-def _each_row(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
+def _each_row(walk: Walk, equation: Equation, *args: Nodes) -> list[Nodes]:
     """A scan that carries nothing (`robins.linalg.rows`)."""
     p = equation.params
-    return Rounds(p["jaxpr"], p["count"]).of(walk, args[: p["shared"]], [], args[p["shared"] :])
+    shared, order = p["shared"], range(p["count"])
+    return _rounds(walk, p["jaxpr"], order, args[:shared], [], args[shared:])
 
 
-class Rounds(NamedTuple):
-    """A body, closed, that is carried out for each row of some arrays."""
+def _rounds(
+    walk: Walk,
+    body: jex.ClosedJaxpr,
+    order: range,
+    consts: Sequence[Nodes],
+    carry: list[Nodes],
+    rows: Sequence[Nodes],
+) -> list[Nodes]:
+    """Arrays carried after a body has been carried out for each row, and arrays of its rows."""
+    if len(order) > 1 and walk.stays_whole(len(order) * size_of(body.jaxpr)):
+        return _rolled(walk, body, order, consts, carry, rows)
+    kept: dict[int, list[Nodes]] = {}
+    carried = len(carry)
+    for k in order:
+        found = walk.closed(body, *consts, *carry, *(np.asarray(row[k]) for row in rows))
+        carry, kept[k] = found[:carried], found[carried:]
+    if not kept:
+        none = [np.zeros((0, *v.shape), dtype=np.int64) for v in body.out_avals[carried:]]
+        return [*carry, *none]
+    return [*carry, *map(np.stack, zip(*(kept[k] for k in sorted(kept)), strict=True))]
 
-    body: Any
-    length: int
-    reverse: bool = False
 
-    def of(
-        self, walk: Walk, consts: Sequence[Nodes], carry: list[Nodes], rows: Sequence[Nodes]
-    ) -> list[Nodes]:
-        """What is carried after the last round, and arrays of what each gives."""
-        large = self.length > 1 and walk.stays_whole(self.length * size_of(self.body.jaxpr))
-        return (self._rolled if large else self._written)(walk, consts, carry, rows)
+def _rolled(
+    walk: Walk,
+    body: jex.ClosedJaxpr,
+    order: range,
+    consts: Sequence[Nodes],
+    carry: list[Nodes],
+    rows: Sequence[Nodes],
+) -> list[Nodes]:
+    """A loop of C; the rows of its inputs are arrays, of which each round picks one."""
+    graph, length = walk.graph, len(order)
+    loop = graph.open(_flat(carry), length)
 
-    def _written(
-        self, walk: Walk, consts: Sequence[Nodes], carry: list[Nodes], rows: Sequence[Nodes]
-    ) -> list[Nodes]:
-        """One round behind the other."""
-        kept: list[list[Nodes]] = []
-        carried, order = len(carry), range(self.length)
-        for k in reversed(order) if self.reverse else order:
-            found = walk.closed(self.body, *consts, *carry, *(np.asarray(row[k]) for row in rows))
-            carry = found[:carried]
-            kept.append(found[carried:])
-        if self.reverse:
-            kept.reverse()
-        return [
-            *carry,
-            *(
-                np.stack([found[j] for found in kept])
-                if kept
-                else np.zeros((0, *v.shape), dtype=np.int64)
-                for j, v in enumerate(self.body.out_avals[carried:])
-            ),
-        ]
+    def row(a: Nodes) -> Nodes:
+        columns = map(np.asarray, a[:: order.step])
+        return walk.each(lambda *nodes: graph.pick(nodes, loop.index), *columns)
 
-    def _rolled(
-        self, walk: Walk, consts: Sequence[Nodes], carry: list[Nodes], rows: Sequence[Nodes]
-    ) -> list[Nodes]:
-        """A loop of C; the rows of its inputs are arrays, of which each round picks one."""
-        graph, length = walk.graph, self.length
-        loop = graph.open(_flat(carry), length)
-        index = loop.index
-
-        def row(a: Nodes) -> Nodes:
-            columns = a[::-1] if self.reverse else a
-            return walk.each(lambda *nodes: graph.pick(nodes, index), *map(np.asarray, columns))
-
-        now = _shaped(loop.leaves, carry)
-        found = walk.closed(self.body, *consts, *now, *map(row, rows))
-        new, kept = found[: len(carry)], found[len(carry) :]
-        loop.next, loop.kept = _flat(_converted(walk, new, now)), _flat(kept)
-        after, rounds = graph.close(loop)
-        out, at = _shaped(after, carry), 0
-        for a in kept:
-            columns = np.array(rounds[at : at + a.size], dtype=np.int64).reshape(a.size, length)
-            stacked = columns.T.reshape(length, *a.shape)
-            out.append(stacked[::-1] if self.reverse else stacked)
-            at += a.size
-        return out
+    now = _shaped(loop.leaves, carry)
+    found = walk.closed(body, *consts, *now, *map(row, rows))
+    new, kept = found[: len(carry)], found[len(carry) :]
+    loop.next, loop.kept = _flat(_converted(walk, new, now)), _flat(kept)
+    after, rounds = graph.close(loop)
+    out, at = _shaped(after, carry), 0
+    for a in kept:
+        columns = np.array(rounds[at : at + a.size], dtype=np.int64).reshape(a.size, length)
+        out.append(columns.T.reshape(length, *a.shape)[:: order.step])
+        at += a.size
+    return out
 
 
 @rule("while")
-def _while(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
+def _while(walk: Walk, equation: Equation, *args: Nodes) -> list[Nodes]:
     """Written out where it is known when it ends, and that is soon; else a loop of C.
 
     In a batch each member goes on for as long as its own condition holds.
