@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from robins.errors import require
@@ -206,7 +207,9 @@ def run(
     extra = dict(aux or {})
     check_names(model, extra)
     _check_lengths(measurements, u, extra)
-    as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
+    # an array of JAX is a program for each shape
+    of_machine = jnp.asarray if machine == "jax" else np.asarray
+    as_arrays = partial(jax.tree_util.tree_map, of_machine)
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
     state, rows = as_arrays(state), (as_arrays(u), measurements, as_arrays(extra))
     scan = _scan if machine == "jax" else _interpreted

@@ -34,7 +34,7 @@ def each_row(function: Callable[..., T], *args: Tree) -> T:
         args: pytrees of arrays with an equal leading axis.
     """
     leaves, tree = jax.tree_util.tree_flatten(args)
-    rows = [jax.typeof(leaf) for leaf in map(jax.numpy.asarray, leaves)]
+    rows = map(jax.typeof, leaves)
     rows = [jax.ShapeDtypeStruct(a.shape[1:], a.dtype, weak_type=a.weak_type) for a in rows]
 
     def flat(*row: Array) -> T:

@@ -336,7 +336,7 @@ def _jaxpr(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, An
     """The jaxpr of a function, and what it takes and gives as pytrees of shapes."""
 
     def shape(x: Any) -> jax.ShapeDtypeStruct:
-        array = jax.typeof(jax.numpy.asarray(x))
+        array = jax.typeof(x)
         return jax.ShapeDtypeStruct(array.shape, array.dtype, weak_type=array.weak_type)
 
     given = jax.tree_util.tree_map(shape, args)
