@@ -1,6 +1,7 @@
 """A scan by the interpreter, and programs that the cache knows by the names of functions."""
 
 import enum
+import importlib
 import shutil
 from collections import OrderedDict
 
@@ -13,11 +14,12 @@ from jax import lax
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
 from robins.filters.rules import huber
 from robins.filters.run import Solution, everything, nothing
-from robins.program import CPP, NativeState, ProgramError, kept
-from robins.program.kept import by_name
+from robins.program import CPP, NativeState, ProgramError, kept, names, scanned
+from robins.program.names import by_name
 from robins.program.scanned import scan
 from robins.rotation import Rotation
 
+memory_module = importlib.import_module("robins.program.memory")
 pytestmark = pytest.mark.skipif(
     not any(map(shutil.which, CPP.names)), reason="the interpreter needs a C++ compiler"
 )
@@ -57,12 +59,29 @@ def test_a_round_that_leaves_another_form_is_refused():
         scan(lambda c, r: (c[:2], r["x"]), "shorter", CARRY, ROWS)
 
 
+@pytest.fixture
+def named(monkeypatch):
+    """Functions of this file have names, and the process remembers nothing."""
+    monkeypatch.setattr(names, "NAMED", {*names.NAMED, __name__})
+
+    def forget():
+        monkeypatch.setattr(scanned, "_known", OrderedDict())
+
+    forget()
+    return forget
+
+
 def never(*_args, **_named):
     raise AssertionError("traced")
 
 
-def test_the_second_time_nothing_is_traced(monkeypatch):
+def another(carry, row):
+    return carry, row["x"]
+
+
+def test_the_second_time_nothing_is_traced(monkeypatch, named):
     want = scan(body, "walk", CARRY, ROWS)
+    named()
     monkeypatch.setattr("robins.program.scanned.trace", never)
     monkeypatch.setattr("jax.eval_shape", never)
     found = scan(body, "walk", CARRY, ROWS)
@@ -70,6 +89,8 @@ def test_the_second_time_nothing_is_traced(monkeypatch):
     jax.tree.map(np.testing.assert_array_equal, found, want)
     with pytest.raises(AssertionError, match="traced"):
         scan(body, "another", CARRY, ROWS)
+    with pytest.raises(AssertionError, match="traced"):
+        scan(another, "walk", CARRY, ROWS)
     with pytest.raises(AssertionError, match="traced"):
         scan(body, "walk", CARRY, ROWS | {"n": ROWS["n"].astype(np.int32)})
 
@@ -104,7 +125,7 @@ def test_a_run_by_the_interpreter_is_the_run_by_jax():
 def test_a_state_steps_without_tracing_once_the_cache_knows_its_program(monkeypatch):
     def stepped():
         monkeypatch.setattr("robins.program.memory._known", OrderedDict())
-        memory = NativeState(np.array([1.0, 2.0]), "adder")
+        memory = NativeState(np.array([1.0, 2.0]), "adder", lasting=True)
         told = memory.step(
             "add", lambda s, u: (s + u, Belief(s * u, (s - u)[None])), np.array([3.0, 0.5])
         )
@@ -118,7 +139,31 @@ def test_a_state_steps_without_tracing_once_the_cache_knows_its_program(monkeypa
     np.testing.assert_array_equal(found[0], [4.0, 2.5])
 
 
-class Colour(enum.Enum):
+def test_a_function_with_no_name_is_traced_in_each_process():
+    """A text may stand for another function there: nothing is kept unless it is asked for."""
+    for f in (lambda s, u: (s + u, u), lambda s, u: (s - u, u)):
+        memory = NativeState(np.ones(2), "mine")
+        memory.step("advance", f, np.ones(2))
+        np.testing.assert_array_equal(memory.state, f(np.ones(2), np.ones(2))[0])
+        memory_module._known.clear()
+
+
+def test_without_a_round_nothing_changes():
+    rows = {"x": np.zeros((0, 3)), "n": np.zeros(0, int)}
+    carry, kept_ = scan(body, "walk", CARRY, rows)
+    jax.tree.map(np.testing.assert_array_equal, carry, CARRY)
+    assert kept_["turned"].wxyz.shape == (0, 4)
+
+
+def test_what_no_program_takes_is_refused():
+    for x in (np.zeros(3, np.int16), jax.random.split(jax.random.key(0), 3)):
+        with pytest.raises(ProgramError, match="no place"):
+            scan(lambda c, r: (c, r), "any", np.zeros(2), x)
+    with pytest.raises(ValueError, match="array of rows"):
+        scan(lambda c, r: (c, r), "any", np.zeros(2), ())
+
+
+class Colour(enum.IntEnum):
     RED = 1
 
 
@@ -132,6 +177,9 @@ def test_names_are_of_robins_and_tell_values_apart():
         None,
         (1,),
         ((1,),),
+        [1],
+        Belief(1, 1),
+        (1, 1),
         np.dtype(int),
         np.dtype(float),
         run,

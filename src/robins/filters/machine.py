@@ -139,7 +139,7 @@ class ProgramStepper:
 
 
 def usual() -> Name:
-    """Machine that begins at once: "vm"; "jax" where there is no interpreter, nor a way to it."""
+    """The machine that compiles nothing, "vm"; "jax" if no interpreter can be had."""
     from robins.program import BuildError
     from robins.program.interpreter import interpreter_of_one
 
@@ -175,4 +175,4 @@ def on(
     else:
         interpreter_of_one()
         engine = interpreted_step
-    return ProgramStepper(filter_, model, state, partial(NativeState, engine=engine))
+    return ProgramStepper(filter_, model, state, partial(NativeState, engine=engine, lasting=True))

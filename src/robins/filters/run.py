@@ -8,11 +8,11 @@ from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo
+from robins.filters.checks import one_of
 from robins.filters.kalman import Again, Filter, FilterState, Prediction
 from robins.filters.model import Data, Model
 from robins.filters.observation import as_measurement
@@ -54,6 +54,7 @@ class Solution(NamedTuple):
 
 
 Rows = tuple[Data, dict[str, State], dict[str, Data]]  # u, y and aux, the last two by sensor
+Machine = Literal["jax", "vm"]
 Keep = Callable[[Step], Data]  # part of a step that is kept
 
 
@@ -172,7 +173,7 @@ def run(
     aux: Mapping[str, Data] | None = None,
     keep: Keep = everything,
     time_s: ArrayLike | None = None,
-    machine: Literal["jax", "vm"] = "jax",
+    machine: Machine = "jax",
 ) -> Solution:
     """Run a filter over measurements: for each step k predict, then update with row k of y.
 
@@ -189,30 +190,30 @@ def run(
         aux: further inputs of sensors, by sensor name, leading axis T.
         keep: part of each `Step` to keep; long campaigns keep little.
         time_s: (T,) time of each step [s], which errors then name.
-        machine: "vm" for the interpreter, which compiles nothing; its results are arrays of NumPy,
-            and equal to rounding.
+        machine: "vm" for the interpreter: nothing is compiled, results are numbers of NumPy.
 
     Raises:
         Exception: report of the filter (`Filter.report`); in transformed code see the codes.
-        robins.program.ProgramError: for "vm": filter or model do what has no place in a program.
-        robins.program.BuildError: for "vm": there is no interpreter, and no compiler of C++.
+        robins.program.ProgramError: of "vm": filter or model have no place in a program.
+        robins.program.BuildError: of "vm": there is no interpreter.
         TypeError: a measurement is not a real number.
-        ValueError: lengths differ, or a measurement names no sensor or has another shape than it.
+        ValueError: no such machine; lengths differ; a measurement names no sensor or has another
+            shape than it.
 
     Warns:
         StepWarning: steps were not taken, or measurements contradict what is known exactly; in
             transformed code see `Solution.tally`.
     """
+    one_of("machine", machine, Machine)
     measurements = _by_sensor(model, y)
     extra = dict(aux or {})
     check_names(model, extra)
     _check_lengths(measurements, u, extra)
-    # an array of JAX is a program for each shape
-    of_machine = jnp.asarray if machine == "jax" else np.asarray
-    as_arrays = partial(jax.tree_util.tree_map, of_machine)
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
-    state, rows = as_arrays(state), (as_arrays(u), measurements, as_arrays(extra))
-    scan = _scan if machine == "jax" else _interpreted
+    rows = u, measurements, extra
+    scan = _interpreted
+    if machine == "jax":  # a new array of JAX is a program for its shape
+        scan, (state, rows) = _scan, jax.tree_util.tree_map(jnp.asarray, (state, rows))
     solution = scan(filter_, model, state, rows, keep)
 
     def again(other: Filter) -> FilterState:

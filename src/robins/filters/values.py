@@ -135,7 +135,11 @@ def content(*trees: object) -> Hashable:
         return np.asarray(jax.random.key_data(x) if is_key else x)
 
     leaves, structure = jax.tree_util.tree_flatten(trees)
-    return structure, tuple((a.dtype.str, a.shape, a.tobytes()) for a in map(raw, leaves))
+    return structure, tuple(
+        # the bytes of an array of objects are addresses
+        (x,) if a.dtype.hasobject else (a.dtype.str, a.shape, a.tobytes())
+        for x, a in zip(leaves, map(raw, leaves), strict=True)
+    )
 
 
 def settled(state: T) -> T:

@@ -18,6 +18,8 @@ from jax.extend import core as jex
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, ArrayLike
 
+from robins.errors import require
+
 T = TypeVar("T")
 Tree = Any  # of arrays
 Param = Any  # a parameter of the primitive
@@ -32,9 +34,14 @@ def each_row(function: Callable[..., T], *args: Tree) -> T:
     Args:
         function: of one row of each of the arguments; what else it needs it may close over.
         args: pytrees of arrays with an equal leading axis.
+
+    Raises:
+        ValueError: there is no array, or their leading axes differ.
     """
     leaves, tree = jax.tree_util.tree_flatten(args)
-    rows = map(jax.typeof, leaves)
+    rows = list(map(jax.typeof, leaves))
+    counts = {a.shape[:1] for a in rows}
+    require(len(counts) == 1 and counts != {()}, "arrays must have equal numbers of rows", counts)
     rows = [jax.ShapeDtypeStruct(a.shape[1:], a.dtype, weak_type=a.weak_type) for a in rows]
 
     def flat(*row: Array) -> T:

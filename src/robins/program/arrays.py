@@ -336,7 +336,7 @@ def nodes_of(e: Equation) -> int:
     every = (x for value in p.values() for x in _each(value))
     if jaxprs := [x for x in every if isinstance(x, jex.ClosedJaxpr)]:
         inside = sum(nodes_of(inner) for one in jaxprs for inner in one.jaxpr.eqns)
-        rounds = p.get("length", 1)
+        rounds = p.get("length", p.get("count", 1))
         return most + inside * (rounds if inside * rounds <= UNROLL else 1)
     match name:
         case "random_bits":

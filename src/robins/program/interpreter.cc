@@ -2,7 +2,7 @@
 
    An instruction is one operation on WIDTH runs; a register is a row of as many numbers, 8 bytes
    each. One text makes two machines: for one run, with the scalars of `scalars.h` (-DONE_RUN), and
-   for a FEW or MANY, with those of `lanes.h`. Operations and routines are the functions that compiled
+   for FEW or MANY runs, with those of `lanes.h`. Operations and routines are the functions that compiled
    programs call, so that results have the same bits. */
 #include "finite.h"
 #ifdef ONE_RUN
@@ -243,7 +243,7 @@ template <int WIDTH> static int rounds_of(const scan *s, const tape *t, int64_t 
     return failed;
 }
 
-/* MANY runs take about as long as three times a FEW. */
+/* One pass of MANY takes about as long as three of FEW. */
 extern "C" int robins_scan(const scan *s, const tape *t, int64_t *registers)
 {
     return (s->runs <= 3 * FEW ? rounds_of<FEW> : rounds_of<MANY>)(s, t, registers);

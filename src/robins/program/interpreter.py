@@ -20,6 +20,7 @@ from robins.program.c import part
 from robins.program.flags import INTERPRETER_FLAGS, OF_KIND, ONE
 from robins.program.lanes import Scan
 from robins.program.native import CPP, Step, address, build_once
+from robins.program.refusal import BuildError
 from robins.program.tape import Tape
 from robins.program.trace import Program
 
@@ -102,11 +103,13 @@ def interpreter_of_many() -> Interpreter:
 
 @lru_cache
 def _loaded(kind: str) -> Interpreter:
-    shipped = Path(str(files("robins.program"))) / "built" / f"{kind}.so"
-    if shipped.is_file():  # in a wheel
-        return Interpreter(shipped)
-    flags = (*INTERPRETER_FLAGS, *OF_KIND[kind])
-    return Interpreter(build_once(text("interpreter.cc"), flags, CPP))
+    path = Path(str(files("robins.program"))) / "built" / f"{kind}.so"
+    if not path.is_file():  # which a wheel has
+        path = build_once(text("interpreter.cc"), (*INTERPRETER_FLAGS, *OF_KIND[kind]), CPP)
+    try:
+        return Interpreter(path)
+    except OSError as error:  # a folder of which nothing may be run, another C library
+        raise BuildError(f"the interpreter cannot be loaded: {error}", str(path)) from None
 
 
 def text(name: str) -> str:

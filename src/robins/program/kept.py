@@ -2,8 +2,8 @@
 
 That is the structure of equations (primitives, parameters, shapes and numbers, not names or where
 code stands); or, before anything is traced, the names of functions of robins and the numbers that
-they are given (`by_name`). A digest is of that, of robins' own code, and of the versions of JAX,
-NumPy and SciPy.
+they are given (`names.by_name`). A digest is of that, of robins' own code, and of the versions of
+JAX, NumPy and SciPy.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import enum
 import hashlib
 import json
 import re
-import sys
 import tempfile
+import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
@@ -31,17 +31,15 @@ from jax.extend import core as jex
 from robins.program.interpreter import Interpreter, interpreter_of_many
 from robins.program.kinds import is_key, numbers_of
 from robins.program.lanes import RoundsEngine
+from robins.program.names import Tree, as_json, of_json
 from robins.program.native import cache_folder
 from robins.program.nodes import Graph
 from robins.program.primitives.control import called
 from robins.program.tape import Tape
 from robins.program.trace import Leaf, Program
 
-Tree = Any  # a structure of JAX, which to a checker is no class
-Json = Any
-NAMED = {"robins", "builtins", "jax"}  # packages whose versions a digest has
-NONE = "builtins:NoneType"
 WORTH = 1_000  # nodes of a program that is kept
+_BEGAN_S = time.time()
 DAMAGED = OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error
 
 
@@ -61,12 +59,14 @@ def kept(
     Raises:
         ProgramError: it cannot be made.
     """
+    is_known = _version() is not None
     path = cache_folder() / f"{digest([*parts, list(interpreter.codes), interpreter.flag])}.npz"
-    with contextlib.suppress(*DAMAGED):
-        return _read(path)
+    if is_known:
+        with contextlib.suppress(*DAMAGED):
+            return _read(path)
     program = write()
     tape, nodes = interpreter.tape(program), len(program.live)
-    if nodes >= WORTH:
+    if is_known and nodes >= WORTH:
         with contextlib.suppress(OSError):  # a full disk, a folder that is gone
             _write(path, program, tape, nodes)
     return program, tape, nodes
@@ -93,7 +93,9 @@ def _write(path: Path, program: Program, tape: Tape, nodes: int) -> None:
     ]
     arrays: dict[str, Any] = {f"array{k}": a for k, a in enumerate(tape.arrays)}
     arrays |= {f"zero{k}": mask for k, mask in program.zeros.items()}
-    about = {"leaves": leaves, "nodes": nodes, "tree": _as_json(program.structure[1])}
+    tree = program.structure[1]
+    results = [] if tree is None else list(map(as_json, tree.children()))
+    about = {"leaves": leaves, "nodes": nodes, "tree": results}
     arrays["about"] = json.dumps(about)
     with tempfile.TemporaryDirectory(dir=path.parent) as own:
         made = Path(own) / path.name
@@ -120,105 +122,38 @@ def _read(path: Path) -> tuple[Program, Tape, int]:
 def results_of(program: Program) -> list[Tree | None]:
     """Structures of the results of a program that gives a tuple.
 
-    One of a program from the cache is None if it holds a class that is not of robins.
+    One of a program from the cache is None where `names.as_json` has no text for it.
     """
     tree = program.structure[1]
     if isinstance(tree, jax.tree_util.PyTreeDef):
         return tree.children()
-    return list(map(_of_json, tree[2]))
-
-
-def _as_json(tree: Tree | None) -> Json:
-    """A structure as class, what it says of its fields, and structures inside."""
-    node = None if tree is None else tree.node_data()
-    if tree is None or node is None:
-        return None
-    try:
-        json.dumps(node[1])  # numbers and names alone
-        return [by_name(node[0]), node[1], list(map(_as_json, tree.children()))]
-    except (LookupError, TypeError):
-        return ["", None, []]
-
-
-def _of_json(tree: Json) -> Tree | None:
-    """The structure, or None if it is not all known; its modules are those that are loaded."""
-    if tree is None:
-        return jax.tree_util.tree_structure(0)
-    kind, about, inner = tree
-    inside = list(map(_of_json, inner))
-    try:
-        made = jax.tree_util.PyTreeDef.from_node_data_and_children
-        about = about if kind == by_name(dict) else _tuples(about)
-        return made(jax.tree_util.default_registry, (_named(kind), about), inside)
-    except (AttributeError, LookupError, TypeError, ValueError):  # or an older version of JAX
-        return None
-
-
-def _tuples(x: Json) -> Json:
-    return tuple(map(_tuples, x)) if isinstance(x, list) else x
+    return [None if one is None else of_json(one) for one in tree]
 
 
 @lru_cache
-def _version() -> str:
-    """A digest of the code that decides what a tape is."""
-    found = hashlib.sha256()
+def _version() -> str | None:
+    """A digest of robins, of what its programs depend on, and of the packages that fold numbers.
+
+    None where it is not known what code this process runs: its files are not there, or were changed
+    since it began.
+    """
+    found, newest = hashlib.sha256(), 0.0
+    kinds = (".py", ".h", ".cc", ".COF")
     for file in sorted(Path(str(files("robins"))).rglob("*.*")):
-        if file.suffix in (".py", ".h", ".cc"):
+        if file.suffix in kinds:
+            newest = max(newest, file.stat().st_mtime)
             found.update(file.read_bytes())
-    for package in ("jax", "numpy", "scipy"):  # the last two fold constants
+    for package in ("jax", "numpy", "scipy"):
         found.update(metadata.version(package).encode())
-    return found.hexdigest()
+    return found.hexdigest() if 0.0 < newest <= _BEGAN_S else None
 
 
 def digest(parts: Iterable[Any]) -> str:
     """A digest of jaxprs, arrays, numbers and texts, nested in any way."""
-    found = hashlib.sha256(_version().encode())
+    draws = jax.config.values["jax_threefry_partitionable"]  # which a jaxpr does not say
+    found = hashlib.sha256(f"{_version()} {draws}".encode())
     _feed(found, list(parts), {})
     return found.hexdigest()[:32]
-
-
-def by_name(value: Any) -> str:
-    """A text that is equal, in any process of this version of robins, for equal values only.
-
-    Args:
-        value: numbers, texts, pytree structures, functions and classes, nested in tuples and lists.
-
-    Raises:
-        LookupError: a function or class that is not of a module of robins or of Python, such as
-            one of a user's file, which may change, or one made in a function; or anything else.
-    """
-    match value:
-        case None | bool() | int() | float() | str() | bytes():
-            return repr(value)
-        case np.dtype():
-            return value.str
-        case enum.Enum():
-            return f"{by_name(type(value))}.{value.name}"
-        case tuple() | list():
-            return f"({','.join(map(by_name, value))})"
-        case jax.tree_util.PyTreeDef():
-            return f"{by_name(value.node_data())}{by_name(value.children())}"
-    name = f"{getattr(value, '__module__', '')}:{getattr(value, '__qualname__', '')}"
-    if _named(name) is not value:
-        raise LookupError(repr(value))
-    return name
-
-
-def _named(name: str) -> Any:
-    """Function or class of a name, in a module that is loaded.
-
-    Raises:
-        LookupError: there is none, or it is of another package than those of `NAMED`.
-    """
-    module, _, path = name.partition(":")
-    if name == NONE:  # which its module does not have
-        return type(None)
-    found: Any = sys.modules.get(module) if module.split(".")[0] in NAMED else None
-    for part in path.split("."):
-        found = getattr(found, part, None)
-    if found is None:
-        raise LookupError(name)
-    return found
 
 
 def _feed(to: Any, value: Any, names: dict[Any, int]) -> None:

@@ -19,8 +19,9 @@ import jax
 import numpy as np
 
 from robins.program.interpreter import interpreted_step, interpreter_of_one
-from robins.program.kept import by_name, kept, results_of
+from robins.program.kept import kept, results_of
 from robins.program.kinds import kind_of
+from robins.program.names import by_name
 from robins.program.native import Engine, Step
 from robins.program.refusal import ProgramError
 from robins.program.trace import Leaf, Program, trace
@@ -153,6 +154,7 @@ class NativeState:
         content: Hashable,
         engine: Engine = interpreted_step,
         unroll: int | None = LIVE_UNROLL,
+        lasting: bool = False,
     ):
         """Take a state.
 
@@ -162,10 +164,14 @@ class NativeState:
                 process.
             engine: what makes steps of programs: `interpreted_step`, or `compiled_step`.
             unroll: as in `trace`.
+            lasting: content and names tell functions apart in other processes too, if they have
+                texts (`names.by_name`): then programs of the interpreter are kept in the user's
+                cache.
 
         Raises:
             ProgramError: the state holds numbers that have no place in a program.
         """
+        self._lasting = lasting
         self._content, self._how = content, (engine, unroll)
         leaves, self._tree = jax.tree_util.tree_flatten(state)
         paths = jax.tree_util.tree_flatten_with_path(state)[0]
@@ -294,9 +300,11 @@ class NativeState:
             args: likewise.
         """
         engine, unroll = self._how
-        if engine is interpreted_step:
+        if self._lasting and engine is interpreted_step:
+            parts, interpreter = [], interpreter_of_one()
             with contextlib.suppress(LookupError):
-                parts, interpreter = [by_name((key, unroll))], interpreter_of_one()
+                parts = ["step", by_name((key, unroll))]
+            if parts:
                 write = partial(self._traced, function, args)
                 program, tape, _ = kept(parts, write, interpreter)
                 return program, self._told(program, function, args), interpreter.steps(tape)

@@ -107,7 +107,7 @@ class LiveInsGnss(Live):
         longest_delay_s: float = 1.0,
         machine: str | None = None,
     ):
-        """Begin; everything is compiled before the first sample.
+        """Begin; programs are made before the first sample.
 
         Args:
             parameters: as of a replay; the lever arm is `gnss.lever_arm`.
@@ -115,8 +115,8 @@ class LiveInsGnss(Live):
             fix_rate_hz: of the receiver.
             filter: a causal one of the replays.
             longest_delay_s: how late a fix may come.
-            machine: that steps the filter, as of `OnlineFilter`, by default `usual`; programs of
-                "vm" are kept in the user's cache, "c" is compiled for minutes once.
+            machine: the machine that steps the filter, as for `OnlineFilter`; default: `usual()`.
+                Programs of "vm" are kept in the user's cache, "c" is compiled for minutes once.
 
         Raises:
             ValueError: a rate or delay is not positive, or there is no such machine or no causal
@@ -127,7 +127,7 @@ class LiveInsGnss(Live):
         require(longest_delay_s > 0.0, "longest_delay_s must be positive", longest_delay_s)
         require(filter not in SMOOTHED, f"{filter} smooths: it needs the whole log")
         made_with = {"fix_rate_hz": fix_rate_hz, "filter": filter, "rate_hz": rate_hz}
-        made_with |= {"longest_delay_s": longest_delay_s, "machine": machine}
+        made_with |= {"longest_delay_s": longest_delay_s, "machine": machine or usual()}
         super().__init__(parameters, **made_with)
         p = parameters
         self._usual = Usual(1.0 / rate_hz, 1.0 / fix_rate_hz)
@@ -140,7 +140,7 @@ class LiveInsGnss(Live):
         back = max(self._window_s, 2.0 * p.aids.window, 1.5, 4.0 * self._usual.fix_s)
         self._back_s = longest_delay_s + 2.0 * self._reach_s + back
         asked = contender(p, self._usual.fix_s, filter)
-        self._on = partial(OnlineFilter, asked.filter, asked.model, machine=machine or usual())
+        self._on = partial(OnlineFilter, asked.filter, asked.model, machine=made_with["machine"])
         self._case, self._suspects = asked.case, asked.filter.suspects
         self._C_bs = axes_of(p.imu.orientation) if any(p.imu.orientation) else None
         self._patience = max(3, round(_PATIENCE_S * rate_hz))

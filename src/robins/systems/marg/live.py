@@ -160,20 +160,24 @@ class LiveMarg(Live):
         declination_rad: float = 0.0,
         machine: str | None = None,
     ):
-        """Begin; everything is compiled before the first sample.
+        """Begin; programs are made before the first sample.
 
         Args:
             parameters: as of a replay.
             rate_hz: of the samples, as the data sheet says; lost ones are told by it.
             declination_rad: of the Earth's field here, clockwise from true north.
-            machine: that steps the filter, as of `OnlineFilter`, by default `usual`; programs of
-                "vm" are kept in the user's cache, "c" is compiled for minutes once.
+            machine: the machine that steps the filter, as for `OnlineFilter`; default: `usual()`.
+                Programs of "vm" are kept in the user's cache, "c" is compiled for minutes once.
 
         Raises:
             ValueError: the rate is not positive, or there is no such machine.
         """
         require(rate_hz > 0.0, "rate_hz must be positive", rate_hz)
-        made_with = {"rate_hz": rate_hz, "declination_rad": declination_rad, "machine": machine}
+        made_with = {
+            "rate_hz": rate_hz,
+            "declination_rad": declination_rad,
+            "machine": machine or usual(),
+        }
         super().__init__(parameters, **made_with)
         p, self._usual_s = parameters, 1.0 / rate_hz
         self._n = max(1, round(p.update.block / self._usual_s))
