@@ -46,6 +46,16 @@ def never(*_):
     raise AssertionError("a program was written")
 
 
+def test_nothing_is_kept_of_code_that_changed_since_the_process_began(cache, monkeypatch):
+    monkeypatch.setattr(kept, "_BEGAN_S", 0.0)
+    kept._version.cache_clear()
+    try:
+        of(0.5)
+        assert not list(cache.glob("*.npz"))
+    finally:
+        kept._version.cache_clear()
+
+
 def test_the_second_time_no_program_is_written(cache, monkeypatch):
     want, first = of(0.5)
     files = sorted(cache.iterdir())

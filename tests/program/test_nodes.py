@@ -89,6 +89,19 @@ def test_what_no_result_needs_is_left_out(graph, x):
     assert unused not in graph.live([used])
 
 
+def test_of_what_a_loop_keeps_only_what_is_read_is_computed(graph, x):
+    loop = graph.open([x], 3)
+    read, unread = (graph.apply(op, loop.leaves[0]) for op in ("sin", "cos"))
+    loop.next, loop.kept = [read], [read, unread, x, number(graph, 0.0)]
+    _, (first, other, same, zero) = graph.close(loop)
+    assert same == [x] * 3  # of all rounds, no array
+    assert zero == [number(graph, 0.0)] * 3
+    assert len({*first, *other}) == 6
+    assert unread not in graph.live([first[1]])
+    assert unread in graph.live([other[2]])
+    assert graph.kept(graph.live([other[2]])) == {(loop.scope, 1): unread}
+
+
 def test_what_does_not_change_is_computed_before_a_loop(graph, x):
     loop = graph.open([x], 3)
     outside = graph.apply("sin", x)

@@ -19,6 +19,7 @@ from robins.filters import (
     kalman,
     unscented,
 )
+from robins.filters.machine import usual
 from robins.filters.rules import Infeasible, gate, h_infinity, with_gamma
 from robins.program import BuildError, NativeState, ProgramError, trace
 
@@ -247,3 +248,13 @@ def test_machines_that_are_not_there(monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(BuildError, match="install one"):
         OnlineFilter(EKF, MODEL, START, "c")
+
+
+def test_the_usual_machine_is_jax_where_no_interpreter_can_be_had(monkeypatch):
+    assert usual() == "vm"
+
+    def none():
+        raise BuildError("there is no C++ compiler")
+
+    monkeypatch.setattr("robins.program.interpreter.interpreter_of_one", none)
+    assert usual() == "jax"

@@ -99,22 +99,23 @@ def constant(x, u):
     return x + u
 
 
+def distance(x, _):
+    return jnp.hypot(x[0], x[1])[None]
+
+
+MODEL = Model(
+    Motion(constant, noise=0.1 * np.eye(2)), (Sensor(distance, np.array([[0.2]]), 1, "r"),)
+)
+START = Belief(np.array([3.0, 4.0]), np.eye(2))
+Y, U = 5.0 + RNG.normal(size=(60, 1)), 0.01 * RNG.normal(size=(60, 2))
+Y[7] = np.nan
+
+
 def test_a_run_by_the_interpreter_is_the_run_by_jax():
-    model = Model(
-        Motion(constant, noise=0.1 * np.eye(2)),
-        (
-            Sensor(
-                lambda x, _: jnp.hypot(x[0], x[1])[None], noise=np.array([[0.2]]), dim=1, name="r"
-            ),
-        ),
-    )
-    y = 5.0 + RNG.normal(size=(60, 1))
-    y[7] = np.nan
-    start, u = Belief(np.array([3.0, 4.0]), np.eye(2)), 0.01 * RNG.normal(size=(60, 2))
     filter_ = kalman(unscented(), rules=(huber(),))
     for keep in (everything, nothing):
         found, want = (
-            run(filter_, model, start, y, u, keep=keep, machine=m) for m in ("vm", "jax")
+            run(filter_, MODEL, START, Y, U, keep=keep, machine=m) for m in ("vm", "jax")
         )
         assert isinstance(found, Solution)
         assert jax.tree.structure(found) == jax.tree.structure(want)
@@ -159,8 +160,11 @@ def test_what_no_program_takes_is_refused():
     for x in (np.zeros(3, np.int16), jax.random.split(jax.random.key(0), 3)):
         with pytest.raises(ProgramError, match="no place"):
             scan(lambda c, r: (c, r), "any", np.zeros(2), x)
-    with pytest.raises(ValueError, match="array of rows"):
-        scan(lambda c, r: (c, r), "any", np.zeros(2), ())
+    for rows in ((), (np.zeros(3), np.zeros(2)), np.zeros(())):
+        with pytest.raises(ValueError, match="rows must be arrays of one length"):
+            scan(lambda c, r: (c, r), "any", np.zeros(2), rows)
+    with pytest.raises(ValueError, match="machine must be 'jax' or 'vm', got 'c'"):
+        run(kalman(unscented()), MODEL, START, Y, U, machine="c")
 
 
 class Colour(enum.IntEnum):

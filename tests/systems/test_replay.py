@@ -15,6 +15,7 @@ from robins.dataset import Dataset
 from robins.earth import Geodetic, earth_rate_n
 from robins.ins.blocks import gained_in_window
 from robins.ins.state import InsState
+from robins.program import BuildError
 from robins.rotation import Rotation as Attitude
 from robins.systems import ins_gnss
 from robins.systems.ins_gnss import SYSTEM, Drive, Replay, drive_dataset
@@ -125,6 +126,24 @@ def test_the_filter_is_far_better_than_the_fixes_and_the_smoother_better_still(c
     smoothed = sigma.sel(filter="ekf+rts", axis_attitude="down").values
     assert heading[-1] < 0.5 * heading[0]
     assert np.all(smoothed <= heading * (1 + 1e-9))
+
+
+def test_without_an_interpreter_jax_computes_the_same_and_it_is_said(
+    clean_outcome, log, monkeypatch
+):
+    def none():
+        raise BuildError("there is no C++ compiler")
+
+    monkeypatch.setattr("robins.program.scanned.interpreter_of_one", none)
+    by_jax = replay_log(logs.clean(log), configuration(), ("ekf",))
+    assert by_jax.notes == [
+        *clean_outcome.notes,
+        "ekf: computed by JAX, which compiles first, as there is no C++ compiler",
+    ]
+    for name, array in by_jax.solution.data_vars.items():
+        want = clean_outcome.solution.sel(filter=["ekf"])[name].values
+        scale = np.nanmax(np.abs(want), initial=1e-300)
+        np.testing.assert_allclose(array.values, want, rtol=0, atol=1e-11 * scale, err_msg=name)
 
 
 def test_the_attitude_is_told_as_angles_and_as_a_quaternion(clean_outcome, log):

@@ -54,7 +54,7 @@ class Solution(NamedTuple):
 
 
 Rows = tuple[Data, dict[str, State], dict[str, Data]]  # u, y and aux, the last two by sensor
-Machine = Literal["jax", "vm"]
+RunMachine = Literal["jax", "vm"]
 Keep = Callable[[Step], Data]  # part of a step that is kept
 
 
@@ -173,12 +173,12 @@ def run(
     aux: Mapping[str, Data] | None = None,
     keep: Keep = everything,
     time_s: ArrayLike | None = None,
-    machine: Machine = "jax",
+    machine: str = "jax",
 ) -> Solution:
     """Run a filter over measurements: for each step k predict, then update with row k of y.
 
-    One compiled scan, for `jax.vmap` over any of the data and for `jax.grad`. Runs share a compiled
-    program if functions of the user and `keep` are the same objects, and shapes are equal.
+    By JAX one compiled scan, for `jax.vmap` over any of the data and for `jax.grad`. Runs share it
+    if functions of the user and `keep` are the same objects, and shapes are equal.
 
     Args:
         filter_: from `kalman` and its kin.
@@ -190,7 +190,7 @@ def run(
         aux: further inputs of sensors, by sensor name, leading axis T.
         keep: part of each `Step` to keep; long campaigns keep little.
         time_s: (T,) time of each step [s], which errors then name.
-        machine: "vm" for the interpreter: nothing is compiled, results are numbers of NumPy.
+        machine: "vm" for the interpreter, outside of what JAX transforms: nothing is compiled.
 
     Raises:
         Exception: report of the filter (`Filter.report`); in transformed code see the codes.
@@ -204,7 +204,7 @@ def run(
         StepWarning: steps were not taken, or measurements contradict what is known exactly; in
             transformed code see `Solution.tally`.
     """
-    one_of("machine", machine, Machine)
+    one_of("machine", machine, RunMachine)
     measurements = _by_sensor(model, y)
     extra = dict(aux or {})
     check_names(model, extra)
@@ -212,7 +212,7 @@ def run(
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
     rows = u, measurements, extra
     scan = _interpreted
-    if machine == "jax":  # a new array of JAX is a program for its shape
+    if machine == "jax":  # each new shape of an array of JAX is a program
         scan, (state, rows) = _scan, jax.tree_util.tree_map(jnp.asarray, (state, rows))
     solution = scan(filter_, model, state, rows, keep)
 

@@ -50,7 +50,7 @@ def standstill(
     quiet_force: float,
     usual_s: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether the unit stood still over the window up to each increment.
+    """True where the unit stood still over the window up to each increment.
 
     Still means: on every axis the spread of turn rate and specific force is below its threshold,
     and the mean rate below four times its own.

@@ -1,4 +1,4 @@
-"""How errors and noise go through a block of increments: Phi and a factor of Q.
+"""Transition of errors and noise over a block of increments: Phi and a factor of Q.
 
 A block of K samples is cut into a few segments. Within one, the error dynamics F is split in two:
 

@@ -1,9 +1,8 @@
-"""A function of one row, on all rows of some arrays: batched by JAX, a loop in a program.
+"""Map of a function over the rows of arrays: a batch for JAX, a loop in a program.
 
-`jax.vmap` leaves no trace of the function of one row: in a program of scalars (`robins.program`)
-each row would be written out, nine times a filter for nine modes of it. The primitive ``each_row``
-keeps that function; all that JAX does with it (compile, batch, differentiate) it does with
-`jax.vmap` of it.
+`jax.vmap` leaves no trace of the function of one row, so a program of scalars (`robins.program`)
+would write out each row: a bank of nine modes as nine filters. The JAX primitive ``each_row`` keeps
+that function. JAX compiles, batches and differentiates it as `jax.vmap` of the function.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from jaxtyping import Array, ArrayLike
 from robins.errors import require
 
 T = TypeVar("T")
-Tree = Any  # of arrays
+Tree = Any  # a pytree of arrays
 Param = Any  # a parameter of the primitive
 
 _each_row = jex.Primitive("each_row")

@@ -317,7 +317,7 @@ class _Writer:
         self.lines.append(f"{pad}}}")
 
     def _row(self, nodes: tuple[Node, ...], index: str, depth: int) -> str:
-        """How a round reads the one of some nodes that is its own."""
+        """Text by which a round reads its own one of some nodes."""
         graph, kind = self.graph, self.graph.kind[nodes[0]]
         found = stride(graph, self.place, nodes)
         if found is None:

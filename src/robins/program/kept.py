@@ -17,7 +17,7 @@ import tempfile
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from functools import lru_cache
 from importlib import metadata
 from importlib.resources import files
@@ -31,7 +31,7 @@ from jax.extend import core as jex
 from robins.program.interpreter import Interpreter, interpreter_of_many
 from robins.program.kinds import is_key, numbers_of
 from robins.program.lanes import RoundsEngine
-from robins.program.names import Tree, as_json, of_json
+from robins.program.names import Tree, as_json, by_name, of_json
 from robins.program.native import cache_folder
 from robins.program.nodes import Graph
 from robins.program.primitives.control import called
@@ -39,7 +39,7 @@ from robins.program.tape import Tape
 from robins.program.trace import Leaf, Program
 
 WORTH = 1_000  # nodes of a program that is kept
-_BEGAN_S = time.time()
+_BEGAN_S = time.time()  # about when the code of this process was read
 DAMAGED = OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error
 
 
@@ -49,7 +49,7 @@ def kept(
     """A program, its tape, and how many nodes it has; from the cache or made.
 
     A program from the cache has its arguments, results and zeros, but neither nodes nor outputs,
-    and of its structure what `results_of` gives.
+    and of the structure of its results the texts of `names.as_json`.
 
     Args:
         parts: all that the program is made of: jaxprs, arrays, numbers, texts.
@@ -119,15 +119,44 @@ def _read(path: Path) -> tuple[Program, Tape, int]:
     return program, tape, about["nodes"]
 
 
-def results_of(program: Program) -> list[Tree | None]:
-    """Structures of the results of a program that gives a tuple.
+def kept_by_name(
+    what: str, key: Hashable, write: Callable[[], Program], interpreter: Interpreter
+) -> tuple[Program, Tape]:
+    """A program and its tape; from the cache if the key has a text (`names.by_name`), else made.
 
-    One of a program from the cache is None where `names.as_json` has no text for it.
+    Args:
+        what: the kind of the program.
+        key: all that the program depends on.
+        write: makes it.
+        interpreter: that carries out the tape.
+
+    Raises:
+        ProgramError: it cannot be made.
+    """
+    try:
+        text = by_name(key)
+    except LookupError:
+        program = write()
+        return program, interpreter.tape(program)
+    program, tape, _ = kept([what, text], write, interpreter)
+    return program, tape
+
+
+def second_result(program: Program, function: Callable[..., Any], *args: Tree) -> Tree:
+    """Structure of the second result of a program; traced where a program of the cache lacks it.
+
+    Args:
+        program: that of the function.
+        function: returns a pair.
+        args: its arguments.
     """
     tree = program.structure[1]
     if isinstance(tree, jax.tree_util.PyTreeDef):
-        return tree.children()
-    return [None if one is None else of_json(one) for one in tree]
+        return tree.children()[1]
+    known = None if tree[1] is None else of_json(tree[1])
+    if known is not None:
+        return known
+    return jax.tree_util.tree_structure(jax.eval_shape(function, *args)[1])
 
 
 @lru_cache

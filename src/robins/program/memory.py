@@ -3,12 +3,12 @@
 `Native` takes a function's arguments apart and puts its results together at every call. Here the
 state is never taken apart: every program has it at the head of its arguments and of its results,
 and these lie in one memory, so that a call copies only what is given besides and what is told.
-Programs are kept for the process, so that a filter made again is not traced again.
+Programs are kept for the process, so that a filter made again is not traced again, and those with
+names in the user's cache (`robins.program.kept`).
 """
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
@@ -19,15 +19,15 @@ import jax
 import numpy as np
 
 from robins.program.interpreter import interpreted_step, interpreter_of_one
-from robins.program.kept import kept, results_of
+from robins.program.kept import kept_by_name, second_result
 from robins.program.kinds import kind_of
-from robins.program.names import by_name
 from robins.program.native import Engine, Step
 from robins.program.refusal import ProgramError
 from robins.program.trace import Leaf, Program, trace
 
 Function = Callable[..., Any]  # of a state and arguments
-Made = tuple[Program, Any, Callable[[], Step]]  # the tree of what it tells; what makes steps of it
+# A program, the structure of its result beside the state, and what makes steps of it.
+Made = tuple[Program, Any, Callable[[], Step]]
 LIVE_UNROLL = 300  # of 15 states as fast as written out, and compiled in two thirds of the time
 _MOST = 128  # programs remembered; the least recently used are forgotten
 _known: OrderedDict[Hashable, Made] = OrderedDict()
@@ -36,7 +36,7 @@ _PYTHON = {float: _FLOAT, int: np.dtype(np.int64), bool: np.dtype(bool)}
 
 
 class Slot(NamedTuple):
-    """Where an array lies in the memory of the reals, or in that of all else."""
+    """Place of an array in the memory of the reals, or in that of all else."""
 
     is_real: bool
     first: int
@@ -71,7 +71,7 @@ class Reader:
     """Puts arrays together from where they lie in memory."""
 
     def __init__(self, told: list[Slot], tree: Any):
-        """Of some slots, and of the structure of what they are the leaves of."""
+        """Take slots, and the structure whose leaves they are."""
         self._tree = tree
         self._blank = [None] * len(told)
         self._arrays = [
@@ -131,7 +131,7 @@ class _Call(NamedTuple):
     result: Reader  # of what it tells, counted from there
 
     def takes(self, leaves: list[Any], tree: Any) -> bool:
-        """Whether it was traced for arguments like these."""
+        """True if it was traced for arguments like these."""
         return tree == self.tree and all(map(_alike, leaves, self.forms))
 
 
@@ -240,7 +240,7 @@ class NativeState:
         return call.result.read(reals, others)
 
     def look(self, name: Hashable, function: Callable[..., Any], *args: Any) -> Any:
-        """What ``(state, *args) -> result`` gives; the state stays.
+        """Return the result of ``(state, *args) -> result``; the state stays.
 
         Args:
             name: as in `step`.
@@ -269,7 +269,7 @@ class NativeState:
             if len(_known) > _MOST:
                 _known.popitem(last=False)
         _known.move_to_end(key)
-        count, (program, told_tree, step) = len(self._slots), made
+        count, (program, result, step) = len(self._slots), made
         begin = self._reals, self._others
         given, *after = slots(program.inputs[count:], begin)
         told, *end = slots(program.results[count:])
@@ -288,7 +288,7 @@ class NativeState:
             (x, k, x, k),
             begin,
             (begin[0] + end[0], begin[1] + end[1]),
-            Reader(told, told_tree),
+            Reader(told, result),
         )
 
     def _made(self, key: Hashable, function: Function, args: tuple) -> Made:
@@ -300,24 +300,15 @@ class NativeState:
             args: likewise.
         """
         engine, unroll = self._how
+        write = partial(self._traced, function, args)
         if self._lasting and engine is interpreted_step:
-            parts, interpreter = [], interpreter_of_one()
-            with contextlib.suppress(LookupError):
-                parts = ["step", by_name((key, unroll))]
-            if parts:
-                write = partial(self._traced, function, args)
-                program, tape, _ = kept(parts, write, interpreter)
-                return program, self._told(program, function, args), interpreter.steps(tape)
-        program = self._traced(function, args)
-        return program, self._told(program, function, args), engine(program)
-
-    def _told(self, program: Program, function: Function, args: tuple) -> Any:
-        """The structure of what a program tells."""
-        _, told = results_of(program)
-        if told is None:
-            results = jax.eval_shape(function, self.state, *args)
-            told = jax.tree_util.tree_structure(results[1])
-        return told
+            interpreter = interpreter_of_one()
+            program, tape = kept_by_name("step", (key, unroll), write, interpreter)
+            step = interpreter.steps(tape)
+        else:
+            program = write()
+            step = engine(program)
+        return program, second_result(program, function, self.state, *args), step
 
     def _traced(self, function: Function, args: tuple) -> Program:
         program = trace(function, self.state, *args, unroll=self._how[1])

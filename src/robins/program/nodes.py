@@ -122,7 +122,7 @@ class Graph:
         return self.add("input", (), kind, index)
 
     def is_constant(self, node: Node) -> bool:
-        """Whether its number is known."""
+        """True if its number is known."""
         return self.op[node] == "constant"
 
     def known(self, node: Node) -> Any:
@@ -198,7 +198,7 @@ class Graph:
     def block(
         self, routine: str, sizes: Sequence[int], args: Sequence[Node], count: int
     ) -> list[Node]:
-        """What a routine of `scalars.h` makes of an array of reals: so many reals."""
+        """The reals that a routine of `scalars.h` makes of an array of reals."""
         block = self.add("block", args, "real", (routine, tuple(sizes), count))
         return [self.add("item", (block,), "real", k) for k in range(count)]
 

@@ -349,7 +349,7 @@ class Staged:
         return Touched(takes, makes, one.within)
 
     def _wanted(self, parts: Sequence[Arrays | Loop]) -> Callable[[Variable], bool]:
-        """Whether a variable is needed outside of the part that makes it."""
+        """Test for variables that are needed outside of the part that makes them."""
         out = {*variables(self._makes), *(v for p in parts for v in taken_by(p.equations))}
         return out.__contains__
 

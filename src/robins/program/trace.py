@@ -130,7 +130,7 @@ class Walk:
         return nodes if zero is None else np.where(zero, self.graph.constant(0, "real"), nodes)
 
     def stays_whole(self, size: int) -> bool:
-        """Whether what is so many scalar operations is not written out, but a loop or a call."""
+        """True if so many scalar operations are a loop or a call, and not written out."""
         return self.unroll is not None and size > self.unroll
 
     def constants(self, value: Any) -> Nodes:
@@ -171,11 +171,11 @@ class Walk:
         return np.array(values).reshape(nodes.shape)
 
     def closed(self, jaxpr: Any, *args: Nodes) -> list[Nodes]:
-        """What a closed jaxpr makes of arrays of nodes."""
+        """Results of a closed jaxpr on arrays of nodes."""
         return self.open(jaxpr.jaxpr, [self.constants(c) for c in jaxpr.consts], args)
 
     def open(self, jaxpr: Any, consts: Sequence[Nodes], args: Sequence[Nodes]) -> list[Nodes]:
-        """What a jaxpr makes of arrays of nodes."""
+        """Results of a jaxpr on arrays of nodes."""
         values: dict[Any, Nodes] = {}
         values.update(zip(jaxpr.constvars, consts, strict=True))
         values.update(zip(jaxpr.invars, args, strict=True))
@@ -189,7 +189,7 @@ class Walk:
         return [read(v) for v in jaxpr.outvars]
 
     def equation(self, equation: Any, *args: Nodes) -> list[Nodes]:
-        """What an equation makes of arrays of nodes.
+        """Results of an equation on arrays of nodes.
 
         Raises:
             ProgramError: there is no rule for it, or not for this use of it.
@@ -220,7 +220,7 @@ class Walk:
         return found
 
     def function(self, function: Callable[..., Any], *args: Nodes, like: Sequence[Any]) -> Any:
-        """What a function of JAX makes of arrays of nodes, which stand for arrays `like` these."""
+        """Results of a function of JAX on arrays of nodes, which stand for arrays `like` these."""
         return self.closed(jax.make_jaxpr(function)(*like), *args)
 
 

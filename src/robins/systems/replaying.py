@@ -66,7 +66,7 @@ PieceT = TypeVar("PieceT", bound=Piece)
 
 
 class Answer(NamedTuple):
-    """What a filter or smoother says of a log; leading axis E epochs of all its pieces."""
+    """Estimates of a filter or smoother on a log; leading axis E epochs of all its pieces."""
 
     name: str
     mean: Any
@@ -77,10 +77,11 @@ class Answer(NamedTuple):
     tally: Tally  # how the steps went, of each piece
     bounds: bool  # its sigmas are bounds of an H-infinity filter
     wrong: Mapping[str, Any] = {}  # (E,) probability by suspect
+    by_jax: str = ""  # why the interpreter could not carry the filter out
 
 
 class Reported(NamedTuple):
-    """What the replays of a system report of every filter."""
+    """Items that the replays of a system report of every filter."""
 
     blocks: Sequence[StateBlock]
     sensors: Mapping[str, SensorAxes]
@@ -141,7 +142,7 @@ def noise_scale(
 
 
 def gap_counts(pieces: Sequence[Piece], problems: Sequence[str]) -> dict[str, int]:
-    """How many gaps ended a piece, and how many blocks lie across a shorter one."""
+    """Numbers of gaps that ended a piece, and of blocks across a shorter one."""
     across = (np.sum(np.asarray(piece.noise_scale) > 1.0) for piece in pieces)
     return {
         "imu_gaps_declared": len(pieces) + len(problems) - 1,
@@ -172,7 +173,7 @@ def navigated(
     smoothers: Mapping[str, str] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Answer]:
-    """What filters and smoothers, by name, say of all pieces; each filter runs over a piece once.
+    """Estimates of all pieces by filters and smoothers; each filter runs over a piece once.
 
     Args:
         pieces: of a log, in the order of time.
@@ -196,31 +197,31 @@ def navigated(
 
 
 def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answer, Answer]:
-    """What a filter says of a piece, and its smoother if that is asked for."""
+    """Estimates of a filter on a piece, and of its smoother if that is asked for."""
     filter_, case = contender.filter, contender.case(piece.world)
     with warnings.catch_warnings():
         # what would be said here is among the warnings of the outcome
         warnings.simplefilter("ignore", StepWarning)
-        found = _ran(contender, case, everything if smoothed else kept, piece.epoch_s)
+        found, why = _ran(contender, case, everything if smoothed else kept, piece.epoch_s)
         of_steps = _kept_of(found.steps) if smoothed else found.steps
     mean, sigma, seen = of_steps
     likelihood, bounds = float(found.log_likelihood), contender.bounds
     tally = found.tally.looking(seen, case.y)
     wrong = probabilities(filter_, seen)
-    answer = Answer("", mean, sigma, seen, case.start, likelihood, tally, bounds, wrong)
+    answer = Answer("", mean, sigma, seen, case.start, likelihood, tally, bounds, wrong, why)
     if not smoothed:
         return answer, answer
     belief = rts_smoother(found)
     return answer, answer._replace(mean=belief.mean, sigma=belief.sigma, updates={}, wrong={})
 
 
-def _ran(contender: Contender, case: Case, keep: Keep, time_s: np.ndarray) -> Solution:
-    """A run by the interpreter; by JAX where that cannot carry it out."""
+def _ran(contender: Contender, case: Case, keep: Keep, time_s: np.ndarray) -> tuple[Solution, str]:
+    """A run by the interpreter; where that cannot carry it out, by JAX, and the reason."""
     arguments = contender.filter, contender.model, case.start, case.y, case.u, case.aux
     try:
-        return run(*arguments, keep=keep, time_s=time_s, machine="vm")
-    except (BuildError, ProgramError):
-        return run(*arguments, keep=keep, time_s=time_s)
+        return run(*arguments, keep=keep, time_s=time_s, machine="vm"), ""
+    except (BuildError, ProgramError) as error:
+        return run(*arguments, keep=keep, time_s=time_s), str(error)
 
 
 def _joined(parts: Sequence[Answer]) -> Answer:
@@ -250,7 +251,7 @@ def epochs_of(pieces: Sequence[Piece]) -> np.ndarray:
 
 
 def end_to_end(trees: Sequence[Any]) -> Any:
-    """What was found of each piece in one, a row of NaN between two so that no curve crosses a gap.
+    """Join what was found of each piece, with a row of NaN between two: no curve crosses a gap.
 
     What holds no real number has a zero there.
     """
@@ -295,12 +296,18 @@ def outcome(
         if answer.updates
         for sentence in doubts(answer.tally, bounds=answer.bounds, assumed=reported.assumed)
     ]
+    compiled = [
+        f"{name}: computed by JAX, which compiles first, as {answer.by_jax}"
+        for name, answer in answers.items()
+        if answer.by_jax
+    ]
+    suspicions = [s for k, a in answers.items() for s in sentences(k, epoch_s, a.wrong)]
     origin = {} if origin_ns is None else {"origin_ns": np.int64(origin_ns)}
     return Outcome(
         solution=xr.Dataset(_tables(epoch_s, answers, reported) | dict(variables), attrs=origin),
         metrics={name: metrics(answer) | _innovations(answer) for name, answer in answers.items()},
         counts=dict(counts),
-        notes=[*notes, *(s for k, a in answers.items() for s in sentences(k, epoch_s, a.wrong))],
+        notes=[*notes, *suspicions, *compiled],
         warnings=[*doubtful, reported.causes] if doubtful else [],
     )
 

@@ -230,7 +230,7 @@ class Imm(Filter):
         return FilterState(belief, Interaction(states, jnp.asarray(self.log_first)))
 
     def mixed(self, states: Data, log_now: Array) -> tuple[Data, Array]:
-        """Where each filter begins, and the predicted log-probabilities."""
+        """States that the filters begin with, and the predicted log-probabilities."""
         joint = log_now[:, None] + jnp.asarray(self.log_change)
         log_weight, log_next = jax.vmap(log_normalised, in_axes=1)(joint)
         weight = jnp.exp(log_weight)  # (to, from)

@@ -87,7 +87,7 @@ def _shaped(nodes: list[Node], like: Any) -> list[Nodes]:
 
 
 def _converted(walk: Walk, arrays: list[Nodes], like: list[Nodes]) -> list[Nodes]:
-    """What a round leaves, in the kinds that it began with."""
+    """Arrays that a round leaves, in the kinds that it began with."""
     graph = walk.graph
     return [
         walk.each(lambda n, old: graph.convert(n, graph.kind[old]), a, b) if a.size else a

@@ -73,7 +73,7 @@ _MOST_START_S = 600.0  # of samples that the start is sought in
 
 
 class Epoch(NamedTuple):
-    """Where the filter is: the end of a block."""
+    """The end of the block up to which the filter has come."""
 
     time_s: float
     wanted_s: float  # the fix, or the start, since which the blocks are counted
@@ -413,7 +413,7 @@ class LiveInsGnss(Live):
             self._steps = self._steps[self._steps[:, 0] > begin]
 
     def _go_back(self, time_s: float) -> None:
-        """To the last epoch that does not know of a fix."""
+        """Return to the last epoch before a fix was known."""
         if not self._past or time_s > self._past[-1][0] + self._reach_s:
             return
         longest_s, keep = self.parameters.update.longest_block, 1

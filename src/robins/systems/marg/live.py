@@ -92,7 +92,7 @@ class _Block(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """What is looked at of a step."""
+    """Numbers of a step that are read."""
 
     q_nb: np.ndarray  # (4,)
     gyro_bias: np.ndarray  # (3,)
@@ -128,7 +128,7 @@ def _whole(samples: model.Samples) -> jax.Array:
 
 
 def _parted(vector: np.ndarray) -> tuple[model.Integrals, np.ndarray]:
-    """What `_whole` gave, leading axis 1."""
+    """The parts of what `_whole` returns, leading axis 1."""
     dt, turn, dv, time, rates, angle, field = np.split(vector, np.cumsum([1, 4, 3, 9, 27, 1]))
     integrals = model.Integrals(
         dt, turn[None], dv[None], time.reshape(1, 3, 3), rates.reshape(1, 3, 9), angle
@@ -332,7 +332,7 @@ class LiveMarg(Live):
                 self._step()
 
     def _ready(self) -> bool:
-        """Whether all is there that a block is made of, flanks of its peaks included."""
+        """True if all samples of a block are there, flanks of its peaks included."""
         if not self._context:  # the first sample of all begins the first block
             self._context = 1 if self._rows else 0
         end = self._context + self._n
@@ -455,7 +455,7 @@ class LiveMarg(Live):
         self._marks = int(self._doubts(found) | (Flag.REST if still else Flag(0)))
 
     def _doubts(self, found: _Step) -> Flag:
-        """What the monitor says of the last looks."""
+        """Flags of the monitor on the last looks."""
         most = math.ceil(_MONITORED_S / (self._n * self._usual_s))
         gain = [np.max(np.abs(found.gyro_gain))]
         row = np.concatenate([found.declination, gain, found.travel, found.magnetometer])
