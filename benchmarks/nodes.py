@@ -4,9 +4,9 @@
     PYTHONPATH=src python benchmarks/nodes.py newer.json [SYSTEM ...]
     python benchmarks/nodes.py compare older.json newer.json
 
-A node is one operation on scalars that a result needs, counted as it is written: the body of a loop
-counts once, and a loop of few operations is written out. A filter that is in the file already is not
-traced again.
+A node is one operation on scalars that a result needs, counted as it is written: the body of a
+loop counts once, and a loop of few operations is written out. A filter that is in the file already
+is not traced again.
 """
 
 import json
