@@ -208,15 +208,15 @@ def _following(row: np.ndarray, level: float) -> Findings:
 
 def _one_sided(row: np.ndarray, level: float) -> Findings:
     for count, above, when in (
-        (row[_SEEN], row[_ABOVE], "of all"),
-        (row[_LATE], row[_LATE_ABOVE], "of the last quarter"),
+        (row[_SEEN], row[_ABOVE], ""),
+        (row[_LATE], row[_LATE_ABOVE], "in the last quarter "),
     ):
         most = max(above, count - above)
         if count >= FEWEST and most > max(_binomial(count, level / 2.0), ONE_SIDE * count):
             z = (2.0 * most - count) / np.sqrt(count)
             yield (
                 z,
-                f"has {most:.0f} {when} its {count:.0f} innovations on one side, by {z:.1f} "
+                f"has {when}{most:.0f} of {count:.0f} innovations on one side, by {z:.1f} "
                 "sigma more than chance: the sensor or the motion may have an error that the "
                 "model leaves out; look at its bias, its units and its axes",
             )
