@@ -1,5 +1,7 @@
 """Claims: a mistyped one is refused before anything is simulated; the worst filter decides."""
 
+import math
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -210,3 +212,15 @@ def test_a_claim_names_what_its_nees_is_of():
     row = {"c": ("a", ("b",), ("nees_velocity",), (0.0, 1.0), (0.0, 1.0))}
     with pytest.raises(ValueError, match="nees_velocity"):
         ratio_claims(row, {"c": "NEES of the attitude, one over the other"})
+
+
+def test_a_ratio_to_zero_is_infinite_and_of_zeros_unknown():
+    of = ratio("a", "b", "share")
+    assert of({"a": {"share": 0.5}, "b": {"share": 0.0}}) == math.inf
+    assert math.isnan(of({"a": {"share": 0.0}, "b": {"share": 0.0}}))
+    text = "a is better than b"
+    (claim,) = ratio_claims(
+        {"k": ("a", ("b",), ("share", "rms"), (0, 1), (0, 1))}, {"k": text}
+    ).values()
+    few = {"a": {"share": 0.5, "rms": 1.0}, "b": {"share": 0.0, "rms": 2.0}}
+    assert claim.value(few) == math.inf

@@ -41,7 +41,7 @@ def graded(good: object, fair: object = False) -> str:
 
 def ratio(ours: str, theirs: str, metric: str) -> Callable[[Metrics], float]:
     """A metric of one filter over that of another."""
-    return lambda metrics: metrics[ours][metric] / metrics[theirs][metric]
+    return lambda metrics: _ratio(metrics[ours][metric], metrics[theirs][metric])
 
 
 def ratio_claims(
@@ -60,14 +60,24 @@ def ratio_claims(
             check_words(texts[key], metric)
 
     def largest(ours: str, theirs: Sequence[str], keys: Sequence[str]) -> Callable[..., float]:
-        return lambda metrics: max(
-            metrics[ours][key] / min(metrics[name][key] for name in theirs) for key in keys
-        )
+        def value(metrics: Metrics) -> float:
+            best = (min(metrics[name][key] for name in theirs) for key in keys)
+            found = [_ratio(metrics[ours][key], of) for key, of in zip(keys, best, strict=True)]
+            return float(np.max(found))
+
+        return value
 
     return {
         key: Claim(texts[key], (ours, *theirs), largest(ours, theirs, keys), band, partly)
         for key, (ours, theirs, keys, band, partly) in rows.items()
     }
+
+
+def _ratio(ours: float, best: float) -> float:
+    """`ours` over `best`, which is zero in a draw of few runs in which none diverged."""
+    if best:
+        return ours / best
+    return math.inf if ours else math.nan
 
 
 def check_words(text: str, metric: str) -> None:
