@@ -23,7 +23,7 @@ RUNS = "runs"  # in the metrics of draws: of how many runs they are
 
 
 class Claim(NamedTuple):
-    """What is claimed, and what decides it."""
+    """A claim and the figure that decides it."""
 
     text: str
     needs: tuple[str, ...]  # filters that must have been run, and exist, for anything to be said
@@ -335,7 +335,7 @@ def _farthest(metrics: Mapping[str, Any]) -> float:
 
 
 def _nis_inside(metrics: Mapping[str, Any]) -> bool:
-    """Whether the grand mean NIS of every sensor is inside its band."""
+    """True if the grand mean NIS of every sensor is inside its band."""
     return all(_inside(metrics[k], metrics[f"{k}_band"]) for k in _grand_means(metrics))
 
 
