@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -14,11 +15,13 @@ KEY = "key<fry>"  # of Threefry 2x32, JAX's generator
 KNOWN = {"f8": "real", "b1": "flag", "u4": "word", "u8": "word64"}
 
 
+@lru_cache
 def is_key(dtype: Any) -> bool:
     """Whether a type is one of JAX's keys of random numbers."""
     return bool(jax.numpy.issubdtype(dtype, jax.dtypes.prng_key))
 
 
+@lru_cache
 def kind_of(dtype: Any, where: str = "") -> str:
     """The kind of scalar that holds numbers of a type.
 

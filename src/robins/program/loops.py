@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax.extend import core as jex
 
+from robins.program.calls import Calls
 from robins.program.kinds import kind_of
 from robins.program.liveness import Equation, Variable, jaxpr_of, variables
 from robins.program.nodes import Graph
@@ -185,7 +186,11 @@ class Body:
         return [known.get(v) for v in self.stays]
 
     def program(
-        self, known: dict[Variable, np.ndarray], zeros: dict[int, np.ndarray], unroll: int | None
+        self,
+        known: dict[Variable, np.ndarray],
+        zeros: dict[int, np.ndarray],
+        unroll: int | None,
+        calls: Calls | None = None,
     ) -> Program:
         """One round as a program: number of the round, carried, staying, rows; to carried and rows.
 
@@ -193,12 +198,13 @@ class Body:
             known: numbers of some that stay, which become part of the program.
             zeros: of what is carried, by its number, the entries that are zero.
             unroll: as in `robins.program.trace`.
+            calls: of earlier attempts.
 
         Raises:
             ProgramError: an equation has no place in a program.
         """
         graph = Graph()
-        walk = Walk(graph, unroll)
+        walk = Walk(graph, unroll, calls)
 
         def taken(shape: tuple[int, ...], dtype: Any) -> Nodes:
             return walk.taken(shape, dtype, zero=zeros.get(len(walk.inputs)))

@@ -24,6 +24,10 @@ from robins.program.operations import KINDS, OPERATIONS
 
 Node = int
 
+ALIKE = {"neg", "not", "and", "or", "max", "min"}  # simpler by the nodes that their arguments are
+COMMUTING = {op for op, row in OPERATIONS.items() if row.commutes}
+_DOUBLE = struct.Struct("<d")
+
 
 @dataclass
 class Loop:
@@ -68,6 +72,7 @@ class Graph:
             ``bits``; ``array`` of nodes, and ``pick`` of an array; ``block`` and ``item``; of loops
             ``leaf``, ``loop`` and ``after``.
         value: of a constant its number; what else an op needs besides its arguments.
+        literal: of a constant a text of its number and kind; None of all others.
         scope: the loop in which a node is computed, 0 outside of all.
         within: of each scope the one around it.
     """
@@ -77,6 +82,7 @@ class Graph:
         self.args: list[tuple[Node, ...]] = []
         self.kind: list[str] = []
         self.value: list[Any] = []
+        self.literal: list[bytes | str | None] = []
         self.scope: list[int] = []
         self.within: list[int] = [0]
         self._known: dict[Any, Node] = {}
@@ -105,16 +111,26 @@ class Graph:
         self.args.append(args)
         self.kind.append(kind)
         self.value.append(value)
-        inner = max((self.scope[a] for a in args), default=0)  # later scopes lie further in
-        self.scope.append(inner if scope is None else scope)
+        self.literal.append(key if op == "constant" else None)
+        if scope is None:  # later scopes lie further in
+            scope = max([self.scope[a] for a in args]) if args and len(self.within) > 1 else 0
+        self.scope.append(scope)
         return node
+
+    def ordered(self, op: str, args: tuple[Node, ...], kind: str, value: Any = None) -> Node:
+        """The node of an operation that is not folded.
+
+        The order of arguments is kept as it was written, so that equal trees look equal.
+        """
+        commutes = op in COMMUTING and args[0] > args[1]
+        return self.add(op, args, kind, value, order=args[::-1] if commutes else None)
 
     # ------------------------------------------------------------------------------- leaves
 
     def constant(self, value: Any, kind: str) -> Node:
         """A number that is known."""
         number = KINDS[kind](value)
-        key = struct.pack("<d", number) if kind == "real" else int(number)
+        key = _DOUBLE.pack(number) if kind == "real" else f"{kind} {int(number)}"
         return self.add("constant", (), kind, number, key)
 
     def input(self, index: int, kind: str) -> Node:
@@ -123,26 +139,25 @@ class Graph:
 
     def is_constant(self, node: Node) -> bool:
         """True if its number is known."""
-        return self.op[node] == "constant"
+        return self.literal[node] is not None
 
     def known(self, node: Node) -> Any:
         """The number of a constant, None of any other node."""
-        return self.value[node] if self.op[node] == "constant" else None
+        return None if self.literal[node] is None else self.value[node]
 
     # --------------------------------------------------------------------------- operations
 
     def apply(self, op: str, *args: Node) -> Node:
         """An operation of `OPERATIONS` on nodes of one kind."""
-        row = OPERATIONS[op]
-        kind = self.kind[args[0]]
-        gives = row.gives or kind
-        if all(self.op[a] == "constant" for a in args):
+        row, known = OPERATIONS[op], [self.literal[a] is not None for a in args]
+        gives = row.gives or self.kind[args[0]]
+        if all(known):
             with np.errstate(all="ignore"):
-                return self.constant(row.fold(*(self.value[a] for a in args)), gives)
-        if (simple := self._simpler(op, args)) is not None:
+                return self.constant(row.fold(*[self.value[a] for a in args]), gives)
+        may_be_simpler = op in ALIKE or any(known)
+        if may_be_simpler and (simple := self._simpler(op, args)) is not None:
             return simple
-        # The order of arguments is kept as it was written, so that equal trees look equal.
-        return self.add(op, args, gives, order=sorted(args) if row.commutes else args)
+        return self.ordered(op, args, gives)
 
     def select(self, condition: Node, new: Node, old: Node) -> Node:
         """``new`` where the condition holds, else ``old``."""
@@ -318,4 +333,4 @@ class Graph:
         return None
 
     def _is(self, node: Node, number: int) -> bool:
-        return self.op[node] == "constant" and bool(self.value[node] == number)
+        return self.literal[node] is not None and bool(self.value[node] == number)

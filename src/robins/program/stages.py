@@ -215,7 +215,7 @@ class Loop:
             return
         body, zeros = self.body, {k: zero_in_all(g) for k, g in enumerate(begin) if k}
         self._write = lambda: lasting(
-            lambda some: [body.program(known, some, self._unroll)], zeros
+            lambda some, calls: [body.program(known, some, self._unroll, calls)], zeros
         )[0]
         try:
             if self._engine is interpreted_rounds:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import jax
@@ -15,6 +16,7 @@ import numpy as np
 from jax.extend import core as jex
 
 from robins import _float64  # noqa: F401
+from robins.program.calls import Calls
 from robins.program.kinds import kind_of, numbers_of
 from robins.program.nodes import Graph, Node
 from robins.program.refusal import ProgramError
@@ -113,10 +115,13 @@ class Walk:
         graph: of nodes.
         inputs: arguments so far; reals count by themselves, all else too.
         unroll: as in `trace`.
+        calls: those that earlier walks wrote with the same `unroll`.
     """
 
-    def __init__(self, graph: Graph, unroll: int | None = None):
+    def __init__(self, graph: Graph, unroll: int | None = None, calls: Calls | None = None):
         self.graph, self.unroll = graph, unroll
+        self._calls = Calls() if calls is None else calls
+        self._constants: dict[int, tuple[Any, Nodes]] = {}  # by id, which the value keeps its own
         self.inputs: list[Leaf] = []
         self.alike: list[tuple[Node, ...]] = []  # rows of arrays, which may be computed in a loop
 
@@ -135,21 +140,27 @@ class Walk:
 
     def constants(self, value: Any) -> Nodes:
         """Nodes of known numbers."""
-        array = numbers_of(value)
-        kind = kind_of(array.dtype)
-        return self.each(lambda x: self.graph.constant(x, kind), array)
+        if (found := self._constants.get(id(value))) is None:
+            array = numbers_of(value)
+            kind = kind_of(array.dtype)
+            nodes = self.each(lambda x: self.graph.constant(x, kind), array)
+            found = self._constants[id(value)] = value, nodes
+        return found[1]
 
     def each(self, function: Callable[..., Node], *arrays: np.ndarray) -> Nodes:
         """A function of nodes on all entries of arrays of one shape."""
-        if len({a.shape for a in arrays}) > 1:
+        shape = arrays[0].shape
+        if any(a.shape != shape for a in arrays):
             arrays = tuple(np.broadcast_arrays(*arrays))
+            shape = arrays[0].shape
+        if not shape:
+            return np.array(function(*[a.item() for a in arrays]), dtype=np.int64)
         flat = [a.ravel().tolist() for a in arrays]
-        made = [function(*entries) for entries in zip(*flat, strict=True)]
-        return np.array(made, dtype=np.int64).reshape(arrays[0].shape)
+        return np.array(list(map(function, *flat)), dtype=np.int64).reshape(shape)
 
     def apply(self, op: str, *arrays: Nodes) -> Nodes:
         """An operation on all entries."""
-        return self.each(lambda *nodes: self.graph.apply(op, *nodes), *arrays)
+        return self.each(partial(self.graph.apply, op), *arrays)
 
     def wrapped(self, nodes: Nodes, dtype: Any) -> Nodes:
         """Whole numbers as a type of fewer than 64 bits holds them; all others as they are."""
@@ -176,9 +187,13 @@ class Walk:
 
     def open(self, jaxpr: Any, consts: Sequence[Nodes], args: Sequence[Nodes]) -> list[Nodes]:
         """Results of a jaxpr on arrays of nodes."""
-        values: dict[Any, Nodes] = {}
-        values.update(zip(jaxpr.constvars, consts, strict=True))
-        values.update(zip(jaxpr.invars, args, strict=True))
+        given = [*consts, *args]
+        return self._calls.results(
+            self.graph, jaxpr, given, self.alike, lambda: self._written(jaxpr, given)
+        )
+
+    def _written(self, jaxpr: Any, given: Sequence[Nodes]) -> list[Nodes]:
+        values = dict(zip([*jaxpr.constvars, *jaxpr.invars], given, strict=True))
 
         def read(v: Any) -> Nodes:
             return self.constants(v.val) if isinstance(v, jex.Literal) else values[v]
@@ -301,7 +316,11 @@ def trace_steps(
                 fix="return (state, ...)",
             )
     zeros = {k: positive_zeros(numbers_of(leaf)) for k, leaf in enumerate(leaves)}
-    return lasting(lambda zeros: [_program(*jaxpr, unroll, zeros) for jaxpr in jaxprs], zeros)
+
+    def made(zeros: Zeros, calls: Calls) -> list[Program]:
+        return [_program(*jaxpr, unroll, zeros, calls) for jaxpr in jaxprs]
+
+    return lasting(made, zeros)
 
 
 def positive_zeros(a: np.ndarray) -> np.ndarray:
@@ -314,16 +333,17 @@ def positive_zeros(a: np.ndarray) -> np.ndarray:
 Zeros = dict[int, np.ndarray]  # of an argument, by its number, entries that are zero
 
 
-def lasting(made: Callable[[Zeros], list[Program]], zeros: Zeros) -> list[Program]:
+def lasting(made: Callable[[Zeros, Calls], list[Program]], zeros: Zeros) -> list[Program]:
     """The programs of steps that change one state, with those of some zeros of it that last.
 
     Args:
         made: the programs that take some entries of their first arguments for zero, whose next
-            values their first results are.
+            values their first results are; and the calls of earlier attempts.
         zeros: the entries to try.
     """
+    calls = Calls()
     while True:
-        programs, kept = made(zeros), zeros
+        programs, kept = made(zeros, calls), zeros
         for program in programs:
             zero = program.graph.constant(0, "real")
             kept = {k: np.asarray(m & (program.outputs[k] == zero)) for k, m in kept.items()}
@@ -345,12 +365,17 @@ def _jaxpr(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, An
 
 
 def _program(
-    jaxpr: Any, given: Any, results: Any, unroll: int | None, zeros: dict[int, np.ndarray]
+    jaxpr: Any,
+    given: Any,
+    results: Any,
+    unroll: int | None,
+    zeros: Zeros,
+    calls: Calls | None = None,
 ) -> Program:
     """The program of a jaxpr, some entries of its arguments known to be zero."""
     import robins.program.primitives  # noqa: F401
 
-    walk = Walk(Graph(), unroll)
+    walk = Walk(Graph(), unroll, calls)
     nodes = [
         walk.taken(leaf.shape, leaf.dtype, leaf.path, zeros.get(index))
         for index, leaf in enumerate(_leaves(given, "arguments"))
