@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Array
 
+from robins.campaign.machine import first_run, with_stack
 from robins.campaign.monte_carlo import contender, reported_rows, solved, worlds
 from robins.filters import Belief, Filter, Model
 from robins.filters.analysis.bound import bound_along, linearised, used_sensors
@@ -25,6 +26,8 @@ from robins.filters.analysis.observability import (
 from robins.filters.model import Data
 from robins.filters.run import nothing
 from robins.manifold import State, dim, is_element
+from robins.program.interpreter import interpreted_rounds
+from robins.program.stages import Staged
 from robins.results import array, variable
 from robins.systems.study import Case, Problem, StateBlock
 from robins.systems.tables import block_array
@@ -100,20 +103,30 @@ def bound_sigma(problem: Problem, name: str, world: Any) -> np.ndarray:
         world: one run, as the problem simulates it.
     """
     c = contender(problem, name)
-    return np.sqrt(np.asarray(_variances(c.filter, c.model, c.case, c.reported, world)))
+
+    def variances(world: Data) -> Array:
+        it = _case(c.filter, c.model, c.case, world)
+        line = linearised(c.model, _start(it), it.truth, it.y, it.u, it.aux)
+        rows, _ = reported_rows(c.reported, it)
+        return _reported(rows, bound_along(line, _start(it).factor).factor)
+
+    shape = jax.eval_shape(lambda: world)
+    one = jax.tree_util.tree_map(lambda x: x[None], world)
+    # What the interpreter cannot do, or all where it cannot be built, JAX computes.
+    return np.sqrt(with_stack(lambda: Staged(variances, shape, engine=interpreted_rounds)(one)[0]))
+
+
+def first_world(problem: Problem) -> Any:
+    """The first run of a problem, as it simulates it."""
+    number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
+    simulate = Staged(problem.simulate, number, engine=interpreted_rounds)
+    return first_run(with_stack(lambda: simulate(np.arange(1))))
 
 
 def _case(filter_: Filter, model: Model, case: Callable[[Data], Case], world: Data) -> Case:
     """The case of a run. In closed loop it takes the filter to know where the vehicle went."""
     it = case(world)
     return it if it.loop is None else solved(filter_, model, it, nothing)[1]
-
-
-@jax.jit
-def _variances(filter_, model, case, reported, world) -> Array:
-    it = _case(filter_, model, case, world)
-    line = linearised(model, _start(it), it.truth, it.y, it.u, it.aux)
-    return _reported(reported_rows(reported, it)[0], bound_along(line, _start(it).factor).factor)
 
 
 def _left(rows: np.ndarray, L: np.ndarray, D: np.ndarray) -> np.ndarray:

@@ -180,55 +180,75 @@ def _version() -> str | None:
 def digest(parts: Iterable[Any]) -> str:
     """A digest of jaxprs, arrays, numbers and texts, nested in any way."""
     draws = jax.config.values["jax_threefry_partitionable"]  # which a jaxpr does not say
-    found = hashlib.sha256(f"{_version()} {draws}".encode())
-    _feed(found, list(parts), {})
-    return found.hexdigest()[:32]
+    found = _Digest()
+    found.feed([f"{_version()} {draws}", *parts])
+    return found.digest()
 
 
-def _feed(to: Any, value: Any, names: dict[Any, int]) -> None:
-    """Add a value to a digest; names: numbers of the variables so far."""
-    match value:
-        case jex.ClosedJaxpr():
-            _feed(to, value.consts, {})
-            _feed(to, value.jaxpr, {})
-        case jex.Jaxpr():
-            inner: dict[Any, int] = {}
-            for v in (*value.constvars, *value.invars):
-                _number(to, v, inner)
-            for e in value.eqns:
-                call = called(e)
-                to.update(f"{'call' if call else e.primitive.name}(".encode())
-                _feed(to, call or e.params, {})
-                _feed(to, e.invars, inner)
-                for v in e.outvars:
-                    _number(to, v, inner)
-            _feed(to, value.outvars, inner)
-        case jex.Literal():
-            _feed(to, numbers_of(value.val), names)
-            to.update(str(value.aval).encode())
-        case jex.Var():
-            to.update(f"v{names[value]}".encode())
-        case np.ndarray() | np.generic() | jax.Array():
-            array = np.ascontiguousarray(numbers_of(value))
-            to.update(f"{array.dtype}{np.shape(array)}".encode())
-            to.update(array.tobytes())
-        case Mapping():
-            for key in sorted(value):
-                to.update(f"{key}:".encode())
-                _feed(to, value[key], names)
-        case enum.Enum():
-            to.update(str(value).encode())
-        case list() | tuple() if not hasattr(value, "_fields"):
-            to.update(f"[{len(value)}".encode())
-            for one in value:
-                _feed(to, one, names)
-        case _:
-            # Functions among the parameters, of JAX's generators and rules of batching, make no
-            # node; they are told apart by name alone.
-            text = re.sub(r" at 0x[0-9a-f]+", "", repr(value))
-            to.update(f"{type(value).__name__} {text};".encode())
+class _Digest:
+    """A digest that is fed values; jaxprs within by digests of their own, each made once."""
+
+    def __init__(self, jaxprs: dict[int, str] | None = None) -> None:
+        self._texts: list[str | bytes] = []
+        self._jaxprs: dict[int, str] = {} if jaxprs is None else jaxprs
+        self._names: dict[Any, int] = {}  # numbers of the variables so far
+
+    def digest(self) -> str:
+        texts = (t.encode() if isinstance(t, str) else t for t in self._texts)
+        return hashlib.sha256(b"".join(texts)).hexdigest()[:32]
+
+    def feed(self, value: Any) -> None:
+        """Add a value."""
+        match value:
+            case jex.ClosedJaxpr():
+                self.feed(value.consts)
+                self.feed(value.jaxpr)
+            case jex.Jaxpr():
+                if (found := self._jaxprs.get(id(value))) is None:
+                    inner = _Digest(self._jaxprs)
+                    inner._equations(value)
+                    found = self._jaxprs[id(value)] = inner.digest()
+                self._texts.append(found)
+            case jex.Literal():
+                self.feed(numbers_of(value.val))
+                self._texts.append(_text_of(value.aval))
+            case jex.Var():
+                self._texts.append(f"v{self._names[value]}")
+            case np.ndarray() | np.generic() | jax.Array():
+                array = np.ascontiguousarray(numbers_of(value))
+                self._texts += [f"{array.dtype.str}{np.shape(array)}", array.tobytes()]
+            case Mapping():
+                for key in sorted(value):
+                    self._texts.append(f"{key}:")
+                    self.feed(value[key])
+            case enum.Enum():
+                self._texts.append(str(value))
+            case list() | tuple() if not hasattr(value, "_fields"):
+                self._texts.append(f"[{len(value)}")
+                for one in value:
+                    self.feed(one)
+            case _:
+                # Functions among the parameters, of JAX's generators and rules of batching, make
+                # no node; they are told apart by name alone.
+                text = re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+                self._texts.append(f"{type(value).__name__} {text};")
+
+    def _equations(self, jaxpr: jex.Jaxpr) -> None:
+        self._number([*jaxpr.constvars, *jaxpr.invars])
+        for e in jaxpr.eqns:
+            call = called(e)
+            self._texts.append(f"{'call' if call else e.primitive.name}(")
+            self.feed(call or e.params)
+            self.feed(e.invars)
+            self._number(e.outvars)
+        self.feed(jaxpr.outvars)
+
+    def _number(self, variables: Iterable[Any]) -> None:
+        for v in variables:
+            self._names[v] = len(self._names)
+            self._texts.append(f"v{self._names[v]}:{_text_of(v.aval)};")
 
 
-def _number(to: Any, v: Any, names: dict[Any, int]) -> None:
-    names[v] = len(names)
-    to.update(f"v{names[v]}:{v.aval};".encode())
+@lru_cache
+def _text_of(aval: Any) -> str:
+    return str(aval)

@@ -11,12 +11,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from robins import _float64, scenario
 from robins.campaign import check_machine, retention
-from robins.campaign.bound import bound_sigma
+from robins.campaign.bound import bound_sigma, first_world
 from robins.campaign.gather import State, blank, example_of, gather
 from robins.campaign.machine import machine_for
 from robins.campaign.outcome import outcome_of
@@ -294,7 +293,7 @@ def _bound(problem: Problem) -> np.ndarray | None:
     of = problem.bound_of
     if of is None or of not in problem.contenders:
         return None
-    return bound_sigma(problem, of, jax.jit(problem.simulate)(jnp.asarray(0)))
+    return bound_sigma(problem, of, first_world(problem))
 
 
 def campaign_show(where: Where, run: int, *, progress: Progress = silent) -> Outcome:
