@@ -76,6 +76,7 @@ class Writer:
         self.around: dict[int, int] = {0: -1}
         self.spans: dict[int, tuple[int, int]] = {}
         self.scope_of: dict[Value, int] = {}  # of a value, where it is written
+        self._places: dict[Value, tuple[Value, int]] = {}
         live = program.live
         self.results = [n for nodes in program.outputs for n in nodes.ravel().tolist()]
         self.inner: dict[int, list[Node]] = defaultdict(list)
@@ -236,6 +237,11 @@ class Writer:
 
     def place(self, value: Value) -> tuple[Value, int]:
         """The value that holds another, and how many registers behind its first."""
+        if (found := self._places.get(value)) is None:
+            found = self._places[value] = self._place(value)
+        return found
+
+    def _place(self, value: Value) -> tuple[Value, int]:
         if isinstance(value, tuple):
             return value, 0
         graph = self.graph
@@ -317,6 +323,7 @@ class Tape:
                 self._constants.setdefault(bits, nx + nk + len(self._constants))
         self._count = nx + nk + len(self._constants)  # registers
         self._of: dict[Value, int] = {}
+        self._lasting: dict[Value, int] = {}  # registers that are not taken back
         self._free: dict[int, list[int]] = defaultdict(list)  # by how many lie together
         self._ends: dict[int, list[tuple[Value, int]]] = defaultdict(list)
         self._rows: list[tuple[int, ...]] = []
@@ -336,7 +343,7 @@ class Tape:
         )
         sizes = len(self._rows), len(pairs), self._count, self._scratch, nx, nk, ny, nm
         self._hold(arrays, np.array(sizes, np.int64))
-        del self._writer, self._rows, self._lists, self._of, self._free, self._ends
+        del self._writer, self._rows, self._lists, self._of, self._lasting, self._free, self._ends
 
     @classmethod
     def of(cls, arrays: Sequence[np.ndarray], sizes: np.ndarray) -> Tape:
@@ -361,6 +368,14 @@ class Tape:
 
     def _register(self, value: Value) -> int:
         value, behind = self._writer.place(value)
+        if (first := self._of.get(value)) is None:
+            first = self._lasting.get(value)
+            if first is None:
+                first = self._lasting[value] = self._argument(value)
+        return first + behind
+
+    def _argument(self, value: Value) -> int:
+        """Register of an argument of the program, or of a constant."""
         match value:
             case ("x", int(k)):
                 return k
@@ -368,7 +383,7 @@ class Tape:
                 return self._nx + k
             case ("constant", kind, number):
                 return self._constants[self._bits(kind, number)]
-        return self._of[value] + behind
+        raise KeyError(value)
 
     def _assemble(self) -> None:
         """Write all instructions; where jumps go is known in the end."""
