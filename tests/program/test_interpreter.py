@@ -20,6 +20,7 @@ from robins.program import (
     flags,
     interpreted_step,
     interpreter,
+    trace,
 )
 from robins.program.interpreter import interpreter_of_many, interpreter_of_one
 from robins.program.operations import KINDS, OPERATIONS
@@ -99,6 +100,12 @@ def test_each_instruction_has_the_bits_of_c():
         for got in (one(*case), *([a[k, 0] for a in many] for many in batches[k >= 20 :])):
             for x, y in zip(bits(got), want, strict=True):
                 np.testing.assert_array_equal(x, y)
+
+
+def test_zeros_keep_their_signs():
+    program = trace(lambda x: (jnp.arctan2(0.0, x), jnp.arctan2(-0.0, x)), np.float64(1.0))
+    for found in (Native(program, interpreted_step)(-2.0), in_one_round(program, [(-2.0,)] * 8)):
+        assert [float(np.ravel(a)[0]) for a in found] == [np.pi, -np.pi]
 
 
 def test_every_operation_is_an_instruction():

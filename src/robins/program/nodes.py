@@ -264,15 +264,18 @@ class Graph:
 
     def live(self, roots: Sequence[Node]) -> list[Node]:
         """All nodes that some need, in the order of computation."""
+        op, args = self.op, self.args
         seen: set[Node] = set()
         ahead = list(roots)
         while ahead:
             node = ahead.pop()
-            if node not in seen:
-                seen.add(node)
-                ahead += self.args[node]
-                if self.op[node] == "loop":
-                    ahead += self.value[node].changes
+            if node in seen:
+                continue
+            seen.add(node)
+            ahead += args[node]
+            if op[node] == "loop":
+                ahead += self.value[node].changes
+            elif op[node] == "after":
                 ahead += self.kept([node]).values()
         return sorted(seen)
 

@@ -26,25 +26,26 @@ CHANGES = ("keep", "move")  # instructions that change what is there
 # A value that an instruction makes or reads: a node; or by name an argument, a constant, or what a
 # loop carries from round to round.
 Value = int | tuple
+Place = tuple[Value, int]  # the value that holds another, and how many registers behind its first
 
 
-@dataclass
+@dataclass(slots=True)
 class Instruction:
     """An operation before its registers are known.
 
     Attributes:
         code: its name; empty if registers are only set aside.
-        result: a value.
-        args: values.
-        listed: values in a list, behind `numbers`.
+        result: the place of a value.
+        args: places of values.
+        listed: places of values in a list, behind `numbers`.
         numbers: as they are.
         count: of results, in registers one after the other.
     """
 
     code: str
-    result: Value | None = None
-    args: tuple[Value, ...] = ()
-    listed: tuple[Value, ...] = ()
+    result: Place | None = None
+    args: tuple[Place, ...] = ()
+    listed: tuple[Place, ...] = ()
     numbers: tuple[int, ...] = ()
     count: int = 1
 
@@ -56,8 +57,10 @@ class Instruction:
     @property
     def read(self) -> list[Value]:
         """Values that have to be there when it is carried out."""
-        changed = [self.result] if self.result is not None and self.code in CHANGES else []
-        return [*self.args, *self.listed, *changed]
+        read = [value for value, _ in self.args + self.listed]
+        if self.result is not None and self.code in CHANGES:
+            read.append(self.result[0])
+        return read
 
 
 class Writer:
@@ -65,7 +68,7 @@ class Writer:
 
     Attributes:
         written: instructions.
-        given: values that are the results.
+        given: places of the values that are the results.
         around: of each loop, by its scope, that around it.
         spans: of each loop, by its scope, the first of its instructions and the one behind it.
     """
@@ -76,7 +79,7 @@ class Writer:
         self.around: dict[int, int] = {0: -1}
         self.spans: dict[int, tuple[int, int]] = {}
         self.scope_of: dict[Value, int] = {}  # of a value, where it is written
-        self._places: dict[Value, tuple[Value, int]] = {}
+        self._places: dict[Value, Place] = {}
         live = program.live
         self.results = [n for nodes in program.outputs for n in nodes.ravel().tolist()]
         self.inner: dict[int, list[Node]] = defaultdict(list)
@@ -92,7 +95,7 @@ class Writer:
         self.done: set[Node] = set()
         self._scope(0, set(live))
         # A result that is not a real is given as a whole number.
-        self.given = [self._as_whole(n) for n in self.results]
+        self.given = [self.place(self._as_whole(n)) for n in self.results]
 
     def _products(self, live: list[Node]) -> list[tuple[Node, Node]]:
         """Sums with the product that is part of them."""
@@ -119,7 +122,17 @@ class Writer:
         numbers: tuple[int, ...] = (),
         count: int = 1,
     ) -> None:
-        self.written.append(Instruction(code, result, args, listed, numbers, count))
+        place = self.place
+        self.written.append(
+            Instruction(
+                code,
+                None if result is None else place(result),
+                tuple([place(v) for v in args]),
+                tuple([place(v) for v in listed]),
+                numbers,
+                count,
+            )
+        )
 
     def _scope(self, scope: int, only: set[Node]) -> None:
         products = set(self.joined.values())
@@ -235,17 +248,20 @@ class Writer:
 
     # ---------------------------------------------------------------------------------- registers
 
-    def place(self, value: Value) -> tuple[Value, int]:
-        """The value that holds another, and how many registers behind its first."""
+    def place(self, value: Value) -> Place:
+        """Where a value lies."""
         if (found := self._places.get(value)) is None:
             found = self._places[value] = self._place(value)
         return found
 
-    def _place(self, value: Value) -> tuple[Value, int]:
+    def _place(self, value: Value) -> Place:
         if isinstance(value, tuple):
             return value, 0
         graph = self.graph
         match graph.op[value]:
+            case "constant" if isinstance(bits := graph.literal[value], bytes):
+                # Not as a number: -0 would be 0.
+                return ("constant", "bits", int.from_bytes(bits, "little", signed=True)), 0
             case "constant":
                 return ("constant", graph.kind[value], graph.value[value]), 0
             case "leaf":
@@ -269,14 +285,13 @@ class Writer:
         scope = self._scopes()
         for at, one in enumerate(self.written):
             for value in one.read:
-                value, _ = self.place(value)
-                until, s = at, scope[at]
-                while s != self.scope_of.get(value, 0):
+                until, s, own = at, scope[at], self.scope_of.get(value, 0)
+                while s != own:
                     until = max(until, self.spans[s][1] - 1)
                     s = self.around[s]
                 last[value] = max(last.get(value, 0), until)
-        for value in self.given:
-            last[self.place(value)[0]] = len(self.written)
+        for value, _ in self.given:
+            last[value] = len(self.written)
         return last
 
     def depth(self, scope: int) -> int:
@@ -316,8 +331,8 @@ class Tape:
         (nx, nk), (ny, nm) = counts(program.inputs), counts(program.results)
         self._nx = nx
         self._constants: dict[int, int] = {}
-        wanted = [writer.place(v)[0] for one in writer.written for v in one.read]
-        for value in [*wanted, *(writer.place(v)[0] for v in writer.given)]:
+        wanted = [v for one in writer.written for v in one.read]
+        for value in dict.fromkeys([*wanted, *(v for v, _ in writer.given)]):
             if isinstance(value, tuple) and value[0] == "constant":
                 bits = self._bits(*value[1:])
                 self._constants.setdefault(bits, nx + nk + len(self._constants))
@@ -360,14 +375,16 @@ class Tape:
     def _bits(self, kind: str, value: np.generic | int) -> int:
         """The 64 bits of a number in a register; a word fills both halves."""
         number = np.zeros(1, np.int64)
-        if kind == "flag":
+        if kind == "bits":
+            number[0] = value
+        elif kind == "flag":
             number[0] = self._flag * bool(value)
         else:
             number.view(KINDS[kind])[:] = value
         return int(number[0])
 
-    def _register(self, value: Value) -> int:
-        value, behind = self._writer.place(value)
+    def _register(self, place: Place) -> int:
+        value, behind = place
         if (first := self._of.get(value)) is None:
             first = self._lasting.get(value)
             if first is None:
@@ -398,7 +415,7 @@ class Tape:
                 self._free_after(at)
             result = 0
             if one.result is not None:
-                value, behind = writer.place(one.result)
+                value, behind = one.result
                 if value not in self._of:
                     self._take(value, one.count, max(last.get(value, 0), at + 1))
                 result = self._of[value] + behind

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -94,7 +94,7 @@ class Program:
     unroll: int | None = None
     zeros: dict[int, np.ndarray] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def live(self) -> list[Node]:
         """The nodes that its results need, in the order of computation."""
         return self.graph.live([n for nodes in self.outputs for n in nodes.ravel().tolist()])
