@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -11,9 +11,9 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Array
 
-from robins.campaign.machine import first_run, with_stack
-from robins.campaign.monte_carlo import contender, reported_rows, solved, worlds
-from robins.filters import Belief, Filter, Model
+from robins.campaign.machine import with_stack
+from robins.campaign.monte_carlo import contender, reported_rows, whole_case, worlds
+from robins.filters import Belief
 from robins.filters.analysis.bound import bound_along, linearised, used_sensors
 from robins.filters.analysis.observability import (
     NOTHING,
@@ -24,12 +24,11 @@ from robins.filters.analysis.observability import (
     worded,
 )
 from robins.filters.model import Data
-from robins.filters.run import nothing
 from robins.manifold import State, dim, is_element
 from robins.program.interpreter import interpreted_rounds
 from robins.program.stages import Staged
 from robins.results import array, variable
-from robins.systems.study import Case, Problem, StateBlock
+from robins.systems.study import Problem, StateBlock
 from robins.systems.tables import block_array
 
 FEW = 1.0  # eigenvalue of the Gramian below which the prior still knows more of a direction
@@ -105,7 +104,7 @@ def bound_sigma(problem: Problem, name: str, world: Any) -> np.ndarray:
     c = contender(problem, name)
 
     def variances(world: Data) -> Array:
-        it = _case(c.filter, c.model, c.case, world)
+        it = whole_case(c.filter, c.model, c.case(world))
         line = linearised(c.model, _start(it), it.truth, it.y, it.u, it.aux)
         rows, _ = reported_rows(c.reported, it)
         return _reported(rows, bound_along(line, _start(it).factor).factor)
@@ -114,19 +113,6 @@ def bound_sigma(problem: Problem, name: str, world: Any) -> np.ndarray:
     one = jax.tree_util.tree_map(lambda x: x[None], world)
     # What the interpreter cannot do, or all where it cannot be built, JAX computes.
     return np.sqrt(with_stack(lambda: Staged(variances, shape, engine=interpreted_rounds)(one)[0]))
-
-
-def first_world(problem: Problem) -> Any:
-    """The first run of a problem, as it simulates it."""
-    number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
-    simulate = Staged(problem.simulate, number, engine=interpreted_rounds)
-    return first_run(with_stack(lambda: simulate(np.arange(1))))
-
-
-def _case(filter_: Filter, model: Model, case: Callable[[Data], Case], world: Data) -> Case:
-    """The case of a run. In closed loop it takes the filter to know where the vehicle went."""
-    it = case(world)
-    return it if it.loop is None else solved(filter_, model, it, nothing)[1]
 
 
 def _left(rows: np.ndarray, L: np.ndarray, D: np.ndarray) -> np.ndarray:
@@ -162,7 +148,7 @@ class _Found(NamedTuple):
 
 @jax.jit
 def _bound(filter_, model, case, reported, subsets, world) -> _Found:
-    it = _case(filter_, model, case, world)
+    it = whole_case(filter_, model, case(world))
     start = _start(it)
     line = linearised(model, start, it.truth, it.y, it.u, it.aux)
 

@@ -307,6 +307,14 @@ def with_stack(function: Callable[[], Any]) -> Any:
         threading.stack_size(before)
 
 
+def first_worlds(problem: Problem, count: int) -> Any:
+    """The first runs of a problem, with a leading axis, by the interpreter where it can be."""
+    sys.audit("robins.simulate", count)  # counted by tests
+    number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
+    simulate = Staged(problem.simulate, number, engine=interpreted_rounds)
+    return with_stack(lambda: simulate(np.arange(count)))
+
+
 def first_run(world: Any) -> Any:
     """First of the worlds with a leading axis of runs, holding none of the others."""
 

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from robins.campaign.monte_carlo import solved, worlds
+from robins.campaign.machine import first_worlds
+from robins.campaign.monte_carlo import whole_case
 from robins.filters import Belief, Code, Filter, Model, StepInfo
 from robins.filters.kalman import WRONG
-from robins.filters.run import nothing
 from robins.filters.trees import select
 from robins.manifold import State
 from robins.systems.study import Case, Problem
@@ -71,9 +71,10 @@ def board_runs(problem: Problem, name: str, count: int) -> list[BoardRun]:
     """The first runs of a problem as one of its filters is given them."""
     contender = problem.contenders[name]
     model, found = contender.model, []
-    for batch, _ in worlds(problem, count, 1):
-        world = jax.tree_util.tree_map(lambda a: a[0], batch)
-        _, case, _ = solved(contender.filter, model, contender.case(world), nothing)
+    batch = first_worlds(problem, count)
+    for k in range(count):
+        world = jax.tree_util.tree_map(lambda a, k=k: a[k], batch)
+        case = whole_case(contender.filter, model, contender.case(world))
         start = case.start
         state = contender.filter.init(start, model.dims) if isinstance(start, Belief) else start
         state = jax.tree_util.tree_map(lambda x: jnp.asarray(x, jnp.asarray(x).dtype), state)

@@ -15,9 +15,9 @@ import numpy as np
 
 from robins import _float64, scenario
 from robins.campaign import check_machine, retention
-from robins.campaign.bound import bound_sigma, first_world
+from robins.campaign.bound import bound_sigma
 from robins.campaign.gather import State, blank, example_of, gather
-from robins.campaign.machine import machine_for
+from robins.campaign.machine import first_run, first_worlds, machine_for
 from robins.campaign.outcome import outcome_of
 from robins.campaign.plan import (
     KEPT,
@@ -293,7 +293,7 @@ def _bound(problem: Problem) -> np.ndarray | None:
     of = problem.bound_of
     if of is None or of not in problem.contenders:
         return None
-    return bound_sigma(problem, of, first_world(problem))
+    return bound_sigma(problem, of, first_run(first_worlds(problem, 1)))
 
 
 def campaign_show(where: Where, run: int, *, progress: Progress = silent) -> Outcome:
