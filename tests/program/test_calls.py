@@ -1,11 +1,14 @@
-"""Calls that were walked before are copied: the same nodes as those of a walk."""
+"""Calls of one form are written from a template: the same nodes as those of a walk."""
+
+import gc
+import weakref
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from robins.program import calls, trace, trace_steps
+from robins.program import Graph, Native, calls, interpreted_step, trace, trace_steps
 from robins.program.nodes import COMMUTING
 from robins.program.trace import Walk
 
@@ -42,6 +45,21 @@ def finite(fine, a):
 
 
 @jax.jit
+def chosen(a, b, c):
+    return jnp.where(c > 0.0, a, jnp.sin(b) * 2.0) + c
+
+
+@jax.jit
+def used(every, fine, inside, x):
+    return jnp.where(every & (fine & inside), x, 0.0) + x
+
+
+@jax.jit
+def picked(a, k):
+    return a[k] * a[1] + jnp.sum(a)
+
+
+@jax.jit
 def gain(S, H):
     L = jnp.linalg.cholesky(S)
     return jax.scipy.linalg.solve_triangular(L, H, lower=True)
@@ -70,23 +88,68 @@ def with_finite(x):
     return [finite(fine, x), finite(jnp.isfinite(x + x), x + x), finite(x > 0, x), finite(fine, -x)]
 
 
+def made_of_one_another(x):
+    """An argument that the first call makes again is not that of the others."""
+    first = chosen(jnp.sin(x[1]) * 2.0, x[1], -x[2])
+    return [first, chosen(x[0], x[2], -x[1]), chosen(x[1], x[0], -x[2])]
+
+
+def flags_made_of_one_another(x):
+    fine, inside, last = x[0] > 1.0, x[1] > 0.2, x[2] > 0.1
+    first = used(fine & inside, fine, inside, x[0])
+    return [first, used(last, inside, last, x[1]), used(inside, last, fine, x[2])]
+
+
+def with_places(x):
+    k = jnp.asarray(4.0 * x[0], int)
+    long = jnp.concatenate([x, 2.0 * x])
+    return [picked(long, k), picked(long[::-1], k), picked(jnp.full(6, x[1]), k)]
+
+
 def with_matrices(x):
     S = jnp.eye(3) + jnp.outer(x, x)
     return [gain(S, S[:, :1]), gain(jnp.diag(x), S[:, :1]), gain(S + 1.0, S[:, 1:2]), gain(S, S)]
 
 
 @pytest.mark.parametrize(
-    "function",
-    [with_numbers, with_negatives, with_same, with_flags, with_finite, with_matrices],
+    ("function", "templates"),
+    [
+        (with_numbers, 1),
+        (with_negatives, 2),
+        (with_same, 1),
+        (with_flags, 2),
+        (with_finite, 1),
+        (with_places, 1),
+        (with_matrices, 1),
+        (made_of_one_another, 0),
+        (flags_made_of_one_another, 0),
+    ],
 )
-def test_a_copy_has_the_nodes_of_a_walk(function, monkeypatch):
-    x, copies = np.array([0.3, 0.7, 1.9]), []
-    into = calls.Copy.into
-    monkeypatch.setattr(calls.Copy, "into", lambda *all_: copies.append(1) or into(*all_))
-    found = trees(trace(function, x))
-    assert copies
+def test_what_a_template_writes_has_the_nodes_of_a_walk(function, templates, monkeypatch):
+    x, written = np.array([0.3, 0.7, 1.9]), []
+    into = calls.Template.into
+    monkeypatch.setattr(calls.Template, "into", lambda *all_: written.append(1) or into(*all_))
+    program = trace(function, x)
+    assert len(written) >= templates
+    for found, wanted in zip(Native(program, interpreted_step)(x), function(x), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-14, atol=1e-15)
     monkeypatch.setattr(calls, "WORTH", 10**9)
-    assert found == trees(trace(function, x))
+    assert trees(program) == trees(trace(function, x))
+
+
+def test_graphs_of_earlier_attempts_are_not_held():
+    held, graph, other = calls.Calls(), Graph(), Graph()
+    jaxpr = jax.make_jaxpr(lambda x: jnp.sin(x) * jnp.cos(x) + x * x)(1.0).jaxpr
+    given = [np.array(graph.input(0, "real"))]
+    held.results(graph, jaxpr, given, [], lambda: given)
+    gone = weakref.ref(graph)
+    held.keep([graph])
+    del graph
+    gc.collect()
+    assert gone() is not None
+    held.keep([other])
+    gc.collect()
+    assert gone() is None
 
 
 def test_a_call_with_a_loop_is_walked_each_time():

@@ -109,6 +109,10 @@ def test_a_digest_tells_structures_and_numbers_apart():
     def jaxpr(function, *like):
         return jax.make_jaxpr(function)(*like)
 
+    def twice(function):
+        inner = jax.jit(function)
+        return lambda a: inner(a) * inner(a + 1.0)
+
     table = np.arange(3.0)
     different = [
         jaxpr(lambda a, b: a + b, 1.0, 2.0),
@@ -121,6 +125,8 @@ def test_a_digest_tells_structures_and_numbers_apart():
         jaxpr(lambda a: a + (table + 1.0), np.ones(3)),
         jaxpr(lambda a: jnp.sum(a, 0), np.ones((2, 2))),
         jaxpr(lambda a: jnp.sum(a, 1), np.ones((2, 2))),
+        jaxpr(twice(lambda a: a * 2.0 + 1.0), 1.0),
+        jaxpr(twice(lambda a: a * 2.0 - 1.0), 1.0),
         {"a": np.float64(1.0)},
         {"a": 1},
         [np.zeros(2), None],
@@ -128,6 +134,7 @@ def test_a_digest_tells_structures_and_numbers_apart():
         [np.zeros(2, bool)],
     ]
     digests = [kept.digest([one]) for one in different]
+    assert digests == [kept.digest([one]) for one in different]
     assert len(set(digests)) == len(digests)
     named = jaxpr(jax.jit(lambda first, other: first + other), 5.0, 6.0)
     called = jaxpr(jax.jit(lambda a, b: a + b), 1.0, 2.0)

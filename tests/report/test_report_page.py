@@ -197,7 +197,7 @@ def test_a_palette_keeps_the_colours_that_carry_meaning(shots):
 
 def test_fewer_colours_and_dots_are_fewer_bytes(shots):
     dots = shots[1].dots
-    forms = [(embed.shrunk(dots, share), *kept) for share, *kept in embed._LADDER]
+    forms = [(embed.shrunk(dots, share), *kept) for share, *kept, _ in embed._LADDER]
     assert forms[0][0].tobytes() == dots.tobytes()
     sizes = [len(embed.packed(*one)) for one in forms]
     assert sizes == sorted(sizes, reverse=True)

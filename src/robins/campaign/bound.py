@@ -93,13 +93,15 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
     return xr.Dataset(data, attrs=told)
 
 
-def bound_sigma(problem: Problem, name: str, world: Any) -> np.ndarray:
+def bound_sigma(problem: Problem, name: str, world: Any, machine: str = "vm") -> np.ndarray:
     """(E, r) standard deviations of the reported components, no lower than any filter gets.
 
     Args:
         problem: whose components they are.
         name: the contender whose model and start are believed.
         world: one run, as the problem simulates it.
+        machine: "jax", or another for the interpreter; what that cannot do, or all where it cannot
+            be built, JAX computes.
     """
     c = contender(problem, name)
 
@@ -109,10 +111,11 @@ def bound_sigma(problem: Problem, name: str, world: Any) -> np.ndarray:
         rows, _ = reported_rows(c.reported, it)
         return _reported(rows, bound_along(line, _start(it).factor).factor)
 
-    shape = jax.eval_shape(lambda: world)
+    if machine == "jax":
+        return np.sqrt(np.asarray(jax.jit(variances)(world)))
+    staged = Staged(variances, jax.eval_shape(lambda: world), engine=interpreted_rounds)
     one = jax.tree_util.tree_map(lambda x: x[None], world)
-    # What the interpreter cannot do, or all where it cannot be built, JAX computes.
-    return np.sqrt(with_stack(lambda: Staged(variances, shape, engine=interpreted_rounds)(one)[0]))
+    return np.sqrt(with_stack(lambda: staged(one)[0]))
 
 
 def _left(rows: np.ndarray, L: np.ndarray, D: np.ndarray) -> np.ndarray:

@@ -312,7 +312,7 @@ def first_worlds(problem: Problem, count: int) -> Any:
     sys.audit("robins.simulate", count)  # counted by tests
     number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
     simulate = Staged(problem.simulate, number, engine=interpreted_rounds)
-    return with_stack(lambda: simulate(np.arange(count)))
+    return jax.device_put(with_stack(lambda: simulate(np.arange(count))))
 
 
 def first_run(world: Any) -> Any:

@@ -22,7 +22,7 @@ from jaxtyping import Array
 from robins.campaign.memory import CHUNK, filled
 from robins.filters import Belief, Code, Step, Tally, run, run_closed
 from robins.filters.analysis.consistency import normalised_sq
-from robins.filters.run import nothing
+from robins.filters.run import checked, nothing
 from robins.filters.values import as_data
 from robins.manifold import State, local
 from robins.program.liveness import bytes_of_jaxpr
@@ -84,7 +84,10 @@ def solved(filter_, model, case: Case, keep: Callable[[Step], Any]) -> tuple[Any
 
 def whole_case(filter_, model, case: Case) -> Case:
     """A case with all its inputs; in closed loop it takes the filter to know them."""
-    return case if case.loop is None else solved(filter_, model, case, nothing)[1]
+    if case.loop is not None:
+        return solved(filter_, model, case, nothing)[1]
+    checked(model, case.y, case.u, case.aux)
+    return case
 
 
 Over = Callable[[Callable[..., Any], Any], Any]  # a function of a row, on all rows of some arrays

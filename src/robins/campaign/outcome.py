@@ -67,7 +67,7 @@ def simulate(
         of = problem.bound_of
         if bound is None and of is not None and of in problem.contenders:
             stage("covariance bound", 1)
-            bound = bound_sigma(problem, of, first)
+            bound = bound_sigma(problem, of, first, by.name)
         for step, name in enumerate(names, 1):
             stage(name, step)
             found[name].merge(statistics(name))

@@ -81,6 +81,16 @@ def _by_sensor(model: Model, data: Data) -> dict[str, State]:
     return {name: as_measurement(name, values) for name, values in data.items()}
 
 
+def checked(
+    model: Model, y: Data, u: Data, aux: Mapping[str, Data] | None
+) -> tuple[dict[str, State], dict[str, Data]]:
+    """Measurements, and further inputs, by sensor; as of `run`, with its errors for them."""
+    measurements, extra = _by_sensor(model, y), dict(aux or {})
+    check_names(model, extra)
+    _check_lengths(measurements, u, extra)
+    return measurements, extra
+
+
 def check_names(model: Model, data: Mapping[str, Data]) -> None:
     """Refuse data of sensors that the model does not have."""
     unknown = set(data) - set(model.dims)
@@ -205,10 +215,7 @@ def run(
             transformed code see `Solution.tally`.
     """
     one_of("machine", machine, RunMachine)
-    measurements = _by_sensor(model, y)
-    extra = dict(aux or {})
-    check_names(model, extra)
-    _check_lengths(measurements, u, extra)
+    measurements, extra = checked(model, y, u, aux)
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
     rows = u, measurements, extra
     scan = _interpreted

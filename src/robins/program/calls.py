@@ -1,10 +1,11 @@
-"""Jaxprs that were walked before: like arguments give like nodes, which are copied.
+"""Jaxprs that were walked before: calls of one form are written from a template.
 
 A jaxpr is walked once for each row of a batch, each sigma point, each hypothesis of a bank, and in
-each attempt of `robins.program.trace.lasting`. Rules look at arguments for three things only: which
-numbers are known, which nodes are the same, and what is negated or tested to be finite. Where these
-agree with those of an earlier call, in this graph or another one, the nodes are the same but for
-their arguments.
+each attempt of `robins.program.trace.lasting`. What a walk writes depends on the form of its
+arguments: which numbers are known, which nodes are the same, and what is negated or tested to be
+finite. It may also depend on how arguments are made of one another: one that is the sine of another
+is the node of a sine that the jaxpr takes itself. A call that met an argument in that way is no
+template for others.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ WORTH = 4  # equations of a jaxpr that is looked up
 
 
 @dataclass(frozen=True)
-class Copy:
-    """Nodes of a call with their arguments by place: first those of the call, then earlier ones.
+class Template:
+    """What calls of one form write; a place counts the arguments of the call, then the steps.
 
     Attributes:
         steps: operation, kind, value and places of the arguments of each.
@@ -49,6 +50,8 @@ class Copy:
                 node = graph.select(*args)
             elif op in ALIKE:
                 node = graph.apply(op, *args)
+            elif op == "pick":
+                node = graph.pick(graph.args[args[0]], args[1])
             else:
                 node = graph.ordered(op, args, kind, value)
             nodes.append(node)
@@ -66,7 +69,7 @@ class Call:
     outputs: list[Nodes]
     alike: list[tuple[Node, ...]]
 
-    def copy(self) -> Copy | None:
+    def template(self) -> Template | None:
         """What is needed to write it again; None if it contains a loop."""
         graph, place = self.graph, {n: k for k, n in enumerate(self.given)}
         ahead = [n for a in self.outputs for n in a.ravel().tolist()]
@@ -87,14 +90,14 @@ class Call:
         outputs = [
             np.array([place[n] for n in a.flat], np.int64).reshape(a.shape) for a in self.outputs
         ]
-        return Copy(steps, outputs, [tuple([place[n] for n in row]) for row in self.alike])
+        return Template(steps, outputs, [tuple([place[n] for n in row]) for row in self.alike])
 
 
 class Calls:
-    """Calls so far, by jaxpr and by what is known of their arguments."""
+    """Calls so far, by jaxpr and by the form of their arguments; all with the same `unroll`."""
 
     def __init__(self) -> None:
-        self._found: dict[Hashable, Call | Copy | None] = {}
+        self._found: dict[Hashable, Call | Template | None] = {}
         self._held: dict[int, Any] = {}  # a jaxpr that is gone could leave its id to another one
 
     def results(
@@ -105,11 +108,11 @@ class Calls:
         alike: list[tuple[Node, ...]],
         write: Callable[[], list[Nodes]],
     ) -> list[Nodes]:
-        """Results of a jaxpr on arrays of nodes, copied where a like call was written before.
+        """Results of a jaxpr on arrays of nodes, from a template where there is one.
 
         Args:
             graph: into which it is written.
-            jaxpr: all that the results depend on besides the arguments.
+            jaxpr: of the call.
             args: arrays of nodes.
             alike: rows which may be computed in loops, to which those of the call are added.
             write: walks through the jaxpr.
@@ -121,15 +124,23 @@ class Calls:
         self._held[id(jaxpr)] = jaxpr
         found = self._found.get(key, self)
         if isinstance(found, Call):
-            found = self._found[key] = found.copy()
-        if isinstance(found, Copy):
+            found = self._found[key] = found.template()
+        if isinstance(found, Template):
             outputs, rows = found.into(graph, given)
             alike += rows
             return outputs
-        begin, outputs = len(alike), write()
+        begin, met, outputs = len(alike), len(graph.met), write()
         if found is self:
-            self._found[key] = Call(graph, given, outputs, alike[begin:])
+            made = [n for n in given if graph.op[n] not in SEEN_THROUGH]
+            is_free = set(made).isdisjoint(graph.met[met:])
+            self._found[key] = Call(graph, given, outputs, alike[begin:]) if is_free else None
         return outputs
+
+    def keep(self, graphs: Sequence[Graph]) -> None:
+        """Forget calls that hold other graphs than these."""
+        for key, found in list(self._found.items()):
+            if isinstance(found, Call) and all(found.graph is not g for g in graphs):
+                del self._found[key]
 
 
 def _form(graph: Graph, args: Sequence[Nodes]) -> tuple[Hashable, list[Node]]:

@@ -21,7 +21,7 @@ def is_key(dtype: Any) -> bool:
     return bool(jax.numpy.issubdtype(dtype, jax.dtypes.prng_key))
 
 
-@lru_cache
+@lru_cache(maxsize=1024)  # a few types; where: the path of an argument
 def kind_of(dtype: Any, where: str = "") -> str:
     """The kind of scalar that holds numbers of a type.
 

@@ -72,9 +72,10 @@ class Graph:
             ``bits``; ``array`` of nodes, and ``pick`` of an array; ``block`` and ``item``; of loops
             ``leaf``, ``loop`` and ``after``.
         value: of a constant its number; what else an op needs besides its arguments.
-        literal: of a constant a text of its number and kind; None of all others.
+        literal: of a constant the bytes of a real, or a text of its kind and number; else None.
         scope: the loop in which a node is computed, 0 outside of all.
         within: of each scope the one around it.
+        met: nodes that were there when they were to be added, in order.
     """
 
     def __init__(self) -> None:
@@ -85,6 +86,7 @@ class Graph:
         self.literal: list[bytes | str | None] = []
         self.scope: list[int] = []
         self.within: list[int] = [0]
+        self.met: list[Node] = []
         self._known: dict[Any, Node] = {}
 
     def __len__(self) -> int:
@@ -105,6 +107,8 @@ class Graph:
         same = args if order is None else tuple(order)
         known = (op, same, kind, value if key is None else key)
         if (found := self._known.get(known)) is not None:
+            if op != "constant":
+                self.met.append(found)
             return found
         node = self._known[known] = len(self.op)
         self.op.append(op)
@@ -154,6 +158,7 @@ class Graph:
         if all(known):
             with np.errstate(all="ignore"):
                 return self.constant(row.fold(*[self.value[a] for a in args]), gives)
+        # All other operations on unknown numbers stay, whatever their arguments are.
         may_be_simpler = op in ALIKE or any(known)
         if may_be_simpler and (simple := self._simpler(op, args)) is not None:
             return simple

@@ -344,6 +344,7 @@ def lasting(made: Callable[[Zeros, Calls], list[Program]], zeros: Zeros) -> list
     calls = Calls()
     while True:
         programs, kept = made(zeros, calls), zeros
+        calls.keep([program.graph for program in programs])
         for program in programs:
             zero = program.graph.constant(0, "real")
             kept = {k: np.asarray(m & (program.outputs[k] == zero)) for k, m in kept.items()}

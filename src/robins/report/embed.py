@@ -19,9 +19,16 @@ DPI = 160  # 1.3 dots per pixel of the page: sharp on a screen, enough for paper
 PAGE_DPI = 120  # one dot a pixel of the page
 _FEW = 8  # pictures; more would not all fit into a page in the best form
 # Share of the dots, colours and effort (of zlib) of a PNG, from the best to the least that can
-# still be read. The last effort gains an eighth of the bytes in six times the time.
-_LADDER = ((1.0, 64, 6), (1.0, 20, 9), (0.75, 20, 9), (0.5625, 20, 9), (0.47, 12, 9))
-_EXPECTED = (1.0, 0.72, 0.52, 0.34, 0.25)  # of the size of the first; 22 figures differ by 0.03
+# still be read, and the size that is expected of it, by that of the first; 22 figures differ by
+# 0.03. The last effort gains an eighth of the bytes in six times the time.
+_LADDER = (
+    (1.0, 64, 6, 1.0),
+    (1.0, 20, 9, 0.72),
+    (0.75, 20, 9, 0.52),
+    (0.5625, 20, 9, 0.34),
+    (0.47, 12, 9, 0.25),
+)
+_SLACK = 0.9  # of the room; where less is filled, too much was expected
 _SIMPLE = 1000  # points; a drawing with more is never smaller than its dots
 _NUMBER = re.compile(rb"-?\d+\.\d{3,}")
 
@@ -149,45 +156,70 @@ def _png_source(content: bytes) -> str:
 
 
 class _Choice:
-    """The forms of one picture, each made only when it is asked for."""
+    """The forms of one picture, each made only when it is asked for.
+
+    Attributes:
+        source: its form.
+        rung: its place on the ladder.
+    """
 
     def __init__(self, drawn: Drawn):
-        self.drawn = drawn
-        self.rungs = list(_LADDER)
-        self.source = self._next()
+        self.drawn, self.rung = drawn, 0
+        self._sources: dict[int, str] = {}
+        self.source = self._form(0)
         if _points(drawn.picture.figure) <= _SIMPLE:
-            lines = _svg_source(svg(drawn.picture.figure))
-            if len(lines) < len(self.source):
-                self.source = lines
+            self.source = min(self.source, _svg_source(svg(drawn.picture.figure)), key=len)
+        self._first = self.source
 
     @property
     def size(self) -> int:
         """Number of characters."""
         return len(self.source)
 
-    def _next(self, rungs: int = 1) -> str:
-        share, *kept = self.rungs[rungs - 1]
-        del self.rungs[:rungs]
-        return _png_source(packed(shrunk(self.drawn.dots, share), *kept))
+    @property
+    def is_last(self) -> bool:
+        """True if there is no coarser form."""
+        return self.rung + 1 == len(_LADDER)
 
-    def shrink(self, rungs: int = 1) -> None:
-        """Take the form that stands so many rungs further down, if it is smaller."""
-        self.source = min(self.source, self._next(rungs), key=len)
+    def _form(self, rung: int) -> str:
+        if rung not in self._sources:
+            share, colours, effort, _ = _LADDER[rung]
+            made = packed(shrunk(self.drawn.dots, share), colours, effort)
+            self._sources[rung] = _png_source(made)
+        return self._sources[rung]
+
+    def take(self, rung: int) -> None:
+        """Take the form at a place of the ladder, or the first one if that is smaller."""
+        self.rung = rung
+        self.source = min(self._first, self._form(rung), key=len) if rung else self._first
 
 
 def _steps(sizes: Sequence[int], limit: int) -> list[int]:
-    """How far each of some pictures is expected to go down, that all fit."""
+    """How far down the ladder each of some pictures is expected to go, that all fit."""
     rungs = [0] * len(sizes)
 
     def expected(k: int) -> float:
-        return sizes[k] * _EXPECTED[rungs[k]]
+        return sizes[k] * _LADDER[rungs[k]][-1]
 
     while sum(map(expected, range(len(sizes)))) > limit:
-        able = [k for k, rung in enumerate(rungs) if rung + 1 < len(_EXPECTED)]
+        able = [k for k, rung in enumerate(rungs) if rung + 1 < len(_LADDER)]
         if not able:
             break
         rungs[max(able, key=expected)] += 1
     return rungs
+
+
+def _refine(choices: Sequence[_Choice], limit: int) -> None:
+    """Take finer forms, the smallest picture first, as long as all fit."""
+    left = [c for c in choices if c.rung]
+    while left and sum(c.size for c in choices) < _SLACK * limit:
+        one = min(left, key=lambda c: c.size)
+        one.take(one.rung - 1)
+        if sum(c.size for c in choices) > limit:
+            one.take(one.rung + 1)
+            left.remove(one)
+        elif not one.rung:
+            left.remove(one)
 
 
 def embed(drawn: Sequence[Drawn], limit: int) -> list[Embedded]:
@@ -196,12 +228,13 @@ def embed(drawn: Sequence[Drawn], limit: int) -> list[Embedded]:
     The largest is made coarser until all fit; only what is coarse already is left out.
     """
     choices = [_Choice(one) for one in drawn]
-    for choice, rungs in zip(choices, _steps([c.size for c in choices], limit), strict=True):
-        if rungs:
-            choice.shrink(rungs)
+    for choice, rung in zip(choices, _steps([c.size for c in choices], limit), strict=True):
+        choice.take(rung)
+    _refine(choices, limit)
     while sum(c.size for c in choices) > limit:
-        if able := [c for c in choices if c.rungs]:
-            max(able, key=lambda c: c.size).shrink()
+        if able := [c for c in choices if not c.is_last and c.source]:
+            one = max(able, key=lambda c: c.size)
+            one.take(one.rung + 1)
         else:
             max(choices, key=lambda c: c.size).source = ""
     return [Embedded(c.drawn.picture, c.source, *c.drawn.pixels) for c in choices]
