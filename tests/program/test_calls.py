@@ -30,6 +30,11 @@ def negated(a, b):
 
 
 @jax.jit
+def greater(a, b):
+    return jnp.maximum(a, b) * a - b + a
+
+
+@jax.jit
 def places(a):
     return jnp.diagonal(a) + a[0] * a[:, 1] - a.T[1]
 
@@ -71,6 +76,10 @@ def with_numbers(x):
 
 def with_negatives(x):
     return [negated(x[0], -x[0]), negated(x[1], -x[1]), negated(x[0], x[1]), negated(-x[2], x[2])]
+
+
+def with_one_node(x):
+    return [greater(x[0], x[0]), greater(x[1], x[1]), greater(x[0], x[2]), greater(x[2], x[1])]
 
 
 def with_same(x):
@@ -115,7 +124,8 @@ def with_matrices(x):
     ("function", "templates"),
     [
         (with_numbers, 1),
-        (with_negatives, 2),
+        (with_negatives, 1),
+        (with_one_node, 2),
         (with_same, 1),
         (with_flags, 2),
         (with_finite, 1),
