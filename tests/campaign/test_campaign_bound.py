@@ -10,7 +10,8 @@ import pytest
 import xarray as xr
 from jaxtyping import Array
 
-from robins.campaign.bound import bound
+from robins.campaign.bound import bound, bound_sigma
+from robins.campaign.monte_carlo import whole_case
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run
 from robins.manifold import Angle
 from robins.results import solution as stored
@@ -155,3 +156,24 @@ def test_a_model_that_does_not_hold_along_the_truth_is_named(problem):
     broken = replace(problem, simulate=lambda i: simulate(i)._replace(truth=nowhere))
     with pytest.raises(ValueError, match="cannot be linearised along the true states"):
         bound(broken, "kf")
+
+
+@pytest.mark.parametrize("run", [0, 1])
+def test_the_bound_of_a_report_is_that_of_jax(problem, run):
+    world = simulate(jnp.asarray(run))
+    found, wanted = (bound_sigma(problem, "kf", world, machine) for machine in ("vm", "jax"))
+    np.testing.assert_allclose(found, wanted, rtol=1e-13)
+    assert found.shape == (STEPS, 2)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"y": {"fax": jnp.zeros((STEPS, 1))}}, "no sensor"),
+        ({"u": jnp.zeros(STEPS - 1)}, "one length"),
+    ],
+)
+def test_a_case_that_no_run_takes_is_refused(problem, change, says):
+    case = simulate(jnp.asarray(0))._replace(**change)
+    with pytest.raises(ValueError, match=says):
+        whole_case(problem.contenders["kf"].filter, MODEL, case)

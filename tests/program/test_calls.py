@@ -30,8 +30,8 @@ def negated(a, b):
 
 
 @jax.jit
-def greater(a, b):
-    return jnp.maximum(a, b) * a - b + a
+def greater(a, b, c):
+    return jnp.maximum(a, b) * jnp.maximum(a, c) - b + a
 
 
 @jax.jit
@@ -79,7 +79,8 @@ def with_negatives(x):
 
 
 def with_one_node(x):
-    return [greater(x[0], x[0]), greater(x[1], x[1]), greater(x[0], x[2]), greater(x[2], x[1])]
+    a, b, c = x
+    return [greater(a, b, a), greater(b, c, b), greater(a, b, b), greater(a, b, c)]
 
 
 def with_same(x):
@@ -125,7 +126,7 @@ def with_matrices(x):
     [
         (with_numbers, 1),
         (with_negatives, 1),
-        (with_one_node, 2),
+        (with_one_node, 1),
         (with_same, 1),
         (with_flags, 2),
         (with_finite, 1),

@@ -1,5 +1,7 @@
 """What single precision costs: told of a filter that it does not hurt, and of one that it ruins."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -131,3 +133,14 @@ def test_what_is_not_a_number_in_one_precision_only_is_infinitely_far(near):
     lost = states._replace(belief=states.belief._replace(mean=mean))
     assert differences(library.state, states, lost)["mean"] == np.inf
     assert differences(library.state, lost, lost)["mean"] == 0.0
+
+
+def test_a_case_is_given_arrays_of_jax():
+    problem = drive(10.0)
+
+    def gap(world):
+        return world._replace(y={"fix": world.y["fix"].at[3].set(jnp.nan)})
+
+    without = {"kf": problem.contenders["kf"]._replace(case=gap)}
+    (run,) = board_runs(replace(problem, contenders=without), "kf", 1)
+    assert np.isnan(run.given["update_fix"][0][3]).all()
