@@ -138,8 +138,8 @@ def with_matrices(x):
 )
 def test_what_a_template_writes_has_the_nodes_of_a_walk(function, templates, monkeypatch):
     x, written = np.array([0.3, 0.7, 1.9]), []
-    into = calls.Template.into
-    monkeypatch.setattr(calls.Template, "into", lambda *all_: written.append(1) or into(*all_))
+    write = calls.written
+    monkeypatch.setattr(calls, "written", lambda *all_: written.append(1) or write(*all_))
     program = trace(function, x)
     assert len(written) >= templates
     for found, wanted in zip(Native(program, interpreted_step)(x), function(x), strict=True):
@@ -149,16 +149,16 @@ def test_what_a_template_writes_has_the_nodes_of_a_walk(function, templates, mon
 
 
 def test_graphs_of_earlier_attempts_are_not_held():
-    held, graph, other = calls.Calls(), Graph(), Graph()
+    held, graph, other = {}, Graph(), Graph()
     jaxpr = jax.make_jaxpr(lambda x: jnp.sin(x) * jnp.cos(x) + x * x)(1.0).jaxpr
     given = [np.array(graph.input(0, "real"))]
-    held.results(graph, jaxpr, given, [], lambda: given)
+    calls.results_of(held, graph, jaxpr, given, [], lambda: given)
     gone = weakref.ref(graph)
-    held.keep([graph])
+    calls.forget(held, [graph])
     del graph
     gc.collect()
     assert gone() is not None
-    held.keep([other])
+    calls.forget(held, [other])
     gc.collect()
     assert gone() is None
 

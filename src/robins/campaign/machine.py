@@ -49,6 +49,7 @@ from robins.campaign.monte_carlo import (
 )
 from robins.campaign.plan import Chunk
 from robins.errors import RobinsError
+from robins.manifold import State
 from robins.program import CPP, BuildError, compiler
 from robins.program.interpreter import interpreted_rounds, interpreter_of_many
 from robins.program.lanes import compiled_rounds
@@ -307,7 +308,7 @@ def with_stack(function: Callable[[], Any]) -> Any:
         threading.stack_size(before)
 
 
-def first_worlds(problem: Problem, count: int) -> Any:
+def first_worlds(problem: Problem, count: int) -> State:
     """The first runs of a problem, with a leading axis, by the interpreter where it can be."""
     sys.audit("robins.simulate", count)  # counted by tests
     number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)

@@ -180,73 +180,77 @@ def _version() -> str | None:
 def digest(parts: Iterable[Any]) -> str:
     """A digest of jaxprs, arrays, numbers and texts, nested in any way."""
     draws = jax.config.values["jax_threefry_partitionable"]  # which a jaxpr does not say
-    found = _Digest()
-    found.feed([f"{_version()} {draws}", *parts])
-    return found.digest()
+    texts: list[str | bytes] = [f"{_version()} {draws}"]
+    _feed(texts, list(parts), {}, {})
+    return _digest_of(texts)
 
 
-class _Digest:
-    """A digest that is fed values; jaxprs within by digests of their own, each made once."""
+def _digest_of(texts: list[str | bytes]) -> str:
+    whole = b"".join(t.encode() if isinstance(t, str) else t for t in texts)
+    return hashlib.sha256(whole).hexdigest()[:32]
 
-    def __init__(self, jaxprs: dict[int, str] | None = None) -> None:
-        self._texts: list[str | bytes] = []
-        self._jaxprs: dict[int, str] = {} if jaxprs is None else jaxprs
-        self._names: dict[Any, int] = {}  # numbers of the variables so far
 
-    def digest(self) -> str:
-        texts = (t.encode() if isinstance(t, str) else t for t in self._texts)
-        return hashlib.sha256(b"".join(texts)).hexdigest()[:32]
+def _feed(to: list[str | bytes], value: Any, names: dict[Any, int], jaxprs: dict[int, str]) -> None:
+    """Add texts of a value.
 
-    def feed(self, value: Any) -> None:
-        """Add a value."""
-        match value:
-            case jex.ClosedJaxpr():
-                self.feed(value.consts)
-                self.feed(value.jaxpr)
-            case jex.Jaxpr():
-                if (found := self._jaxprs.get(id(value))) is None:
-                    inner = _Digest(self._jaxprs)
-                    inner._equations(value)
-                    found = self._jaxprs[id(value)] = inner.digest()
-                self._texts.append(found)
-            case jex.Literal():
-                self.feed(numbers_of(value.val))
-                self._texts.append(_text_of(value.aval))
-            case jex.Var():
-                self._texts.append(f"v{self._names[value]}")
-            case np.ndarray() | np.generic() | jax.Array():
-                array = np.ascontiguousarray(numbers_of(value))
-                self._texts += [f"{array.dtype.str}{np.shape(array)}", array.tobytes()]
-            case Mapping():
-                for key in sorted(value):
-                    self._texts.append(f"{key}:")
-                    self.feed(value[key])
-            case enum.Enum():
-                self._texts.append(str(value))
-            case list() | tuple() if not hasattr(value, "_fields"):
-                self._texts.append(f"[{len(value)}")
-                for one in value:
-                    self.feed(one)
-            case _:
-                # Functions among the parameters, of JAX's generators and rules of batching, make
-                # no node; they are told apart by name alone.
-                text = re.sub(r" at 0x[0-9a-f]+", "", repr(value))
-                self._texts.append(f"{type(value).__name__} {text};")
+    Args:
+        to: texts so far.
+        value: jaxpr, array, number or text, nested in any way.
+        names: numbers of the variables so far.
+        jaxprs: digests of the jaxprs so far, by id: many occur more than once.
+    """
+    match value:
+        case jex.ClosedJaxpr():
+            _feed(to, value.consts, {}, jaxprs)
+            _feed(to, value.jaxpr, {}, jaxprs)
+        case jex.Jaxpr():
+            if (found := jaxprs.get(id(value))) is None:
+                found = jaxprs[id(value)] = _digest_of(_equations(value, jaxprs))
+            to.append(found)
+        case jex.Literal():
+            _feed(to, numbers_of(value.val), names, jaxprs)
+            to.append(_text_of(value.aval))
+        case jex.Var():
+            to.append(f"v{names[value]}")
+        case np.ndarray() | np.generic() | jax.Array():
+            array = np.ascontiguousarray(numbers_of(value))
+            to += [f"{array.dtype.str}{np.shape(array)}", array.tobytes()]
+        case Mapping():
+            for key in sorted(value):
+                to.append(f"{key}:")
+                _feed(to, value[key], names, jaxprs)
+        case enum.Enum():
+            to.append(str(value))
+        case list() | tuple() if not hasattr(value, "_fields"):
+            to.append(f"[{len(value)}")
+            for one in value:
+                _feed(to, one, names, jaxprs)
+        case _:
+            # Functions among the parameters, of JAX's generators and rules of batching, make no
+            # node; they are told apart by name alone.
+            text = re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+            to.append(f"{type(value).__name__} {text};")
 
-    def _equations(self, jaxpr: jex.Jaxpr) -> None:
-        self._number([*jaxpr.constvars, *jaxpr.invars])
-        for e in jaxpr.eqns:
-            call = called(e)
-            self._texts.append(f"{'call' if call else e.primitive.name}(")
-            self.feed(call or e.params)
-            self.feed(e.invars)
-            self._number(e.outvars)
-        self.feed(jaxpr.outvars)
 
-    def _number(self, variables: Iterable[Any]) -> None:
+def _equations(jaxpr: jex.Jaxpr, jaxprs: dict[int, str]) -> list[str | bytes]:
+    """Texts of a jaxpr, its variables by their numbers."""
+    to: list[str | bytes] = []
+    names: dict[Any, int] = {}
+
+    def number(variables: Iterable[Any]) -> None:
         for v in variables:
-            self._names[v] = len(self._names)
-            self._texts.append(f"v{self._names[v]}:{_text_of(v.aval)};")
+            names[v] = len(names)
+            to.append(f"v{names[v]}:{_text_of(v.aval)};")
+
+    number([*jaxpr.constvars, *jaxpr.invars])
+    for e in jaxpr.eqns:
+        call = called(e)
+        to.append(f"{'call' if call else e.primitive.name}(")
+        _feed(to, call or e.params, {}, jaxprs)
+        _feed(to, e.invars, names, jaxprs)
+        number(e.outvars)
+    _feed(to, jaxpr.outvars, names, jaxprs)
+    return to
 
 
 @lru_cache

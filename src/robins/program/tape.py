@@ -249,7 +249,7 @@ class Writer:
     # ---------------------------------------------------------------------------------- registers
 
     def place(self, value: Value) -> Place:
-        """Where a value lies."""
+        """Place of a value."""
         if (found := self._places.get(value)) is None:
             found = self._places[value] = self._place(value)
         return found

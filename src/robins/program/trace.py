@@ -16,7 +16,7 @@ import numpy as np
 from jax.extend import core as jex
 
 from robins import _float64  # noqa: F401
-from robins.program.calls import Calls
+from robins.program.calls import Calls, forget, results_of
 from robins.program.kinds import kind_of, numbers_of
 from robins.program.nodes import Graph, Node
 from robins.program.refusal import ProgramError
@@ -120,7 +120,7 @@ class Walk:
 
     def __init__(self, graph: Graph, unroll: int | None = None, calls: Calls | None = None):
         self.graph, self.unroll = graph, unroll
-        self._calls = Calls() if calls is None else calls
+        self._calls: Calls = {} if calls is None else calls
         self._constants: dict[int, tuple[Any, Nodes]] = {}  # by id, which the value keeps its own
         self.inputs: list[Leaf] = []
         self.alike: list[tuple[Node, ...]] = []  # rows of arrays, which may be computed in a loop
@@ -188,8 +188,8 @@ class Walk:
     def open(self, jaxpr: Any, consts: Sequence[Nodes], args: Sequence[Nodes]) -> list[Nodes]:
         """Results of a jaxpr on arrays of nodes."""
         given = [*consts, *args]
-        return self._calls.results(
-            self.graph, jaxpr, given, self.alike, lambda: self._written(jaxpr, given)
+        return results_of(
+            self._calls, self.graph, jaxpr, given, self.alike, lambda: self._written(jaxpr, given)
         )
 
     def _written(self, jaxpr: Any, given: Sequence[Nodes]) -> list[Nodes]:
@@ -341,10 +341,10 @@ def lasting(made: Callable[[Zeros, Calls], list[Program]], zeros: Zeros) -> list
             values their first results are; and the calls of earlier attempts.
         zeros: the entries to try.
     """
-    calls = Calls()
+    calls: Calls = {}
     while True:
         programs, kept = made(zeros, calls), zeros
-        calls.keep([program.graph for program in programs])
+        forget(calls, [program.graph for program in programs])
         for program in programs:
             zero = program.graph.constant(0, "real")
             kept = {k: np.asarray(m & (program.outputs[k] == zero)) for k, m in kept.items()}

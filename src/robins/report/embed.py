@@ -195,7 +195,7 @@ class _Choice:
 
 
 def _steps(sizes: Sequence[int], limit: int) -> list[int]:
-    """How far down the ladder each of some pictures is expected to go, that all fit."""
+    """Places on the ladder at which some pictures are expected to fit together."""
     rungs = [0] * len(sizes)
 
     def expected(k: int) -> float:
