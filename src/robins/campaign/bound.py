@@ -138,7 +138,7 @@ def _reported(rows: Array | None, factor: Array) -> Array:
 
 
 class _Found(NamedTuple):
-    """What a run tells."""
+    """Bound of one run, and what it is made of."""
 
     variance: Array  # (V, E, r) by subset of the sensors
     prior: Array  # (r,) variances

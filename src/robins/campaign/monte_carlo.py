@@ -249,5 +249,5 @@ def joined(needed: dict[str, Any], named: dict[str, Any]) -> dict[str, Any]:
 
 
 def cut(records: Any, count: int) -> Any:
-    """Of records with a leading axis of runs the first so many, as NumPy."""
+    """First runs of records with a leading axis of runs, as NumPy."""
     return jax.tree_util.tree_map(lambda x: np.asarray(x)[:count], records)

@@ -80,7 +80,7 @@ def simulate(
 
 
 def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray | None) -> Outcome:
-    """What the statistics of all filters say; bound: (E, r) covariance bound, if there is one."""
+    """Outcome of the statistics of all filters; bound: (E, r) covariance bound, if there is one."""
     metrics = {name: _metrics(problem, name, s, bound) for name, s in found.items()}
     claims = _claims(problem, found, bound, metrics)
     return Outcome(
@@ -179,7 +179,7 @@ def _undecided(key: str, more: int | None) -> str:
 
 
 def _chances(s: Statistics) -> dict[str, Probability]:
-    """How often a filter diverges; one run alone says nothing of that."""
+    """Shares of runs in which a filter diverges; one run alone has none."""
     return {"diverged_share": Probability.among(s.lost)} if s.runs > 1 else {}
 
 
@@ -266,7 +266,7 @@ def campaign_solution(
 
 
 def _scatter(b: StateBlock, found: dict[str, Statistics]) -> dict[str, Any]:
-    """How the errors of a block are spread over the runs: their mean, covariance, percentiles."""
+    """Spread of the errors of a block over the runs: their mean, covariance, percentiles."""
     runs = next(iter(found.values())).runs
     mean = _stack(found, lambda s: s.mean)[:, :, b.where]
     covariance = _stack(found, lambda s: s.covariance(b))
@@ -297,7 +297,7 @@ def _wrong(problem: Problem, found: dict[str, Statistics]) -> dict[str, xr.Varia
 
 
 def _notes(found: dict[str, Statistics]) -> dict[str, Any]:
-    """What rules noted in the first run, NaN for filters that have no such rule.
+    """Notes of rules in the first run, NaN for filters that have no such rule.
 
     With several sensors the last one's are those of the step.
     """

@@ -3,9 +3,9 @@
 A jaxpr is walked once for each row of a batch, each sigma point, each hypothesis of a bank, and in
 each attempt of `robins.program.trace.lasting`. What a walk writes depends on the form of its
 arguments: which numbers are known, which nodes are the same, and what is negated or tested to be
-finite. It may also depend on how arguments are made of one another: one that is the sine of another
-is the node of a sine that the jaxpr takes itself. A call that met an argument in that way is no
-template for others.
+finite. It may also depend on how arguments are computed from one another: if one is the sine of
+another, and the jaxpr takes that sine too, both are one node. Such a call is no template for
+others.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ Nodes = np.ndarray
 SEEN_THROUGH = {"neg", "not", "is_finite"}  # rules and folding look at the arguments of these
 OWN = {"input", "leaf", "loop", "after"}  # of one graph: such a call is not copied
 WORTH = 4  # equations of a jaxpr that is looked up
-
 
 Rows = list[tuple[Node, ...]]  # which may be computed in loops
 # A call as it was written: the graph, its arguments, its results and its rows.

@@ -17,7 +17,7 @@ KNOWN = {"f8": "real", "b1": "flag", "u4": "word", "u8": "word64"}
 
 @lru_cache
 def is_key(dtype: Any) -> bool:
-    """Whether a type is one of JAX's keys of random numbers."""
+    """True if a type is one of JAX's keys of random numbers."""
     return bool(jax.numpy.issubdtype(dtype, jax.dtypes.prng_key))
 
 

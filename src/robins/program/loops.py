@@ -69,7 +69,7 @@ def along(e: Equation) -> Along | None:
 
 
 def _by_rows(e: Equation, name: str, p: Any, length: int) -> bool:
-    """Whether an equation does to each row of its arrays the same."""
+    """True if an equation does the same to each row of its arrays."""
     given = [v.aval.shape for v in e.invars]
     rank = len(e.outvars[0].aval.shape)
     if name in RANDOM and not any(s and s[0] == length for s in given):

@@ -270,7 +270,7 @@ def campaign_report(where: Where) -> Outcome:
             where,
             "the same `robins campaign run` computes it.",
         )
-    outcome = outcome_of(problem, found.found, _bound(problem))
+    outcome = outcome_of(problem, found.found, _bound(problem, plan.machine))
     short = {name: n for name, n in found.done.items() if n < plan.runs}
     warnings = [f"{name}: {n} of {plan.runs} runs are done" for name, n in short.items()]
     return replace(
@@ -289,11 +289,11 @@ def campaign_report(where: Where) -> Outcome:
     )
 
 
-def _bound(problem: Problem) -> np.ndarray | None:
+def _bound(problem: Problem, machine: str) -> np.ndarray | None:
     of = problem.bound_of
     if of is None or of not in problem.contenders:
         return None
-    return bound_sigma(problem, of, first_run(first_worlds(problem, 1)))
+    return bound_sigma(problem, of, first_run(first_worlds(problem, 1)), machine)
 
 
 def campaign_show(where: Where, run: int, *, progress: Progress = silent) -> Outcome:
