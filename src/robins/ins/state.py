@@ -22,6 +22,7 @@ from robins.ins.errors import decay_rates, scale_of
 from robins.ins.increments import Increments, displacement
 from robins.ins.mechanise import Nav, advance, rows, unpacked, vector
 from robins.ins.transition import linearise
+from robins.linalg.rows import each_row
 from robins.rotation import Rotation
 
 Perturbation = Any  # a number or (3,) body axes
@@ -75,7 +76,7 @@ def step(x: InsState, inc: Increments, noise: InsNoise | None = None) -> InsStat
 def propagate(x: InsState, block: Increments, noise: InsNoise | None = None) -> InsState:
     """Move over a block of K raw increments (leading axis); zero ones change nothing."""
     true, faded = _corrected(x, block, noise)
-    last, _ = lax.scan(lambda at, row: (advance(at, row), None), vector(x.nav), rows(true))
+    last, _ = lax.scan(lambda at, inc: (advance(at, rows(inc)), None), vector(x.nav), true)
     return _at(x, last, faded)
 
 
@@ -98,7 +99,7 @@ def propagate_linear(
         factor L of the covariance Q = L L' that the noise adds to the error.
     """
     true, faded = _corrected(x, block, noise)
-    last, starts = lax.scan(lambda at, row: (advance(at, row), at), vector(x.nav), rows(true))
+    last, starts = lax.scan(lambda at, inc: (advance(at, rows(inc)), at), vector(x.nav), true)
     Phi, L = linearise(x, true, starts, noise, segments)
     return _at(x, last, faded), Phi, L
 
@@ -106,21 +107,23 @@ def propagate_linear(
 def _corrected(x: InsState, block: Increments, noise: InsNoise | None):
     """The increments without the errors of the sensors; what is left of the biases at the end."""
     block = Increments(*(None if a is None else jnp.asarray(a, float) for a in block))
-    dt = block.dt[:, None]
-    until = jnp.cumsum(dt, 0)
+    until = jnp.cumsum(block.dt)
     rates = decay_rates(x, noise)[:6]
-    fading = jnp.exp(-(until - 0.5 * dt) * rates[None])  # in the middle of each increment
-    gyro_bias = x.gyro_bias[None] * fading[:, :3]
-    accel_bias = x.accel_bias[None] * fading[:, 3:]
-    gyro_gain = 1.0 / (1.0 + scale_of(x, "gyro"))[None]
-    accel_gain = 1.0 / (1.0 + scale_of(x, "accel"))[None]
-    true = Increments(
-        block.dt,
-        (block.theta - gyro_bias * dt) * gyro_gain,
-        (block.dv - accel_bias * dt) * accel_gain,
-        (displacement(block) - 0.5 * accel_bias * dt**2) * accel_gain,
-    )
-    return true, jnp.exp(-until[-1] * rates)
+    gyro_gain = 1.0 / (1.0 + scale_of(x, "gyro"))
+    accel_gain = 1.0 / (1.0 + scale_of(x, "accel"))
+
+    def corrected(raw: Increments, until: Array) -> Increments:
+        dt = raw.dt
+        fading = jnp.exp(-(until - 0.5 * dt) * rates)  # in the middle of the increment
+        gyro_bias, accel_bias = x.gyro_bias * fading[:3], x.accel_bias * fading[3:]
+        return Increments(
+            dt,
+            (raw.theta - gyro_bias * dt) * gyro_gain,
+            (raw.dv - accel_bias * dt) * accel_gain,
+            (displacement(raw) - 0.5 * accel_bias * dt**2) * accel_gain,
+        )
+
+    return each_row(corrected, block, until), jnp.exp(-until[-1] * rates)
 
 
 def _at(x: InsState, last: Float[Array, "10"], faded: Float[Array, "6"]) -> InsState:

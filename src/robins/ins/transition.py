@@ -22,7 +22,7 @@ the body shakes.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,6 @@ from robins import _float64, linalg  # noqa: F401
 from robins.ins.errors import decay_rates, frame_dynamics, scale_of
 from robins.ins.increments import Increments
 from robins.ins.mechanise import unpacked
-from robins.linalg.rows import each_row
 from robins.rotation import skew
 
 _GAUSS = 0.5 + np.array([-1.0, 1.0]) * np.sqrt(3.0) / 6.0  # points of the unit interval
@@ -59,58 +58,129 @@ def linearise(
         padding = [(0, segments * each - count)] + [(0, 0)] * (a.ndim - 1)
         return jnp.pad(a, padding, mode).reshape(segments, each, *a.shape[1:])
 
-    parts = each_row(
-        lambda inc, at: _segment(x, inc, at, noise),
-        jax.tree.map(lambda a: cut(a, "constant"), true),
-        cut(starts, "edge"),
-    )
-    Phi, M = parts[0][0], parts[1][0]
-    for Phi_next, M_next in zip(parts[0][1:], parts[1][1:], strict=True):
-        Phi, M = Phi_next @ Phi, jnp.concatenate([Phi_next @ M, M_next], 1)
-    return Phi, linalg.tria(M)
+    def before(later: _Transition, row):
+        """Transition from the start of a segment to the end of the block, and its noise there."""
+        one, impulses = _segment(x, *row, noise)
+        return later.after(one, impulses)
+
+    rows = jax.tree.map(lambda a: cut(a, "constant"), true), cut(starts, "edge")
+    m = len(decay_rates(x, noise))
+    nothing = _Transition(jnp.eye(9), jnp.zeros((9, m)), jnp.ones(m))
+    whole, columns = jax.lax.scan(before, nothing, rows, reverse=True)
+    lower = jnp.zeros((m, 9))
+    Phi = jnp.block([[whole.nav, whole.inputs], [lower, jnp.diag(whole.fade)]])
+    # From the last segment to the first: in the order of computation nothing is moved in memory.
+    return Phi, linalg.tria(columns[::-1].reshape(-1, 9 + m).T)
 
 
-def _segment(x, true: Increments, starts, noise):
-    """Phi of one segment, and columns M with M M' the covariance its noise adds."""
-    dt = true.dt
-    C = unpacked(starts).q_nb.as_dcm()
-    total = jnp.sum(dt)
-    left = (total - jnp.cumsum(dt))[:, None, None]  # time in the segment after each sample
+class _Transition(NamedTuple):
+    """Transition [[nav, inputs], [0, diag(fade)]] of navigation errors and sensor errors."""
 
-    # What each sample does to phi, dv and dp, as `mechanise` does it, and what becomes of that by
-    # the end of the segment.
-    push = skew(_apply(C, true.dv))
-    shift = skew(_apply(C, true.dr)) + left * push
-    turn = _into(_product(C, _mean_rotation(true.theta)), dt, true.theta, x, "gyro")
-    turned = jnp.cumsum(turn, 0) - turn  # misalignment before each sample, per gyro error
-    drive = _into(C, dt, true.dv, x, "accel")
-    drift = _into(C, 0.5 * dt**2, true.dr, x, "accel") + left * drive
-    by_gyro = (-turn, _product(push, turned), _product(shift, turned))
-    by_accel = (jnp.zeros_like(drive), -drive, -drift)
-    push, shift = jnp.sum(push, 0), jnp.sum(shift, 0)
-    by_gyro, by_accel = (tuple(jnp.sum(a, 0) for a in by) for by in (by_gyro, by_accel))
+    nav: Float[Array, "9 9"]
+    inputs: Float[Array, "9 m"]
+    fade: Float[Array, "m"]
 
-    eye, zero = jnp.eye(3), jnp.zeros((3, 3))
-    fast = jnp.block([[eye, zero, zero], [-push, eye, zero], [-shift, total * eye, eye]])
-    inputs = _in_order(jnp.concatenate(by_gyro), jnp.concatenate(by_accel))
+    def after(
+        self, first: _Transition, impulses: list[_Impulses]
+    ) -> tuple[_Transition, Float[Array, "c n"]]:
+        """Products with the transition before this one, and with columns of noise, one to a row."""
+        parts = [first.nav, first.inputs]
+        parts += [part for one in impulses for part in (one.white, one.walk)]
+        ends = np.cumsum([part.shape[1] for part in parts])[:-1]
+        nav, inputs, *columns = jnp.split(self.nav @ jnp.concatenate(parts, 1), ends, 1)
+        whole = _Transition(nav, inputs + self.inputs * first.fade[None], self.fade * first.fade)
+        rows = []
+        for white, walk, one in zip(columns[::2], columns[1::2], impulses, strict=True):
+            lower = jnp.zeros((len(one.left), white.shape[1])), jnp.diag(self.fade * one.left)
+            for upper, low in zip((white, walk + self.inputs * one.left[None]), lower, strict=True):
+                rows.append(jnp.concatenate([upper, low]).T)
+        return whole, jnp.concatenate(rows)
+
+
+class _Impulses(NamedTuple):
+    """Columns [[white, walk], [0, diag(left)]]: unit impulses at one point of time."""
+
+    white: Float[Array, "9 6"]
+    walk: Float[Array, "9 m"]
+    left: Float[Array, "m"]
+
+
+def _segment(x, true: Increments, starts, noise) -> tuple[_Transition, list[_Impulses]]:
+    """Transition over one segment, and the impulses of noise in it."""
+    total = jnp.sum(true.dt)
+    push, shift, turn, lever, drive, drift = _sums(x, true, starts, total)
+
+    push = skew(push)
+    by_accel = jnp.concatenate([jnp.zeros_like(drive), -drive, -drift])
+    inputs = _in_order(jnp.concatenate([-turn, lever]), by_accel)
 
     # Half of the slow part before, half after.
     middle = unpacked(starts[len(starts) // 2])
     slow = 0.5 * total * frame_dynamics(middle).at[6:9, 3:6].set(0.0)
     slow = jnp.eye(9) + slow + 0.5 * slow @ slow
-    rates = decay_rates(x, noise)
-    fade = jnp.exp(-0.5 * total * rates)
-    m = len(rates)
-    Phi = jnp.block(
-        [[slow @ fast @ slow, slow @ inputs * fade[None]], [jnp.zeros((m, 9)), jnp.diag(fade**2)]]
-    )
+    fade = jnp.exp(-0.5 * total * decay_rates(x, noise))
+    phi, dv, dp = slow[:3], slow[3:6], slow[6:]
+    then = jnp.concatenate([phi, dv - push @ phi, dp + total * dv - skew(shift) @ phi])  # fast slow
+    nav, inputs = jnp.split(slow @ jnp.concatenate([then, inputs], 1), [9], 1)
+    whole = _Transition(nav, inputs * fade[None], fade**2)
 
     safe = jnp.where(total > 0.0, total, 1.0)
-    means = (push / safe, -by_gyro[0] / safe, -by_accel[1] / safe)
-    return Phi, _impulses(x, noise, C, total, means)
+    return whole, _impulses(x, noise, starts, total, (push / safe, turn / safe, drive / safe))
 
 
-def _impulses(x, noise, C, total, means) -> Float[Array, "n c"]:
+class _Sums(NamedTuple):
+    """Sums over samples, as `mechanise` takes them, of what becomes of errors in a segment.
+
+    Columns of the matrices are errors of three axes: biases, and scales where those are states.
+    """
+
+    push: Float[Array, "3"]  # -dv of a misalignment is its skew
+    shift: Float[Array, "3"]  # likewise -dp
+    turn: Float[Array, "3 a"]  # -phi of errors of gyros
+    lever: Float[Array, "6 a"]  # dv and dp of these
+    drive: Float[Array, "3 b"]  # -dv of errors of accelerometers
+    drift: Float[Array, "3 b"]  # -dp
+
+
+def _sums(x, true: Increments, starts, total) -> _Sums:
+    """Sums over the samples of a segment: a loop, so that a program has its body once."""
+    scaled = x.gyro_scale is not None, x.accel_scale is not None
+    a, b = (3 + 3 * s for s in scaled)
+
+    def columns(C, bias, scale, has_scale):
+        parts = [C * bias, C * scale[None]] if has_scale else [C * bias]
+        return jnp.concatenate(parts, 1)
+
+    def sample(sums: _Sums, row):
+        (dt, theta, dv, dr), start, elapsed = row
+        C = unpacked(start).q_nb.as_dcm()
+        left = total - elapsed  # time in the segment after the sample
+        push = _product(C, dv[:, None])[:, 0]
+        shift = _product(C, dr[:, None])[:, 0] + left * push
+        # a misalignment by errors of gyros so far becomes velocity and position
+        lever = [_product(skew(by), sums.turn) for by in (push, shift)]
+        turn = columns(_product(C, _mean_rotation(theta)), dt, theta, scaled[0])
+        drive = columns(C, dt, dv, scaled[1])
+        drift = columns(C, dt * (0.5 * dt + left), dr + left * dv, scaled[1])
+        more = _Sums(push, shift, turn, jnp.concatenate(lever), drive, drift)
+        return jax.tree.map(jnp.add, sums, more), None
+
+    shapes = (3,), (3,), (3, a), (6, a), (3, b), (3, b)
+    rows = true, starts, jnp.cumsum(true.dt)
+    sums, _ = jax.lax.scan(sample, _Sums(*map(jnp.zeros, shapes)), rows)
+    by_gyro, by_accel = (
+        jnp.tile(1.0 / (1.0 + scale_of(x, sensor)), 1 + has_scale)[None]
+        for sensor, has_scale in zip(("gyro", "accel"), scaled, strict=True)
+    )
+    return sums._replace(
+        turn=sums.turn * by_gyro,
+        lever=sums.lever * by_gyro,
+        drive=sums.drive * by_accel,
+        drift=sums.drift * by_accel,
+    )
+
+
+def _impulses(x, noise, starts, total, means) -> list[_Impulses]:
     """Columns M with M M' the covariance that noise adds over a segment of length `total`.
 
     The response at the end to unit impulses at the Gauss points, times the size of the noise and
@@ -119,11 +189,13 @@ def _impulses(x, noise, C, total, means) -> Float[Array, "n c"]:
     """
     force, turn, drive = means
     rates, sigma = decay_rates(x, noise), _drives(x, noise)
-    m = len(rates)
-    columns = []
+    # The root of zero has no slope, and a block may be all padding.
+    safe = jnp.where(total > 0.0, 0.5 * total, 1.0)
+    weight = jnp.where(total > 0.0, jnp.sqrt(safe), 0.0)
+    found = []
     for c in _GAUSS:
         to_end = total * (1.0 - c)
-        C_c = C[int(c * len(C))]
+        C_c = unpacked(starts[int(c * len(starts))]).q_nb.as_dcm()
         phi = C_c * (_spread(noise.gyro_arw) / (1.0 + scale_of(x, "gyro")))[None]
         dv = C_c * (_spread(noise.accel_vrw) / (1.0 + scale_of(x, "accel")))[None]
         pull = to_end * force  # a misalignment becomes velocity at this share
@@ -134,21 +206,9 @@ def _impulses(x, noise, C, total, means) -> Float[Array, "n c"]:
         by_gyro = (-g, 0.5 * pull @ g, to_end / 6.0 * pull @ g)
         by_accel = (jnp.zeros_like(a), -a, -0.5 * to_end * a)
         walk = _in_order(jnp.concatenate(by_gyro), jnp.concatenate(by_accel)) * sigma[None]
-        left = jnp.diag(jnp.exp(-to_end * rates) * sigma)
-        columns.append(jnp.block([[white, walk], [jnp.zeros((m, 6)), left]]))
-    # The root of zero has no slope, and a block may be all padding.
-    safe = jnp.where(total > 0.0, 0.5 * total, 1.0)
-    weight = jnp.where(total > 0.0, jnp.sqrt(safe), 0.0)
-    return weight * jnp.concatenate(columns, 1)
-
-
-def _into(C, dt, value, x, sensor: str):
-    """C diag(dt), and C diag(value) if the scale is a state: (k, 3, 3 or 6)."""
-    gain = 1.0 / (1.0 + scale_of(x, sensor))[None]
-    columns = [C * (dt[:, None] * gain)[:, None]]
-    if getattr(x, f"{sensor}_scale") is not None:
-        columns.append(C * (value * gain)[:, None])
-    return jnp.concatenate(columns, -1)
+        left = jnp.exp(-to_end * rates) * sigma
+        found.append(_Impulses(weight * white, weight * walk, weight * left))
+    return found
 
 
 def _in_order(by_gyro, by_accel):
@@ -174,16 +234,12 @@ def _spread(value) -> Float[Array, "3"]:
 def _mean_rotation(theta):
     """Mean of exp(s theta x) over s from 0 to 1; the series is good to 1e-6 at half a radian."""
     turn = skew(theta)
-    sq = jnp.sum(theta * theta, -1)[:, None, None]
+    sq = jnp.sum(theta * theta)
     once = 1.0 / 2.0 - sq / 24.0 * (1.0 - sq / 30.0)
     twice = 1.0 / 6.0 - sq / 120.0 * (1.0 - sq / 42.0)
-    return jnp.eye(3)[None] + once * turn + twice * _product(turn, turn)
+    return jnp.eye(3) + once * turn + twice * _product(turn, turn)
 
 
 def _product(a, b):
-    """Matrix products (k, 3, 3) (k, 3, m): sums, for small products one by one are slow."""
-    return jnp.sum(a[..., None] * b[:, None], 2)
-
-
-def _apply(C, v):
-    return jnp.sum(C * v[:, None], 2)
+    """Product of two matrices as sums, for small products one by one are slow."""
+    return jnp.sum(a[:, :, None] * b[None], 1)
