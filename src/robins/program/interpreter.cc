@@ -39,7 +39,7 @@ static inline whole whole_neg(whole a) { return -a; }
     DO(real_select) DO(flag_select) DO(whole_select) DO(word_select) DO(word64_select) \
     DO(real_pick) DO(flag_pick) DO(whole_pick) DO(word_pick) DO(word64_pick) \
     DO(product) DO(cholesky) DO(solve_lower) DO(triangle) DO(householder) DO(eigh) DO(lu) \
-    DO(begin) DO(round) DO(keep) DO(again) DO(leave_unless)
+    DO(begin) DO(round) DO(take) DO(keep) DO(again) DO(leave_unless)
 
 #define CODE1(result, kind, function) CODE_##function,
 #define CODE(name) CODE_##name,
@@ -148,15 +148,18 @@ static void execute(const int32_t *code, int64_t count, const int32_t *lists, in
     } break;
 #endif
             FOR_EACH_KIND(PICK)
-        case CODE_product: GATHERED(product(m, n, width, in, out))
+        case CODE_product: GATHERED(product(m, n, width, in, in + m * n, out))
         case CODE_cholesky: GATHERED(cholesky(m, in, out))
-        case CODE_solve_lower: GATHERED(solve_lower(m, n, in, out))
+        case CODE_solve_lower: GATHERED(solve_lower(m, n, in, in + m * m, out))
         case CODE_triangle: GATHERED(triangle(m, n, width, in, out))
         case CODE_householder: GATHERED(householder(m, n, width, in, out))
         case CODE_eigh: GATHERED(eigh(m, in, out))
         case CODE_lu: GATHERED(lu(m, n, in, out))
         case CODE_begin: rounds[p[1]] = 0; break;
         case CODE_round: EACH { ROW(whole, p[1])[v] = WHOLE(rounds[p[2]]); } break;
+        case CODE_take: /* the entry of an array for this round */
+            memcpy(ROW(real, p[1]), ROW(real, lists[p[2] + rounds[p[3]]]), 8 * WIDTH);
+            break;
         case CODE_keep:
             memcpy(ROW(real, p[1] + rounds[p[3]]), ROW(real, p[2]), 8 * WIDTH);
             break;

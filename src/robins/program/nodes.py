@@ -42,6 +42,7 @@ class Loop:
         condition: a node inside the loop, of its leaves.
         next: what the leaves are in the next round.
         kept: nodes whose values in all rounds are kept; only where `count` is known.
+        sizes: of the arrays, one after the other, that these are the entries of.
     """
 
     scope: int
@@ -52,6 +53,7 @@ class Loop:
     condition: Node | None = None
     next: list[Node] = field(default_factory=list)
     kept: list[Node] = field(default_factory=list)
+    sizes: list[int] = field(default_factory=list)
 
     @property
     def changes(self) -> list[Node]:
@@ -206,7 +208,7 @@ class Graph:
             return among[int(value)]
         if len(set(among)) == 1:
             return among[0]
-        if len(among) > 4:
+        if len(among) > 4 or self.is_round(index):
             array = self.add("array", among, self.kind[among[0]])
             return self.add("pick", (array, index), self.kind[among[0]])
         found = among[-1]
@@ -214,6 +216,10 @@ class Graph:
             here = self.apply("eq", index, self.constant(k, self.kind[index]))
             found = self.select(here, among[k], found)
         return found
+
+    def is_round(self, node: Node) -> bool:
+        """True if a node is the number of a round."""
+        return self.op[node] == "leaf" and self.value[node][1] < 0
 
     def block(
         self, routine: str, sizes: Sequence[int], args: Sequence[Node], count: int

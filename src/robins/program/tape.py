@@ -158,6 +158,9 @@ class Writer:
                 routine, sizes, count = graph.value[node]
                 numbers = (*sizes, 0, 0, 0)[:3]
                 self._write(routine, node, listed=args, numbers=(*numbers, len(args)), count=count)
+            case "pick" if graph.is_round(args[1]):
+                scope, _ = graph.value[args[1]]
+                self._write("take", node, listed=graph.args[args[0]], numbers=(scope,))
             case "pick":
                 self._write(f"{graph.kind[node]}_pick", node, args[1], listed=graph.args[args[0]])
             case "select":
@@ -232,19 +235,22 @@ class Writer:
 
     def _next(self, loop: Loop) -> None:
         """The leaves of the next round, none written before it is read."""
-        s = loop.scope
+        s, graph = loop.scope, self.graph
         changed = [k for k, n in enumerate(loop.next) if n != loop.leaves[k]]
-        new: dict[int, Value] = {}
+        new: dict[int, Value] = dict(enumerate(loop.next))
         for k in changed:
-            kind = self.graph.kind[loop.leaves[k]]
+            is_leaf = graph.op[n := loop.next[k]] == "leaf" and graph.value[n][0] == s
             self.scope_of["next", s, k] = s
-            if loop.condition is None:
-                self._write("move", ("next", s, k), loop.next[k])
+            if loop.condition is not None:
+                code = f"{graph.kind[loop.leaves[k]]}_select"
+                self._write(code, ("next", s, k), loop.condition, n, (s, k))
+            elif is_leaf:
+                self._write("move", ("next", s, k), n)
             else:
-                self._write(f"{kind}_select", ("next", s, k), loop.condition, loop.next[k], (s, k))
+                continue
             new[k] = ("next", s, k)
-        for k, value in new.items():
-            self._write("move", (s, k), value)
+        for k in changed:
+            self._write("move", (s, k), new[k])
 
     # ---------------------------------------------------------------------------------- registers
 
@@ -462,6 +468,9 @@ class Tape:
         if not one.listed:
             return (*args,) if one.result is None else (result, *args)
         begin = len(self._lists)
+        if one.code == "take":
+            self._lists += listed
+            return result, begin, self._writer.depth(one.numbers[0])
         self._lists += [*one.numbers, *listed]
         if not one.numbers:
             return result, begin, args[0]

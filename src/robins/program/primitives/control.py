@@ -154,6 +154,7 @@ def _rolled(
     found = walk.closed(body, *consts, *now, *map(row, rows))
     new, kept = found[: len(carry)], found[len(carry) :]
     loop.next, loop.kept = _flat(_converted(walk, new, now)), _flat(kept)
+    loop.sizes = [a.size for a in kept]
     after, rounds = graph.close(loop)
     out, at = _shaped(after, carry), 0
     for a in kept:
