@@ -8,12 +8,14 @@ written where it is used. Selects, comparisons and functions are calls of `scala
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from collections.abc import Sequence
 from importlib.resources import files
 
+from robins.program.layout import IN_PLACE, Array, Layout, operands
 from robins.program.nodes import Loop, Node
 from robins.program.operations import OPERATIONS
 from robins.program.precision import DOUBLE, Precision
-from robins.program.roll import Pack, Packing, Roll, stride
+from robins.program.roll import Pack, Packing, Roll
 from robins.program.trace import Program
 from robins.program.wrap import wrapped
 
@@ -62,19 +64,19 @@ class _Writer:
         self.names: dict[Node, str] = {}  # how a node is read
         self.inlined: set[Node] = set()
         self.written: set[int] = set()  # loops over packs
+        self.strides: dict[Node, tuple[Array, int, int]] = {}  # arrays that lie in another one
         live = program.live
         self.results = [n for nodes in program.outputs for n in nodes.ravel().tolist()]
         roots = [*self.results]
         users: dict[Node, list[Node]] = defaultdict(list)
         self.uses: Counter[Node] = Counter()
-        self.kept = self.graph.kept(live)
         for node in live:
             for arg in self.graph.args[node]:
                 self.uses[arg] += 1
                 users[arg].append(node)
             if self.graph.op[node] == "loop":
                 roots += self.graph.value[node].changes
-        roots += self.kept.values()
+        roots += self.graph.kept(live).values()
         self.user = {n: u[0] for n, u in users.items() if len(u) == 1}
         self.roots = set(roots)
         self.schedule: dict[int, list[Node | Roll]] = defaultdict(list)
@@ -82,9 +84,14 @@ class _Writer:
         if program.alike:
             packing = Packing(self.graph, live, self.roots, program.alike, program.unroll or 0)
             self.place, self.schedule = packing.place, packing.schedule()
+            self.layout = packing.layout
         else:
+            self.layout = Layout(self.graph, live, self.place, self.roots)
             for node in live:
                 self.schedule[self.graph.scope[node]].append(node)
+        picks = [self.graph.args[n] for n in live if self.graph.op[n] == "pick"]
+        # arrays that are picked from by any number
+        self.addressed = {array for array, index in picks if not self.graph.is_round(index)}
 
     def function(self, name: str, linkage: str) -> list[str]:
         """The lines of the function."""
@@ -181,7 +188,10 @@ class _Writer:
             case "after":
                 loop: Loop = graph.value[graph.args[node][0]]
                 k, row = graph.value[node]
-                return f"l{loop.scope}_{k}" if row is None else f"k{loop.scope}_{k}[{row}]"
+                if row is None:
+                    return f"l{loop.scope}_{k}"
+                (_, name, _), at = self.layout.source(node)
+                return f"{name}[{at}]"
         if node in self.place:
             pack, k = self.place[node]
             return f"p{pack.index}[{k}]"
@@ -200,8 +210,11 @@ class _Writer:
             return f"{sign}{parts[0]}" if len(parts) == 1 else f" {sign} ".join(parts)
         if op == "pick":
             array, index = args
-            if graph.op[index] == "leaf" and graph.value[index][1] < 0:
-                return f"a{array}[n{graph.value[index][0]}]"
+            if graph.is_round(index):
+                number = f"n{graph.value[index][0]}"
+                if array in self.strides:
+                    return self._at(self.strides[array], graph.kind[node], number)
+                return f"a{array}[{number}]"
             return f"{graph.kind[node]}_pick(a{array}, {self._read(index)})"
         name = {
             "select": f"{graph.kind[node]}_select",
@@ -220,6 +233,10 @@ class _Writer:
     # -------------------------------------------------------------------- arrays, blocks, loops
 
     def _array(self, node: Node, depth: int) -> None:
+        args = self.graph.args[node]
+        if node not in self.addressed and (found := self.layout.stride(args)):
+            self.names[node], self.strides[node] = "", found
+            return
         entries = [self._read(a) for a in self.graph.args[node]]
         self._listed(f"const {self.graph.kind[node]} a{node}[{len(entries)}]", entries, depth)
         self.names[node] = f"a{node}"
@@ -237,13 +254,20 @@ class _Writer:
         self.lines += [f"{pad}    {line.rstrip(' ,')}", f"{pad}}};"]
 
     def _block(self, node: Node, depth: int) -> None:
-        """A call of a routine; its arguments are in braces, so that their memory serves again."""
+        """A call of a routine; copies for it are in braces, so that their memory serves again."""
         routine, sizes, count = self.graph.value[node]
-        entries = [self._read(a) for a in self.graph.args[node]]
-        told = ", ".join([*map(str, sizes), f"in{node}", f"b{node}"])
-        pad = "    " * depth
+        pad, kind = "    " * depth, "real" if routine in IN_PLACE else "const real"
         self.lines += [f"{pad}real b{node}[{count}];", f"{pad}{{"]
-        self._listed(f"real in{node}[{len(entries)}]", entries, depth + 1)
+        given = []
+        for index, nodes in enumerate(operands(self.graph, node)):
+            if found := self.layout.operand(node, index):
+                array, first = found
+                given.append(self._address(array, first))
+            else:
+                given.append(f"in{node}_{index}")
+                entries = [self._read(a) for a in nodes]
+                self._listed(f"{kind} {given[-1]}[{len(entries)}]", entries, depth + 1)
+        told = ", ".join([*map(str, sizes), *given, f"b{node}"])
         self.lines += [f"{pad}    {routine}({told});", f"{pad}}}"]
         self.names[node] = f"b{node}"
 
@@ -252,9 +276,10 @@ class _Writer:
         self.names[node] = ""
         for k, n in enumerate(loop.begin):
             self.lines.append(f"{pad}{graph.kind[n]} l{s}_{k} = {self._read(n)};")
-        kept = {k: n for k, n in enumerate(loop.kept) if (s, k) in self.kept}
-        for k, n in kept.items():
-            self.lines.append(f"{pad}{graph.kind[n]} k{s}_{k}[{loop.count}];")
+        rows = self.layout.rows[s]
+        for name, entries in rows:
+            kind, size = graph.kind[loop.kept[entries[0]]], len(entries) * (loop.count or 0)
+            self.lines.append(f"{pad}{kind} {name}[{size}];")
         inner = f"{pad}    "
         if loop.count is not None:
             self.lines.append(f"{pad}for (int n{s} = 0; n{s} < {loop.count}; ++n{s}) {{")
@@ -266,8 +291,10 @@ class _Writer:
             going = self._read(loop.condition)
             self.lines.append(f"{inner}if (!ANY({going})) {{ break; }}")
             self._scope(s, depth + 1)
-        for k, n in kept.items():
-            self.lines.append(f"{inner}k{s}_{k}[n{s}] = {self._read(n)};")
+        for name, entries in rows:
+            for column, k in enumerate(entries):
+                at = place_of(column, [(f"n{s}", len(entries))])
+                self.lines.append(f"{inner}{name}[{at}] = {self._read(loop.kept[k])};")
         changed = [k for k, n in enumerate(loop.next) if n != loop.leaves[k]]
         new = {k: self._read(loop.next[k]) for k in changed}
         for k in changed:  # a leaf that becomes another is read before that one is written
@@ -318,22 +345,33 @@ class _Writer:
 
     def _row(self, nodes: tuple[Node, ...], index: str, depth: int) -> str:
         """Text by which a round reads its own one of some nodes."""
-        graph, kind = self.graph, self.graph.kind[nodes[0]]
-        found = stride(graph, self.place, nodes)
+        kind = self.graph.kind[nodes[0]]
+        found = self.layout.stride(nodes)
         if found is None:
             name = f"g{len(self.lines)}"
             entries = [self._read(n) for n in nodes]
             self._listed(f"const {kind} {name}[{len(nodes)}]", entries, depth)
             return f"{name}[{index}]"
-        (where, name), first, step = found
-        times = index if step == 1 else f"{step} * {index}"
-        at = f"{first} + {times}" if first else times
-        match where:
-            case "pack":
-                return f"p{name}[{at}]"
-            case "block":
-                return f"b{name}[{at}]"
-        return self._input_at(kind, at)
+        return self._at(found, kind, index)
+
+    def _at(self, found: tuple[Array, int, int], kind: str, index: str) -> str:
+        """Text by which an entry of some nodes in an array is read."""
+        (what, name, rounds), first, step = found
+        steps = [(f"n{scope}", by) for scope, by in rounds] + [(index, step)]
+        at = place_of(first, steps)
+        return self._input_at(kind, at) if what == "input" else f"{what}{name}[{at}]"
+
+    def _address(self, array: Array, first: int) -> str:
+        """Text of a pointer to a real in an array."""
+        what, name, rounds = array
+        at = place_of(first, [(f"n{scope}", by) for scope, by in rounds])
+        return ("x" if what == "input" else f"{what}{name}") + (f" + {at}" if at != "0" else "")
+
+
+def place_of(first: int, steps: Sequence[tuple[str, int]]) -> str:
+    """Text of a place in an array: the first one, and steps."""
+    parts = [index if by == 1 else f"{by} * {index}" for index, by in steps if by]
+    return " + ".join([str(first)] * (first != 0 or not parts) + parts).replace("+ -", "- ")
 
 
 def live_inputs(program: Program) -> list[Node]:

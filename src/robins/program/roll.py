@@ -13,8 +13,8 @@ import heapq
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
+from robins.program.layout import Layout
 from robins.program.nodes import Graph, Node
 from robins.program.operations import OPERATIONS
 
@@ -74,6 +74,7 @@ class Packing:
         self.unroll = unroll
         self.graph, self.live, self.roots = graph, set(live), roots
         self.place: dict[Node, tuple[Pack, int]] = {}  # of a node in a pack: which round
+        self.layout = Layout(graph, live, self.place, roots)
         # What says whether a loop goes on is computed before all else in it.
         loops = [graph.value[n] for n in live if graph.op[n] == "loop"]
         going = [loop.condition for loop in loops if loop.condition is not None]
@@ -248,7 +249,7 @@ class Packing:
 
     def _cost(self, roll: Roll) -> int:
         """How many arrays are to be written for a loop."""
-        return sum(1 for nodes in roll.gathered if stride(self.graph, self.place, nodes) is None)
+        return sum(1 for nodes in roll.gathered if self.layout.stride(nodes) is None)
 
     def _mark_kept(self) -> None:
         """Mark what is read outside of its round."""
@@ -306,31 +307,3 @@ def ordered(needs: Mapping[Node, set[Node]]) -> tuple[list[Node], set[Node]]:
             if waits[user] == 0:
                 heapq.heappush(ready, user)
     return order, set(needs) - set(order)
-
-
-Array = tuple[str, Any]  # of C: what it is, and its number or kind
-
-
-def source(
-    graph: Graph, place: dict[Node, tuple[Pack, int]], node: Node
-) -> tuple[Array | None, int]:
-    """The array of C in which a node lies, and where in it; None for what is in none."""
-    if node in place:
-        return ("pack", place[node][0].index), place[node][1]
-    if graph.op[node] == "input":
-        return ("input", graph.kind[node]), graph.value[node]
-    if graph.op[node] == "item":
-        return ("block", graph.args[node][0]), graph.value[node]
-    return None, 0
-
-
-def stride(
-    graph: Graph, place: dict[Node, tuple[Pack, int]], nodes: tuple[Node, ...]
-) -> tuple[Array, int, int] | None:
-    """The array in which nodes lie one step from each other: array, first place, step."""
-    found = [source(graph, place, n) for n in nodes]
-    array, first = found[0]
-    step = found[1][1] - first
-    if array is None or any(f != (array, first + k * step) for k, f in enumerate(found)):
-        return None
-    return array, first, step

@@ -183,13 +183,12 @@ static inline real real_erf_inv(real x)
     return real_select(real_lt(REAL(1.0), size), REAL(NAN), p * x);
 }
 
-/* A B' of A (m, depth) and B (n, depth), which lie one after the other. Here and in `reflect` four
+/* A B' of A (m, depth) and B (n, depth). Here and in `reflect` four
    sums go side by side, so that each need not wait for its last addition; each is in order. */
-static inline void product(int m, int depth, int n, real *in, real *out)
+static inline void product(int m, int depth, int n, const real *a, const real *b0, real *out)
 {
-    const real *a = in;
     for (int i = 0; i < m; ++i, a += depth) {
-        const real *b = in + m * depth;
+        const real *b = b0;
         for (int left = n; left > 0; --left, b += depth) {
             if (left >= 4) {
                 const real *p = b + depth, *q = p + depth, *r = q + depth;
@@ -216,7 +215,7 @@ static inline void product(int m, int depth, int n, real *in, real *out)
 }
 
 /* Lower Cholesky factor of a symmetric matrix; all NaN where a pivot is not positive. */
-static inline void cholesky(int n, real *in, real *out)
+static inline void cholesky(int n, const real *in, real *out)
 {
     flag positive = FLAG(1);
     for (int i = 0; i < n * n; ++i) { out[i] = REAL(0.0); }
@@ -235,10 +234,9 @@ static inline void cholesky(int n, real *in, real *out)
     for (int i = 0; i < n * n; ++i) { out[i] = real_select(positive, out[i], REAL(NAN)); }
 }
 
-/* L^-1 B of lower-triangular L (n, n) and B (n, width), which lie one after the other. */
-static inline void solve_lower(int n, int width, real *in, real *out)
+/* L^-1 B of lower-triangular L (n, n) and B (n, width). */
+static inline void solve_lower(int n, int width, const real *l, const real *b, real *out)
 {
-    const real *l = in, *b = in + n * n;
     for (int i = 0; i < n; ++i) {
         for (int j = 0; j < width; ++j) {
             real rest = b[i * width + j];
@@ -399,7 +397,7 @@ static inline void eigh(int n, real *in, real *out)
 
 /* L and U in one matrix (m, n), rows exchanged so that the greatest pivot comes first; the rows
    exchanged (min(m, n)), and the order that they make (m). */
-static inline void lu(int m, int n, real *in, real *out)
+static inline void lu(int m, int n, const real *in, real *out)
 {
     const int steps = m < n ? m : n;
     real *pivot = out + m * n, *order = pivot + steps;

@@ -1,0 +1,160 @@
+"""Where the numbers of a program lie in the arrays of its C, so that they are read in place.
+
+A routine takes a pointer, and a loop an offset and a step, where the numbers that it needs already
+lie in one array; else they are copied into an array of their own.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Collection, Sequence
+from itertools import accumulate, pairwise
+from typing import Any, NamedTuple
+
+from robins.program.nodes import Graph, Loop, Node
+
+# Prefix of its name or "input", number or kind, and which rounds move a place in it by how much.
+Array = tuple[str, Any, tuple[tuple[int, int], ...]]
+Entry = tuple[int, int]  # a loop by its scope, and the number of a node that it keeps
+
+OPERANDS = {
+    "product": lambda m, depth, n: (m * depth, n * depth),
+    "solve_lower": lambda n, width: (n * n, n * width),
+}
+IN_PLACE = {"triangle", "householder", "eigh"}  # change what they are given
+
+
+def operands(graph: Graph, block: Node) -> list[tuple[Node, ...]]:
+    """Arguments of a block, matrix by matrix."""
+    routine, sizes, _ = graph.value[block]
+    args = graph.args[block]
+    counts = OPERANDS[routine](*sizes) if routine in OPERANDS else (len(args),)
+    return [args[a:b] for a, b in pairwise(accumulate([0, *counts]))]
+
+
+class Rows(NamedTuple):
+    """An array of what a loop keeps of all rounds, a row for each."""
+
+    name: str
+    entries: list[int]  # of a row: numbers of kept nodes
+
+
+class Layout:
+    """Arrays of the live nodes of a graph.
+
+    Attributes:
+        place: of a node in a pack: the pack and the round.
+        rows: arrays that a loop keeps, by its scope.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        live: Sequence[Node],
+        place: dict[Node, tuple[Any, int]],
+        roots: Collection[Node],
+    ):
+        """Choose arrays; roots are read where all is done."""
+        self._graph, self.place = graph, place
+        self._readers = Counter([*roots, *(a for n in live for a in set(graph.args[n]))])
+        kept: dict[int, set[int]] = defaultdict(set)
+        for scope, k in graph.kept(live):
+            kept[scope].add(k)
+        whole: dict[tuple[Node, int], Entry] = {}  # operands that are all of an array
+        for block in live:
+            if graph.op[block] == "block":
+                for index, nodes in enumerate(operands(graph, block)):
+                    if entries := self._entries(nodes):
+                        whole[block, index] = entries[0]
+                        kept[entries[0][0]].update(k for _, k in entries)
+        self.rows: dict[int, list[Rows]] = {}
+        self._column: dict[Entry, tuple[Rows, int]] = {}
+        for node in live:
+            if graph.op[node] == "loop":
+                self._lay_out(graph.value[node], kept[graph.value[node].scope])
+        self._whole = {key: self._column[entry][0] for key, entry in whole.items()}
+
+    def _lay_out(self, loop: Loop, kept: set[int]) -> None:
+        arrays = self.rows[loop.scope] = []
+        for part, (begin, end) in enumerate(pairwise(accumulate([0, *loop.sizes]))):
+            if entries := [k for k in range(begin, end) if k in kept]:
+                arrays.append(Rows(f"k{loop.scope}_{part}", entries))
+                for column, k in enumerate(entries):
+                    self._column[loop.scope, k] = arrays[-1], column
+
+    def _is_kept(self, node: Node) -> bool:
+        return self._graph.op[node] == "after" and self._graph.value[node][1] is not None
+
+    def _entries(self, nodes: Sequence[Node]) -> list[Entry]:
+        """Entries of one array of a loop, if these nodes are all of it, known ones included."""
+        graph = self._graph
+        first = next((n for n in nodes if self._is_kept(n)), None)
+        if first is None:
+            return []
+        loop, k = graph.value[graph.args[first][0]], graph.value[first][0]
+        begin, end = next(p for p in pairwise(accumulate([0, *loop.sizes])) if k < p[1])
+        columns = range(begin, end)
+        if len(nodes) != len(columns) * loop.count:
+            return []
+        for i, node in enumerate(nodes):
+            row, column = divmod(i, len(columns))
+            value = loop.kept[columns[column]]
+            if graph.op[value] == "constant":
+                same = node == value
+            else:
+                of_loop = self._is_kept(node) and graph.value[graph.args[node][0]] is loop
+                same = of_loop and graph.value[node] == (columns[column], row)
+            if not same:
+                return []
+        return [(loop.scope, k) for k in columns]
+
+    def source(self, node: Node) -> tuple[Array | None, int]:
+        """The array in which a node lies, and where in it; None for what is in none."""
+        graph = self._graph
+        if node in self.place:
+            return ("p", self.place[node][0].index, ()), self.place[node][1]
+        match graph.op[node]:
+            case "input":
+                return ("input", graph.kind[node], ()), graph.value[node]
+            case "item":
+                return ("b", graph.args[node][0], ()), graph.value[node]
+            case "after" if self._is_kept(node):
+                k, row = graph.value[node]
+                rows, column = self._column[graph.value[graph.args[node][0]].scope, k]
+                return ("", rows.name, ()), row * len(rows.entries) + column
+            case "pick" if graph.is_round(graph.args[node][1]):
+                array, index = graph.args[node]
+                if found := self.stride(graph.args[array]):
+                    (what, name, rounds), first, step = found
+                    return (what, name, (*rounds, (graph.value[index][0], step))), first
+        return None, 0
+
+    def stride(self, nodes: Sequence[Node]) -> tuple[Array, int, int] | None:
+        """The array in which nodes lie one step from each other: array, first place, step."""
+        array, first = self.source(nodes[0])
+        if array is None:
+            return None
+        step = self.source(nodes[1])[1] - first if len(nodes) > 1 else 1
+        if any(self.source(n) != (array, first + k * step) for k, n in enumerate(nodes)):
+            return None
+        return array, first, step
+
+    def operand(self, block: Node, index: int) -> tuple[Array, int] | None:
+        """The array in which an operand lies, and from where on; None if it is to be copied.
+
+        A routine that works in place is given no number that something else reads.
+        """
+        graph, nodes = self._graph, operands(self._graph, block)[index]
+        if rows := self._whole.get((block, index)):
+            found: tuple[Array, int, int] | None = ("", rows.name, ()), 0, 1
+        else:
+            found = self.stride(nodes)
+        if found is None or found[2] != 1:
+            return None
+        if graph.value[block][0] in IN_PLACE:
+            made = [n for n in nodes if graph.op[n] != "constant"]
+            alone = all(self._readers[n] == 1 for n in made)
+            now = all(graph.scope[n] == graph.scope[block] for n in made)
+            if found[0][0] == "input" or not (alone and now):
+                return None
+        return found[0], found[1]
