@@ -23,6 +23,7 @@ from robins.ins.blocks import cut, epochs_between, gained_in_window, rate_about,
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsState
+from robins.program.evaluated import evaluated
 from robins.results import Outcome, Progress, array, silent, variable
 from robins.rotation import Rotation
 from robins.systems import replaying
@@ -116,10 +117,13 @@ def first_belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
     """At the first fix, moved from the antenna to the IMU."""
     g, row = log.gnss, start.fix
     v = np.zeros(3) if log.v_n is None else np.nan_to_num(log.v_n[row])
-    antenna = Geodetic(*(jnp.asarray(a[row]) for a in (g.lat_rad, g.lon_rad, g.alt_m)))
-    q_nb = Rotation(jnp.asarray(start.q_nb))
-    arm = q_nb.apply(np.asarray(parameters.gnss.lever_arm))
-    position = antenna.retract(-arm + jnp.asarray(v * parameters.gnss.latency))
+    antenna = Geodetic(*(np.asarray(a[row]) for a in (g.lat_rad, g.lon_rad, g.alt_m)))
+
+    def imu_at(antenna, q_nb, arm_b, moved_n):
+        return antenna.retract(moved_n - q_nb.apply(arm_b))
+
+    q_nb, arm_b = Rotation(jnp.asarray(start.q_nb)), np.asarray(parameters.gnss.lever_arm)
+    position = evaluated(imu_at, antenna, q_nb, arm_b, v * parameters.gnss.latency)
     nav = Nav(q_nb, jnp.asarray(v), position)
     return model.start_belief(
         nav,

@@ -24,6 +24,7 @@ time of a step, so that they do not depend on how often fixes come.
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -40,6 +41,7 @@ from robins.filters.rules import student_t
 from robins.filters.values import Numbers, as_data, value
 from robins.ins.state import InsState
 from robins.linalg import block_diagonal
+from robins.program.evaluated import evaluated
 from robins.systems.ins_gnss.model import IMU, POSITION, VELOCITY, Velocity
 from robins.systems.parts import Block, moved_by
 from robins.systems.study import Case
@@ -205,7 +207,7 @@ def supposed(model: Model, of: Hypothesis) -> Model:
 
 def case(asked: bool, world: Case) -> Case:
     """The case of a world whose start is about the navigation state alone."""
-    return world._replace(start=widened(world.start, asked))
+    return world._replace(start=evaluated(partial(widened, asked=asked), world.start))
 
 
 # ----------------------------------------------------------------------------- in hindsight

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins import rotation
-from robins.earth import Geodetic, gravity
+from robins.earth import Geodetic, gravity_n
 from robins.earth.magnetic import decimal_year, elements, field_n, wmm_for
 from robins.ins.alignment import level
 from robins.ins.rest import (
@@ -19,6 +19,7 @@ from robins.ins.rest import (
     standstill,
     unrest,
 )
+from robins.program.evaluated import evaluated
 from robins.systems.ins_gnss.parameters import Aids, Start
 from robins.systems.ins_gnss.recording import Log
 
@@ -117,9 +118,13 @@ def turned(q, theta):
 
 def with_heading(q_nb: np.ndarray, heading_rad: float) -> np.ndarray:
     """The same tilt with another heading."""
-    _, _, now = rotation.to_euler(jnp.asarray(q_nb))
-    turn = rotation.from_rotvec(jnp.array([0.0, 0.0, 1.0]) * (heading_rad - now))
-    return np.asarray(rotation.multiply(turn, jnp.asarray(q_nb)))
+
+    def turned_to(q_nb, heading_rad):
+        _, _, now = rotation.to_euler(q_nb)
+        turn = rotation.from_rotvec(jnp.array([0.0, 0.0, 1.0]) * (heading_rad - now))
+        return rotation.multiply(turn, q_nb)
+
+    return np.asarray(evaluated(turned_to, q_nb, heading_rad))
 
 
 def _fast_fix(log: Log, start: Start) -> tuple[int | None, str]:
@@ -230,7 +235,7 @@ def find_start(log: Log, start: Start, aids: Aids, usual: Usual | None = None) -
         at = first + int(np.argmin(np.sum(spread[first : last + 1] ** 2, axis=1)))
         tilt, how, bias = 3.0 * start.tilt, "on the quietest second, moving", np.zeros(3)
     force, some = mean_force[at], np.flatnonzero(whole)[0]
-    here = float(gravity(*(jnp.asarray(float(x[some])) for x in (g.lat_rad, g.alt_m))))
+    here = np.linalg.norm(gravity_n(*(np.asarray(x[some], float) for x in (g.lat_rad, g.alt_m))))
     if not 0.5 * here < np.linalg.norm(force) < 1.5 * here:
         raise ValueError(
             f"cannot level: the mean specific force at {time_s[at]:.2f} s is "

@@ -16,6 +16,7 @@ from robins.ins.alignment import triad
 from robins.ins.frames import to_ned_frd
 from robins.ins.increments import Increments, after_gap, from_imu, usual_interval
 from robins.manifold import Angle
+from robins.program.evaluated import evaluated
 from robins.rotation import Rotation
 from robins.systems.marg import model
 from robins.systems.marg.parameters import Accelerometer, Gyro, Magnetometer, Replay
@@ -272,7 +273,7 @@ def attitude_of(force_b: np.ndarray, field_b: np.ndarray | None) -> np.ndarray:
     north = level if field_b is None else field_b
     across = np.linalg.norm(np.cross(force_b / np.linalg.norm(force_b), north))
     C_nb = triad(force_b, north if across > 1e-3 * np.linalg.norm(north) else level)
-    return np.asarray(Rotation.from_dcm(jnp.asarray(C_nb)).wxyz)
+    return np.asarray(evaluated(Rotation.from_dcm, C_nb).wxyz)
 
 
 def first_look(increments: Increments, field_b: np.ndarray, parameters: Replay) -> FirstLook:
