@@ -128,6 +128,7 @@ def test_the_width_of_a_chunk_is_that_which_fits():
     kib = 1 << 10
     assert memory.width_of(kib, 128 * kib) == 64
     assert memory.width_of(4 * kib, 128 * kib) == 32
+    assert memory.width_of(3 * kib, 128 * kib) == 32  # 40 would, and take longer for a run
     assert memory.width_of(5 * kib, 128 * kib) == 24  # 25 would
     assert memory.width_of(100 * kib, 128 * kib) == 8
     assert memory.at_once(memory.MEMORY // 64, 8, cores=64) == 8
