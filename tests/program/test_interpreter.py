@@ -98,7 +98,10 @@ def test_each_instruction_has_the_bits_of_c():
     batches = [in_one_round(program, cases[:few]) for few in (10, 20, 130)]
     for k, case in enumerate(cases):
         want = bits(compiled(*case))
-        for got in (one(*case), *([a[k, 0] for a in many] for many in batches[(k >= 10) + (k >= 20) :])):
+        for got in (
+            one(*case),
+            *([a[k, 0] for a in many] for many in batches[(k >= 10) + (k >= 20) :]),
+        ):
             for x, y in zip(bits(got), want, strict=True):
                 np.testing.assert_array_equal(x, y)
 

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from robins.errors import RobinsError
 from robins.program.stages import Loop, Staged
 
-LOOP_S = 0.5  # of the compiler, for any loop
-NODE_S = 4e-4  # and for a node of its program (`benchmarks/campaigns.py --compile`)
-SAVED = 0.4  # of the interpreter's time, by compiled lanes (`benchmarks/program.py`)
+LOOP_S = 0.6  # of the compiler, for any loop
+NODE_S = 3e-4  # and for a node of its program (`benchmarks/campaigns.py --compile`)
+SAVED = 0.5  # of the interpreter's time, by compiled lanes (`benchmarks/program.py`)
 
 
 class HandOver:

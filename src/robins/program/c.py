@@ -135,6 +135,8 @@ class _Writer:
                 self.names[node] = self._read_input(node)
             case "array":
                 self._array(node, depth)
+            case "pick" if graph.args[node][0] in self.strides:
+                self.names[node] = self._expression(node)
             case "block":
                 self._block(node, depth)
             case "loop":

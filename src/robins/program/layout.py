@@ -151,10 +151,10 @@ class Layout:
             found = self.stride(nodes)
         if found is None or found[2] != 1:
             return None
+        array, first, _ = found
         if graph.value[block][0] in IN_PLACE:
-            made = [n for n in nodes if graph.op[n] != "constant"]
-            alone = all(self._readers[n] == 1 for n in made)
-            now = all(graph.scope[n] == graph.scope[block] for n in made)
-            if found[0][0] == "input" or not (alone and now):
+            # A loop around that in which rows are picked comes back to them.
+            is_ours = all(self._readers[n] == 1 for n in nodes if graph.op[n] != "constant")
+            if array[0] == "input" or array[2] or not is_ours:
                 return None
-        return found[0], found[1]
+        return array, first
