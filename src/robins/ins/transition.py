@@ -22,7 +22,7 @@ the body shakes.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +36,12 @@ from robins.ins.mechanise import unpacked
 from robins.rotation import skew
 
 _GAUSS = 0.5 + np.array([-1.0, 1.0]) * np.sqrt(3.0) / 6.0  # points of the unit interval
+
+
+# [[nav, inputs], [0, diag(fade)]] of navigation errors and sensor errors: (9, 9), (9, m), (m,)
+Transition = tuple[Array, Array, Array]
+# Columns [[white, walk], [0, diag(left)]] of unit impulses at one time: (9, 6), (9, m), (m,)
+Impulses = tuple[Array, Array, Array]
 
 
 def linearise(
@@ -58,54 +64,36 @@ def linearise(
         padding = [(0, segments * each - count)] + [(0, 0)] * (a.ndim - 1)
         return jnp.pad(a, padding, mode).reshape(segments, each, *a.shape[1:])
 
-    def before(later: _Transition, row):
+    def before(later: Transition, row):
         """Transition from the start of a segment to the end of the block, and its noise there."""
-        one, impulses = _segment(x, *row, noise)
-        return later.after(one, impulses)
+        increments, at = row
+        return _after(later, *_segment(x, increments, at, noise))
 
     rows = jax.tree.map(lambda a: cut(a, "constant"), true), cut(starts, "edge")
     m = len(decay_rates(x, noise))
-    nothing = _Transition(jnp.eye(9), jnp.zeros((9, m)), jnp.ones(m))
-    whole, columns = jax.lax.scan(before, nothing, rows, reverse=True)
-    lower = jnp.zeros((m, 9))
-    Phi = jnp.block([[whole.nav, whole.inputs], [lower, jnp.diag(whole.fade)]])
+    nothing = jnp.eye(9), jnp.zeros((9, m)), jnp.ones(m)
+    (nav, inputs, fade), columns = jax.lax.scan(before, nothing, rows, reverse=True)
+    Phi = jnp.block([[nav, inputs], [jnp.zeros((m, 9)), jnp.diag(fade)]])
     # From the last segment to the first: in the order of computation nothing is moved in memory.
     return Phi, linalg.tria(columns[::-1].reshape(-1, 9 + m).T)
 
 
-class _Transition(NamedTuple):
-    """Transition [[nav, inputs], [0, diag(fade)]] of navigation errors and sensor errors."""
-
-    nav: Float[Array, "9 9"]
-    inputs: Float[Array, "9 m"]
-    fade: Float[Array, "m"]
-
-    def after(
-        self, first: _Transition, impulses: list[_Impulses]
-    ) -> tuple[_Transition, Float[Array, "c n"]]:
-        """Products with the transition before this one, and with columns of noise, one to a row."""
-        parts = [first.nav, first.inputs]
-        parts += [part for one in impulses for part in (one.white, one.walk)]
-        ends = np.cumsum([part.shape[1] for part in parts])[:-1]
-        nav, inputs, *columns = jnp.split(self.nav @ jnp.concatenate(parts, 1), ends, 1)
-        whole = _Transition(nav, inputs + self.inputs * first.fade[None], self.fade * first.fade)
-        rows = []
-        for white, walk, one in zip(columns[::2], columns[1::2], impulses, strict=True):
-            lower = jnp.zeros((len(one.left), white.shape[1])), jnp.diag(self.fade * one.left)
-            for upper, low in zip((white, walk + self.inputs * one.left[None]), lower, strict=True):
-                rows.append(jnp.concatenate([upper, low]).T)
-        return whole, jnp.concatenate(rows)
+def _after(later: Transition, first: Transition, impulses: list[Impulses]):
+    """Products of a transition with the one before it, and with columns of noise, one to a row."""
+    nav, inputs, fade = later
+    parts = [*first[:2], *(part for white, walk, _ in impulses for part in (white, walk))]
+    ends = np.cumsum([part.shape[1] for part in parts])[:-1]
+    nav, first_inputs, *columns = jnp.split(nav @ jnp.concatenate(parts, 1), ends, 1)
+    rows = []
+    for white, walk, (_, _, left) in zip(columns[::2], columns[1::2], impulses, strict=True):
+        lower = jnp.zeros((len(left), white.shape[1])), jnp.diag(fade * left)
+        for upper, low in zip((white, walk + inputs * left[None]), lower, strict=True):
+            rows.append(jnp.concatenate([upper, low]).T)
+    whole = nav, first_inputs + inputs * first[2][None], fade * first[2]
+    return whole, jnp.concatenate(rows)
 
 
-class _Impulses(NamedTuple):
-    """Columns [[white, walk], [0, diag(left)]]: unit impulses at one point of time."""
-
-    white: Float[Array, "9 6"]
-    walk: Float[Array, "9 m"]
-    left: Float[Array, "m"]
-
-
-def _segment(x, true: Increments, starts, noise) -> tuple[_Transition, list[_Impulses]]:
+def _segment(x, true: Increments, starts, noise) -> tuple[Transition, list[Impulses]]:
     """Transition over one segment, and the impulses of noise in it."""
     total = jnp.sum(true.dt)
     push, shift, turn, lever, drive, drift = _sums(x, true, starts, total)
@@ -122,28 +110,23 @@ def _segment(x, true: Increments, starts, noise) -> tuple[_Transition, list[_Imp
     phi, dv, dp = slow[:3], slow[3:6], slow[6:]
     then = jnp.concatenate([phi, dv - push @ phi, dp + total * dv - skew(shift) @ phi])  # fast slow
     nav, inputs = jnp.split(slow @ jnp.concatenate([then, inputs], 1), [9], 1)
-    whole = _Transition(nav, inputs * fade[None], fade**2)
+    whole = nav, inputs * fade[None], fade**2
 
     safe = jnp.where(total > 0.0, total, 1.0)
     return whole, _impulses(x, noise, starts, total, (push / safe, turn / safe, drive / safe))
 
 
-class _Sums(NamedTuple):
-    """Sums over samples, as `mechanise` takes them, of what becomes of errors in a segment.
+def _sums(x, true: Increments, starts, total):
+    """Sums over the samples of a segment: a loop, so that a program has its body once.
 
-    Columns of the matrices are errors of three axes: biases, and scales where those are states.
+    Samples are taken as `mechanise` takes them. Columns of the matrices are errors of three axes:
+    biases, and scales where those are states.
+
+    Returns:
+        push, shift: (3,), whose skews are -dv and -dp of a misalignment.
+        turn, lever: (3, a) -phi and (6, a) dv and dp of errors of gyros.
+        drive, drift: (3, b) -dv and (3, b) -dp of errors of accelerometers.
     """
-
-    push: Float[Array, "3"]  # -dv of a misalignment is its skew
-    shift: Float[Array, "3"]  # likewise -dp
-    turn: Float[Array, "3 a"]  # -phi of errors of gyros
-    lever: Float[Array, "6 a"]  # dv and dp of these
-    drive: Float[Array, "3 b"]  # -dv of errors of accelerometers
-    drift: Float[Array, "3 b"]  # -dp
-
-
-def _sums(x, true: Increments, starts, total) -> _Sums:
-    """Sums over the samples of a segment: a loop, so that a program has its body once."""
     scaled = x.gyro_scale is not None, x.accel_scale is not None
     a, b = (3 + 3 * s for s in scaled)
 
@@ -151,36 +134,32 @@ def _sums(x, true: Increments, starts, total) -> _Sums:
         parts = [C * bias, C * scale[None]] if has_scale else [C * bias]
         return jnp.concatenate(parts, 1)
 
-    def sample(sums: _Sums, row):
+    def sample(sums, row):
         (dt, theta, dv, dr), start, elapsed = row
         C = unpacked(start).q_nb.as_dcm()
         left = total - elapsed  # time in the segment after the sample
         push = _product(C, dv[:, None])[:, 0]
         shift = _product(C, dr[:, None])[:, 0] + left * push
         # a misalignment by errors of gyros so far becomes velocity and position
-        lever = [_product(skew(by), sums.turn) for by in (push, shift)]
+        lever = jnp.concatenate([_product(skew(by), sums[2]) for by in (push, shift)])
         turn = columns(_product(C, _mean_rotation(theta)), dt, theta, scaled[0])
         drive = columns(C, dt, dv, scaled[1])
         drift = columns(C, dt * (0.5 * dt + left), dr + left * dv, scaled[1])
-        more = _Sums(push, shift, turn, jnp.concatenate(lever), drive, drift)
-        return jax.tree.map(jnp.add, sums, more), None
+        more = push, shift, turn, lever, drive, drift
+        return tuple(map(jnp.add, sums, more)), None
 
-    shapes = (3,), (3,), (3, a), (6, a), (3, b), (3, b)
+    begin = tuple(map(jnp.zeros, ((3,), (3,), (3, a), (6, a), (3, b), (3, b))))
     rows = true, starts, jnp.cumsum(true.dt)
-    sums, _ = jax.lax.scan(sample, _Sums(*map(jnp.zeros, shapes)), rows)
+    (push, shift, *of_sensors), _ = jax.lax.scan(sample, begin, rows)
     by_gyro, by_accel = (
         jnp.tile(1.0 / (1.0 + scale_of(x, sensor)), 1 + has_scale)[None]
         for sensor, has_scale in zip(("gyro", "accel"), scaled, strict=True)
     )
-    return sums._replace(
-        turn=sums.turn * by_gyro,
-        lever=sums.lever * by_gyro,
-        drive=sums.drive * by_accel,
-        drift=sums.drift * by_accel,
-    )
+    turn, lever, drive, drift = of_sensors
+    return push, shift, turn * by_gyro, lever * by_gyro, drive * by_accel, drift * by_accel
 
 
-def _impulses(x, noise, starts, total, means) -> list[_Impulses]:
+def _impulses(x, noise, starts, total, means) -> list[Impulses]:
     """Columns M with M M' the covariance that noise adds over a segment of length `total`.
 
     The response at the end to unit impulses at the Gauss points, times the size of the noise and
@@ -207,7 +186,7 @@ def _impulses(x, noise, starts, total, means) -> list[_Impulses]:
         by_accel = (jnp.zeros_like(a), -a, -0.5 * to_end * a)
         walk = _in_order(jnp.concatenate(by_gyro), jnp.concatenate(by_accel)) * sigma[None]
         left = jnp.exp(-to_end * rates) * sigma
-        found.append(_Impulses(weight * white, weight * walk, weight * left))
+        found.append((weight * white, weight * walk, weight * left))
     return found
 
 

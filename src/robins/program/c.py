@@ -11,11 +11,11 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from importlib.resources import files
 
-from robins.program.layout import IN_PLACE, Array, Layout, operands
+from robins.program.layout import IN_PLACE, Array, Layout, Pack, Roll, operands
 from robins.program.nodes import Loop, Node
 from robins.program.operations import OPERATIONS
 from robins.program.precision import DOUBLE, Precision
-from robins.program.roll import Pack, Packing, Roll
+from robins.program.roll import Packing
 from robins.program.trace import Program
 from robins.program.wrap import wrapped
 
@@ -192,8 +192,9 @@ class _Writer:
                 k, row = graph.value[node]
                 if row is None:
                     return f"l{loop.scope}_{k}"
-                (_, name, _), at = self.layout.source(node)
-                return f"{name}[{at}]"
+                array, at = self.layout.source(node)
+                assert array is not None
+                return f"{array[1]}[{at}]"
         if node in self.place:
             pack, k = self.place[node]
             return f"p{pack.index}[{k}]"

@@ -11,26 +11,28 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 from robins.program.nodes import Graph
 from robins.program.refusal import ProgramError
 from robins.program.trace import Walk
 
+Data = Any  # a pytree of arrays
 T = TypeVar("T")
 
 
-def evaluated(function: Callable[..., T], *args: Any) -> T:
+def evaluated(function: Callable[..., T], *args: Data) -> T:
     """Return ``function(*args)``, computed by folding the constants of its program.
 
     Args:
         function: pure. One with a routine in it, such as eigenvalues, or with what has no place in
             a program is computed by JAX; so is any where JAX traces.
-        args: pytrees of arrays.
+        args: as it takes.
     """
     import robins.program.primitives  # noqa: F401
 
     given = jax.tree_util.tree_leaves(args)
-    if any(isinstance(a, jax.core.Tracer) for a in given):
+    if any(isinstance(a, Tracer) for a in given):
         return function(*args)
     jaxpr, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
     walk = Walk(Graph())

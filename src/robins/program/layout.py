@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
-from typing import Any, NamedTuple
 
 from robins.program.nodes import Graph, Loop, Node
 
 # Prefix of its name or "input", number or kind, and which rounds move a place in it by how much.
-Array = tuple[str, Any, tuple[tuple[int, int], ...]]
+Array = tuple[str, Node | str, tuple[tuple[int, int], ...]]
 Entry = tuple[int, int]  # a loop by its scope, and the number of a node that it keeps
+# An array of what a loop keeps, a row for each round: its name, and which nodes are in a row.
+Rows = tuple[str, list[int]]
 
 OPERANDS = {
     "product": lambda m, depth, n: (m * depth, n * depth),
@@ -32,11 +34,38 @@ def operands(graph: Graph, block: Node) -> list[tuple[Node, ...]]:
     return [args[a:b] for a, b in pairwise(accumulate([0, *counts]))]
 
 
-class Rows(NamedTuple):
-    """An array of what a loop keeps of all rounds, a row for each."""
+@dataclass
+class Pack:
+    """One operation in all rounds of a loop.
 
-    name: str
-    entries: list[int]  # of a row: numbers of kept nodes
+    Attributes:
+        nodes: one a round.
+        args: for each argument one node, a pack of the same loop, or a node for each round.
+    """
+
+    nodes: tuple[Node, ...]
+    args: list[Node | Pack | tuple[Node, ...]] = field(default_factory=list)
+    loop: Roll | None = None
+    kept: bool = False  # whether something outside of the round reads it
+
+    @property
+    def index(self) -> Node:
+        """A number of its own."""
+        return self.nodes[0]
+
+
+@dataclass
+class Roll:
+    """A loop over packs, in the order of computation."""
+
+    rounds: int
+    scope: int
+    packs: list[Pack] = field(default_factory=list)
+
+    @property
+    def gathered(self) -> set[tuple[Node, ...]]:
+        """What comes from elsewhere, another node in each round."""
+        return {a for pack in self.packs for a in pack.args if isinstance(a, tuple)}
 
 
 class Layout:
@@ -51,7 +80,7 @@ class Layout:
         self,
         graph: Graph,
         live: Sequence[Node],
-        place: dict[Node, tuple[Any, int]],
+        place: dict[Node, tuple[Pack, int]],
         roots: Collection[Node],
     ):
         """Choose arrays; roots are read where all is done."""
@@ -78,7 +107,7 @@ class Layout:
         arrays = self.rows[loop.scope] = []
         for part, (begin, end) in enumerate(pairwise(accumulate([0, *loop.sizes]))):
             if entries := [k for k in range(begin, end) if k in kept]:
-                arrays.append(Rows(f"k{loop.scope}_{part}", entries))
+                arrays.append((f"k{loop.scope}_{part}", entries))
                 for column, k in enumerate(entries):
                     self._column[loop.scope, k] = arrays[-1], column
 
@@ -120,8 +149,8 @@ class Layout:
                 return ("b", graph.args[node][0], ()), graph.value[node]
             case "after" if self._is_kept(node):
                 k, row = graph.value[node]
-                rows, column = self._column[graph.value[graph.args[node][0]].scope, k]
-                return ("", rows.name, ()), row * len(rows.entries) + column
+                (name, entries), column = self._column[graph.value[graph.args[node][0]].scope, k]
+                return ("", name, ()), row * len(entries) + column
             case "pick" if graph.is_round(graph.args[node][1]):
                 array, index = graph.args[node]
                 if found := self.stride(graph.args[array]):
@@ -146,7 +175,7 @@ class Layout:
         """
         graph, nodes = self._graph, operands(self._graph, block)[index]
         if rows := self._whole.get((block, index)):
-            found: tuple[Array, int, int] | None = ("", rows.name, ()), 0, 1
+            found: tuple[Array, int, int] | None = ("", rows[0], ()), 0, 1
         else:
             found = self.stride(nodes)
         if found is None or found[2] != 1:

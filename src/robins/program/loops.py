@@ -9,7 +9,7 @@ written to memory. What a round leaves for the next is carried.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jax.extend import core as jex
@@ -47,25 +47,21 @@ RANDOM = {"random_bits", "random_split"}
 Named = dict[Variable, Nodes]
 
 
-class Along(NamedTuple):
-    """The axis along which an equation goes."""
-
-    length: int
-    backwards: bool = False
+Along = tuple[int, bool]  # length of an axis, and whether equations go along it backwards
 
 
 def along(e: Equation) -> Along | None:
     """The axis along which an equation goes, if it does and can be part of a loop."""
     name, p = e.primitive.name, e.params
     if name == "scan":
-        return Along(p["length"], p["reverse"]) if p["length"] >= SHORTEST else None
+        return (p["length"], p["reverse"]) if p["length"] >= SHORTEST else None
     shapes = [v.aval.shape for v in e.outvars]
     if not all(shapes) or len({s[0] for s in shapes}) > 1 or e.effects:
         return None
     length = shapes[0][0]
     if length < ROUNDS or any(np.prod(s[1:]) > WIDEST for s in shapes):
         return None
-    return Along(length) if _by_rows(e, name, p, length) else None
+    return (length, False) if _by_rows(e, name, p, length) else None
 
 
 def _by_rows(e: Equation, name: str, p: Any, length: int) -> bool:
@@ -164,7 +160,7 @@ class Body:
         self.begin: list[Variable] = []
         self.after: list[Variable] = []
         for e in equations:
-            whole, by_row = uses(e, axis.length)
+            whole, by_row = uses(e, axis[0])
             if e.primitive.name == "scan":
                 fixed, carried = e.params["num_consts"], e.params["num_carry"]
                 whole = [v for v in e.invars[:fixed] if not isinstance(v, jex.Literal)]
@@ -263,7 +259,7 @@ class Body:
         index: Nodes,
     ) -> list[Nodes]:
         """What an equation makes of rows: the same equation on arrays of one row."""
-        name, p, length = e.primitive.name, dict(e.params), self.axis.length
+        name, p, length = e.primitive.name, dict(e.params), self.axis[0]
         by_row = uses(e, length)[1]
         if name == "iota":
             kind = kind_of(e.outvars[0].aval.dtype)

@@ -12,9 +12,8 @@ from __future__ import annotations
 import heapq
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 
-from robins.program.layout import Layout
+from robins.program.layout import Layout, Pack, Roll
 from robins.program.nodes import Graph, Node
 from robins.program.operations import OPERATIONS
 
@@ -22,40 +21,6 @@ FEWEST = 8  # rounds of a loop
 LEAST = 3  # operations in a round, and so many times the arrays that are gathered for it
 
 PACKED = {*OPERATIONS, "select", "convert", "bits"}
-
-
-@dataclass
-class Pack:
-    """One operation in all rounds of a loop.
-
-    Attributes:
-        nodes: one a round.
-        args: for each argument one node, a pack of the same loop, or a node for each round.
-    """
-
-    nodes: tuple[Node, ...]
-    args: list[Node | Pack | tuple[Node, ...]] = field(default_factory=list)
-    loop: Roll | None = None
-    kept: bool = False  # whether something outside of the round reads it
-
-    @property
-    def index(self) -> Node:
-        """A number of its own."""
-        return self.nodes[0]
-
-
-@dataclass
-class Roll:
-    """A loop over packs, in the order of computation."""
-
-    rounds: int
-    scope: int
-    packs: list[Pack] = field(default_factory=list)
-
-    @property
-    def gathered(self) -> set[tuple[Node, ...]]:
-        """What comes from elsewhere, another node in each round."""
-        return {a for pack in self.packs for a in pack.args if isinstance(a, tuple)}
 
 
 Seeds = Iterable[tuple[Node, ...]]

@@ -225,7 +225,7 @@ class Loop:
                 program, engine = self._write(), self._engine
             stays = len(body.stays) - len(known)
             axis = self.axis
-            self.rounds = Rounds(program, axis.length, len(begin), stays, axis.backwards, engine)
+            self.rounds = Rounds(program, axis[0], len(begin), stays, axis[1], engine)
         except (ProgramError, BuildError) as error:
             self.refused = error
             takes, makes = taken_by(self.equations), made_by(self.equations, self._wanted)
@@ -264,7 +264,7 @@ def cut(
         if axis is None:
             whole, rows = [v for v in e.invars if not isinstance(v, jex.Literal)], []
         else:
-            whole, rows = uses(e, axis.length)
+            whole, rows = uses(e, axis[0])
         of = [level[v] + (v in source or v in after) for v in whole if v in level]
         for v in rows:
             if v in level:
