@@ -141,7 +141,7 @@ class Written:
         outputs = walk.open(jaxpr, (), nodes)
         results = [Leaf(shape(v), v.aval.dtype, kind_of(v.aval.dtype), "") for v in self.makes]
         return Program(
-            *(walk.graph, walk.inputs, outputs, results, (None, None), walk.alike, UNROLL)
+            *(walk.graph, walk.inputs, outputs, results, (None, None))
         )
 
     def _of_runs(self, runs: int, values: Values) -> Sequence[np.ndarray]:

@@ -7,15 +7,14 @@ written where it is used. Selects, comparisons and functions are calls of `scala
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Sequence
 from importlib.resources import files
 
-from robins.program.layout import IN_PLACE, Array, Layout, Pack, Roll, operands
+from robins.program.layout import IN_PLACE, Array, Layout, operands
 from robins.program.nodes import Loop, Node
 from robins.program.operations import OPERATIONS
 from robins.program.precision import DOUBLE, Precision
-from robins.program.roll import Packing
 from robins.program.trace import Program
 from robins.program.wrap import wrapped
 
@@ -63,32 +62,23 @@ class _Writer:
         self.lines: list[str] = []
         self.names: dict[Node, str] = {}  # how a node is read
         self.inlined: set[Node] = set()
-        self.written: set[int] = set()  # loops over packs
         self.strides: dict[Node, tuple[Array, int, int]] = {}  # arrays that lie in another one
         live = program.live
         self.results = [n for nodes in program.outputs for n in nodes.ravel().tolist()]
         roots = [*self.results]
         users: dict[Node, list[Node]] = defaultdict(list)
-        self.uses: Counter[Node] = Counter()
         for node in live:
             for arg in self.graph.args[node]:
-                self.uses[arg] += 1
                 users[arg].append(node)
             if self.graph.op[node] == "loop":
                 roots += self.graph.value[node].changes
         roots += self.graph.kept(live).values()
         self.user = {n: u[0] for n, u in users.items() if len(u) == 1}
         self.roots = set(roots)
-        self.schedule: dict[int, list[Node | Roll]] = defaultdict(list)
-        self.place: dict[Node, tuple[Pack, int]] = {}
-        if program.alike:
-            packing = Packing(self.graph, live, self.roots, program.alike, program.unroll or 0)
-            self.place, self.schedule = packing.place, packing.schedule()
-            self.layout = packing.layout
-        else:
-            self.layout = Layout(self.graph, live, self.place, self.roots)
-            for node in live:
-                self.schedule[self.graph.scope[node]].append(node)
+        self.inner: dict[int, list[Node]] = defaultdict(list)
+        for node in live:
+            self.inner[self.graph.scope[node]].append(node)
+        self.layout = Layout(self.graph, live, self.roots)
         picks = [self.graph.args[n] for n in live if self.graph.op[n] == "pick"]
         # arrays that are picked from by any number
         self.addressed = {array for array, index in picks if not self.graph.is_round(index)}
@@ -119,12 +109,9 @@ class _Writer:
 
     def _scope(self, scope: int, depth: int, only: set[Node] | None = None) -> None:
         """Write the nodes of a scope, or those of them that are named."""
-        for one in self.schedule[scope]:
-            if isinstance(one, Roll):
-                if id(one) not in self.written and (only is None or one.packs[0].index in only):
-                    self._roll(one, depth)
-            elif one not in self.names and (only is None or one in only):
-                self._node(one, depth)
+        for node in self.inner[scope]:
+            if node not in self.names and (only is None or node in only):
+                self._node(node, depth)
 
     def _node(self, node: Node, depth: int) -> None:
         graph, op = self.graph, self.graph.op[node]
@@ -153,7 +140,6 @@ class _Writer:
         graph, user = self.graph, self.user.get(node)
         return (
             user is not None
-            and user not in self.place
             and node not in self.roots
             and len(text) <= WIDEST
             and graph.scope[user] == graph.scope[node]
@@ -195,21 +181,16 @@ class _Writer:
                 array, at = self.layout.source(node)
                 assert array is not None
                 return f"{array[1]}[{at}]"
-        if node in self.place:
-            pack, k = self.place[node]
-            return f"p{pack.index}[{k}]"
         text = self.names[node]
         infix = bare and node in self.inlined and self._infix(node)
         return f"({text})" if infix else text
 
-    def _expression(
-        self, node: Node, read: list[str] | None = None, bare: list[str] | None = None
-    ) -> str:
-        """The operation of a node, on arguments as they are read, and as beside an operator."""
+    def _expression(self, node: Node) -> str:
+        """The operation of a node on its arguments."""
         graph, op, args = self.graph, self.graph.op[node], self.graph.args[node]
         kind = graph.kind[args[0]]
         if sign := self._infix(node):
-            parts = [self._read(a, bare=True) for a in args] if bare is None else bare
+            parts = [self._read(a, bare=True) for a in args]
             return f"{sign}{parts[0]}" if len(parts) == 1 else f" {sign} ".join(parts)
         if op == "pick":
             array, index = args
@@ -224,7 +205,7 @@ class _Writer:
             "convert": f"{graph.kind[node]}_of_{kind}",
             "bits": f"{graph.kind[node]}_bits_{kind}",
         }.get(op, f"{kind}_{op}")
-        return f"{name}({', '.join(map(self._read, args) if read is None else read)})"
+        return f"{name}({', '.join(map(self._read, args))})"
 
     def _infix(self, node: Node) -> str:
         """The operator of a node, if it is one in C for numbers of its kind."""
@@ -312,50 +293,6 @@ class _Writer:
                 text = f"{kind}_select({self._read(loop.condition)}, {text}, l{s}_{k})"
             self.lines.append(f"{inner}l{s}_{k} = {text};")
         self.lines.append(f"{pad}}}")
-
-    def _roll(self, roll: Roll, depth: int) -> None:
-        """A loop over packs: one round of it, its names those of the first."""
-        self.written.add(id(roll))
-        pad, index = "    " * depth, f"q{roll.packs[0].index}"
-        uses = Counter(id(a) for pack in roll.packs for a in pack.args if isinstance(a, Pack))
-        rows = {nodes: self._row(nodes, index, depth) for nodes in roll.gathered}
-        for pack in roll.packs:
-            if pack.kept:
-                kind = self.graph.kind[pack.index]
-                self.lines.append(f"{pad}{kind} p{pack.index}[{roll.rounds}];")
-        self.lines.append(f"{pad}for (int {index} = 0; {index} < {roll.rounds}; ++{index}) {{")
-        names: dict[int, tuple[str, bool]] = {}  # of a pack, and whether it is an expression
-
-        def read(arg: Node | Pack | tuple[Node, ...], bare: bool) -> str:
-            if isinstance(arg, Pack):
-                text, is_expression = names[id(arg)]
-                return f"({text})" if bare and is_expression else text
-            return rows[arg] if isinstance(arg, tuple) else self._read(arg, bare)
-
-        for pack in roll.packs:
-            first, kind = pack.index, self.graph.kind[pack.index]
-            text = self._expression(
-                first, *([read(a, b) for a in pack.args] for b in (False, True))
-            )
-            if pack.kept or uses[id(pack)] > 1 or len(text) > WIDEST:
-                names[id(pack)] = f"{PREFIX[kind]}{first}", False
-                self.lines.append(f"{pad}    const {kind} {PREFIX[kind]}{first} = {text};")
-                if pack.kept:
-                    self.lines.append(f"{pad}    p{first}[{index}] = {PREFIX[kind]}{first};")
-            else:
-                names[id(pack)] = text, bool(self._infix(first))
-        self.lines.append(f"{pad}}}")
-
-    def _row(self, nodes: tuple[Node, ...], index: str, depth: int) -> str:
-        """Text by which a round reads its own one of some nodes."""
-        kind = self.graph.kind[nodes[0]]
-        found = self.layout.stride(nodes)
-        if found is None:
-            name = f"g{len(self.lines)}"
-            entries = [self._read(n) for n in nodes]
-            self._listed(f"const {kind} {name}[{len(nodes)}]", entries, depth)
-            return f"{name}[{index}]"
-        return self._at(found, kind, index)
 
     def _at(self, found: tuple[Array, int, int], kind: str, index: str) -> str:
         """Text by which an entry of some nodes in an array is read."""

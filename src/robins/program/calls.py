@@ -24,22 +24,20 @@ SEEN_THROUGH = {"neg", "not", "is_finite"}  # rules and folding look at the argu
 OWN = {"input", "leaf", "loop", "after"}  # of one graph: such a call is not copied
 WORTH = 4  # equations of a jaxpr that is looked up
 
-Rows = list[tuple[Node, ...]]  # which may be computed in loops
-# A call as it was written: the graph, its arguments, its results and its rows.
-Call = tuple[Graph, list[Node], list[Nodes], Rows]
-# Operation, kind, value and arguments of each node that is written, results and rows; a number
-# counts the arguments of the call, then the nodes.
-Template = tuple[list[tuple[str, str, Any, tuple[int, ...]]], list[np.ndarray], Rows]
+# A call as it was written: the graph, its arguments and its results.
+Call = tuple[Graph, list[Node], list[Nodes]]
+# Operation, kind, value and arguments of each node that is written, and results; a number counts
+# the arguments of the call, then the nodes.
+Template = tuple[list[tuple[str, str, Any, tuple[int, ...]]], list[np.ndarray]]
 # By jaxpr and form, all with the same `unroll`; None of calls that are walked each time.
 Calls = dict[Hashable, Call | Template | None]
 
 
 def template_of(call: Call) -> Template | None:
     """The template that a call leaves; None if it contains a loop."""
-    graph, given, outputs, alike = call
+    graph, given, outputs = call
     place = {n: k for k, n in enumerate(given)}
     ahead = [n for a in outputs for n in a.ravel().tolist()]
-    ahead += [n for row in alike for n in row]
     seen = set(place)
     while ahead:
         node = ahead.pop()
@@ -54,12 +52,12 @@ def template_of(call: Call) -> Template | None:
         steps.append((graph.op[node], graph.kind[node], graph.value[node], places))
         place[node] = len(place)
     shaped = [np.array([place[n] for n in a.flat], np.int64).reshape(a.shape) for a in outputs]
-    return steps, shaped, [tuple([place[n] for n in row]) for row in alike]
+    return steps, shaped
 
 
-def written(template: Template, graph: Graph, given: Sequence[Node]) -> tuple[list[Nodes], Rows]:
-    """Results and rows of a call with other arguments, written into a graph."""
-    steps, outputs, alike = template
+def written(template: Template, graph: Graph, given: Sequence[Node]) -> list[Nodes]:
+    """Results of a call with other arguments, written into a graph."""
+    steps, outputs = template
     nodes = list(given)
     for op, kind, value, places in steps:
         args = tuple([nodes[k] for k in places])
@@ -75,8 +73,7 @@ def written(template: Template, graph: Graph, given: Sequence[Node]) -> tuple[li
             node = graph.ordered(op, args, kind, value)
         nodes.append(node)
     found = np.array(nodes, np.int64)
-    rows = [tuple([nodes[k] for k in row]) for row in alike]
-    return [np.asarray(found[a]) for a in outputs], rows
+    return [np.asarray(found[a]) for a in outputs]
 
 
 def results_of(
@@ -84,7 +81,6 @@ def results_of(
     graph: Graph,
     jaxpr: jex.Jaxpr,
     args: Sequence[Nodes],
-    alike: Rows,
     write: Callable[[], list[Nodes]],
 ) -> list[Nodes]:
     """Results of a jaxpr on arrays of nodes, from a template where there is one.
@@ -94,7 +90,6 @@ def results_of(
         graph: into which it is written.
         jaxpr: of the call.
         args: arrays of nodes.
-        alike: rows, to which those of the call are added.
         write: walks through the jaxpr.
     """
     if len(jaxpr.eqns) < WORTH:
@@ -102,24 +97,22 @@ def results_of(
     form, given = _form(graph, args)
     key = jaxpr, form  # a jaxpr equals itself alone
     is_known, found = key in calls, calls.get(key)
-    if found is not None and len(found) == 4:
+    if found is not None and len(found) == 3:
         found = calls[key] = template_of(found)
     if found is not None:
-        outputs, rows = written(found, graph, given)
-        alike += rows
-        return outputs
-    begin, met, outputs = len(alike), len(graph.met), write()
+        return written(found, graph, given)
+    met, outputs = len(graph.met), write()
     if not is_known:
         made = [n for n in given if graph.op[n] not in SEEN_THROUGH]
         is_free = set(made).isdisjoint(graph.met[met:])
-        calls[key] = (graph, given, outputs, alike[begin:]) if is_free else None
+        calls[key] = (graph, given, outputs) if is_free else None
     return outputs
 
 
 def forget(calls: Calls, graphs: Sequence[Graph]) -> None:
     """Drop the calls that hold other graphs than these."""
     for key, found in list(calls.items()):
-        if found is not None and len(found) == 4 and all(found[0] is not g for g in graphs):
+        if found is not None and len(found) == 3 and all(found[0] is not g for g in graphs):
             del calls[key]
 
 

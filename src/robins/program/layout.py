@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
 
 from robins.program.nodes import Graph, Loop, Node
@@ -34,57 +33,16 @@ def operands(graph: Graph, block: Node) -> list[tuple[Node, ...]]:
     return [args[a:b] for a, b in pairwise(accumulate([0, *counts]))]
 
 
-@dataclass
-class Pack:
-    """One operation in all rounds of a loop.
-
-    Attributes:
-        nodes: one a round.
-        args: for each argument one node, a pack of the same loop, or a node for each round.
-    """
-
-    nodes: tuple[Node, ...]
-    args: list[Node | Pack | tuple[Node, ...]] = field(default_factory=list)
-    loop: Roll | None = None
-    kept: bool = False  # whether something outside of the round reads it
-
-    @property
-    def index(self) -> Node:
-        """A number of its own."""
-        return self.nodes[0]
-
-
-@dataclass
-class Roll:
-    """A loop over packs, in the order of computation."""
-
-    rounds: int
-    scope: int
-    packs: list[Pack] = field(default_factory=list)
-
-    @property
-    def gathered(self) -> set[tuple[Node, ...]]:
-        """What comes from elsewhere, another node in each round."""
-        return {a for pack in self.packs for a in pack.args if isinstance(a, tuple)}
-
-
 class Layout:
     """Arrays of the live nodes of a graph.
 
     Attributes:
-        place: of a node in a pack: the pack and the round.
         rows: arrays that a loop keeps, by its scope.
     """
 
-    def __init__(
-        self,
-        graph: Graph,
-        live: Sequence[Node],
-        place: dict[Node, tuple[Pack, int]],
-        roots: Collection[Node],
-    ):
+    def __init__(self, graph: Graph, live: Sequence[Node], roots: Collection[Node]):
         """Choose arrays; roots are read where all is done."""
-        self._graph, self.place = graph, place
+        self._graph = graph
         self._readers = Counter([*roots, *(a for n in live for a in set(graph.args[n]))])
         kept: dict[int, set[int]] = defaultdict(set)
         for scope, k in graph.kept(live):
@@ -140,8 +98,6 @@ class Layout:
     def source(self, node: Node) -> tuple[Array | None, int]:
         """The array in which a node lies, and where in it; None for what is in none."""
         graph = self._graph
-        if node in self.place:
-            return ("p", self.place[node][0].index, ()), self.place[node][1]
         match graph.op[node]:
             case "input":
                 return ("input", graph.kind[node], ()), graph.value[node]

@@ -228,7 +228,7 @@ class Body:
         for v in self.made:
             results.append(Leaf(v.aval.shape[1:], v.aval.dtype, kind_of(v.aval.dtype), "row"))
         return Program(
-            graph, walk.inputs, outputs, results, (None, None), walk.alike, unroll, dict(zeros)
+            graph, walk.inputs, outputs, results, (None, None), dict(zeros)
         )
 
     def _scanned(

@@ -21,7 +21,6 @@ from robins.program.kinds import kind_of, numbers_of
 from robins.program.nodes import Graph, Node
 from robins.program.refusal import ProgramError
 from robins.program.refused import REFUSED
-from robins.program.roll import FEWEST
 
 # Scalar operations up to which a loop or a factorisation is written out: all of a filter of nine
 # states, not the thirty samples of an IMU between two fixes.
@@ -80,8 +79,6 @@ class Program:
         outputs: arrays of nodes, and
         results: what they are.
         structure: pytrees of the arguments and of the results.
-        alike: rows of nodes which may be computed in loops; nothing where all is written out.
-        unroll: as it was told to `trace`.
         zeros: of an argument, by its number, which entries it takes to be zero.
     """
 
@@ -90,8 +87,6 @@ class Program:
     outputs: list[Nodes]
     results: list[Leaf]
     structure: tuple[Any, Any]
-    alike: list[tuple[Node, ...]] = field(default_factory=list)
-    unroll: int | None = None
     zeros: dict[int, np.ndarray] = field(default_factory=dict)
 
     @cached_property
@@ -123,7 +118,6 @@ class Walk:
         self._calls: Calls = {} if calls is None else calls
         self._constants: dict[int, tuple[Any, Nodes]] = {}  # by id, which the value keeps its own
         self.inputs: list[Leaf] = []
-        self.alike: list[tuple[Node, ...]] = []  # rows of arrays, which may be computed in a loop
 
     def taken(self, shape: tuple[int, ...], dtype: Any, path: str = "", zero: Any = None) -> Nodes:
         """Nodes of one more argument; zero: (shape) which of its entries are known to be zero."""
@@ -189,7 +183,7 @@ class Walk:
         """Results of a jaxpr on arrays of nodes."""
         given = [*consts, *args]
         return results_of(
-            self._calls, self.graph, jaxpr, given, self.alike, lambda: self._written(jaxpr, given)
+            self._calls, self.graph, jaxpr, given, lambda: self._written(jaxpr, given)
         )
 
     def _written(self, jaxpr: Any, given: Sequence[Nodes]) -> list[Nodes]:
@@ -225,13 +219,6 @@ class Walk:
         found = list(found) if isinstance(found, (list, tuple)) else [found]
         if name in OVERFLOWING:
             found = [self.wrapped(found[0], equation.outvars[0].aval.dtype)]
-        if self.unroll is not None:
-            for array in found:
-                for axis, size in enumerate(array.shape):
-                    if size >= FEWEST:
-                        self.alike += map(
-                            tuple, np.moveaxis(array, axis, -1).reshape(-1, size).tolist()
-                        )
         return found
 
     def function(self, function: Callable[..., Any], *args: Nodes, like: Sequence[Any]) -> Any:
@@ -385,5 +372,5 @@ def _program(
     structures = tuple(jax.tree_util.tree_structure(tree) for tree in (given, results))
     leaves = _leaves(results, "results")
     return Program(
-        *(walk.graph, walk.inputs, outputs, leaves, structures, walk.alike, unroll, zeros)
+        *(walk.graph, walk.inputs, outputs, leaves, structures, zeros)
     )
