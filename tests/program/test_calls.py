@@ -152,7 +152,7 @@ def test_graphs_of_earlier_attempts_are_not_held():
     held, graph, other = {}, Graph(), Graph()
     jaxpr = jax.make_jaxpr(lambda x: jnp.sin(x) * jnp.cos(x) + x * x)(1.0).jaxpr
     given = [np.array(graph.input(0, "real"))]
-    calls.results_of(held, graph, jaxpr, given, [], lambda: given)
+    calls.results_of(held, graph, jaxpr, given, lambda: given)
     gone = weakref.ref(graph)
     calls.forget(held, [graph])
     del graph
