@@ -140,9 +140,7 @@ class Written:
         jaxpr = jaxpr_of(self._equations, self.takes, self.makes)
         outputs = walk.open(jaxpr, (), nodes)
         results = [Leaf(shape(v), v.aval.dtype, kind_of(v.aval.dtype), "") for v in self.makes]
-        return Program(
-            *(walk.graph, walk.inputs, outputs, results, (None, None))
-        )
+        return Program(*(walk.graph, walk.inputs, outputs, results, (None, None)))
 
     def _of_runs(self, runs: int, values: Values) -> Sequence[np.ndarray]:
         given = [(values[self.takes[k]], self._batched[k]) for k in self._free]

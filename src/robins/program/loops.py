@@ -227,9 +227,7 @@ class Body:
             results.append(Leaf(v.aval.shape, v.aval.dtype, kind_of(v.aval.dtype), "carried"))
         for v in self.made:
             results.append(Leaf(v.aval.shape[1:], v.aval.dtype, kind_of(v.aval.dtype), "row"))
-        return Program(
-            graph, walk.inputs, outputs, results, (None, None), dict(zeros)
-        )
+        return Program(graph, walk.inputs, outputs, results, (None, None), dict(zeros))
 
     def _scanned(
         self,

@@ -371,6 +371,4 @@ def _program(
     outputs = walk.closed(jaxpr, *nodes)
     structures = tuple(jax.tree_util.tree_structure(tree) for tree in (given, results))
     leaves = _leaves(results, "results")
-    return Program(
-        *(walk.graph, walk.inputs, outputs, leaves, structures, zeros)
-    )
+    return Program(*(walk.graph, walk.inputs, outputs, leaves, structures, zeros))
