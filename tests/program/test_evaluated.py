@@ -15,7 +15,7 @@ C = np.linalg.qr(RNG.normal(size=(3, 3)))[0]
 def parts(x, n):
     return {
         "sum": jnp.sum(jnp.sin(x) / (1.0 + x * x)),
-        "same": x[::-1] > 0.5,
+        "flags": x[::-1] > 0.5,
         "twice": (2 * n, None),
     }
 
@@ -24,7 +24,15 @@ def values(x, n):
     return jnp.linalg.eigh(x @ x.T)[0], n
 
 
-@pytest.mark.parametrize("function", [parts, values])
+def by_numpy(x, n):
+    return jnp.asarray(np.linalg.norm(np.asarray(x)) + n)
+
+
+def many(x, n):
+    return jnp.sum(jnp.sin(jnp.outer(x, jnp.arange(1e4)))), n
+
+
+@pytest.mark.parametrize("function", [parts, values, by_numpy, many])
 def test_it_gives_what_jax_gives(function):
     x, n = RNG.normal(size=(3, 3)), np.int32(7)
     want, got = function(jnp.asarray(x), n), evaluated(function, x, n)
@@ -40,10 +48,10 @@ def test_where_jax_traces_it_is_traced():
 
 
 def test_nothing_is_compiled():
-    compiled = []
+    compiled, ended = [], []
 
     def heard(event, duration, **about):
-        if event.endswith("backend_compile_duration"):
+        if event.endswith("backend_compile_duration") and not ended:
             compiled.append(about)
 
     jax.monitoring.register_event_duration_secs_listener(heard)
@@ -53,3 +61,9 @@ def test_nothing_is_compiled():
     want = jnp.hypot(jnp.tan(x[:5]), x[2:]) @ x.T
     assert compiled
     np.testing.assert_allclose(found, want, rtol=1e-14)
+    ended.append(True)  # JAX keeps its listeners
+
+
+def test_what_the_function_holds_may_be_traced():
+    found = jax.jit(lambda t: evaluated(lambda x: x * t, np.ones(3)))(2.0)
+    np.testing.assert_array_equal(found, 2.0 * np.ones(3))

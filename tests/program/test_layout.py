@@ -120,6 +120,7 @@ def copied(case):
 
 def test_a_factorisation_takes_the_rows_of_a_loop_as_they_lie():
     assert copied(all_of_it) == []
+    assert "triangle(30, 5, 5, k1_0, " in function(trace(all_of_it, X, unroll=20))
     assert copied(read_elsewhere) == [LEAST]  # in place it would change what is read
     assert copied(a_result) == [LEAST]
 

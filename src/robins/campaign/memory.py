@@ -12,7 +12,7 @@ import sys
 
 LEAST = 8  # runs of a chunk: the lanes of a processor
 CHUNK = 64  # runs of a chunk at most: they fill a core's vectors, and more would not fit its cache
-FEWER = 32  # with which the interpreter takes as long for a run as with 48
+SOME = 32  # with which the interpreter takes as long for a run as with 48
 CHUNK_BYTES = 192 << 20  # of a chunk in lanes, of which several are computed at once
 MEMORY = 768 << 20  # bytes of all chunks at once
 
@@ -26,10 +26,13 @@ def filled(runs: int, most: int = CHUNK) -> int:
 
 
 def width_of(bytes_of_run: int, most: int) -> int:
-    """Runs of a chunk that takes so many bytes at most; a multiple of `LEAST`, up to `CHUNK`."""
+    """Runs of a chunk that takes so many bytes at most.
+
+    A multiple of `LEAST` up to `CHUNK`; `SOME` instead of a few more.
+    """
     fitting = most // max(bytes_of_run, 1) // LEAST * LEAST
     width = min(max(fitting, LEAST), CHUNK)
-    return FEWER if FEWER < width < CHUNK - LEAST else width
+    return SOME if SOME < width < CHUNK - LEAST else width
 
 
 def at_once(bytes_of_run: int, width: int, cores: int) -> int:

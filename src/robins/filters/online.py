@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping
-from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -20,7 +19,6 @@ from robins.filters.run import Step, everything
 from robins.filters.tally import Tally, doubts
 from robins.filters.values import Numbers, settled
 from robins.manifold import State
-from robins.program.evaluated import evaluated
 
 T = TypeVar("T")
 WINDOW = 400  # last updates of each sensor that are judged
@@ -65,9 +63,7 @@ class OnlineFilter:
                 raises it for an operation that C lacks, with the line of the model or the rule.
         """
         self.filter, self.model = filter_, model
-        if isinstance(start, Belief):
-            start = evaluated(partial(filter_.init, dims=model.dims), start)
-        state = settled(start)
+        state = settled(filter_.init(start, model.dims) if isinstance(start, Belief) else start)
         self._machine = on(machine, self.filter, self.model, state)
         self._reports = filter_.reports
         self._start = self._copied(self.state)

@@ -112,9 +112,9 @@ def _corrected(x: InsState, block: Increments, noise: InsNoise | None):
     gyro_gain = 1.0 / (1.0 + scale_of(x, "gyro"))
     accel_gain = 1.0 / (1.0 + scale_of(x, "accel"))
 
-    def corrected(raw: Increments, until: Array) -> Increments:
+    def corrected(raw: Increments, end: Array) -> Increments:
         dt = raw.dt
-        fading = jnp.exp(-(until - 0.5 * dt) * rates)  # in the middle of the increment
+        fading = jnp.exp(-(end - 0.5 * dt) * rates)  # in the middle of the increment
         gyro_bias, accel_bias = x.gyro_bias * fading[:3], x.accel_bias * fading[3:]
         return Increments(
             dt,

@@ -40,7 +40,7 @@ _GAUSS = 0.5 + np.array([-1.0, 1.0]) * np.sqrt(3.0) / 6.0  # points of the unit 
 
 # [[nav, inputs], [0, diag(fade)]] of navigation errors and sensor errors: (9, 9), (9, m), (m,)
 Transition = tuple[Array, Array, Array]
-# Columns [[white, walk], [0, diag(left)]] of unit impulses at one time: (9, 6), (9, m), (m,)
+# Columns [[white, walk], [0, diag(left)]] of noise at one time: (9, 6), (9, m), (m,)
 Impulses = tuple[Array, Array, Array]
 
 
@@ -79,7 +79,7 @@ def linearise(
 
 
 def _after(later: Transition, first: Transition, impulses: list[Impulses]):
-    """Products of a transition with the one before it, and with columns of noise, one to a row."""
+    """Return ``later @ first``, and the columns ``later @ impulses``, one to a row."""
     nav, inputs, fade = later
     parts = [*first[:2], *(part for white, walk, _ in impulses for part in (white, walk))]
     ends = np.cumsum([part.shape[1] for part in parts])[:-1]

@@ -219,7 +219,7 @@ class _Writer:
     def _array(self, node: Node, depth: int) -> None:
         args = self.graph.args[node]
         if node not in self.addressed and (found := self.layout.stride(args)):
-            self.names[node], self.strides[node] = "", found
+            self.strides[node] = found
             return
         entries = [self._read(a) for a in self.graph.args[node]]
         self._listed(f"const {self.graph.kind[node]} a{node}[{len(entries)}]", entries, depth)

@@ -17,30 +17,36 @@ from robins.program.nodes import Graph
 from robins.program.refusal import ProgramError
 from robins.program.trace import Walk
 
-Data = Any  # a pytree of arrays
+Data = Any  # a pytree of arrays of numbers
 T = TypeVar("T")
+MOST = 20_000  # operations, folded in 0.2 s
 
 
 def evaluated(function: Callable[..., T], *args: Data) -> T:
     """Return ``function(*args)``, computed by folding the constants of its program.
 
+    JAX computes it where it traces the arguments, and functions that cannot be traced or folded: of
+    many operations, with routines such as eigenvalues, or with what has no place in a program.
+
     Args:
-        function: pure. One with a routine in it, such as eigenvalues, or with what has no place in
-            a program is computed by JAX; so is any where JAX traces.
-        args: as it takes.
+        function: pure. It is called with traced arguments, so it does not see bad numbers: those
+            are to be refused before. A real converted to a whole number is in its range.
+        args: arguments of the function.
     """
-    import robins.program.primitives  # noqa: F401
+    from robins.program.primitives.control import size_of
 
     given = jax.tree_util.tree_leaves(args)
     if any(isinstance(a, Tracer) for a in given):
         return function(*args)
-    jaxpr, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
-    walk = Walk(Graph())
     try:
+        jaxpr, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
+        walk = Walk(Graph())
+        if size_of(jaxpr.jaxpr) > MOST:
+            return function(*args)
         found = walk.closed(jaxpr, *[walk.constants(np.asarray(a)) for a in given])
-        known = list(map(walk.known, found))
-    except ProgramError:
+    except (ProgramError, TypeError):  # a TypeError of JAX, of what reads traced numbers
         return function(*args)
+    known = list(map(walk.known, found))
     if any(x is None for x in known):
         return function(*args)
     leaves, tree = jax.tree_util.tree_flatten(shapes)

@@ -2,8 +2,8 @@
 
    An instruction is one operation on WIDTH runs; a register is a row of as many numbers, 8 bytes
    each. One text makes two machines: for one run, with the scalars of `scalars.h` (-DONE_RUN), and
-   for FEW, SOME or MANY runs, with those of `lanes.h`. Operations and routines are the functions that
-   compiled programs call, so that results have the same bits. */
+   for FEW, SOME or MANY runs, with those of `lanes.h`. Operations and routines are the functions
+   that compiled programs call, so that results have the same bits. */
 #include "finite.h"
 #ifdef ONE_RUN
 #include "scalars.h"

@@ -12,7 +12,8 @@ from itertools import accumulate, pairwise
 
 from robins.program.nodes import Graph, Loop, Node
 
-# Prefix of its name or "input", number or kind, and which rounds move a place in it by how much.
+# The prefix of its name and the rest ("b" and a block; "" and a name), or "input" and a kind; then
+# the scopes of loops whose rounds move the place of a number, each with the step of one round.
 Array = tuple[str, Node | str, tuple[tuple[int, int], ...]]
 Entry = tuple[int, int]  # a loop by its scope, and the number of a node that it keeps
 # An array of what a loop keeps, a row for each round: its name, and which nodes are in a row.
@@ -41,7 +42,7 @@ class Layout:
     """
 
     def __init__(self, graph: Graph, live: Sequence[Node], roots: Collection[Node]):
-        """Choose arrays; roots are read where all is done."""
+        """Choose arrays; roots are results and what loops keep or change."""
         self._graph = graph
         self._readers = Counter([*roots, *(a for n in live for a in set(graph.args[n]))])
         kept: dict[int, set[int]] = defaultdict(set)
@@ -138,7 +139,7 @@ class Layout:
             return None
         array, first, _ = found
         if graph.value[block][0] in IN_PLACE:
-            # A loop around that in which rows are picked comes back to them.
+            # Rows that are picked by a round are needed again when a loop around it repeats.
             is_ours = all(self._readers[n] == 1 for n in nodes if graph.op[n] != "constant")
             if array[0] == "input" or array[2] or not is_ours:
                 return None

@@ -42,7 +42,7 @@ class Loop:
         condition: a node inside the loop, of its leaves.
         next: what the leaves are in the next round.
         kept: nodes whose values in all rounds are kept; only where `count` is known.
-        sizes: of the arrays, one after the other, that these are the entries of.
+        sizes: of the arrays, one after the other, that the nodes of `kept` are the entries of.
     """
 
     scope: int

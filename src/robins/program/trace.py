@@ -244,7 +244,8 @@ def trace(function: Callable[..., Any], *args: Any, unroll: int | None = UNROLL)
             matter. What the function holds otherwise is known, and folded.
         unroll: the number of scalar operations up to which a loop or a factorisation is written
             out; above, it is a loop or a call. Written out it is faster, and longer. None writes
-            out everything that is known to end.
+            out everything that is known to end. Arrays in no loop (`jax.lax.scan`,
+            `robins.linalg.rows.each_row`) are written out entry by entry.
 
     Raises:
         ProgramError: it does something that has no place in a program; the message names the line.

@@ -12,6 +12,7 @@ import os
 from collections import Counter
 from collections.abc import Mapping
 from enum import IntFlag
+from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import jax
@@ -19,6 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins.errors import RobinsError
+from robins.filters import Belief, Filter, FilterState, Model, OnlineFilter
+from robins.program.evaluated import evaluated
 from robins.results import snapshot
 from robins.scenario import Parameters
 from robins.scenario.text import mapping_of, text_of
@@ -30,6 +33,15 @@ _ONE_G = (0.9, 1.1)  # size of gravity in g
 
 class LiveError(RobinsError, ValueError):
     """A sample, or what a live object is made with, cannot be used; the object goes on."""
+
+
+def online(
+    filter_: Filter, model: Model, start: Belief | FilterState, machine: str
+) -> OnlineFilter:
+    """Online filter of robins' own, the state at its start computed without a compiler."""
+    if isinstance(start, Belief):
+        start = evaluated(partial(filter_.init, dims=model.dims), start)
+    return OnlineFilter(filter_, model, start, machine=machine)
 
 
 class Flag(IntFlag):

@@ -67,9 +67,7 @@ def _product(walk: Walk, A: Nodes, B: Nodes) -> Nodes:
     zero = [n for n in {*A.ravel().tolist(), *B.ravel().tolist()} if walk.graph._is(n, 0)]
     dense = (~np.isin(A, zero)).astype(int) @ (~np.isin(B, zero)).astype(int).T
     real = A.size and walk.graph.kind[int(A.flat[0])] == "real"
-    # Written out it takes no longer than what it would take to copy the operands.
-    is_worth = 2 * int(dense.sum()) > 2 * (A.size + B.size)
-    if real and min(m, n) > 1 and is_worth and walk.stays_whole(2 * int(dense.sum())):
+    if real and min(m, n) > 1 and walk.stays_whole(2 * int(dense.sum())):
         return call(walk, "product", [m, depth, n], [A, B], [(m, n)])[0]
     rows = [[dot(walk, x, y) for y in B.tolist()] for x in A.tolist()]
     return np.array(rows, dtype=np.int64).reshape(m, n)

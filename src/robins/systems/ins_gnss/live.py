@@ -60,6 +60,7 @@ from robins.systems.streaming import (
     LiveError,
     as_before,
     numbers,
+    online,
     refuse_units,
     stamp,
 )
@@ -140,7 +141,7 @@ class LiveInsGnss(Live):
         back = max(self._window_s, 2.0 * p.aids.window, 1.5, 4.0 * self._usual.fix_s)
         self._back_s = longest_delay_s + 2.0 * self._reach_s + back
         asked = contender(p, self._usual.fix_s, filter)
-        self._on = partial(OnlineFilter, asked.filter, asked.model, machine=made_with["machine"])
+        self._on = partial(online, asked.filter, asked.model, machine=made_with["machine"])
         self._case, self._suspects = asked.case, asked.filter.suspects
         self._C_bs = axes_of(p.imu.orientation) if any(p.imu.orientation) else None
         self._patience = max(3, round(_PATIENCE_S * rate_hz))

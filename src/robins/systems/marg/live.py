@@ -61,6 +61,7 @@ from robins.systems.streaming import (
     LiveError,
     as_before,
     numbers,
+    online,
     refuse_units,
     stamp,
 )
@@ -185,9 +186,7 @@ class LiveMarg(Live):
         self._most_context = math.ceil(LONGEST_S * rate_hz) + 2 * _FLANK
         half = 0.5 * declination_rad
         self._turn_north = (math.cos(half), 0.0, 0.0, math.sin(half))
-        self._on = partial(
-            OnlineFilter, filter_of(p), model.model_of(p), machine=machine or usual()
-        )
+        self._on = partial(online, filter_of(p), model.model_of(p), machine=machine or usual())
         self._online: OnlineFilter | None = None
         self._door = Door(_LONGEST_GAP_S, max(3, round(_PATIENCE_S * rate_hz)))
         self._begin_anew()
