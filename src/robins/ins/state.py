@@ -41,7 +41,7 @@ class InsState(NamedTuple):
 
     @classmethod
     def start(cls, nav: Nav, scales: bool = False) -> InsState:
-        """At `nav`, with sensors believed perfect."""
+        """State at `nav`, with sensors believed perfect."""
         scale = jnp.zeros(3) if scales else None
         return cls(*nav, jnp.zeros(3), jnp.zeros(3), scale, scale)
 

@@ -251,8 +251,8 @@ class _Writer:
                 given.append(f"in{node}_{index}")
                 entries = [self._read(a) for a in nodes]
                 self._listed(f"{kind} {given[-1]}[{len(entries)}]", entries, depth + 1)
-        told = ", ".join([*map(str, sizes), *given, f"b{node}"])
-        self.lines += [f"{pad}    {routine}({told});", f"{pad}}}"]
+        arguments = ", ".join([*map(str, sizes), *given, f"b{node}"])
+        self.lines += [f"{pad}    {routine}({arguments});", f"{pad}}}"]
         self.names[node] = f"b{node}"
 
     def _loop(self, loop: Loop, node: Node, depth: int) -> None:

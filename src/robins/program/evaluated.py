@@ -44,7 +44,7 @@ def evaluated(function: Callable[..., T], *args: Data) -> T:
         if size_of(jaxpr.jaxpr) > MOST:
             return function(*args)
         found = walk.closed(jaxpr, *[walk.constants(np.asarray(a)) for a in given])
-    except (ProgramError, TypeError):  # a TypeError of JAX, of what reads traced numbers
+    except (ProgramError, TypeError):  # JAX raises TypeError where traced numbers are read
         return function(*args)
     known = list(map(walk.known, found))
     if any(x is None for x in known):

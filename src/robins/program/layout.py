@@ -1,4 +1,4 @@
-"""Where the numbers of a program lie in the arrays of its C, so that they are read in place.
+"""Places of the numbers of a program in the arrays of its C, so that they are read in place.
 
 A routine takes a pointer, and a loop an offset and a step, where the numbers that it needs already
 lie in one array; else they are copied into an array of their own.

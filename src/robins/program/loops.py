@@ -178,7 +178,7 @@ class Body:
         return jaxpr_of(self.equations, list(dict.fromkeys(takes)), [*self.after, *self.made])
 
     def known(self, known: Mapping[Variable, np.ndarray]) -> list[np.ndarray | None]:
-        """What is known of those that stay, in their order."""
+        """Known numbers of the variables that stay, in their order; None of the others."""
         return [known.get(v) for v in self.stays]
 
     def program(
@@ -256,7 +256,7 @@ class Body:
         rows: dict[Variable, Nodes],
         index: Nodes,
     ) -> list[Nodes]:
-        """What an equation makes of rows: the same equation on arrays of one row."""
+        """Results of an equation on arrays of one row."""
         name, p, length = e.primitive.name, dict(e.params), self.axis[0]
         by_row = uses(e, length)[1]
         if name == "iota":

@@ -114,7 +114,7 @@ def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
 
 
 def first_belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
-    """At the first fix, moved from the antenna to the IMU."""
+    """Belief at the first fix, moved from the antenna to the IMU."""
     g, row = log.gnss, start.fix
     v = np.zeros(3) if log.v_n is None else np.nan_to_num(log.v_n[row])
     antenna = Geodetic(*(np.asarray(a[row]) for a in (g.lat_rad, g.lon_rad, g.alt_m)))
@@ -215,7 +215,7 @@ def _answers(
     wanted: Sequence[str],
     progress: Progress,
 ) -> tuple[dict[str, Answer], list[str], list[str]]:
-    """What each filter and smoother says, notes and warnings of the bank.
+    """Answers of each filter and smoother, notes and warnings of the bank.
 
     The smoother of one hypothesis takes that which the bank thinks likely in hindsight: it does not
     see positions that were off, and has the bank's process noise.
@@ -389,7 +389,7 @@ def replay(
 
 @jax.jit
 def antenna_of(mount: model.Mount, mean: InsState, rate_b) -> Geodetic:
-    """Where a filter thinks the antenna is, at each epoch."""
+    """Position of the antenna as a filter estimates it, at each epoch."""
     return jax.vmap(lambda x, omega: model.read_position(mount, x, omega))(mean, rate_b)
 
 
@@ -399,7 +399,7 @@ def _estimates(mean: InsState) -> Mapping[str, Any]:
 
 
 def distances(log: Log, used: np.ndarray, epoch_s: np.ndarray, antenna: Geodetic) -> dict[str, Any]:
-    """How far the antenna is from the best fixes, with aids and in outages.
+    """Distances of the antenna from the best fixes, with aids and in outages.
 
     The best fixes are those of quality 1 where the receiver states a quality, else all.
     """

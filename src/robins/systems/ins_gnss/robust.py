@@ -214,7 +214,7 @@ def case(asked: bool, world: Case) -> Case:
 
 
 class Verdict(NamedTuple):
-    """What a bank thinks of each step once the whole log is known."""
+    """Verdict of a bank on each step, once the whole log is known."""
 
     off: np.ndarray  # (E,) probability that positions are off
     scale: np.ndarray  # (E,) of the covariance of the process noise, geometric mean
