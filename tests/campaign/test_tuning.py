@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from robins.campaign.many_runs import ManyRuns
 from robins.campaign.tuning import Data, Objective, TooLittle, Trial, choose
 
 KEYS = ["a", "b"]
@@ -14,9 +15,9 @@ def spread(count, sigma, seed=0):
 
 
 def likelihood(numbers, z):
-    """Minus the log density of normal numbers (parts, N) of a standard deviation, mean by part."""
+    """(1,) minus the mean log density of normal numbers (N,) of a standard deviation."""
     (sigma,) = numbers
-    return jnp.mean(jnp.log(sigma) + 0.5 * (z / sigma) ** 2, axis=1)[:, None]
+    return jnp.mean(jnp.log(sigma) + 0.5 * (z / sigma) ** 2)[None]
 
 
 def first(mean):
@@ -126,6 +127,28 @@ def test_a_filter_that_is_lost_on_what_was_held_out_is_worse(lost_at, better):
         found = likelihood(numbers, z)
         return jnp.where(held_out & (jnp.abs(numbers[0] - lost_at) < 0.2), jnp.inf, found)
 
-    z, no, yes = spread(20, 2.0), np.zeros((20, 1), bool), np.ones((20, 1), bool)
+    z, no, yes = spread(20, 2.0), np.zeros(20, bool), np.ones(20, bool)
     found = choose(Objective(of_one, measure, first), ["a"], Data((z, no)), Data((z, yes)))
     assert found.better is better
+
+
+def test_numbers_that_differ_are_arguments_of_one_program():
+    """Also one that first differs late, beside one that never does."""
+    traced = []
+
+    def measure(numbers, z):
+        traced.append(1)
+        sigma, bend, fixed = numbers
+        return likelihood((sigma,), z) + bend + fixed
+
+    def numbers(x):
+        return np.exp(x), np.maximum(x - 1.0, 0.0), np.float64(7.0)
+
+    z = spread(21, 2.0)  # no multiple of the lanes, with any number of points
+    many = ManyRuns(measure)
+    for some in ([0.0, 0.5, 0.9], [0.1, 0.2], [0.0, 2.0], [1.5]):
+        found = many(list(map(numbers, some)), z)
+        want = [np.log(np.exp(x)) + 0.5 * np.mean((z / np.exp(x)) ** 2, 1) for x in some]
+        bent = np.maximum(np.array(some) - 1.0, 0.0)[:, None] + 7.0
+        np.testing.assert_allclose(found[..., 0], want + bent, rtol=1e-14)
+    assert len(traced) == 2

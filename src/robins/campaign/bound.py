@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,8 @@ import xarray as xr
 from jaxtyping import Array
 
 from robins.campaign.machine import with_stack
-from robins.campaign.monte_carlo import contender, reported_rows, whole_case, worlds
+from robins.campaign.many_runs import ManyRuns
+from robins.campaign.monte_carlo import contender, reported_rows, whole_case
 from robins.filters import Belief
 from robins.filters.analysis.bound import bound_along, linearised, used_sensors
 from robins.filters.analysis.observability import (
@@ -28,7 +29,7 @@ from robins.manifold import State, dim, is_element
 from robins.program.interpreter import interpreted_rounds
 from robins.program.stages import Staged
 from robins.results import array, variable
-from robins.systems.study import Problem, StateBlock
+from robins.systems.study import Contender, Problem, StateBlock
 from robins.systems.tables import block_array
 
 FEW = 1.0  # eigenvalue of the Gramian below which the prior still knows more of a direction
@@ -66,29 +67,29 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
     names = [s.name for s in c.model.sensors]
     one_less = use & ~np.eye(len(use), dtype=bool)
     subsets = jnp.asarray(np.concatenate([[use], [np.zeros_like(use)], one_less]))
-    variance, prior, first = 0.0, 0.0, None
-    for batch, count in worlds(problem, runs):
-        for k in range(count):
-            world = jax.tree_util.tree_map(lambda x, k=k: x[k], batch)
-            found = _bound(c.filter, c.model, c.case, c.reported, subsets, world)
-            variance = variance + np.asarray(found.variance) / runs
-            prior = prior + np.asarray(found.prior) / runs
-            first = first or found
-    assert first is not None
-    L, D = np.asarray(first.L), np.asarray(first.D)
+
+    def bounded(_: Data, number: Array) -> dict[str, Data]:
+        return _bounded(c, subsets, problem.simulate(number))
+
+    found = jax.tree_util.tree_map(
+        lambda x: x[0], ManyRuns(bounded)([()], np.arange(runs, dtype=int))
+    )
+    variance, prior = (np.mean(found[k], axis=0) for k in ("variance", "prior"))
+    first = jax.tree_util.tree_map(lambda x: x[0], found)
+    L, D = first["L"], first["D"]
     sigma, prior = np.sqrt(variance), np.sqrt(prior)
     if not (np.all(np.isfinite(sigma)) and np.all(np.isfinite(L))):
         raise ValueError(
             f"the bound of filter '{name}' is not finite: its model cannot be linearised along the "
             "true states, or something in it grows without bound and is not seen"
         )
-    shown = [i for i in range(len(names)) if first.spoke[i] and use[i]]
+    shown = [i for i in range(len(names)) if first["spoke"][i] and use[i]]
     if not shown:
         raise ValueError(f"no sensor of filter '{name}' is left that measures: it has {names}")
-    rows = np.eye(len(D)) if first.rows is None else np.asarray(first.rows)
+    rows = np.eye(len(D)) if first["rows"] is None else first["rows"]
     left = _left(rows, L[-1], D)
     data = _sigmas(problem, sigma, prior, left, [names[i] for i in shown], shown)
-    data |= _information(*_states(problem.blocks, rows, first.mean), L, D)
+    data |= _information(*_states(problem.blocks, rows, first["mean"]), L, D)
     told = {"filter": name, "runs": runs, "without": ", ".join(without)}
     return xr.Dataset(data, attrs=told)
 
@@ -137,35 +138,38 @@ def _reported(rows: Array | None, factor: Array) -> Array:
     return jnp.sum(mapped**2, axis=-1)
 
 
-class _Found(NamedTuple):
-    """Bound of one run, and what it is made of."""
+def _bounded(c: Contender, subsets: Array, world: Data) -> dict[str, Data]:
+    """Bound of one run, and what it is made of.
 
-    variance: Array  # (V, E, r) by subset of the sensors
-    prior: Array  # (r,) variances
-    mean: State  # of the start
-    L: Array  # (E, n, n) of the Gramian, with the first subset
-    D: Array  # (n,) its units
-    spoke: Array  # (S,) which sensors ever measured anything
-    rows: Array | None  # (r, n) what is reported of the start
+    Args:
+        c: whose model and start are believed.
+        subsets: (V, S) of the sensors.
+        world: the run, as the problem simulates it.
 
-
-@jax.jit
-def _bound(filter_, model, case, reported, subsets, world) -> _Found:
-    it = whole_case(filter_, model, case(world))
-    start = _start(it)
-    line = linearised(model, start, it.truth, it.y, it.u, it.aux)
-
-    rows, _ = reported_rows(reported, it)
+    Returns:
+        variance (V, E, r) by subset; prior (r,) variances; mean of the start; L (E, n, n) of the
+        Gramian with the first subset, and D (n,) its units; spoke (S,) which sensors ever measured
+        anything; rows (r, n) what is reported of the start, or None.
+    """
+    it = whole_case(c.filter, c.model, c.case(world))
+    start = jax.tree_util.tree_map(jnp.asarray, _start(it))
+    line = linearised(c.model, start, it.truth, it.y, it.u, it.aux)
+    rows, _ = reported_rows(c.reported, it)
     first = None if rows is None else rows if rows.ndim == 2 else rows[0]
 
-    def of(use):
+    def of(use: Array) -> Array:
         return _reported(rows, bound_along(line, start.factor, use).factor)
 
-    L = observability_along(line, start.sigma, subsets[0])
     spoke = [jnp.array(False) if s is None else jnp.any(s.present) for s in line.sights]
-    prior = _reported(first, start.factor)
-    heard = jnp.stack(spoke)
-    return _Found(jax.vmap(of)(subsets), prior, start.mean, L, start.sigma, heard, first)
+    return {
+        "variance": jax.vmap(of)(subsets),
+        "prior": _reported(first, start.factor),
+        "mean": start.mean,
+        "L": observability_along(line, start.sigma, subsets[0]),
+        "D": start.sigma,
+        "spoke": jnp.stack(spoke),
+        "rows": first,
+    }
 
 
 def _sigmas(

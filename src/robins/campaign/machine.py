@@ -59,6 +59,7 @@ from robins.systems.study import Problem
 MACHINES = ("vm", "c", "jax")
 BETWEEN_S = 1.0  # between two times that memory is given back
 COMPILERS = 3  # at once, beside that of the worlds: some take a gigabyte
+NUMBER = jax.ShapeDtypeStruct((), int)  # shape of the number of a run
 STACK = 1 << 28  # bytes of a thread's stack, on which lanes hold all that a step computes
 
 Taken = Callable[[str, Any], Any]  # of a filter's name and its record of a chunk: what is kept
@@ -121,7 +122,7 @@ class ByJax:
             yield
             return
         programs = traced(self.problem, self._batch, width)
-        with _threads(min(others, COMPILERS)) as pool:
+        with threads(min(others, COMPILERS)) as pool:
             # contenders that differ in numbers are the same program
             distinct = {id(one.jaxpr): one for one in programs.values()}
             begun = {
@@ -168,9 +169,8 @@ class InLanes:
     def __init__(self, problem: Problem, name: str = "vm"):
         self.problem, self.name = problem, name
         self._engine = interpreted_rounds if name == "vm" else compiled_rounds
-        number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
-        self._simulate = Staged(problem.simulate, number, engine=self._engine)
-        self._world = jax.eval_shape(problem.simulate, number)
+        self._simulate = Staged(problem.simulate, NUMBER, engine=self._engine)
+        self._world = jax.eval_shape(problem.simulate, NUMBER)
         self._filters = {name: self._staged(name, named=True) for name in problem.contenders}
         stages = (self._simulate, *self._filters.values())
         self.bytes_of_run = max(one.bytes_of_run for one in stages)
@@ -213,7 +213,7 @@ class InLanes:
         width = chunk or self.width(runs)
         workers = at_once(self.bytes_of_run, width, available_cores())
         begins, ahead_by = range(width, runs, width), workers + 1
-        with _threads(workers) as pool:
+        with threads(workers) as pool:
             # The first chunk compiles: each filter on a core of its own.
             count = min(width, runs)
             world = pool.submit(self._worlds, 0, width, count).result()
@@ -287,7 +287,7 @@ class InLanes:
 
 
 @contextmanager
-def _threads(count: int) -> Iterator[ThreadPoolExecutor]:
+def threads(count: int) -> Iterator[ThreadPoolExecutor]:
     """Threads with a stack large enough for lanes and compilers; what waits for one is dropped."""
     before = threading.stack_size(STACK)
     pool = ThreadPoolExecutor(count)
@@ -311,8 +311,7 @@ def with_stack(function: Callable[[], Any]) -> Any:
 def first_worlds(problem: Problem, count: int) -> State:
     """The first runs of a problem, with a leading axis, by the interpreter where it can be."""
     sys.audit("robins.simulate", count)  # counted by tests
-    number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
-    simulate = Staged(problem.simulate, number, engine=interpreted_rounds)
+    simulate = Staged(problem.simulate, NUMBER, engine=interpreted_rounds)
     return jax.device_put(with_stack(lambda: simulate(np.arange(count))))
 
 

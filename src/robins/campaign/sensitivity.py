@@ -10,8 +10,8 @@ parameters too. Both are estimated by Saltelli et al. (2010, Comput. Phys. Commu
 has it, from two samples A and B of n points and for each parameter A with its column of B.
 
 Here the world varies and the filter does not: it believes the scenario as written. The numbers that
-vary are data of one compiled program, which is possible because parameters are records that take
-what JAX traces in the place of a number.
+vary are data of one program, which is possible because parameters are records that take what JAX
+traces in the place of a number.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ import numpy as np
 from jaxtyping import Array
 from scipy import stats
 
-from robins.campaign.memory import CHUNK, MEMORY, width_of
+from robins.campaign.machine import one_by_one
+from robins.campaign.many_runs import ManyRuns
 from robins.campaign.monte_carlo import one_record
 from robins.filters import Belief
 from robins.filters.model import Data
-from robins.program.liveness import bytes_of_jaxpr
 from robins.scenario import Parameters
 from robins.systems.study import Contender, Study, View
 
@@ -139,7 +139,7 @@ class Budget(NamedTuple):
             numbers |= one.at(shares[k])
         world = self.study.simulate(placed(self.given, numbers), self.course, self.seed, index)
         blocks = tuple((b.name, b.where.start, b.where.stop) for b in self.view.blocks)
-        record = one_record(blocks, self.contender, world)
+        record = one_record(blocks, self.contender, world, over=one_by_one)
         error, sigma = record["error"], record["sigma"]
         found = jnp.all(jnp.isfinite(error)) & jnp.all(jnp.isfinite(sigma))
         counted = error[self.view.count_from : self.view.count_to]
@@ -206,7 +206,7 @@ def simulate_points(
     runs: int,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """All runs of all points, in batches of one shape and of bounded memory.
+    """All runs of all points.
 
     Args:
         budget: what is run.
@@ -220,25 +220,7 @@ def simulate_points(
     Raises:
         jax.errors.JAXTypeError: a world cannot be traced; see `untraceable`.
     """
-    total, d = len(shares) * runs, shares.shape[1]
-    batch = jax.jit(jax.vmap(budget.run))
-
-    def shapes(width: int) -> tuple[Any, Any]:
-        number = jnp.asarray(0).dtype
-        return jax.ShapeDtypeStruct((width, d), float), jax.ShapeDtypeStruct((width,), number)
-
-    width = min(total, CHUNK)
-    each = -(-bytes_of_jaxpr(batch.trace(*shapes(width)).jaxpr.jaxpr) // width)
-    width = min(width, width_of(each, MEMORY))
-    squares, believed = [], []
-    for begin in range(0, total, width):
-        at = np.minimum(np.arange(begin, begin + width), total - 1)  # the last is filled up
-        found, told = batch(jnp.asarray(shares[at // runs]), jnp.asarray(at % runs))
-        squares.append(np.asarray(found))
-        believed.append(np.asarray(told))
-        progress(min(begin + width, total) / total)
-    joined = np.concatenate(squares)[:total]
-    return joined.reshape(len(shares), runs, -1), np.concatenate(believed)[:total].reshape(-1, runs)
+    return ManyRuns(budget.run)(list(shares), np.arange(runs), progress)
 
 
 # --------------------------------------------------------------------------------- the indices

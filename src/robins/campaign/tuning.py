@@ -8,6 +8,7 @@ much of a difference is chance: by the spread of the parts.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Hashable, Sequence
 from functools import cached_property
@@ -20,8 +21,8 @@ from jaxtyping import Array, Float
 from scipy import optimize
 from scipy.special import ndtri, stdtrit
 
+from robins.campaign.many_runs import ManyRuns
 from robins.errors import RobinsError
-from robins.filters.values import as_data
 from robins.results import Progress, silent
 
 FARTHEST = math.log(1000.0)  # of a factor, either way
@@ -30,7 +31,7 @@ FEWEST_PARTS = 6
 Tree = Any  # a pytree of arrays
 Measure = Callable[[Tree, Tree], Array]
 _STEP = 0.01  # of differences of runs
-_COARSE = 0.1  # where a run may leap, or compiles anew
+_COARSE = 0.1  # where a run may leap, or is traced anew
 _CURVED = 0.05  # of differences of gradients
 _LOST = 1e6  # objective where a filter is lost
 
@@ -40,7 +41,7 @@ class Trial(NamedTuple):
 
     Attributes:
         kind: where it differs, what is measured may leap, as by another threshold.
-        numbers: pytree of arrays; another structure is compiled anew.
+        numbers: pytree of arrays; of another structure it is traced anew.
     """
 
     kind: Hashable
@@ -48,7 +49,7 @@ class Trial(NamedTuple):
 
 
 class Data(NamedTuple):
-    """What is measured on: arrays of `Objective.measure`, and which of the parts count."""
+    """What is measured on: arrays with a leading axis of runs, and which of the parts count."""
 
     arrays: Any
     rows: np.ndarray | None = None  # numbers of parts; None: all
@@ -59,7 +60,7 @@ class Objective(NamedTuple):
 
     Attributes:
         trial: ``x (p,) -> Trial``; raises a ValueError where there is no such filter.
-        measure: ``(numbers, arrays) -> (parts, k)``, pure, to be compiled.
+        measure: ``(numbers, arrays of one run) -> (k,) or (parts, k)``, pure.
         total: ``(k,) mean of the parts -> objective``; smooth.
     """
 
@@ -113,7 +114,7 @@ def choose(
     """Find x on some data, and judge it on other data.
 
     By gradient (L-BFGS-B) where the parameters are numbers of the model, by search (Nelder & Mead
-    1965) where they are of the filter itself, whose decisions leap, or decide what is compiled.
+    1965) where they are of the filter itself, whose decisions leap, or decide a structure.
 
     Args:
         objective: what is to be small.
@@ -150,27 +151,22 @@ def choose(
             )
     sigma = _sigma(slopes, x, names)
     progress(0.95, "judging on data held out")
-    before, after = (slopes.parts(at, judged_on) for at in (x0, x))
+    before, after = slopes.parts([x0, x], judged_on)
     gain, low = _gain(objective.total, before, after)
     return Tuned(x, sigma, slopes.gradient, slopes.evaluations, before, after, gain, low)
-
-
-@jax.jit
-def _measured(measure: Measure, numbers: Tree, arrays: Tree) -> Array:
-    return measure(numbers, arrays)
 
 
 class Slopes:
     """An objective and its gradient, on the data that x is chosen on.
 
-    By central differences: a run is compiled once for all x, and the same noise makes the objective
+    By central differences: all ends are computed at once, and the same noise makes the objective
     smooth. The derivative of a run (forward mode through the factorisations of 2 700 steps of
     INS/GNSS) was 20 times as long to compute and 5 times to compile as the run.
     """
 
     def __init__(self, objective: Objective, p: int, data: Data, progress: Progress = silent):
         self._objective, self._p, self._data, self._progress = objective, p, data, progress
-        self._measure = as_data(objective.measure)
+        self._measured: dict[Hashable, ManyRuns] = {}  # by structure
         self.evaluations = 0
 
     @cached_property
@@ -180,20 +176,27 @@ class Slopes:
             near = [self._objective.trial(x) for x in (np.zeros(self._p), *_STEP * np.eye(self._p))]
         except ValueError:
             return False
-        return all(_form(one) == _form(near[0]) for one in near)
+        return all((one.kind, _form(one)) == (near[0].kind, _form(near[0])) for one in near)
 
-    def parts(self, x: np.ndarray, data: Data | None = None) -> np.ndarray:
-        """(parts, k), of the data to choose on or others; NaN where there is no such filter."""
+    def parts(self, at: Sequence[np.ndarray], data: Data | None = None) -> list[np.ndarray]:
+        """(parts, k) at each x, of the data to choose on or others; NaN if there is no filter."""
         data = data or self._data
-        self.evaluations += 1
+        self.evaluations += len(at)
         share = 0.9 * self.evaluations / (self.evaluations + 40.0 * self._p)
         self._progress(share, f"evaluation {self.evaluations}")
-        try:
-            trial = self._objective.trial(x)
-        except ValueError:
-            return np.full((1, 1), np.nan)
-        parts = np.asarray(_measured(self._measure, trial.numbers, data.arrays))
-        return parts if data.rows is None else parts[data.rows]
+        found = [np.full((1, 1), np.nan)] * len(at)
+        every: dict[Hashable, dict[int, Trial]] = {}
+        for k, x in enumerate(at):
+            with contextlib.suppress(ValueError):
+                trial = self._objective.trial(x)
+                every.setdefault(_form(trial), {})[k] = trial
+        for form, trials in every.items():
+            measured = self._measured.setdefault(form, ManyRuns(self._objective.measure))
+            of = measured([trial.numbers for trial in trials.values()], data.arrays)
+            for k, some in zip(trials, of, strict=True):
+                parts = some.reshape(-1, some.shape[-1])
+                found[k] = parts if data.rows is None else parts[data.rows]
+        return found
 
     def total(self, parts: np.ndarray) -> float:
         """The objective of some parts; infinite where the filter is lost."""
@@ -207,9 +210,12 @@ class Slopes:
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(parts, k), and by x (parts, k, p)."""
         step = _STEP if self.gradient else _COARSE
+        steps = step * np.eye(self._p)
+        here, *ends = self.parts([x, *(x + steps), *(x - steps)])
+        above, below = ends[: self._p], ends[self._p :]
         with np.errstate(invalid="ignore"):  # of a filter that is lost
-            ends = [self.parts(x + h) - self.parts(x - h) for h in step * np.eye(self._p)]
-        return self.parts(x), np.stack(ends, axis=-1) / (2.0 * step)
+            slope = [(a - b) / (2.0 * step) for a, b in zip(above, below, strict=True)]
+        return here, np.stack(slope, axis=-1)
 
     def gradients(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """The objective, and by x the contribution of each part (parts, p), whose mean it is."""
@@ -222,9 +228,9 @@ class Slopes:
 
 
 def _form(trial: Trial) -> Hashable:
-    """Common part of two trials, without which a slope between them is none."""
+    """Structure of the numbers of a trial, which those of one program have in common."""
     leaves, tree = jax.tree_util.tree_flatten(trial.numbers)
-    return trial.kind, tree, tuple((np.shape(x), jnp.result_type(x)) for x in leaves)
+    return tree, tuple((np.shape(x), jnp.result_type(x)) for x in leaves)
 
 
 def _by_mean(total: Callable[[np.ndarray], float], mean: np.ndarray) -> np.ndarray:
@@ -254,7 +260,7 @@ def _least(slopes: Slopes, p: int) -> np.ndarray:
         return found.x
     corners = np.vstack([np.zeros(p), 0.7 * np.eye(p)])
     found = optimize.minimize(
-        lambda x: min(slopes.total(slopes.parts(x)), _LOST),
+        lambda x: min(slopes.total(slopes.parts([x])[0]), _LOST),
         np.zeros(p),
         method="Nelder-Mead",
         bounds=edge,

@@ -260,7 +260,7 @@ def report(where: str, out: Path | None, as_json: bool) -> None:
 @option("--out", required=True, metavar="DIR", help="Folder, or an address such as s3://name/dir.")
 @option("--runs", type=click.IntRange(min=1), help="At each point. [default: as given]")
 @option("--workers", type=click.IntRange(min=1), help="Processes. [default: one a core]")
-@option("--machine", type=click.Choice(["jax", "vm", "c"]), default="jax", show_default=True)
+@MACHINE
 @choices
 @TRUST
 @answers

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +17,9 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import scenario
-from robins.campaign.monte_carlo import Blocks, batch_of, blocks_of, one_record
+from robins.campaign.machine import one_by_one
+from robins.campaign.many_runs import ManyRuns
+from robins.campaign.monte_carlo import Blocks, blocks_of, one_record
 from robins.campaign.sensitivity import depends
 from robins.campaign.tuning import Data, Objective, TooLittle, Tree, Trial
 from robins.filters import Filter, run
@@ -132,16 +133,16 @@ def on_runs(
         raise InputError(f"is none of {known}", f"--by {by}", "choose one of these.")
     measured = OfRuns(blocks_of(problem), problem.count_from, problem.count_to)
     progress(0.0, "simulating")
-    batch = batch_of(problem)
-    worlds = batch(jnp.arange(runs)), batch(jnp.arange(runs, 2 * runs))
+    worlds = ManyRuns(lambda _, k: problem.simulate(k))([()], np.arange(2 * runs))
 
     def parsed(more: Sequence[str]) -> Any:
         return read.parsed((*settings, *more))
 
     lay_out = read.study.lay_out
-    course = lay_out(parsed(settings_at(tuned, np.zeros(len(tuned)))))
+    ends = [parsed(settings_at(tuned, x)) for x in np.outer((0.0, 1.0), np.ones(len(tuned)))]
+    course = lay_out(ends[0])
     # what a filter believes of the course, such as its process noise, is what it is told
-    moves = depends(course, course, lay_out(parsed(settings_at(tuned, np.ones(len(tuned))))))
+    moves = depends(course, *map(lay_out, ends))
 
     def trial(x: np.ndarray) -> Trial:
         given = parsed(settings_at(tuned, x))
@@ -152,8 +153,8 @@ def on_runs(
         filter=chosen,
         vary=tuned,
         objective=Objective(trial, measured, total_of(by, names)),
-        chosen_on=Data(worlds[0]),
-        judged_on=Data(worlds[1]),
+        chosen_on=Data(jax.tree_util.tree_map(lambda x: x[0, :runs], worlds)),
+        judged_on=Data(jax.tree_util.tree_map(lambda x: x[0, runs:], worlds)),
         parts="runs",
         blocks=problem.blocks,
         by=worded(by),
@@ -191,13 +192,9 @@ class OfRuns:
     count_from: int = kind()
     count_to: int | None = kind()
 
-    def __call__(self, numbers: Any, worlds: Any) -> Array:
-        """(runs, k)."""
-        return jax.vmap(partial(self.one, Contender(*numbers)))(worlds)
-
-    def one(self, contender: Contender, world: Any) -> Array:
-        """(k,) of a run."""
-        found = one_record(self.blocks, contender, world)
+    def __call__(self, numbers: Any, world: Any) -> Array:
+        """(k,)."""
+        found = one_record(self.blocks, Contender(*numbers), world, over=one_by_one)
         notes = [update.notes for update in found["updates"].values()]
         density = sum(jnp.sum(n["predicted.log_density"]) for n in notes)
         count = sum(jnp.sum(n["predicted.components"]) for n in notes)
@@ -248,8 +245,8 @@ def on_log(
 
     with refusing(opened.source):
         first = trial(np.zeros(len(tuned)))
-    of_steps = np.asarray(_compiled_steps(*first.numbers))
-    count = int(np.sum(of_steps[:, COMPONENTS]))
+    measured = [given[1] for given in first.numbers[2]]
+    count = sum(int(np.sum(np.isfinite(y))) for y in jax.tree_util.tree_leaves(measured))
     segments = min(SEGMENTS, count // _FEWEST)
     held = np.arange(segments) % 3 == 2
     if np.sum(held) < 3:
@@ -262,8 +259,8 @@ def on_log(
         filter=chosen,
         vary=tuned,
         objective=Objective(trial, OfSegments(segments), total_of(INNOVATIONS, ())),
-        chosen_on=Data((), np.flatnonzero(~held)),
-        judged_on=Data((), np.flatnonzero(held)),
+        chosen_on=Data(np.zeros(1), np.flatnonzero(~held)),
+        judged_on=Data(np.zeros(1), np.flatnonzero(held)),
         parts="segments",
         blocks=(),
         by=worded(INNOVATIONS),
@@ -284,9 +281,6 @@ def _steps(filter_: Any, model: Any, given: Sequence[Any]) -> Array:
         of = run(filter_, model, start, y, u, aux, keep=predicted).steps
         rows.append(jnp.stack([of.log_density, of.components.astype(float)], axis=1))
     return jnp.concatenate(rows)
-
-
-_compiled_steps = jax.jit(_steps)
 
 
 @value

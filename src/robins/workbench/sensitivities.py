@@ -34,7 +34,7 @@ RUNS, SAMPLES = 10, 256
 MOST = 1 << 14  # samples
 WIDE = 0.2  # width of a bound from which on an order is doubted
 NOTHING = 1e-12  # total index of a parameter that does nothing
-_COMPILED = 0.1  # share of the time after which batches are computed
+_TRACED = 0.1  # share of the time after which batches are computed
 _RANGE = re.compile(r"(.+?)\s+to\s+(.+)")
 _NUMBER = re.compile(r"([-+0-9.eE]+)\s*(.*)")
 
@@ -141,9 +141,9 @@ def sensitivity(
 
     def told(share: float) -> None:
         done = round(share * count)
-        progress(_COMPILED + (1.0 - _COMPILED) * share, f"{done} of {count} points")
+        progress(_TRACED + (1.0 - _TRACED) * share, f"{done} of {count} points")
 
-    progress(0.01, f"compiling {count} points of {runs} runs")
+    progress(0.01, f"tracing {count} points of {runs} runs")
     try:
         found, believed = simulate_points(budget, points.reshape(count, -1), runs, told)
     except jax.errors.JAXTypeError as error:
@@ -164,7 +164,7 @@ def sensitivity(
         scenario=read.label,
         seed=seed,
         runs=runs,
-        machine="jax",
+        machine="vm",
         tables=[table(solution)],
         last_lines=[
             "Table:  {out}/sensitivity.csv   all indices with their bounds; points.csv has samples",
@@ -197,9 +197,9 @@ def _refused(budget: Budget, every: Sequence[Uncertain]) -> InputError:
     names = [every[k].key for k in untraceable(budget)] or [one.key for one in every]
     return InputError(
         "decides a shape or a branch of the simulation, or goes through NumPy there, so that it "
-        "cannot be varied without compiling anew",
+        "cannot be varied within one program",
         " and ".join(f"--vary {name}" for name in names),
-        "`robins sweep` compiles each value; in a world of your own compute with jax.numpy.",
+        "`robins sweep` traces each value; in a world of your own compute with jax.numpy.",
     )
 
 

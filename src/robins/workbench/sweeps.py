@@ -105,7 +105,7 @@ def sweep(
     *,
     vary: Sequence[str],
     workers: int | None = None,
-    machine: str = "jax",
+    machine: str = "",
     settings: Sequence[str] = (),
     progress: Progress = silent,
     **options: Any,
@@ -120,7 +120,7 @@ def sweep(
         where: a folder, or an address of object storage.
         vary: one or two texts ``key=a,b,c``.
         workers: processes; by default one a core.
-        machine: "jax" or "c", which compiles a program for each point.
+        machine: as for `plan_campaign`.
         settings: "path=value" texts that change the scenario at all points.
         progress: called with the share done and what is being done.
         **options: runs, seed and filters, as for `plan_campaign`.

@@ -1,0 +1,120 @@
+"""A function of numbers and of a run, at many points and for many runs, on all cores."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from time import thread_time
+from typing import Any
+
+import jax
+import numpy as np
+
+from robins.campaign.handover import HandOver
+from robins.campaign.machine import available_cores, threads
+from robins.campaign.memory import CHUNK_BYTES, LEAST, at_once, width_of
+from robins.program.interpreter import interpreted_rounds
+from robins.program.stages import Staged
+
+Tree = Any  # a pytree of arrays
+
+
+class ManyRuns:
+    """A pure function ``(numbers, arrays of a run) -> results``, interpreted for many runs.
+
+    It is compiled meanwhile where that pays, with the same bits. What has no place in a program JAX
+    computes. Numbers that differ between points are arguments of the program; the others are part
+    of it, until they differ from those of the first point.
+    """
+
+    def __init__(self, function: Callable[[Tree, Tree], Tree]):
+        self._function = function
+        self._first: list[Any] = []  # leaves of the first point
+        self._differ: list[int] = []  # those that are arguments
+        self._staged: Staged | None = None
+
+    def __call__(
+        self,
+        points: Sequence[Tree],
+        arrays: Tree,
+        progress: Callable[[float], None] = lambda share: None,
+    ) -> Tree:
+        """Compute all runs at all points.
+
+        Args:
+            points: numbers, all of one structure and of the same shapes, in any call.
+            arrays: with a leading axis of runs.
+            progress: called with the share done.
+
+        Returns:
+            NumPy arrays with leading axes of points and of runs.
+
+        Raises:
+            jax.errors.JAXTypeError: the function cannot be traced.
+        """
+        runs = len(jax.tree_util.tree_leaves(arrays)[0])
+        numbers = self._that_differ(points)
+        staged = self._staged
+        if staged is None:
+            staged = self._staged = self._traced(points[0], numbers, arrays)
+            self._hand_over = HandOver([staged])
+
+        def given(at: np.ndarray) -> tuple[Tree, Tree]:
+            of_runs = jax.tree_util.tree_map(lambda x: x[at % runs], arrays)
+            return {k: x[at // runs] for k, x in numbers.items()}, of_runs
+
+        found = self._computed(staged, len(points) * runs, given, progress)
+        shape = len(points), runs
+        return jax.tree_util.tree_map(lambda x: x.reshape(*shape, *x.shape[1:]), found)
+
+    def _that_differ(self, points: Sequence[Tree]) -> dict[int, np.ndarray]:
+        """The leaves that are arguments, by number, each with a leading axis of points."""
+        leaves = list(map(jax.tree_util.tree_leaves, points))
+        self._first = self._first or leaves[0]
+        rows = [np.stack(list(map(np.asarray, some))) for some in zip(*leaves, strict=True)]
+        pairs = zip(rows, self._first, strict=True)
+        differ = [k for k, (row, first) in enumerate(pairs) if np.any(row != np.asarray(first))]
+        if not set(differ) <= set(self._differ):
+            self._differ = sorted({*differ, *self._differ})
+            self._staged = None
+        return {k: rows[k] for k in self._differ}
+
+    def _traced(self, point: Tree, numbers: Mapping[int, np.ndarray], arrays: Tree) -> Staged:
+        """The function as one of the numbers that differ, and of a run."""
+        tree, fixed = jax.tree_util.tree_structure(point), dict(enumerate(self._first))
+
+        def function(numbers: Mapping[int, Any], of_run: Tree) -> Tree:
+            return self._function(tree.unflatten((fixed | dict(numbers)).values()), of_run)
+
+        shapes = jax.tree_util.tree_map(
+            lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (dict(numbers), arrays)
+        )
+        return Staged(function, *shapes, engine=interpreted_rounds)
+
+    def _computed(
+        self,
+        staged: Staged,
+        runs: int,
+        given: Callable[[np.ndarray], tuple[Tree, Tree]],
+        progress: Callable[[float], None],
+    ) -> Tree:
+        """Results of as many runs, in chunks, one on each core."""
+        each = -(-runs // available_cores())
+        width = min(width_of(staged.bytes_of_run, CHUNK_BYTES), -(-each // LEAST) * LEAST)
+        workers = at_once(staged.bytes_of_run, width, available_cores())
+
+        def chunk(begin: int) -> Tree:
+            begun, count = thread_time(), min(width, runs - begin)
+            found = staged(*given(np.arange(begin, begin + width).clip(max=runs - 1)))
+            self._hand_over.took(width, thread_time() - begun, runs - begin - count)
+            return jax.tree_util.tree_map(lambda x: np.asarray(x)[:count], found)
+
+        begins, ahead, done = range(0, runs, width), deque[Any](), []
+        with threads(workers) as pool:
+            for k in range(len(begins) + workers):
+                if k < len(begins):
+                    ahead.append(pool.submit(chunk, begins[k]))
+                if k >= workers:
+                    done.append(ahead.popleft().result())
+                    progress(len(done) / len(begins))
+        return jax.tree_util.tree_map(lambda *parts: np.concatenate(parts), *done)
