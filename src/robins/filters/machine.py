@@ -17,7 +17,7 @@ from robins.filters.checks import one_of
 from robins.filters.kalman import Advanced, Filter, FilterState, Prediction, Updated
 from robins.filters.model import Data, Model, Motion, Sensor
 from robins.filters.run import Keep, Step, filter_step
-from robins.filters.values import Numbers, content, on_device
+from robins.filters.values import Numbers, on_device, parted
 
 T = TypeVar("T")
 Name = Literal["jax", "vm", "c"]
@@ -33,10 +33,6 @@ class CompiledState(Protocol):
         self, name: Hashable, function: Callable[..., tuple[FilterState, T]], *args: Data
     ) -> T:
         """Step the state by ``(state, *args) -> (state, result)``; return the result."""
-        ...
-
-    def look(self, name: Hashable, function: Callable[..., T], *args: Data) -> T:
-        """Return the result of ``(state, *args) -> result``; the state stays."""
         ...
 
 
@@ -103,39 +99,59 @@ class JaxStepper:
 
 
 class ProgramStepper:
-    """`JaxStepper` with a memory, which folds the numbers of filter and model into its programs."""
+    """`JaxStepper` with a memory, which holds the numbers of filter and model too.
+
+    So programs made for one filter serve all that differ from it in numbers alone.
+    """
 
     is_numpy = True
 
     def __init__(self, filter_: Filter, model: Model, state: FilterState, machine: Machine):
         """Take a filter, a model and a state into the memory that a machine makes."""
-        self._filter, self._model = filter_, model
-        self._memory = machine(state, content(filter_, model))
+        self._numbers, self._joined, key = parted((filter_, model))
+        self._memory = machine(self._held(state), key)
+
+    def _held(self, state: FilterState) -> FilterState:
+        return state._replace(memory=(state.memory, self._numbers))
 
     @property
     def state(self) -> FilterState:
-        return self._memory.state
+        state = self._memory.state
+        return state._replace(memory=state.memory[0])
 
     @state.setter
     def state(self, state: FilterState) -> None:
-        self._memory.state = state
+        self._memory.state = self._held(state)
+
+    def _step(self, name: Hashable, function: Callable[..., tuple[FilterState, T]], *args: Data):
+        """Step by ``(filter, model, state, *args) -> (state, result)``; return the result."""
+
+        def stepped(held: FilterState, *args: Data) -> tuple[FilterState, T]:
+            memory, numbers = held.memory
+            state, result = function(*self._joined(numbers), held._replace(memory=memory), *args)
+            return state._replace(memory=(state.memory, numbers)), result
+
+        return self._memory.step(name, stepped, *args)
 
     def predict(self, u: Data) -> Prediction:
-        predicted = partial(_predicted, self._filter, self._model.motion)
-        return self._memory.step("predict", predicted, u)
+        return self._step("predict", lambda f, m, x, u: _predicted(f, m.motion, x, u), u)
 
     def update(self, name: str, y: Data, aux: Data) -> StepInfo:
-        updated = partial(_updated, self._filter, self._model.sensor(name))
-        return self._memory.step(("update", name), updated, y, aux)
+        def updated(filter_: Filter, model: Model, *given: Data) -> Updated:
+            return _updated(filter_, model.sensor(name), *given)
+
+        return self._step(("update", name), updated, y, aux)
 
     def step(
         self, u: Data, y: Mapping[str, Data], aux: Mapping[str, Data], keep: Callable[[Step], T]
     ) -> tuple[T, Codes]:
-        stepped = partial(_stepped, self._filter, self._model, keep=keep)
-        return self._memory.step(("step", keep), stepped, u, y, aux)
+        return self._step(("step", keep), partial(_stepped, keep=keep), u, y, aux)
 
     def look(self, question: Callable[..., T], *args: Data) -> T:
-        return self._memory.look(question, partial(question, self._filter, self._model), *args)
+        def answered(filter_: Filter, model: Model, state: FilterState, *args: Data):
+            return state, question(filter_, model, state, *args)
+
+        return self._step(("look", question), answered, *args)
 
 
 def usual() -> Name:

@@ -142,6 +142,37 @@ def content(*trees: object) -> Hashable:
     )
 
 
+def parted(tree: T) -> tuple[np.ndarray, Callable[[Numbers], T], Hashable]:
+    """Part the numbers that a program takes from what it is made of.
+
+    Zeros, ones and what is not finite are part of the program, where they spare operations.
+
+    Returns:
+        (n,) reals; the tree that has others in their places; and the key of all else.
+    """
+    leaves, structure = jax.tree_util.tree_flatten(tree)
+    fixed, given, places = [], [np.zeros(0)], []
+    for leaf in leaves:
+        free = np.zeros(np.shape(leaf), bool)
+        if getattr(leaf, "dtype", None) == np.float64:
+            known = np.asarray(leaf)
+            free = np.isfinite(known) & ~np.isin(known, (-1.0, 0.0, 1.0))
+            given.append(known[free])
+            leaf = np.where(free, 0.5, known)
+        fixed.append(leaf)
+        places.append(free)
+
+    def joined(numbers: Numbers) -> T:
+        found, at = [], 0
+        for free, known in zip(places, fixed, strict=True):
+            where = np.where(free, at + np.cumsum(free).reshape(free.shape) - 1, 0)
+            at += int(np.sum(free))
+            found.append(jax.numpy.where(free, numbers[where], known) if np.any(free) else known)
+        return structure.unflatten(found)
+
+    return np.concatenate(given), joined, content(structure.unflatten(fixed))
+
+
 def settled(state: T) -> T:
     """State without weak types, which would compile everything again after the first step."""
     if not any(getattr(x, "weak_type", False) for x in jax.tree_util.tree_leaves(state)):

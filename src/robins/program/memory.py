@@ -142,7 +142,7 @@ def _alike(x: Any, known: Form) -> bool:
 
 
 class NativeState:
-    """A state in the memory of C, and functions that step it or look at it.
+    """A state in the memory of C, and functions that step it.
 
     Attributes:
         state: as a pytree of arrays, a copy; assign to go on from another of the same shapes.
@@ -238,24 +238,6 @@ class NativeState:
         (x, k), (x_end, k_end) = call.begin, call.end
         reals, others = self._x[x:x_end].copy(), self._k[k:k_end]
         return call.result.read(reals, others)
-
-    def look(self, name: Hashable, function: Callable[..., Any], *args: Any) -> Any:
-        """Return the result of ``(state, *args) -> result``; the state stays.
-
-        Args:
-            name: as in `step`.
-            function: likewise.
-            args: likewise.
-
-        Raises:
-            ProgramError: as in `step`.
-            BuildError: likewise.
-        """
-
-        def still(state: Any, *args: Any) -> Any:
-            return state, function(state, *args)
-
-        return self.step(("look", name), still, *args)
 
     def _call(
         self, name: Hashable, function: Callable[..., Any], args: Any, leaves: list[Any], tree: Any
