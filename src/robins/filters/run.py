@@ -17,7 +17,7 @@ from robins.filters.kalman import Again, Filter, FilterState, Prediction
 from robins.filters.model import Data, Model
 from robins.filters.observation import as_measurement
 from robins.filters.tally import Tally, warn_not_taken
-from robins.filters.values import content, is_known, settled
+from robins.filters.values import is_known, parted, settled
 from robins.manifold import State
 
 
@@ -137,6 +137,18 @@ def _body(filter_: Filter, model: Model, keep: Keep, carry: Carry, row: Rows) ->
     return (state, total, tally.and_step(step.prediction.code, step.info)), keep(step)
 
 
+def _round(
+    joined: Callable[[Array], tuple[Filter, Model]],
+    keep: Keep,
+    carry: tuple[Array, Carry],
+    row: Rows,
+) -> tuple[tuple[Array, Carry], Data]:
+    """`_body` with numbers of filter and model that are carried, so that its program has none."""
+    numbers, begun = carry
+    after, kept = _body(*joined(numbers), keep, begun, row)
+    return (numbers, after), kept
+
+
 def _begun(state: FilterState, rows: Rows) -> Carry:
     return state, jnp.zeros(()), Tally.blank(tuple(rows[1]))
 
@@ -154,9 +166,10 @@ def _interpreted(
     # Imported here: a filter needs no programs.
     from robins.program.scanned import scan
 
-    body, holds = partial(_body, filter_, model, keep), (content(filter_, model), keep)
-    (state, total, tally), steps = scan(body, holds, _begun(settled(state), rows), rows)
-    return Solution(steps, state, total, tally)
+    numbers, joined, key = parted((filter_, model))
+    carry = numbers, _begun(settled(state), rows)
+    (_, found), steps = scan(partial(_round, joined, keep), (key, keep), carry, rows)
+    return Solution(steps, *found)
 
 
 def report_run(
