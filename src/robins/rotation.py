@@ -252,14 +252,15 @@ def _refuse_no_rotation(C: Array) -> Array | None:
     return None
 
 
-def from_euler(roll_rad, pitch_rad, heading_rad) -> Float[Array, "*b 4"]:
+def from_euler(roll_rad, pitch_rad, heading_rad) -> Float[Real, "*b 4"]:
     """Quaternion q_nb (NED from FRD): C_nb = Rz(heading) Ry(pitch) Rx(roll)."""
-    args = (jnp.asarray(a, float) for a in (roll_rad, pitch_rad, heading_rad))
-    roll, pitch, heading = jnp.broadcast_arrays(*args)
-    cr, sr = jnp.cos(roll / 2), jnp.sin(roll / 2)
-    cp, sp = jnp.cos(pitch / 2), jnp.sin(pitch / 2)
-    ch, sh = jnp.cos(heading / 2), jnp.sin(heading / 2)
-    return jnp.stack(
+    angles = roll_rad, pitch_rad, heading_rad
+    xp = np if all(isinstance(a, np.ndarray | np.generic) for a in angles) else jnp
+    roll, pitch, heading = xp.broadcast_arrays(*(xp.asarray(a, float) for a in angles))
+    cr, sr = xp.cos(roll / 2), xp.sin(roll / 2)
+    cp, sp = xp.cos(pitch / 2), xp.sin(pitch / 2)
+    ch, sh = xp.cos(heading / 2), xp.sin(heading / 2)
+    return xp.stack(
         [
             cr * cp * ch + sr * sp * sh,
             sr * cp * ch - cr * sp * sh,

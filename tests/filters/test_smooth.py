@@ -167,6 +167,9 @@ def test_a_prediction_that_was_not_taken_holds_the_state():
     assert int(solution.steps.prediction.code[5]) == Code.NOT_FINITE
     smooth = rts_smoother(solution)
     np.testing.assert_array_equal(smooth.mean[4], smooth.mean[5])
+    interpreted = rts_smoother(solution, machine="vm")
+    np.testing.assert_allclose(interpreted.mean, smooth.mean, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(interpreted.covariance, smooth.covariance, rtol=1e-11, atol=1e-12)
     # Which is what a step of no motion, no noise and no measurement would be.
     F[5], G[5], y[5] = np.eye(N), 0.0, np.nan
     agree(smooth, both(EKF, (F, G, H, W, m0, P0, y))[2], 1e-9)

@@ -58,7 +58,7 @@ from robins.filters.rules import (
     variational_bayes,
 )
 from robins.filters.run import _scan
-from robins.filters.values import as_data, content, kind, number, value
+from robins.filters.values import as_data, content, kind, number, parted, value
 
 EYE = jnp.eye(N)
 MODEL = line()
@@ -307,6 +307,31 @@ def test_numbers_with_other_bits_are_other_content(pair):
     one, other = (gate(0.9), *pair)[1:]
     assert content(Line(np.float64(one), "a")) != content(Line(np.float64(other), "a"))
     assert content(Line(np.float64(one), "a")) == content(Line(np.float64(one), "a"))
+
+
+def test_numbers_part_from_a_tree_and_join_to_it():
+    def tree(*numbers):
+        a, b, c, d = map(np.float64, numbers)
+        return {"a": np.array([[a, 0.0], [-1.0, b]]), "b": (3, np.array([])), "c": c, "d": -d}
+
+    given = tree(2.0, np.nextafter(1.0, 2.0), np.inf, 0.0)
+    numbers, joined, key = parted(given)
+    np.testing.assert_array_equal(numbers, [2.0, np.nextafter(1.0, 2.0)])
+    assert content(joined(numbers)) == content(given)
+    assert content(joined(numbers + 1.5)) == content(tree(3.5, 2.5 + 2**-52, np.inf, 0.0))
+    # what is left out of the program is not in its key; zeros, ones and what is not finite are
+    same = {(5.0, 7.0, np.inf, 0.0): True}
+    same |= dict.fromkeys([(1.0, 7.0, np.inf, 0.0), (5.0, 7.0, 9.0, 0.0)], False)
+    same |= {(5.0, 7.0, np.inf, 1.0): False}
+    assert [parted(tree(*other))[2] == key for other in same] == list(same.values())
+    assert parted(tree(2.0, 7.0, np.inf, -0.0))[2] != key
+
+
+def test_numbers_of_filters_part_and_join():
+    for filter_ in (kalman(rules=[gate()]), imm([kalman(), kalman()], np.full((2, 2), 0.5))):
+        numbers, joined, _ = parted(filter_)
+        assert numbers.size
+        assert content(joined(numbers)) == content(filter_)
 
 
 def test_a_rule_of_functions_is_a_value_too():

@@ -14,7 +14,7 @@ from jax import lax
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
 from robins.filters.rules import huber
 from robins.filters.run import Solution, everything, nothing
-from robins.program import CPP, NativeState, ProgramError, kept, names, scanned
+from robins.program import CPP, BuildError, NativeState, ProgramError, kept, names, scanned
 from robins.program.names import by_name
 from robins.program.scanned import scan
 from robins.rotation import Rotation
@@ -51,6 +51,27 @@ def test_it_gives_what_jax_gives():
     assert jax.tree.structure(found) == jax.tree.structure(want)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
         assert a.dtype == b.dtype
+        np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-15)
+
+
+def moved(row):
+    x, turn = row
+    return {"x": Rotation(x).retract(turn), "length": jnp.sum(turn**2)}
+
+
+@pytest.mark.parametrize("there", [True, False], ids=["interpreter", "none"])
+def test_a_function_is_computed_on_each_row(monkeypatch, there):
+    def missing():
+        raise BuildError("there is no C++ compiler", "")
+
+    if not there:
+        monkeypatch.setattr(scanned, "interpreter_of_one", missing)
+    q = RNG.normal(size=(30, 4))
+    rows = q / np.linalg.norm(q, axis=1)[:, None], RNG.normal(size=(30, 3))
+    found, want = scanned.on_each(moved, rows), jax.vmap(moved)(jax.tree.map(jnp.asarray, rows))
+    assert jax.tree.structure(found) == jax.tree.structure(want)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
+        assert isinstance(a, np.ndarray)
         np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-15)
 
 

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code
 from robins.filters.kalman import Prediction
-from robins.filters.run import Solution
+from robins.filters.model import Data
+from robins.filters.run import RunMachine, Solution
 
 # Rounding of a row of a factor, as a share of the row's length.
 _ROUNDING = 1e-14
 
 
-def rts_smoother(solution: Solution) -> Belief:
+def rts_smoother(solution: Solution, machine: RunMachine = "jax") -> Belief:
     """Smoothed beliefs of a run that kept its steps.
 
     Backwards from the last step, with the gain G = P F' (P-)^-1:
@@ -29,10 +31,15 @@ def rts_smoother(solution: Solution) -> Belief:
     amplify. Later measurements with less information on a direction than that rounding are ignored
     there. Covariance added by a rule (fading, inflation) is treated as process noise.
 
+    Args:
+        solution: the run.
+        machine: "vm" for the interpreter, outside of what JAX transforms: nothing is compiled.
+
     Returns:
         Beliefs with leading axis T; the last one is the filter's.
 
     Raises:
+        robins.program.ProgramError: of "vm": the state has no place in a program.
         ValueError: the run did not keep predictions and posteriors.
     """
     steps = solution.steps
@@ -40,18 +47,37 @@ def rts_smoother(solution: Solution) -> Belief:
     require(kept, "smoothing needs a run that kept its steps: leave `keep` at its default")
     single = steps.prediction.transition is not None
     require(single, "smoothing needs one transition a step, which this kind of filter has not")
+    if machine == "vm":
+        return _interpreted(steps.posterior, steps.prediction)
     return _backwards(steps.posterior, steps.prediction)
 
 
 @jax.jit
 def _backwards(posterior: Belief, predictions: Prediction) -> Belief:
+    last, rows = _end_and_rows(posterior, predictions)
+    _, earlier = jax.lax.scan(_back, last, rows, reverse=True)
+    return jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, b[None]]), earlier, last)
+
+
+def _interpreted(posterior: Belief, predictions: Prediction) -> Belief:
+    # Imported here: a filter needs no programs.
+    from robins.program.scanned import named_scan
+
+    arrays = jax.tree_util.tree_map(np.asarray, (posterior, predictions))
+    last, rows = _end_and_rows(*arrays)
+    backwards = jax.tree_util.tree_map(lambda x: x[::-1], rows)
+    _, later = named_scan(_back, last, backwards)
+    return jax.tree_util.tree_map(lambda a, b: np.concatenate([a[::-1], b[None]]), later, last)
+
+
+def _end_and_rows(posterior: Belief, predictions: Prediction) -> tuple[Belief, Data]:
+    """Last belief, and for each step before it its belief with the prediction that follows."""
     last = jax.tree_util.tree_map(lambda x: x[-1], posterior)
     rows = (
         jax.tree_util.tree_map(lambda x: x[:-1], posterior),
         jax.tree_util.tree_map(lambda x: x[1:], predictions),
     )
-    _, earlier = jax.lax.scan(_back, last, rows, reverse=True)
-    return jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, b[None]]), earlier, last)
+    return last, rows
 
 
 def _back(later: Belief, row: tuple[Belief, Prediction]) -> tuple[Belief, Belief]:

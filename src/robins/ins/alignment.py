@@ -21,13 +21,14 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from robins.earth import OMEGA_E, gravity
 from robins.errors import require
 from robins.ins.imu_errors import ImuErrorModel, mean_sigma
-from robins.rotation import Rotation
+from robins.rotation import Rotation, from_euler, to_dcm
 
 UNKNOWN_HEADING_RAD = np.pi / np.sqrt(3.0)
 """Sigma of an angle of which nothing is known: uniform over the circle."""
@@ -151,8 +152,8 @@ def level(
             "the nose points straight up or down, where it has no heading: use gyrocompass, or "
             "mount the unit another way"
         )
-    q_nb = Rotation.from_euler(np.arctan2(-f[..., 1], -f[..., 2]), pitch, heading)
-    C_nb = np.asarray(q_nb.as_dcm())
+    q_nb = from_euler(np.arctan2(-f[..., 1], -f[..., 2]), pitch, heading)
+    C_nb = to_dcm(q_nb)
     heading, heading_sigma = (np.broadcast_to(x, pitch.shape) for x in (heading, heading_sigma))
 
     # What a tilt leaves of phi_D at a heading held fast: phi_D = d(heading) - tan(pitch) d, with d
@@ -164,7 +165,7 @@ def level(
     )
     covariance = _spread(force, sigma_f)
     covariance[..., 2, 2] += heading_sigma**2
-    return Alignment(q_nb, covariance, "level")
+    return Alignment(Rotation(jnp.asarray(q_nb)), covariance, "level")
 
 
 def gyrocompass(

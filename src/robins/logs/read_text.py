@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from robins import rotation
@@ -289,7 +288,7 @@ def _quaternions(read: Read) -> np.ndarray:
         return unit_quaternions(
             read.file, f"{names[0]} .. {names[-1]}", q, read.rows, read.findings
         )
-    q = np.asarray(rotation.from_euler(*map(jnp.asarray, read.stack("euler").T)))
+    q = np.asarray(rotation.from_euler(*read.stack("euler").T))
     return np.asarray(swap_q(q)) if read.nav == "ENU" else q
 
 

@@ -17,7 +17,7 @@ from robins.program.kinds import is_key
 from robins.program.lanes import KINDS, Rounds
 from robins.program.memory import LIVE_UNROLL, form
 from robins.program.names import Tree
-from robins.program.refusal import ProgramError
+from robins.program.refusal import BuildError, ProgramError
 from robins.program.tape import Tape
 from robins.program.trace import Program, trace
 
@@ -69,6 +69,35 @@ def scan(body: Body, content: Hashable, carry: Data, rows: Data) -> tuple[Data, 
     found = [a[0] for a in rounds(1, [(a, False) for a in arrays])]
     begun, _ = tree.children()
     return begun.unflatten(found[:count]), keeps.unflatten(found[count:])
+
+
+def named_scan(body: Body, carry: Data, rows: Data) -> tuple[Data, Data]:
+    """`scan` of a function of a module, known by its name; by JAX where there is no interpreter.
+
+    Args:
+        body: as of `scan`; it may be a `partial` that binds such functions.
+        carry: likewise.
+        rows: likewise.
+    """
+    function, bound = getattr(body, "func", body), getattr(body, "args", ())
+    try:
+        return scan(body, bound, carry, rows)
+    except BuildError:
+        return jax.device_get(_by_jax(function, bound, carry, rows))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _by_jax(function: Body, bound: tuple, carry: Data, rows: Data) -> tuple[Data, Data]:
+    return jax.lax.scan(partial(function, *bound), carry, rows)
+
+
+def on_each(function: Callable[[Data], Data], rows: Data) -> Data:
+    """Return ``jax.vmap(function)(rows)`` with numbers of NumPy, by `named_scan`."""
+    return named_scan(partial(_alone, function), (), rows)[1]
+
+
+def _alone(function: Callable[[Data], Data], carry: Data, row: Data) -> tuple[Data, Data]:
+    return carry, function(row)
 
 
 def _array(x: Data) -> np.ndarray:

@@ -27,6 +27,7 @@ from robins.filters.whiteness import joined
 from robins.ins.blocks import Blocks
 from robins.ins.increments import after_gap
 from robins.program import BuildError, ProgramError
+from robins.program.scanned import on_each
 from robins.results import Outcome, Progress, silent, variable
 from robins.systems.study import Case, Contender, SensorAxes, StateBlock
 from robins.systems.suspects import probabilities, sentences, tables
@@ -161,11 +162,6 @@ def kept(step: Step) -> tuple[Any, Any, dict[str, Update]]:
     return step.posterior.mean, step.posterior.sigma, updates(step, (PROBABILITY, WRONG))
 
 
-@jax.jit
-def _kept_of(steps: Step) -> tuple[Any, Any, dict[str, Update]]:
-    return jax.vmap(kept)(steps)
-
-
 def navigated(
     pieces: Sequence[Piece],
     wanted: Sequence[str],
@@ -203,7 +199,7 @@ def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answe
         # what would be said here is among the warnings of the outcome
         warnings.simplefilter("ignore", StepWarning)
         found, why = _ran(contender, case, everything if smoothed else kept, piece.epoch_s)
-        of_steps = _kept_of(found.steps) if smoothed else found.steps
+        of_steps = on_each(kept, found.steps) if smoothed else found.steps
     mean, sigma, seen = of_steps
     likelihood, bounds = float(found.log_likelihood), contender.bounds
     tally = found.tally.looking(seen, case.y)
@@ -211,8 +207,16 @@ def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answe
     answer = Answer("", mean, sigma, seen, case.start, likelihood, tally, bounds, wrong, why)
     if not smoothed:
         return answer, answer
-    belief = rts_smoother(found)
-    return answer, answer._replace(mean=belief.mean, sigma=belief.sigma, updates={}, wrong={})
+    belief = _smoothed(found)
+    sigma = np.linalg.norm(belief.factor, axis=-1)
+    return answer, answer._replace(mean=belief.mean, sigma=sigma, updates={}, wrong={})
+
+
+def _smoothed(found: Solution) -> Belief:
+    try:
+        return rts_smoother(found, machine="vm")
+    except ProgramError:
+        return rts_smoother(found)
 
 
 def _ran(contender: Contender, case: Case, keep: Keep, time_s: np.ndarray) -> tuple[Solution, str]:
@@ -328,8 +332,9 @@ def _tables(
                 values = np.stack([blank if row is None else np.asarray(row) for row in rows])
                 data |= block_array(role, block, values)
     if all("q_nb" in of for of in found):
-        q_nb = jnp.stack([jnp.asarray(of["q_nb"]) for of in found])
-        euler = np.stack(rotation.to_euler(q_nb), axis=-1)
+        q_nb = np.stack([np.asarray(of["q_nb"]) for of in found])
+        euler = np.stack(on_each(rotation.to_euler, q_nb.reshape(-1, 4)), axis=-1)
+        euler = euler.reshape(*q_nb.shape[:-1], 3)
         data |= attitude_array(q_nb, reported.euler.frame)
     else:
         euler = np.stack([np.asarray(of["euler"]) for of in found])

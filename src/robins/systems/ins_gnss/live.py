@@ -30,7 +30,6 @@ from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from robins.dataset import ImuTable
@@ -51,7 +50,7 @@ from robins.systems.ins_gnss.log import (
 )
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.recording import Log, axes_of, believed_sigmas
-from robins.systems.ins_gnss.start import CARRIED, Usual, calmest, find_start, turned
+from robins.systems.ins_gnss.start import Usual, calmest, find_start, turned
 from robins.systems.parts import Block
 from robins.systems.streaming import (
     Door,
@@ -454,7 +453,7 @@ class LiveInsGnss(Live):
     def _compile(self) -> None:
         """Have all compiled by a standstill that is thrown away."""
         step = round(1e9 * self._usual.sample_s)
-        turned(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros((CARRIED, 3)))
+        turned(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros((0, 3)))
         second, ones = max(1, round(1e9 / step)), np.ones(3)
         place = Replay.model_validate({"start": {"known_heading": 0.0}}).start
         p, self.parameters = self.parameters, self.parameters.model_copy(update={"start": place})

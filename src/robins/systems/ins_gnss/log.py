@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from robins.dataset import Dataset
 from robins.earth import Geodetic
@@ -24,6 +25,7 @@ from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsState
 from robins.program.evaluated import evaluated
+from robins.program.scanned import named_scan, on_each
 from robins.results import Outcome, Progress, array, silent, variable
 from robins.rotation import Rotation
 from robins.systems import replaying
@@ -387,15 +389,23 @@ def replay(
     return outcome
 
 
-@jax.jit
-def antenna_of(mount: model.Mount, mean: InsState, rate_b) -> Geodetic:
+def antenna_of(mount: model.Mount, mean: InsState, rate_b: Array | np.ndarray) -> Geodetic:
     """Position of the antenna as a filter estimates it, at each epoch."""
-    return jax.vmap(lambda x, omega: model.read_position(mount, x, omega))(mean, rate_b)
+    return named_scan(_antenna, mount, (mean, rate_b))[1]
+
+
+def _antenna(mount: model.Mount, row: tuple[InsState, Array]) -> tuple[model.Mount, Geodetic]:
+    return mount, model.read_position(mount, *row)
 
 
 def _estimates(mean: InsState) -> Mapping[str, Any]:
     biases_and_scales = {name: getattr(mean, name) for name in InsState._fields[3:]}
     return {"velocity": mean.v_n, "q_nb": mean.q_nb.wxyz, **biases_and_scales}
+
+
+def _between(places: tuple[Geodetic, Geodetic]) -> Array:
+    """(3,) m, north, east, down, from one place to another."""
+    return places[0].local(places[1])
 
 
 def distances(log: Log, used: np.ndarray, epoch_s: np.ndarray, antenna: Geodetic) -> dict[str, Any]:
@@ -408,9 +418,9 @@ def distances(log: Log, used: np.ndarray, epoch_s: np.ndarray, antenna: Geodetic
     if g.quality is not None and np.any(use):
         use = use & (g.quality == np.min(g.quality[use]))
     epoch = np.searchsorted(epoch_s, log.gnss_s[use] - 1e-9)
-    at = jax.tree_util.tree_map(lambda x: x[epoch], antenna)
-    fix = Geodetic(*(jnp.asarray(v[use]) for v in (g.lat_rad, g.lon_rad, g.alt_m)))
-    error, withheld = np.asarray(fix.local(at)), log.withheld[use]
+    at = jax.tree_util.tree_map(lambda x: np.asarray(x)[epoch], antenna)
+    fix = Geodetic(*(v[use] for v in (g.lat_rad, g.lon_rad, g.alt_m)))
+    error, withheld = on_each(_between, (fix, at)), log.withheld[use]
     across = np.hypot(error[:, 0], error[:, 1])
     out: dict[str, Any] = {
         "aided_horizontal_rms_m": _rms(across[~withheld]),

@@ -62,7 +62,7 @@ def in_body_axes(dataset: Dataset, orientation: Sequence[float]) -> Dataset:
 
 def axes_of(orientation: Sequence[float]) -> np.ndarray:
     """(3, 3) from the sensor's axes to forward-right-down; orientation as in `in_body_axes`."""
-    C_bs = np.asarray(rotation.to_dcm(rotation.from_euler(*orientation))).T
+    C_bs = np.asarray(rotation.to_dcm(rotation.from_euler(*np.asarray(orientation)))).T
     whole = np.round(C_bs)  # right angles exchange axes and mix nothing
     return np.where(np.abs(C_bs - whole) < 1e-15, whole, C_bs) + 0.0
 

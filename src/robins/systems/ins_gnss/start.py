@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from robins import rotation
 from robins.earth import Geodetic, gravity_n
@@ -20,6 +20,7 @@ from robins.ins.rest import (
     unrest,
 )
 from robins.program.evaluated import evaluated
+from robins.program.scanned import named_scan
 from robins.systems.ins_gnss.parameters import Aids, Start
 from robins.systems.ins_gnss.recording import Log
 
@@ -103,17 +104,13 @@ def _moving_fixes(log: Log, speed: float) -> tuple[np.ndarray, np.ndarray]:
     return time_s[told], way[told] > limit[told]
 
 
-CARRIED = 4096  # increments, to multiples of which those that carry the tilt are filled up
-
-
-@jax.jit
-def turned(q, theta):
+def turned(q: np.ndarray, theta: np.ndarray) -> np.ndarray:
     """Attitude (4,) after rotation vectors (N, 3) in body axes."""
+    return named_scan(_turned_by, q, theta)[0]
 
-    def step(q, t):
-        return rotation.normalise(rotation.multiply(q, rotation.from_rotvec(t))), None
 
-    return jax.lax.scan(step, q, theta)[0]
+def _turned_by(q: Array, theta: Array) -> tuple[Array, None]:
+    return rotation.normalise(rotation.multiply(q, rotation.from_rotvec(theta))), None
 
 
 def with_heading(q_nb: np.ndarray, heading_rad: float) -> np.ndarray:
@@ -256,10 +253,8 @@ def find_start(log: Log, start: Start, aids: Aids, usual: Usual | None = None) -
         assert v_n is not None
         assert fast is not None
         carried = theta[at + 1 : last + 1] - bias * dt[at + 1 : last + 1, None]
-        # one compilation for most logs, and for a live start none
-        carried = jnp.asarray(np.pad(carried, ((0, -len(carried) % CARRIED), (0, 0))))
         heading = float(np.arctan2(v_n[fast, 1], v_n[fast, 0]))
-        q_nb = with_heading(np.asarray(turned(jnp.asarray(q_nb), carried)), heading)
+        q_nb = with_heading(turned(q_nb, carried), heading)
         begin_s = float(gnss_s[fast])
         sentence += (
             f"; heading {np.degrees(heading) % 360:.1f} deg from the course at {begin_s:.1f} s, "

@@ -121,22 +121,6 @@ def _kept(step: Step) -> jax.Array:
     return jnp.concatenate([jnp.asarray(part, float) for part in parts])
 
 
-@jax.jit
-def _whole(samples: model.Samples) -> jax.Array:
-    """Integrals of one block and its mean field, in one vector."""
-    leaves = jax.tree_util.tree_leaves(model.integrate(samples))
-    return jnp.concatenate([leaf.reshape(-1) for leaf in leaves])
-
-
-def _parted(vector: np.ndarray) -> tuple[model.Integrals, np.ndarray]:
-    """The parts of what `_whole` returns, leading axis 1."""
-    dt, turn, dv, time, rates, angle, field = np.split(vector, np.cumsum([1, 4, 3, 9, 27, 1]))
-    integrals = model.Integrals(
-        dt, turn[None], dv[None], time.reshape(1, 3, 3), rates.reshape(1, 3, 9), angle
-    )
-    return integrals, field[None]
-
-
 class LiveMarg(Live):
     """The attitude at each sample, at once (see the module for what differs from a replay).
 
@@ -392,7 +376,7 @@ class LiveMarg(Live):
         """Add a block to those that wait for a step."""
         p = self.parameters
         samples = model.Samples(dt[None], theta[None], dv[None], field[None])
-        integrals, field_b = _parted(np.asarray(_whole(samples)))
+        integrals, field_b = model.integrate(samples)
         rate, force = mean_rate(integrals), mean_force(integrals)
         still, sigma = self._watch.look(
             float(np.asarray(integrals.dt_s)[0]), rate[0], force[0], field_b[0]

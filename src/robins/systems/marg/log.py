@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation as SciRotation
@@ -177,8 +176,9 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
         _filled(dv, blocks, n, 0.0),
         _filled(field, blocks, n, np.nan),
     )
-    integrals, block_field = jax.tree.map(np.asarray, model.integrate(samples))
-    rest = at_rest(integrals.dt_s, mean_rate(integrals), mean_force(integrals), block_field, p.rest)
+    integrals, block_field = model.integrate(samples)
+    dt_s = np.asarray(integrals.dt_s)
+    rest = at_rest(dt_s, mean_rate(integrals), mean_force(integrals), block_field, p.rest)
     still = rest.still
 
     turn, lost, gaps = not_sampled(dt, full, doubt, accel_full, usual, p)

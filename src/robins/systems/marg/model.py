@@ -28,12 +28,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float
 
 from robins import rotation
 from robins.filters import Model, Motion, Sensor
 from robins.manifold import Angle
+from robins.program.scanned import on_each
 from robins.rotation import Rotation, left_jacobian, skew
 from robins.systems.marg.parameters import Replay
 from robins.systems.parts import NED
@@ -338,13 +340,12 @@ def of_block(samples: Samples) -> tuple[Integrals, Array]:
     return Integrals(jnp.sum(samples.dt_s), q, dv, turn_time, turn_rates, angle), field_b
 
 
-@jax.jit
-def integrate(samples: Samples) -> tuple[Integrals, Array]:
-    """What every block integrates to, leading axis K, and its mean field.
+def integrate(samples: Samples) -> tuple[Integrals, np.ndarray]:
+    """What every block integrates to, leading axis K, and its mean field; in NumPy.
 
     The field is in body axes at the end of the block, (K, 3) T; NaN where there is none.
     """
-    return jax.vmap(of_block)(samples)
+    return on_each(of_block, samples)
 
 
 def _turns(bias: Array, gain: Array, dt: Array, theta: Array) -> Array:
@@ -359,39 +360,54 @@ def _turns(bias: Array, gain: Array, dt: Array, theta: Array) -> Array:
     return jax.lax.scan(add, jnp.array([1.0, 0.0, 0.0, 0.0]), (dt, theta))[1]
 
 
-@jax.jit
 def causal_attitudes(
     start: MargState, posterior: MargState, samples: Samples
-) -> Float[Array, "K n 4"]:
+) -> Float[np.ndarray, "K n 4"]:
     """Attitude at every sample from what was known by then.
 
     Inside a block the last posterior is carried on by the gyro; at its end stands the new one.
     `start` is the state before the first block, `posterior` has those at the ends, leading axis K.
     """
     before = jax.tree_util.tree_map(
-        lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b[:-1]]), start, posterior
+        lambda a, b: np.concatenate([np.asarray(a)[None], np.asarray(b)[:-1]]), start, posterior
     )
-    turned = jax.vmap(_turns)(before.gyro_bias, before.gyro_gain, samples.dt_s, samples.theta)
-    q = rotation.normalise(rotation.multiply(before.q_nb.wxyz[:, None, :], turned))
-    return q.at[:, -1].set(posterior.q_nb.wxyz)
+    given = before.q_nb.wxyz, before.gyro_bias, before.gyro_gain
+    q = on_each(_carried, (*given, samples.dt_s, samples.theta))
+    q[:, -1] = posterior.q_nb.wxyz
+    return q
 
 
-@jax.jit
+def _carried(block: tuple[Array, Array, Array, Array, Array]) -> Array:
+    q_nb, *given = block
+    return rotation.normalise(rotation.multiply(q_nb[None], _turns(*given)))
+
+
 def smoothed_attitudes(
     smoothed: MargState, samples: Samples
-) -> tuple[Float[Array, "K n 4"], Float[Array, "4"]]:
+) -> tuple[Float[np.ndarray, "K n 4"], Float[np.ndarray, "4"]]:
     """Attitude at every sample from smoothed states at the ends of blocks, and at the start.
 
     The gyro carries each state over the next block; what it misses the next one by is laid over
     the block in equal parts. The first block is gone through backwards.
     """
-    bias, gain, q_end = smoothed.gyro_bias, smoothed.gyro_gain, smoothed.q_nb.wxyz
-    turned = jax.vmap(_turns)(bias, gain, samples.dt_s, samples.theta)
-    first = rotation.multiply(q_end[:1], rotation.conjugate(turned[:1, -1]))
-    start = jnp.concatenate([first, q_end[:-1]])
-    q = rotation.multiply(start[:, None, :], turned)
-    missed = rotation.to_rotvec(rotation.multiply(q_end, rotation.conjugate(q[:, -1])))
-    n = samples.dt_s.shape[1]
-    share = jnp.arange(1.0, n + 1.0) / float(n)
-    mend = rotation.from_rotvec(share[None, :, None] * missed[:, None, :])
-    return rotation.normalise(rotation.multiply(mend, q)), rotation.normalise(start[0])
+    given = smoothed.gyro_bias, smoothed.gyro_gain, samples.dt_s, samples.theta
+    q_end = np.asarray(smoothed.q_nb.wxyz)
+    first = on_each(_begun, (q_end[:1], *(x[:1] for x in given)))
+    start = np.concatenate([first, q_end[:-1]])
+    return on_each(_mended, (start, q_end, *given)), first[0]
+
+
+def _begun(block: tuple[Array, Array, Array, Array, Array]) -> Array:
+    """(4,) attitude before a block, from that at its end."""
+    q_end, *given = block
+    return rotation.normalise(rotation.multiply(q_end, rotation.conjugate(_turns(*given)[-1])))
+
+
+def _mended(block: tuple[Array, Array, Array, Array, Array, Array]) -> Array:
+    """(n, 4) attitudes of a block between two that are known."""
+    start, q_end, *given = block
+    q = rotation.multiply(start[None], _turns(*given))
+    missed = rotation.to_rotvec(rotation.multiply(q_end, rotation.conjugate(q[-1])))
+    share = jnp.arange(1.0, len(q) + 1.0) / float(len(q))
+    mend = rotation.from_rotvec(share[:, None] * missed[None])
+    return rotation.normalise(rotation.multiply(mend, q))
