@@ -48,12 +48,12 @@ def never(*_):
 
 def test_nothing_is_kept_of_code_that_changed_since_the_process_began(cache, monkeypatch):
     monkeypatch.setattr(kept, "_BEGAN_S", 0.0)
-    kept._version.cache_clear()
+    kept._code.cache_clear()
     try:
         of(0.5)
         assert not list(cache.glob("*.npz"))
     finally:
-        kept._version.cache_clear()
+        kept._code.cache_clear()
 
 
 def test_the_second_time_no_program_is_written(cache, monkeypatch):
@@ -92,6 +92,20 @@ def test_another_number_or_direction_is_another_program(cache):
     want = jax.vmap(lambda x: function(0.25, x, True)[1])(X)
     np.testing.assert_allclose(of(0.25, True)[0][1], want, rtol=1e-13)
     assert before < between < len(list(cache.iterdir()))
+
+
+def test_what_other_packages_made_serves_from_a_wheel_alone(cache, monkeypatch):
+    want, _ = of(0.5)
+    files = [file.name for file in cache.iterdir()]
+    monkeypatch.setattr(kept, "_packages", lambda: ["0.0.0"] * 3)
+    written = []
+    monkeypatch.setattr(kept, "_write", lambda path, *_: written.append(path.name))
+    of(0.5)
+    assert sorted(written) == sorted(files)
+    monkeypatch.setattr(kept, "IN_WHEEL", cache)
+    monkeypatch.setattr("robins.program.loops.Body.program", never)
+    for a, b in zip(want, of(0.5)[0], strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 @pytest.mark.parametrize("damage", [b"", b"PK nothing", None])

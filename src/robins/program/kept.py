@@ -1,9 +1,9 @@
-"""Tapes kept in the user's cache, by what they were made of.
+"""Tapes kept in the user's cache, or in a wheel, by what they were made of.
 
 That is the structure of equations (primitives, parameters, shapes and numbers, not names or where
 code stands); or, before anything is traced, the names of functions of robins and the numbers that
-they are given (`names.by_name`). A digest is of that, of robins' own code, and of the versions of
-JAX, NumPy and SciPy.
+they are given (`names.by_name`). A digest is of that and of robins' own code. Those of the cache
+also tell the versions of JAX, NumPy and SciPy, which trace and fold, and serve no others.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from robins.program.tape import Tape
 from robins.program.trace import Leaf, Program
 
 WORTH = 1_000  # nodes of a program that is kept
+IN_WHEEL = Path(str(files("robins.program"))) / "tapes"  # those of the live filters, by a release
 _BEGAN_S = time.time()  # about when the code of this process was read
 DAMAGED = OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error
 
@@ -59,11 +60,14 @@ def kept(
     Raises:
         ProgramError: it cannot be made.
     """
-    is_known = _version() is not None
-    path = cache_folder() / f"{digest([*parts, list(interpreter.codes), interpreter.flag])}.npz"
+    is_known = _code() is not None
+    name = f"{digest([*parts, list(interpreter.codes), interpreter.flag])}.npz"
+    path = cache_folder() / name
     if is_known:
         with contextlib.suppress(*DAMAGED):
-            return _read(path)
+            return _read(path, _packages())
+        with contextlib.suppress(*DAMAGED):
+            return _read(IN_WHEEL / name)
     program = write()
     tape, nodes = interpreter.tape(program), len(program.live)
     if is_known and nodes >= WORTH:
@@ -95,7 +99,7 @@ def _write(path: Path, program: Program, tape: Tape, nodes: int) -> None:
     arrays |= {f"zero{k}": mask for k, mask in program.zeros.items()}
     tree = program.structure[1]
     results = [] if tree is None else list(map(as_json, tree.children()))
-    about = {"leaves": leaves, "nodes": nodes, "tree": results}
+    about = {"leaves": leaves, "nodes": nodes, "tree": results, "packages": _packages()}
     arrays["about"] = json.dumps(about)
     with tempfile.TemporaryDirectory(dir=path.parent) as own:
         made = Path(own) / path.name
@@ -103,9 +107,16 @@ def _write(path: Path, program: Program, tape: Tape, nodes: int) -> None:
         made.replace(path)
 
 
-def _read(path: Path) -> tuple[Program, Tape, int]:
+def _read(path: Path, packages: list[str] | None = None) -> tuple[Program, Tape, int]:
+    """Read what was kept by these versions of packages, or by any if none are named.
+
+    Raises:
+        OSError and others (`DAMAGED`): there is none, or it is damaged.
+    """
     with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
         about = json.loads(str(found["about"]))
+        if packages not in (None, about["packages"]):
+            raise KeyError(str(path))
         tape = Tape.of([found[f"array{k}"] for k in range(4)], found["sizes"])
         zeros = {int(k[4:]): found[k] for k in found.files if k.startswith("zero")}
     inputs, results = (
@@ -160,8 +171,14 @@ def second_result(program: Program, function: Callable[..., Any], *args: Tree) -
 
 
 @lru_cache
-def _version() -> str | None:
-    """A digest of robins, of what its programs depend on, and of the packages that fold numbers.
+def _packages() -> list[str]:
+    """Versions of the packages that trace programs and fold their numbers."""
+    return [metadata.version(package) for package in ("jax", "numpy", "scipy")]
+
+
+@lru_cache
+def _code() -> str | None:
+    """A digest of robins, and of what its programs depend on.
 
     None where it is not known what code this process runs: its files are not there, or were changed
     since it began.
@@ -172,15 +189,13 @@ def _version() -> str | None:
         if file.suffix in kinds:
             newest = max(newest, file.stat().st_mtime)
             found.update(file.read_bytes())
-    for package in ("jax", "numpy", "scipy"):
-        found.update(metadata.version(package).encode())
     return found.hexdigest() if 0.0 < newest <= _BEGAN_S else None
 
 
 def digest(parts: Iterable[Any]) -> str:
     """A digest of jaxprs, arrays, numbers and texts, nested in any way."""
     draws = jax.config.values["jax_threefry_partitionable"]  # which a jaxpr does not say
-    texts: list[str | bytes] = [f"{_version()} {draws}"]
+    texts: list[str | bytes] = [f"{_code()} {draws}"]
     _feed(texts, list(parts), {}, {})
     return _digest_of(texts)
 
