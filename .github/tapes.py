@@ -31,5 +31,6 @@ if __name__ == "__main__":
         os.environ["XDG_CACHE_HOME"] = cache
         make()
         for tape in sorted(Path(cache).rglob("*.npz")):
-            shutil.copy(tape, into)
-            print(f"{tape.name}: {tape.stat().st_size / 1e3:.0f} kB")
+            name = f"{tape.name.partition('.')[0]}.npz"  # for all versions of packages
+            shutil.copy(tape, into / name)
+            print(f"{name}: {tape.stat().st_size / 1e3:.0f} kB")

@@ -1,5 +1,6 @@
 """The choice of parameters against closed forms: a variance has a maximum likelihood of its own."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -152,3 +153,24 @@ def test_numbers_that_differ_are_arguments_of_one_program():
         bent = np.maximum(np.array(some) - 1.0, 0.0)[:, None] + 7.0
         np.testing.assert_allclose(found[..., 0], want + bent, rtol=1e-14)
     assert len(traced) == 2
+
+
+def test_what_differs_does_so_by_its_bits_and_keys_come_back():
+    def drawn(numbers, k):
+        given, sign = numbers
+        return {
+            "sign": jnp.copysign(1.0, sign) + 0.0 * k.astype(float),
+            "key": jax.random.key(k),
+            "y": given[0],
+        }
+
+    many = ManyRuns(drawn)
+    y = np.array([2.0, np.nan])
+    found = many([(y, np.float64(0.0)), (y.copy(), np.float64(-0.0))], np.arange(3))
+    np.testing.assert_array_equal(found["sign"], [[1.0] * 3, [-1.0] * 3])
+    np.testing.assert_array_equal(found["y"], np.full((2, 3), 2.0))
+    assert many._differ == [1]
+    keys = jax.random.key_data(jax.vmap(jax.random.key)(jnp.arange(3)))
+    np.testing.assert_array_equal(jax.random.key_data(found["key"][1]), keys)
+    with pytest.raises(ValueError, match="there must be points and runs"):
+        many([], np.arange(3))

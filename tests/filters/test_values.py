@@ -58,7 +58,7 @@ from robins.filters.rules import (
     variational_bayes,
 )
 from robins.filters.run import _scan
-from robins.filters.values import as_data, content, kind, number, parted, value
+from robins.filters.values import as_data, content, kind, number, split_numbers, value
 
 EYE = jnp.eye(N)
 MODEL = line()
@@ -315,7 +315,7 @@ def test_numbers_part_from_a_tree_and_join_to_it():
         return {"a": np.array([[a, 0.0], [-1.0, b]]), "b": (3, np.array([])), "c": c, "d": -d}
 
     given = tree(2.0, np.nextafter(1.0, 2.0), np.inf, 0.0)
-    numbers, joined, key = parted(given)
+    numbers, joined, key = split_numbers(given)
     np.testing.assert_array_equal(numbers, [2.0, np.nextafter(1.0, 2.0)])
     assert content(joined(numbers)) == content(given)
     assert content(joined(numbers + 1.5)) == content(tree(3.5, 2.5 + 2**-52, np.inf, 0.0))
@@ -323,13 +323,18 @@ def test_numbers_part_from_a_tree_and_join_to_it():
     same = {(5.0, 7.0, np.inf, 0.0): True}
     same |= dict.fromkeys([(1.0, 7.0, np.inf, 0.0), (5.0, 7.0, 9.0, 0.0)], False)
     same |= {(5.0, 7.0, np.inf, 1.0): False}
-    assert [parted(tree(*other))[2] == key for other in same] == list(same.values())
-    assert parted(tree(2.0, 7.0, np.inf, -0.0))[2] != key
+    assert [split_numbers(tree(*other))[2] == key for other in same] == list(same.values())
+    assert split_numbers(tree(2.0, 7.0, np.inf, -0.0))[2] != key
+
+
+def test_a_number_of_python_is_told_from_one_that_is_an_argument():
+    first, second = ((0.5, np.float64(2.0)), (np.float64(2.0), 0.5))
+    assert split_numbers(first)[2] != split_numbers(second)[2]
 
 
 def test_numbers_of_filters_part_and_join():
     for filter_ in (kalman(rules=[gate()]), imm([kalman(), kalman()], np.full((2, 2), 0.5))):
-        numbers, joined, _ = parted(filter_)
+        numbers, joined, _ = split_numbers(filter_)
         assert numbers.size
         assert content(joined(numbers)) == content(filter_)
 

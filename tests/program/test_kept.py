@@ -96,12 +96,14 @@ def test_another_number_or_direction_is_another_program(cache):
 
 def test_what_other_packages_made_serves_from_a_wheel_alone(cache, monkeypatch):
     want, _ = of(0.5)
-    files = [file.name for file in cache.iterdir()]
-    monkeypatch.setattr(kept, "_packages", lambda: ["0.0.0"] * 3)
+    files = list(cache.iterdir())
+    monkeypatch.setattr(kept, "_packages", lambda: "0.0.0")
     written = []
     monkeypatch.setattr(kept, "_write", lambda path, *_: written.append(path.name))
     of(0.5)
-    assert sorted(written) == sorted(files)
+    assert len(written) == len(files)
+    for file in files:
+        file.rename(cache / f"{file.name.partition('.')[0]}.npz")
     monkeypatch.setattr(kept, "IN_WHEEL", cache)
     monkeypatch.setattr("robins.program.loops.Body.program", never)
     for a, b in zip(want, of(0.5)[0], strict=True):

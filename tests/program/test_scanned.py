@@ -14,7 +14,7 @@ from jax import lax
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
 from robins.filters.rules import huber
 from robins.filters.run import Solution, everything, nothing
-from robins.program import CPP, BuildError, NativeState, ProgramError, kept, names, scanned
+from robins.program import CPP, NativeState, ProgramError, kept, names, scanned
 from robins.program.names import by_name
 from robins.program.scanned import scan
 from robins.rotation import Rotation
@@ -61,11 +61,7 @@ def moved(row):
 
 @pytest.mark.parametrize("there", [True, False], ids=["interpreter", "none"])
 def test_a_function_is_computed_on_each_row(monkeypatch, there):
-    def missing():
-        raise BuildError("there is no C++ compiler", "")
-
-    if not there:
-        monkeypatch.setattr(scanned, "interpreter_of_one", missing)
+    monkeypatch.setattr(scanned, "_can_interpret", lambda: there)
     q = RNG.normal(size=(30, 4))
     rows = q / np.linalg.norm(q, axis=1)[:, None], RNG.normal(size=(30, 3))
     found, want = scanned.on_each(moved, rows), jax.vmap(moved)(jax.tree.map(jnp.asarray, rows))

@@ -13,7 +13,9 @@ import numpy as np
 from robins.campaign.handover import HandOver
 from robins.campaign.machine import available_cores, threads
 from robins.campaign.memory import CHUNK_BYTES, LEAST, at_once, width_of
+from robins.errors import require
 from robins.program.interpreter import interpreted_rounds
+from robins.program.kinds import is_key
 from robins.program.stages import Staged
 
 Tree = Any  # a pytree of arrays
@@ -50,9 +52,11 @@ class ManyRuns:
             NumPy arrays with leading axes of points and of runs.
 
         Raises:
+            ValueError: there is no point, or no run.
             jax.errors.JAXTypeError: the function cannot be traced.
         """
         runs = len(jax.tree_util.tree_leaves(arrays)[0])
+        require(len(points) > 0 and runs > 0, "there must be points and runs", (len(points), runs))
         numbers = self._that_differ(points)
         staged = self._staged
         if staged is None:
@@ -71,13 +75,12 @@ class ManyRuns:
         """The leaves that are arguments, by number, each with a leading axis of points."""
         leaves = list(map(jax.tree_util.tree_leaves, points))
         self._first = self._first or leaves[0]
-        rows = [np.stack(list(map(np.asarray, some))) for some in zip(*leaves, strict=True)]
-        pairs = zip(rows, self._first, strict=True)
-        differ = [k for k, (row, first) in enumerate(pairs) if np.any(row != np.asarray(first))]
+        each = list(zip(*leaves, strict=True))
+        differ = [k for k, some in enumerate(each) if not _are_equal(self._first[k], some)]
         if not set(differ) <= set(self._differ):
             self._differ = sorted({*differ, *self._differ})
             self._staged = None
-        return {k: rows[k] for k in self._differ}
+        return {k: np.stack(list(map(np.asarray, each[k]))) for k in self._differ}
 
     def _traced(self, point: Tree, numbers: Mapping[int, np.ndarray], arrays: Tree) -> Staged:
         """The function as one of the numbers that differ, and of a run."""
@@ -107,7 +110,9 @@ class ManyRuns:
             begun, count = thread_time(), min(width, runs - begin)
             found = staged(*given(np.arange(begin, begin + width).clip(max=runs - 1)))
             self._hand_over.took(width, thread_time() - begun, runs - begin - count)
-            return jax.tree_util.tree_map(lambda x: np.asarray(x)[:count], found)
+            return jax.tree_util.tree_map(
+                lambda x: x[:count] if is_key(x.dtype) else np.asarray(x)[:count], found
+            )
 
         begins, ahead, done = range(0, runs, width), deque[Any](), []
         with threads(workers) as pool:
@@ -117,4 +122,15 @@ class ManyRuns:
                 if k >= workers:
                     done.append(ahead.popleft().result())
                     progress(len(done) / len(begins))
-        return jax.tree_util.tree_map(lambda *parts: np.concatenate(parts), *done)
+        return jax.tree_util.tree_map(_end_to_end, *done)
+
+
+def _are_equal(first: Tree, others: Sequence[Tree]) -> bool:
+    """Compare the bits of numbers: NaN is NaN, and -0 is not 0."""
+    bits = np.asarray(first).tobytes()
+    return all(one is first or np.asarray(one).tobytes() == bits for one in others)
+
+
+def _end_to_end(*parts: Tree) -> Tree:
+    """Join arrays of NumPy, or keys of JAX."""
+    return (jax.numpy if is_key(parts[0].dtype) else np).concatenate(parts)

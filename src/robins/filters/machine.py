@@ -17,7 +17,7 @@ from robins.filters.checks import one_of
 from robins.filters.kalman import Advanced, Filter, FilterState, Prediction, Updated
 from robins.filters.model import Data, Model, Motion, Sensor
 from robins.filters.run import Keep, Step, filter_step
-from robins.filters.values import Numbers, on_device, parted
+from robins.filters.values import Numbers, on_device, split_numbers
 
 T = TypeVar("T")
 Name = Literal["jax", "vm", "c"]
@@ -108,7 +108,7 @@ class ProgramStepper:
 
     def __init__(self, filter_: Filter, model: Model, state: FilterState, machine: Machine):
         """Take a filter, a model and a state into the memory that a machine makes."""
-        self._numbers, self._joined, key = parted((filter_, model))
+        self._numbers, self._joined, key = split_numbers((filter_, model))
         self._memory = machine(self._held(state), key)
 
     def _held(self, state: FilterState) -> FilterState:

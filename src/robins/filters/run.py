@@ -17,7 +17,7 @@ from robins.filters.kalman import Again, Filter, FilterState, Prediction
 from robins.filters.model import Data, Model
 from robins.filters.observation import as_measurement
 from robins.filters.tally import Tally, warn_not_taken
-from robins.filters.values import is_known, parted, settled
+from robins.filters.values import is_known, settled, split_numbers
 from robins.manifold import State
 
 
@@ -166,7 +166,7 @@ def _interpreted(
     # Imported here: a filter needs no programs.
     from robins.program.scanned import scan
 
-    numbers, joined, key = parted((filter_, model))
+    numbers, joined, key = split_numbers((filter_, model))
     carry = numbers, _begun(settled(state), rows)
     (_, found), steps = scan(partial(_round, joined, keep), (key, keep), carry, rows)
     return Solution(steps, *found)

@@ -9,6 +9,7 @@ import numpy as np
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code
+from robins.filters.checks import one_of
 from robins.filters.kalman import Prediction
 from robins.filters.model import Data
 from robins.filters.run import RunMachine, Solution
@@ -33,15 +34,16 @@ def rts_smoother(solution: Solution, machine: RunMachine = "jax") -> Belief:
 
     Args:
         solution: the run.
-        machine: "vm" for the interpreter, outside of what JAX transforms: nothing is compiled.
+        machine: "vm" for the interpreter where it can, outside of what JAX transforms: nothing is
+            compiled.
 
     Returns:
         Beliefs with leading axis T; the last one is the filter's.
 
     Raises:
-        robins.program.ProgramError: of "vm": the state has no place in a program.
         ValueError: the run did not keep predictions and posteriors.
     """
+    one_of("machine", machine, RunMachine)
     steps = solution.steps
     kept = hasattr(steps, "prediction")
     require(kept, "smoothing needs a run that kept its steps: leave `keep` at its default")

@@ -142,13 +142,14 @@ def content(*trees: object) -> Hashable:
     )
 
 
-def parted(tree: T) -> tuple[np.ndarray, Callable[[Numbers], T], Hashable]:
-    """Part the numbers that a program takes from what it is made of.
+def split_numbers(tree: T) -> tuple[np.ndarray, Callable[[Numbers], T], Hashable]:
+    """Split a tree into numbers that are arguments of a program, and the rest that is its key.
 
-    Zeros, ones and what is not finite are part of the program, where they spare operations.
+    Arguments are the reals of float64, but not zeros, ones, minus ones and what is not finite,
+    which spare operations as constants.
 
     Returns:
-        (n,) reals; the tree that has others in their places; and the key of all else.
+        (n,) the numbers; a function that makes the tree with others in their places; and the key.
     """
     leaves, structure = jax.tree_util.tree_flatten(tree)
     fixed, given, places = [], [np.zeros(0)], []
@@ -170,7 +171,8 @@ def parted(tree: T) -> tuple[np.ndarray, Callable[[Numbers], T], Hashable]:
             found.append(jax.numpy.where(free, numbers[where], known) if np.any(free) else known)
         return structure.unflatten(found)
 
-    return np.concatenate(given), joined, content(structure.unflatten(fixed))
+    masks = tuple((free.shape, free.tobytes()) for free in places)
+    return np.concatenate(given), joined, (content(structure.unflatten(fixed)), masks)
 
 
 def settled(state: T) -> T:

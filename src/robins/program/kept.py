@@ -2,8 +2,8 @@
 
 That is the structure of equations (primitives, parameters, shapes and numbers, not names or where
 code stands); or, before anything is traced, the names of functions of robins and the numbers that
-they are given (`names.by_name`). A digest is of that and of robins' own code. Those of the cache
-also tell the versions of JAX, NumPy and SciPy, which trace and fold, and serve no others.
+they are given (`names.by_name`). A digest is of that and of robins' own code. Names in the cache
+also tell the versions of JAX, NumPy and SciPy, which trace and fold; those in a wheel serve all.
 """
 
 from __future__ import annotations
@@ -61,13 +61,11 @@ def kept(
         ProgramError: it cannot be made.
     """
     is_known = _code() is not None
-    name = f"{digest([*parts, list(interpreter.codes), interpreter.flag])}.npz"
-    path = cache_folder() / name
-    if is_known:
+    name = digest([*parts, list(interpreter.codes), interpreter.flag])
+    path = cache_folder() / f"{name}.{_packages()}.npz"
+    for there in (path, IN_WHEEL / f"{name}.npz") if is_known else ():
         with contextlib.suppress(*DAMAGED):
-            return _read(path, _packages())
-        with contextlib.suppress(*DAMAGED):
-            return _read(IN_WHEEL / name)
+            return _read(there)
     program = write()
     tape, nodes = interpreter.tape(program), len(program.live)
     if is_known and nodes >= WORTH:
@@ -99,7 +97,7 @@ def _write(path: Path, program: Program, tape: Tape, nodes: int) -> None:
     arrays |= {f"zero{k}": mask for k, mask in program.zeros.items()}
     tree = program.structure[1]
     results = [] if tree is None else list(map(as_json, tree.children()))
-    about = {"leaves": leaves, "nodes": nodes, "tree": results, "packages": _packages()}
+    about = {"leaves": leaves, "nodes": nodes, "tree": results}
     arrays["about"] = json.dumps(about)
     with tempfile.TemporaryDirectory(dir=path.parent) as own:
         made = Path(own) / path.name
@@ -107,16 +105,9 @@ def _write(path: Path, program: Program, tape: Tape, nodes: int) -> None:
         made.replace(path)
 
 
-def _read(path: Path, packages: list[str] | None = None) -> tuple[Program, Tape, int]:
-    """Read what was kept by these versions of packages, or by any if none are named.
-
-    Raises:
-        OSError and others (`DAMAGED`): there is none, or it is damaged.
-    """
+def _read(path: Path) -> tuple[Program, Tape, int]:
     with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
         about = json.loads(str(found["about"]))
-        if packages not in (None, about["packages"]):
-            raise KeyError(str(path))
         tape = Tape.of([found[f"array{k}"] for k in range(4)], found["sizes"])
         zeros = {int(k[4:]): found[k] for k in found.files if k.startswith("zero")}
     inputs, results = (
@@ -171,9 +162,9 @@ def second_result(program: Program, function: Callable[..., Any], *args: Tree) -
 
 
 @lru_cache
-def _packages() -> list[str]:
+def _packages() -> str:
     """Versions of the packages that trace programs and fold their numbers."""
-    return [metadata.version(package) for package in ("jax", "numpy", "scipy")]
+    return "-".join(metadata.version(package) for package in ("jax", "numpy", "scipy"))
 
 
 @lru_cache

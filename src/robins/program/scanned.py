@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -72,18 +73,34 @@ def scan(body: Body, content: Hashable, carry: Data, rows: Data) -> tuple[Data, 
 
 
 def named_scan(body: Body, carry: Data, rows: Data) -> tuple[Data, Data]:
-    """`scan` of a function of a module, known by its name; by JAX where there is no interpreter.
+    """`scan` of a function of a module, known by its name; else by JAX.
+
+    JAX computes where there is no interpreter, and what has no place in a program.
 
     Args:
-        body: as of `scan`; it may be a `partial` that binds such functions.
-        carry: likewise.
-        rows: likewise.
+        body: as of `scan`; a function, or a `partial` that binds functions as first arguments.
+        carry: as of `scan`.
+        rows: as of `scan`.
+
+    Raises:
+        ValueError: a `partial` binds arguments by name; or as of `scan`.
     """
     function, bound = getattr(body, "func", body), getattr(body, "args", ())
+    require(not getattr(body, "keywords", None), "bind no arguments by name", body)
+    if _can_interpret():
+        with contextlib.suppress(ProgramError):
+            return scan(body, bound, carry, rows)
+    return jax.device_get(_by_jax(function, bound, carry, rows))
+
+
+@lru_cache
+def _can_interpret() -> bool:
+    """True if there is an interpreter; without one no other is sought at each call."""
     try:
-        return scan(body, bound, carry, rows)
+        interpreter_of_one()
     except BuildError:
-        return jax.device_get(_by_jax(function, bound, carry, rows))
+        return False
+    return True
 
 
 @partial(jax.jit, static_argnums=(0, 1))

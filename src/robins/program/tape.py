@@ -430,6 +430,8 @@ class Tape:
                 jumps.append((len(self._rows), 3, one.numbers[2]))
             elif one.code == "leave_unless":
                 jumps.append((len(self._rows), 2, writer.spans[one.numbers[0]][1]))
+            if one.code and one.code not in self._codes:
+                raise ProgramError(f"the interpreter has no operation '{one.code}'")
             if one.code:
                 row = self._row(one, result, args, listed)
                 self._rows.append((self._codes[one.code], *(*row, 0, 0, 0)[:4]))

@@ -207,16 +207,9 @@ def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answe
     answer = Answer("", mean, sigma, seen, case.start, likelihood, tally, bounds, wrong, why)
     if not smoothed:
         return answer, answer
-    belief = _smoothed(found)
+    belief = rts_smoother(found, machine="vm")
     sigma = np.linalg.norm(belief.factor, axis=-1)
     return answer, answer._replace(mean=belief.mean, sigma=sigma, updates={}, wrong={})
-
-
-def _smoothed(found: Solution) -> Belief:
-    try:
-        return rts_smoother(found, machine="vm")
-    except ProgramError:
-        return rts_smoother(found)
 
 
 def _ran(contender: Contender, case: Case, keep: Keep, time_s: np.ndarray) -> tuple[Solution, str]:

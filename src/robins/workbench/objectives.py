@@ -245,8 +245,8 @@ def on_log(
 
     with refusing(opened.source):
         first = trial(np.zeros(len(tuned)))
-    measured = [given[1] for given in first.numbers[2]]
-    count = sum(int(np.sum(np.isfinite(y))) for y in jax.tree_util.tree_leaves(measured))
+    _, model, cases = first.numbers
+    count = sum(_components(y, model.dims[s]) for case in cases for s, y in case[1].items())
     segments = min(SEGMENTS, count // _FEWEST)
     held = np.arange(segments) % 3 == 2
     if np.sum(held) < 3:
@@ -272,6 +272,13 @@ def on_log(
         "judge.",
         checked=parsed,
     )
+
+
+def _components(y: Tree, dim: int) -> int:
+    """Number of measured components of a sensor, of which a quaternion has three."""
+    leaves = map(np.asarray, jax.tree_util.tree_leaves(y))
+    each = sum(np.sum(np.isfinite(x.reshape(len(x), -1)), axis=1) for x in leaves)
+    return int(np.sum(np.minimum(each, dim)))
 
 
 def _steps(filter_: Any, model: Any, given: Sequence[Any]) -> Array:
