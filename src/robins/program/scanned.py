@@ -88,7 +88,7 @@ def named_scan(body: Body, carry: Data, rows: Data) -> tuple[Data, Data]:
     function, bound = getattr(body, "func", body), getattr(body, "args", ())
     require(not getattr(body, "keywords", None), "bind no arguments by name", body)
     if _can_interpret():
-        with contextlib.suppress(ProgramError):
+        with contextlib.suppress(ProgramError, BuildError):
             return scan(body, bound, carry, rows)
     return jax.device_get(_by_jax(function, bound, carry, rows))
 
