@@ -1,6 +1,7 @@
 """Programs of the live filters for a wheel, so that they start at once where it is installed.
 
-python .github/tapes.py src/robins/program/tapes
+Make them: python .github/tapes.py src/robins/program/tapes
+Check that an installed wheel has them: python .github/tapes.py
 """
 
 import os
@@ -24,13 +25,21 @@ def make() -> None:
             LiveInsGnss(Navigated(), rate_hz, filter=name)
 
 
-if __name__ == "__main__":
-    into = Path(sys.argv[1])
-    into.mkdir(parents=True, exist_ok=True)
+def main() -> None:
+    """Write the programs into the folder that is named, or check that none is made."""
     with tempfile.TemporaryDirectory() as cache:
         os.environ["XDG_CACHE_HOME"] = cache
         make()
-        for tape in sorted(Path(cache).rglob("*.npz")):
+        written = sorted(Path(cache).rglob("*.npz"))
+        if not sys.argv[1:]:
+            sys.exit(f"{len(written)} programs are not in the wheel" if written else 0)
+        into = Path(sys.argv[1])
+        into.mkdir(parents=True, exist_ok=True)
+        for tape in written:
             name = f"{tape.name.partition('.')[0]}.npz"  # for all versions of packages
             shutil.copy(tape, into / name)
             print(f"{name}: {tape.stat().st_size / 1e3:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()

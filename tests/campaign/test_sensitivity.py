@@ -120,7 +120,7 @@ def test_a_point_is_the_scenario_run_with_its_values():
     vary = ["outlier_share=0 to 0.2", "outlier_factor=2 to 50"]
     short = ("duration=20 s",)
     shares = np.array([[0.25, 0.5], [1.0, 0.0], [0.0, 0.7]])
-    squares, _ = sobol.simulate_points(budget_of(BALLOON, "gated", vary, short, 3), shares, 5)
+    squares, *_ = sobol.simulate_points(budget_of(BALLOON, "gated", vary, short, 3), shares, 5)
     assert squares.shape == (3, 5, 2)
     settings = (*short, "outlier_share=0.05", "outlier_factor=10")
     alone = run(BALLOON, runs=5, seed=3, filters=("gated",), settings=settings).metrics["gated"]
@@ -307,7 +307,7 @@ def test_errors_that_do_not_vary_and_wide_bounds_are_told(monkeypatch):
         """RMS left: both parameters alike; right: a constant; both: the first alone."""
         first = shares[:, 0]
         rms = np.stack([1.0 + first + shares[:, 1], np.ones(len(shares)), 1.0 + first], axis=1)
-        return np.repeat(rms[:, None] ** 2, runs, axis=1), np.zeros((len(shares), runs))
+        return np.repeat(rms[:, None] ** 2, runs, axis=1), np.zeros((len(shares), runs)), []
 
     monkeypatch.setattr(sensitivities, "simulate_points", simulated)
     found = sensitivity(PAIR, vary=[LEFT, RIGHT], runs=2, samples=64)

@@ -32,6 +32,7 @@ from robins.results import array, variable
 from robins.systems.study import Contender, Problem, StateBlock
 from robins.systems.tables import block_array
 
+_AT_ONCE = 128  # runs: histories of the information of each are held
 FEW = 1.0  # eigenvalue of the Gramian below which the prior still knows more of a direction
 _FEWEST, _MOST = 3, 6  # directions that are told
 
@@ -71,11 +72,7 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
     def bounded(_: Data, number: Array) -> dict[str, Data]:
         return _bounded(c, subsets, problem.simulate(number))
 
-    found = jax.tree_util.tree_map(
-        lambda x: x[0], ManyRuns(bounded)([()], np.arange(runs, dtype=int))
-    )
-    variance, prior = (np.mean(found[k], axis=0) for k in ("variance", "prior"))
-    first = jax.tree_util.tree_map(lambda x: x[0], found)
+    first, variance, prior = _of_all(ManyRuns(bounded), runs)
     L, D = first["L"], first["D"]
     sigma, prior = np.sqrt(variance), np.sqrt(prior)
     if not (np.all(np.isfinite(sigma)) and np.all(np.isfinite(L))):
@@ -92,6 +89,18 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
     data |= _information(*_states(problem.blocks, rows, first["mean"]), L, D)
     told = {"filter": name, "runs": runs, "without": ", ".join(without)}
     return xr.Dataset(data, attrs=told)
+
+
+def _of_all(bounded: ManyRuns, runs: int) -> tuple[dict[str, Data], np.ndarray, np.ndarray]:
+    """What `_bounded` finds in the first run, and the means of its variance and prior over all."""
+    first: dict[str, Data] = {}
+    variance = prior = np.zeros(())
+    for begin in range(0, runs, _AT_ONCE):
+        found = bounded([()], np.arange(begin, min(begin + _AT_ONCE, runs)))
+        first = first or jax.tree_util.tree_map(lambda x: x[0, 0], found)
+        variance = variance + np.sum(found["variance"][0], axis=0)
+        prior = prior + np.sum(found["prior"][0], axis=0)
+    return first, variance / runs, prior / runs
 
 
 def bound_sigma(problem: Problem, name: str, world: Any, machine: str = "vm") -> np.ndarray:

@@ -71,6 +71,12 @@ class ManyRuns:
         shape = len(points), runs
         return jax.tree_util.tree_map(lambda x: x.reshape(*shape, *x.shape[1:]), found)
 
+    @property
+    def notes(self) -> list[str]:
+        """Parts that JAX computed, with the reason."""
+        refused = self._staged.refused if self._staged else []
+        return [f"a part stays with JAX, as {why}" for why in refused]
+
     def _that_differ(self, points: Sequence[Tree]) -> dict[int, np.ndarray]:
         """The leaves that are arguments, by number, each with a leading axis of points."""
         leaves = list(map(jax.tree_util.tree_leaves, points))

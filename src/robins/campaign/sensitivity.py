@@ -205,7 +205,7 @@ def simulate_points(
     shares: np.ndarray,
     runs: int,
     progress: Callable[[float], None] = lambda share: None,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """All runs of all points.
 
     Args:
@@ -215,12 +215,13 @@ def simulate_points(
         progress: called with the share done.
 
     Returns:
-        (points, runs, blocks) and (points, runs), as of `Budget.run`.
+        (points, runs, blocks) and (points, runs), as of `Budget.run`; parts that JAX computed.
 
     Raises:
         jax.errors.JAXTypeError: a world cannot be traced; see `untraceable`.
     """
-    return ManyRuns(budget.run)(list(shares), np.arange(runs), progress)
+    run = ManyRuns(budget.run)
+    return *run(list(shares), np.arange(runs), progress), run.notes
 
 
 # --------------------------------------------------------------------------------- the indices

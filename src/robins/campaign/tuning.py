@@ -81,6 +81,7 @@ class Tuned(NamedTuple):
         after: (parts, k) with what was found.
         gain: by how much the objective of the data held out is less; negative: it is worse.
         gain_low: its lower bound, of 95 % confidence one-sided.
+        notes: parts that JAX computed, with the reason.
     """
 
     x: Float[np.ndarray, "p"]
@@ -91,6 +92,7 @@ class Tuned(NamedTuple):
     after: np.ndarray
     gain: float
     gain_low: float
+    notes: list[str]
 
     @property
     def better(self) -> bool:
@@ -153,7 +155,9 @@ def choose(
     progress(0.95, "judging on data held out")
     before, after = slopes.parts([x0, x], judged_on)
     gain, low = _gain(objective.total, before, after)
-    return Tuned(x, sigma, slopes.gradient, slopes.evaluations, before, after, gain, low)
+    return Tuned(
+        x, sigma, slopes.gradient, slopes.evaluations, before, after, gain, low, slopes.notes
+    )
 
 
 class Slopes:
@@ -197,6 +201,11 @@ class Slopes:
                 parts = some.reshape(-1, some.shape[-1])
                 found[k] = parts if data.rows is None else parts[data.rows]
         return found
+
+    @property
+    def notes(self) -> list[str]:
+        """Parts that JAX computed, with the reason."""
+        return list(dict.fromkeys(note for one in self._measured.values() for note in one.notes))
 
     def total(self, parts: np.ndarray) -> float:
         """The objective of some parts; infinite where the filter is lost."""

@@ -145,7 +145,7 @@ def sensitivity(
 
     progress(0.01, f"tracing {count} points of {runs} runs")
     try:
-        found, believed = simulate_points(budget, points.reshape(count, -1), runs, told)
+        found, believed, jax_parts = simulate_points(budget, points.reshape(count, -1), runs, told)
     except jax.errors.JAXTypeError as error:
         raise _refused(budget, every) from error
     squares = found.reshape(*points.shape[:2], *found.shape[1:])
@@ -159,7 +159,7 @@ def sensitivity(
             "sensitivity.csv": _table(wanted, every, ranges, squares, view.blocks, computed),
             "points.csv": _points(every, ranges, points, squares, view.blocks),
         },
-        notes=[*_notes(wanted, every, ranges, squares, view.blocks), *view.notes],
+        notes=[*_notes(wanted, every, ranges, squares, view.blocks), *view.notes, *jax_parts],
         warnings=_warnings(wanted, every, squares, told_of, view.blocks, computed),
         scenario=read.label,
         seed=seed,

@@ -134,6 +134,7 @@ def _outcome(of: Asked, found: Tuned, seed: int) -> Outcome:
             f"Held out: {change}.",
             of.told,
             f"Small is made: {of.by}; by {how}, {found.evaluations} evaluations.",
+            *found.notes,
         ],
         warnings=warnings,
         scenario=of.label,
