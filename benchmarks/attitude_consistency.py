@@ -79,17 +79,17 @@ def main() -> None:
         for trial in (t for folder in folders for t in READERS[name](folder) if t.development):
             log = prepare(trial.log, p)
             w, count = log.world, len(log.rows)
-            answer = run(filter_of(p), model_of(p), w.start, w.y, w.u, w.aux)
-            beliefs = answer.steps.posterior, rts_smoother(answer)
+            answer = run(filter_of(p), model_of(p), w.start, w.y, w.u, w.aux, machine="vm")
+            beliefs = answer.steps.posterior, rts_smoother(answer, machine="vm")
             assert trial.log.attitude is not None
             true, counts = truth_at(trial.log.attitude, log.time_ns[log.rows])
-            turned, lasted = (np.asarray(a)[:count] for a in (w.u.samples.angle, w.u.samples.dt_s))
+            turned, lasted = (np.asarray(a) for a in (w.u.samples.angle, w.u.samples.dt_s))
             floor = np.hypot(p.stated.heading, p.stated.delay * turned / lasted)
             for way, belief, errors in zip(
                 ("causal", "smoothed"), beliefs, drawn(answer.steps, count, rng), strict=True
             ):
-                q = np.asarray(belief.mean.q_nb.wxyz)[:count]
-                sigma = np.hypot(np.asarray(belief.sigma)[:count, HEADING], floor)
+                q = np.asarray(belief.mean.q_nb.wxyz)
+                sigma = np.hypot(np.asarray(belief.sigma)[:, HEADING], floor)
                 seen = (orientation_errors(q, true).heading / sigma)[counts]
                 nees = float(np.mean(seen**2))
                 errors = errors + floor[:, None] * rng.standard_normal(DRAWS)

@@ -41,9 +41,8 @@ def test_it_is_the_filter_of_a_replay(ran):
     """Which is given blocks that were integrated before."""
     made, _, found = ran
     prepared = prepare(made.log, PARAMETERS)
-    count, world = len(prepared.rows), prepared.world
-    y, u, aux = jax.tree_util.tree_map(lambda a: a[:count], (world.y, world.u, world.aux))
-    expected = run(filter_of(PARAMETERS), model_of(PARAMETERS), world.start, y, u, aux)
+    w = prepared.world
+    expected = run(filter_of(PARAMETERS), model_of(PARAMETERS), w.start, w.y, w.u, w.aux)
     for got, want in zip(
         jax.tree_util.tree_leaves(found.steps.posterior),
         jax.tree_util.tree_leaves(expected.steps.posterior),

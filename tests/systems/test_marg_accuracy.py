@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robins.dataset import AttitudeTable
-from robins.systems.marg.log import attitude_of
 from robins.systems.marg.replay import orientation_errors, rms_deg, truth_at
+from robins.systems.marg.start import attitude_of
 
 
 def scalar_first(rotation):

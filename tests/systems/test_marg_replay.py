@@ -12,8 +12,9 @@ from robins.dataset import ImuTable
 from robins.filters import OnlineFilter
 from robins.ins.increments import from_imu
 from robins.systems.marg import Replay, filter_of, model_of, prepare, replay
-from robins.systems.marg.log import Pace, as_means, at_samples
+from robins.systems.marg.log import at_samples
 from robins.systems.marg.model import MAGNETOMETER, TRAVEL
+from robins.systems.marg.path import Pace, as_means
 
 GAIN = 0.01 * np.array([[0.6, -0.4, 0.2], [0.3, -0.7, 0.5], [-0.2, 0.4, 0.5]])
 PARAMETERS = Replay()
@@ -240,12 +241,12 @@ def test_a_causal_replay_alone_gives_the_same(moved):
 def test_a_live_filter_gives_the_numbers_of_the_replay(moved):
     dataset, outcome = moved
     log = prepare(dataset, PARAMETERS).world
-    online = OnlineFilter(filter_of(PARAMETERS), model_of(PARAMETERS), log.start)
+    online = OnlineFilter(filter_of(PARAMETERS), model := model_of(PARAMETERS), log.start)
     row = lambda tree, k: jax.tree_util.tree_map(lambda a: a[k], tree)  # noqa: E731
     for k in range(120):
         online.predict(row(log.u, k))
-        for sensor, values in log.y.items():
-            online.update(row(values, k), sensor, row(log.aux[sensor], k))
+        for sensor in model.dims:
+            online.update(row(log.y[sensor], k), sensor, row(log.aux[sensor], k))
     sigma = outcome.solution["sigma_attitude"].sel(filter="marg").values[119]
     # what is stated holds, beside what the filter knows, what no state carries
     stated, samples = PARAMETERS.stated, log.u.samples

@@ -1,21 +1,30 @@
 """Rest of a nine-axis unit by spread and constancy, and the bias that it shows."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from robins.systems.marg.parameters import Rest
-from robins.systems.marg.rest import at_rest
+from robins.systems.marg.rest import Watch
 
 BLOCK_S, GRAVITY = 0.1, 9.81
 NO_FIELD = np.full((200, 3), np.nan)
 
 
 def told(rate, field=NO_FIELD, noise=0.0, seed=0):
-    """Rest of 20 s of blocks, with gravity in one place; the rate (200, 3) or (3,) in deg/s."""
+    """Rest in 20 s of blocks, with gravity in one place; the rate (200, 3) or (3,) in deg/s."""
     rng = np.random.default_rng(seed)
     rate = np.broadcast_to(np.radians(rate), (200, 3)) + noise * rng.standard_normal((200, 3))
-    force = np.tile([0.0, 0.0, -GRAVITY], (200, 1))
-    return at_rest(np.full(200, BLOCK_S), rate, force, field, Rest())
+    return at_rest(BLOCK_S, rate, field)
+
+
+def at_rest(block_s, rate, field):
+    """(K,) bool, whether each block is at rest; and what the first rest shows."""
+    watch, force = Watch(block_s, Rest()), np.array([0.0, 0.0, -GRAVITY])
+    rows = zip(rate, field, strict=True)
+    still = [watch.look(block_s, one, force, field_b)[0] for one, field_b in rows]
+    return SimpleNamespace(still=np.array(still), first=watch.first, first_sigma=watch.first_sigma)
 
 
 @pytest.mark.parametrize("bias", [0.0, 4.4, -9.5])
@@ -66,7 +75,6 @@ def test_a_field_that_turns_is_a_unit_that_turns():
 
 
 def test_samples_that_are_too_rare_tell_nothing():
-    force = np.tile([0.0, 0.0, -GRAVITY], (30, 1))
-    found = at_rest(np.ones(30), np.zeros((30, 3)), force, NO_FIELD[:30], Rest())
+    found = at_rest(1.0, np.zeros((30, 3)), NO_FIELD[:30])
     assert not found.still.any()
     assert found.first is None

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from robins.systems.marg.saturation import bridged, levels
+from robins.systems.marg.saturation import beyond, bridged, levels
 
 TIME = np.arange(3000) / 100.0
+TIME_NS = np.arange(3000) * 10_000_000
 
 
 def shakes(hertz=4.0, size=10.0, seed=0):
@@ -55,22 +56,24 @@ def test_a_turn_at_one_rate_is_no_plateau(stays_s):
 def test_peaks_are_put_back_to_within_what_is_stated():
     true = shakes(hertz=3.0)
     cut = np.clip(true, -7.3, 7.3)
-    found = bridged(TIME, cut, np.inf)
-    assert found.full[:, 0].sum() > 100
-    assert not found.full[:, 1:].any()
-    there = np.isfinite(found.doubt[:, 0])
-    assert there.sum() > 0.9 * found.full[:, 0].sum()
-    lost, left = (np.abs(a - true)[there, 0].sum() for a in (cut, found.rate))
+    full = beyond(cut, levels(cut, 0.01), np.inf)
+    rate, doubt = bridged(TIME_NS, cut, full)
+    assert full[:, 0].sum() > 100
+    assert not full[:, 1:].any()
+    there = np.isfinite(doubt[:, 0])
+    assert there.sum() > 0.9 * full[:, 0].sum()
+    lost, left = (np.abs(a - true)[there, 0].sum() for a in (cut, rate))
     assert left < 0.25 * lost
     # areas of peaks, which is what turns the unit, against the stated spread
-    assert np.mean(np.abs(found.rate - true)[there, 0] < 3.0 * found.doubt[there, 0]) > 0.9
-    np.testing.assert_array_equal(found.rate[~found.full], cut[~found.full])
+    assert np.mean(np.abs(rate - true)[there, 0] < 3.0 * doubt[there, 0]) > 0.9
+    np.testing.assert_array_equal(rate[~full], cut[~full])
 
 
 def test_a_range_that_is_told_is_used_and_a_long_stay_is_not_bridged():
-    rate = np.zeros((500, 3))
-    rate[100:300, 2] = 34.9
-    found = bridged(TIME[:500], rate, 34.9)
-    assert found.full[:, 2].sum() == 200
-    assert np.isnan(found.doubt).all()
-    np.testing.assert_array_equal(found.rate, rate)
+    cut = np.zeros((500, 3))
+    cut[100:300, 2] = 34.9
+    full = beyond(cut, levels(cut, 0.01), 34.9)
+    rate, doubt = bridged(TIME_NS[:500], cut, full)
+    assert full[:, 2].sum() == 200
+    assert np.isnan(doubt).all()
+    np.testing.assert_array_equal(rate, cut)

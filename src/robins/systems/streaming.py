@@ -195,13 +195,11 @@ class Live:
             "made_with": self._made_with,
             "counts": dict(self.counts),
             "own": {name: getattr(self, name) for name in self._kept},
-            "parts": {name: dict(vars(getattr(self, name))) for name in self._parts},
+            "parts": {name: _state_of(getattr(self, name)) for name in self._parts},
             "filter": None
             if now is None
             else [np.asarray(x) for x in jax.tree_util.tree_leaves(now)],
         }
-        for part in state["parts"].values():
-            part.pop("_rest", None)  # parameters, which the file has as text
         return text_of(_plain(self.parameters.model_dump(exclude_none=True))), state
 
 
@@ -213,10 +211,32 @@ def _made_again(cls: type[LiveT], parameters: str, state: Mapping[str, Any]) -> 
     for name, value in state["own"].items():
         setattr(made, name, value)
     for name, part in state["parts"].items():
-        vars(getattr(made, name)).update(part)
+        _go_on(getattr(made, name), part)
     if state["filter"] is not None:
         made._go_on_from([jnp.asarray(x) for x in state["filter"]])
     return made
+
+
+def _state_of(part: Any) -> dict[str, Any]:
+    """Attributes of an object and of its parts, but for parameters and counts."""
+    return {
+        name: _state_of(value) if _is_part(value) else value
+        for name, value in vars(part).items()
+        if not isinstance(value, Parameters | Counter)
+    }
+
+
+def _go_on(part: Any, known: Mapping[str, Any]) -> None:
+    """Set what `_state_of` found."""
+    for name, value in known.items():
+        if _is_part(getattr(part, name)):
+            _go_on(getattr(part, name), value)
+        else:
+            setattr(part, name, value)
+
+
+def _is_part(value: Any) -> bool:
+    return type(value).__module__.startswith("robins.") and hasattr(value, "__dict__")
 
 
 def as_before(like: Any, leaves: list[Any]) -> Any:

@@ -5,10 +5,11 @@ from pathlib import Path
 from robins.errors import moved
 from robins.systems.marg.aboard import aboard
 from robins.systems.marg.live import LiveMarg
-from robins.systems.marg.log import first_belief, first_look, prepare
+from robins.systems.marg.log import prepare
 from robins.systems.marg.model import Block, Samples, integrate, model_of
 from robins.systems.marg.parameters import Replay
 from robins.systems.marg.replay import FILTERS, filter_of, recorded, replay
+from robins.systems.marg.start import first_belief, first_look
 from robins.systems.study import System
 
 SYSTEM = System(

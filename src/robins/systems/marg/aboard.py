@@ -157,7 +157,6 @@ def case_of(parameters: Replay, of: Hand) -> Case:
     made: Prepared = prepare(of.log, parameters)
     world, samples, count = made.world, made.samples, len(made.rows)
     u = Given(samples.dt_s, samples.theta, samples.dv, *world.u[1:])
-    y, aux, u = jax.tree_util.tree_map(lambda a: np.asarray(a)[:count], (world.y, world.aux, u))
     truth = model.MargState(
         q_nb=Rotation(jnp.asarray(np.roll(of.q_nb.as_quat()[made.rows], 1, axis=-1))),
         v_n=jnp.asarray(of.v_n[made.rows]),
@@ -168,7 +167,7 @@ def case_of(parameters: Replay, of: Hand) -> Case:
         declination=jnp.zeros(count),
         field=jnp.tile(FIELD_N[[0, 2]], (count, 1)),
     )
-    return Case(world.start, u, y, aux, truth)
+    return Case(world.start, u, world.y, world.aux, truth)
 
 
 def aboard(parameters: Replay, seed: int) -> Problem:

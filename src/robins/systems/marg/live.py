@@ -1,20 +1,17 @@
 """The orientation of a unit while it moves: one sample in, its attitude out at once.
 
-`LiveMarg` is the filter "marg" of a replay, by the same code, block after block. What a replay
-takes from later samples, a live object waits for or does without:
+`LiveMarg` is the filter "marg" of a replay: both take their samples through `marg.path`, in chunks
+of one sample here. What the path waits for shows in the flags of an answer:
 
-- The start needs half a second of rest or three of motion, and rest at the start 1.5 s more or less
-  (`rest.after`), for it shows the bias. Until then answers are `STARTING`, without numbers; the
-  samples are kept, and the filter then goes through them, two blocks a sample. From there on the
-  answers are those of the replay.
-- A peak that the end of a gyro's range cut off is put back from both flanks. The filter waits for
-  the second one, at most 0.2 s and three samples; until its block is whole the gyros carry the
-  attitude on as they read, and answers are `BEHIND`. Then they are again those of the replay.
-- The end of a range that nobody told (`gyro.range`) is known once it was reached twice by jumps.
-  Peaks before that are put back by a replay, and not here; so are those of a chip that filters
-  what it cuts off, where plateaus alone show the end.
-- A stamp that comes late after a long interval is told from a gap by the next one: `BEHIND` for one
-  sample, at the end of a block.
+- `STARTING`, without numbers: the start is not known. Samples are kept, and the filter then takes
+  two blocks a sample until it has caught up. From there on the answers are those of the replay.
+- `BEHIND`: a block waits for the flank of a peak that a gyro cut off, or for the stamp after a long
+  interval; until then the gyros carry the attitude on as they read.
+
+What differs from a replay of the whole log:
+
+- The ends of the ranges of gyros are those that the samples so far show, where `gyro.range` does
+  not state them.
 - A gap of more than ten seconds, or a clock that was set, is a new start; a replay bridges it.
 - `DOUBTFUL` is told when the monitor knows it. It marks the looks that led to it in a replay.
 - True north is told by who makes the object (`declination_rad`); a replay takes it from the fixes.
@@ -30,29 +27,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from robins.dataset import ImuTable
 from robins.errors import require
-from robins.filters import Belief, Code, OnlineFilter
+from robins.filters import Code, OnlineFilter
 from robins.filters.machine import usual
 from robins.filters.run import Step
-from robins.ins.increments import Increments, from_imu
+from robins.ins.increments import Increments
 from robins.linalg.scalars import product
 from robins.systems.marg import model, monitor
-from robins.systems.marg.log import (
-    Pace,
-    as_means,
-    first_belief,
-    first_look,
-    inputs,
-    mean_force,
-    mean_rate,
-    measurements,
-    not_sampled,
-)
 from robins.systems.marg.parameters import Replay
+from robins.systems.marg.path import Path, Steps
 from robins.systems.marg.replay import filter_of, stated_sigma
-from robins.systems.marg.rest import RestFound, Watch
-from robins.systems.marg.saturation import LONGEST_S, Range, bridged
+from robins.systems.marg.start import first_belief, first_look
 from robins.systems.replaying import kept
 from robins.systems.streaming import (
     Door,
@@ -67,7 +52,6 @@ from robins.systems.streaming import (
 )
 from robins.systems.tables import Update
 
-_FLANK = 3  # samples of a flank, by which a peak is put back
 _STEPS = 2  # of the filter in a sample, where it has to catch up
 _LONGEST_GAP_S, _PATIENCE_S = 10.0, 0.1
 _MONITORED_S = 60.0  # of looks, that the monitor is shown
@@ -80,16 +64,6 @@ class Attitude(NamedTuple):
     q_nb: np.ndarray  # (4,) body to NED, scalar first; NaN while `STARTING`
     sigma_rad: np.ndarray  # (3,) about north, east, down, as of the last step of the filter
     flags: Flag
-
-
-class _Block(NamedTuple):
-    """A block of samples that the filter has not taken yet."""
-
-    samples: int
-    u: Any
-    y: Any
-    aux: Any
-    still: bool
 
 
 class _Step(NamedTuple):
@@ -128,15 +102,14 @@ class LiveMarg(Live):
         counts: `imu_nan`, `imu_inf`, `imu_absurd`, `imu_duplicate`, `imu_backward`, `imu_ahead`
             (refused), `begun_anew`, `field_missing`, `field_implausible`, `imu_saturated`,
             `imu_bridged`, `imu_gaps`, `blocks_in_free_fall`, `steps_not_taken`.
-        look: what the start was found from; None before.
     """
 
     _parameters: ClassVar[type[Replay]] = Replay
     _kept: ClassVar[tuple[str, ...]] = (
-        "_time_ns", "_rows", "_context", "_field", "_pending", "_begun", "_looks", "_since",
-        "_q", "_sigma", "_bias", "_gain", "_marks", "_stepped", "_in_motion", "_open",
+        "_field", "_pending", "_looks", "_since", "_q", "_sigma", "_bias", "_gain", "_marks",
+        "_starting", "_open",
     )  # fmt: skip
-    _parts: ClassVar[tuple[str, ...]] = ("_door", "_range", "_watch", "_pace")
+    _parts: ClassVar[tuple[str, ...]] = ("_door", "_path")
 
     def __init__(
         self,
@@ -165,9 +138,6 @@ class LiveMarg(Live):
         }
         super().__init__(parameters, **made_with)
         p, self._usual_s = parameters, 1.0 / rate_hz
-        self._n = max(1, round(p.update.block / self._usual_s))
-        # a peak that ends in a block may have begun in those before
-        self._most_context = math.ceil(LONGEST_S * rate_hz) + 2 * _FLANK
         half = 0.5 * declination_rad
         self._turn_north = (math.cos(half), 0.0, 0.0, math.sin(half))
         self._on = partial(online, filter_of(p), model.model_of(p), machine=machine or usual())
@@ -178,37 +148,32 @@ class LiveMarg(Live):
 
     def _begin_anew(self) -> None:
         """Forget all but the counts and the stamps."""
-        self._time_ns: list[int] = []
-        self._rows: list[np.ndarray] = []  # (9,) gyro, accel, field of the samples kept
-        self._context = 0  # of them, those that the filter has behind it
         self._field = np.full(3, np.nan)  # of a sample that was refused
-        self._pending: list[Any] = []  # blocks as tuples, which wait for a step
-        self._begun: list[Any] = []  # increments and field, until the start is found
+        self._pending: list[Any] = []  # leaves of steps that wait, and whether the unit lies still
         self._looks = np.zeros((0, 8))  # what the monitor is shown
         self._since: list[Any] = []  # (dt, turn) of the samples after the last step
         self._q = (math.nan,) * 4
         self._sigma, self._bias, self._gain = np.full(3, np.nan), np.zeros(3), np.zeros((3, 3))
         self._marks = 0  # flags that hold from a block to the next
-        self._stepped = False  # whether the filter has begun
-        self._open = 0  # samples without a step, up to the last with a gyro at its end
-        self._in_motion = False  # whether it has to begin in motion
+        self._starting = True  # until the filter has come to the newest sample
+        self._open = 0  # samples without a block, up to the last with a gyro at its end
         self._online = None
-        self._range, self._pace = Range(), Pace()
-        self._watch = Watch(self._n * self._usual_s, self.parameters.rest)
+        self._path = Path(self.parameters, self._usual_s)
+        self._path.counts = self.counts
 
     def _compile(self) -> None:
-        """Have all compiled by a block that is thrown away."""
-        step = np.full(self._n, self._usual_s)
-        force = np.tile([0.0, 0.0, -self.parameters.accelerometer.gravity], (self._n, 1))
-        field = np.full((self._n, 3), 2e-5)
-        theta, dv = np.zeros((self._n, 3)), force * step[:, None]
-        nothing = np.zeros((self._n, 3)), np.zeros(self._n)
-        self._start(Increments(step, theta, dv), field)
-        self._integrated(step, theta, dv, field, *nothing)
+        """Have all compiled by blocks that are thrown away."""
+        count = 2 + math.ceil(self.parameters.start.still / self._usual_s) + 2 * self._path.n
+        gravity = self.parameters.accelerometer.gravity
+        rows = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -gravity, 2e-5, 2e-5, 2e-5], (count, 1))
+        time_ns = (np.arange(count) * 1e9 * self._usual_s).astype(np.int64)
+        self._wait(self._path.push(time_ns, rows))
+        found = self._path.start(is_whole=True)
+        assert found is not None
+        self._online = self._on(found[1])
         self._step()
-        counts = type(self.counts)()
+        self.counts.clear()
         self._begin_anew()
-        self.counts = counts
 
     # ------------------------------------------------------------------------------ a sample
 
@@ -236,12 +201,14 @@ class LiveMarg(Live):
         elif why:
             self.counts[f"imu_{why}"] += 1
             return self._answer(time, Flag.REFUSED)
-        self._range.read(gyro)
-        self._time_ns.append(time)
-        self._rows.append(np.concatenate([values, self._field]))
+        row = np.concatenate([values, self._field])
         self._field = np.full(3, np.nan)
-        mark = self._saturated(gyro, accel)
-        if len(self._rows) > 1:
+        before = self._path.waiting
+        steps = self._path.push(np.array([time]), row[None])
+        self._wait(steps)
+        mark = self._saturated(gyro, accel, before)
+        self._open = max(0, self._open - self._path.n * sum(len(s.still) for s in steps))
+        if len(self._path.rows) > 1:
             self._carry()
         self._catch_up()
         return self._answer(time, mark)
@@ -261,23 +228,21 @@ class LiveMarg(Live):
         else:
             self.counts["field_implausible"] += 1
 
-    def _saturated(self, gyro: np.ndarray, accel: np.ndarray) -> Flag:
-        p = self.parameters
-        limit = np.minimum(self._range.levels, 0.99 * p.gyro.range)
-        full = np.any((gyro <= -limit[:, 0]) | (gyro >= limit[:, 1]))
+    def _saturated(self, gyro: np.ndarray, accel: np.ndarray, before: int) -> Flag:
+        """Whether a sample is at the end of a range; `before` it waited so many for a block."""
+        full = bool(np.any(self._path.full(gyro[None])))
         if full:
-            self._open = len(self._rows) - self._context
-        hard = np.any(np.abs(accel) >= 0.99 * p.accelerometer.range)
+            self._open = before + 1
+        hard = bool(self._path.hard(accel[None])[0])
         return Flag.SATURATED if full or hard else Flag(0)
 
     def _carry(self) -> None:
-        """The last attitude, carried over the newest sample by the gyros."""
-        last = slice(max(0, len(self._rows) - 3), None)
-        rows = np.array(self._rows[last])
-        made = self._increments(np.array(self._time_ns[last]), rows[:, :3], rows[:, 3:6])
+        """Carry the last attitude over the newest sample by the gyros."""
+        rows = self._path.rows[-3:]
+        made = self._path.increments(self._path.time_ns[-3:], rows[:, :3], rows[:, 3:6])
         since = float(made.dt[-1]), np.asarray(made.theta[-1])
         self._since.append(since)
-        if self._stepped:
+        if not self._starting:
             self._q = self._turned(self._q, *since)
 
     def _turned(self, q: Any, dt: float, theta: np.ndarray) -> tuple[float, ...]:
@@ -289,136 +254,49 @@ class LiveMarg(Live):
 
     def _answer(self, time_ns: int, mark: Flag) -> Attitude:
         flags = mark | Flag(self._marks)
-        if not self._stepped or self._pending:
+        if self._starting:
             nothing = np.full(4, np.nan)
             return Attitude(time_ns, nothing, nothing[:3], mark | Flag.STARTING)
-        if self._open > 0 or len(self._rows) - self._context >= self._n:
+        if self._open > 0 or self._pending or self._path.waiting >= self._path.n:
             flags |= Flag.BEHIND
         q = np.array(product(self._turn_north, self._q))
         return Attitude(time_ns, q / np.linalg.norm(q), self._sigma, flags)
 
-    # ---------------------------------------------------------------------- samples to blocks
-
-    def _increments(self, time_ns: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> Increments:
-        table = ImuTable(time_ns, gyro, accel, "rate")
-        if self.parameters.update.samples == "means":
-            table = as_means(table, self._usual_s)
-        return from_imu(table, self._usual_s)[0]
+    def _wait(self, made: list[Steps]) -> None:
+        """Add steps to those that wait."""
+        for steps in made:
+            rows = steps.u, steps.y, steps.aux
+            self._like = jax.tree_util.tree_structure(rows)
+            leaves = [np.asarray(a) for a in jax.tree_util.tree_leaves(rows)]
+            for k, still in enumerate(steps.still):
+                self._pending.append(([a[k] for a in leaves], bool(still)))
 
     def _catch_up(self) -> None:
+        """Take steps that wait, once the start is known."""
+        if self._online is None:
+            self._seek()
         for _ in range(_STEPS):
-            if self._ready():
-                self._cut()
-                if not self._stepped:
-                    self._look()
-            if self._stepped and self._pending:
+            if self._online is not None and self._pending:
                 self._step()
-
-    def _ready(self) -> bool:
-        """True if all samples of a block are there, flanks of its peaks included."""
-        if not self._context:  # the first sample of all begins the first block
-            self._context = 1 if self._rows else 0
-        end = self._context + self._n
-        more = len(self._rows) - end
-        if more < 0 or (self.parameters.update.samples == "instants" and more == 0):
-            return False
-        if more == 0 and self._time_ns[-1] - self._time_ns[-2] > 1.5e9 * self._usual_s:
-            return False  # the next stamp tells whether samples are missing
-        rate = np.array(self._rows)[:, :3]
-        limit = np.minimum(self._range.levels, 0.99 * self.parameters.gyro.range)
-        full = (rate <= -limit[:, 0]) | (rate >= limit[:, 1])
-        for axis in np.flatnonzero(np.any(full[self._context : end], axis=0)):
-            column = full[:, axis]
-            last = end - 1 - int(np.argmax(column[self._context : end][::-1]))
-            after = np.flatnonzero(~column[last:])
-            begin = last - int(np.argmin(column[: last + 1][::-1])) if not column[0] else 0
-            if len(after) == 0:
-                if (self._time_ns[-1] - self._time_ns[begin]) * 1e-9 <= LONGEST_S:
-                    return False
-            elif len(rate) < last + after[0] + _FLANK and not np.any(column[last + after[0] :]):
-                return False
-        return True
-
-    def _cut(self) -> None:
-        """Make the next block; keep what is context of the one after it."""
-        end, p = self._context + self._n, self.parameters
-        time_ns, rows = np.array(self._time_ns), np.array(self._rows)
-        seconds = (time_ns - time_ns[0]) * 1e-9
-        rate, full, doubt = bridged(seconds, rows[:, :3], p.gyro.range, self._range.levels)
-        hard = np.any(np.abs(rows[:, 3:6]) >= 0.99 * p.accelerometer.range, axis=1)
-        made = self._increments(time_ns, rate, rows[:, 3:6])
-        own = slice(self._context - 1, end - 1)  # increments that end with samples of the block
-        ends = slice(self._context - 1, end)
-        dt, theta, dv = (np.asarray(a, float)[own] for a in made[:3])
-        lost = not_sampled(dt, full[ends], doubt[ends], hard[ends], self._usual_s, p)
-        block = slice(self._context, end)
-        self.counts["imu_saturated"] += int(np.sum(np.any(full, axis=1)[block] | hard[block]))
-        back = np.any(full & np.isfinite(doubt), axis=1)
-        self.counts["imu_bridged"] += int(np.sum(back[block]))
-        self.counts["imu_gaps"] += lost[2]
-        if not self._stepped:
-            self._begun.append((dt, theta, dv, rows[block, 6:], rows[block, :6]))
-        self._integrated(dt, theta, dv, rows[block, 6:], *lost[:2])
-        drop = max(0, end - self._most_context)
-        del self._time_ns[:drop], self._rows[:drop]
-        self._context = end - drop
-        self._open = max(0, self._open - self._n)
-
-    def _integrated(
-        self,
-        dt: np.ndarray,
-        theta: np.ndarray,
-        dv: np.ndarray,
-        field: np.ndarray,
-        lost_turn: np.ndarray,
-        lost_s: np.ndarray,
-    ) -> None:
-        """Add a block to those that wait for a step."""
-        p = self.parameters
-        samples = model.Samples(dt[None], theta[None], dv[None], field[None])
-        integrals, field_b = model.integrate(samples)
-        rate, force = mean_rate(integrals), mean_force(integrals)
-        still, sigma = self._watch.look(
-            float(np.asarray(integrals.dt_s)[0]), rate[0], force[0], field_b[0]
-        )
-        rest = RestFound(np.array([still]), np.array([sigma]), None, sigma)
-        u, falling = inputs(integrals, rest.still, lost_turn.sum(0)[None], lost_s.sum()[None], p)
-        y, aux = measurements(integrals, field_b, rest, p, self._pace)
-        self.counts["blocks_in_free_fall"] += int(np.asarray(falling)[0])
-        row = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], (u, y, aux))
-        leaves = jax.tree_util.tree_leaves(row)
-        self._like = jax.tree_util.tree_structure(row)
-        self._pending.append((leaves, bool(still)))
+        self._starting = self._starting and (self._online is None or bool(self._pending))
 
     # ------------------------------------------------------------------------ start and steps
 
-    def _look(self) -> None:
-        """Find the start as soon as a replay of the samples so far would find the same."""
-        start = self.parameters.start
-        dt, theta, dv, field, raw = map(np.concatenate, zip(*self._begun, strict=True))
-        lasted = float(np.sum(dt))
-        wait_s = start.moving if self._in_motion else start.still
-        if lasted <= wait_s or not self._watch.settled:
+    def _seek(self) -> None:
+        """Begin the filter as soon as the start is known."""
+        if not self._pending:
             return
-        increments = Increments(dt, theta, dv)
-        if not (self._in_motion or first_look(increments, field, self.parameters).still):
-            self._in_motion = True
+        increments, _ = self._path.begun
+        found = self._path.start()
+        if found is None:
             return
+        rate, force = (a / increments.dt[:, None] for a in (increments.theta, increments.dv))
         try:
-            refuse_units(raw[:, :3], raw[:, 3:6])
+            refuse_units(rate, force)
         except LiveError:
             self._begin_anew()
             raise
-        self._start(increments, field)
-
-    def _start(self, increments: Increments, field: np.ndarray) -> None:
-        p = self.parameters
-        look = first_look(increments, field, p)
-        nothing = np.zeros(0)
-        rest = RestFound(nothing, nothing, self._watch.first, self._watch.first_sigma)
-        belief: Belief = first_belief(look, p, rest)
-        self._online = self._on(belief)
-        self._begun, self._stepped = [], True
+        self._online = self._on(found[1])
 
     def _step(self) -> None:
         """Take the next block into the filter, and carry its attitude to the newest sample."""
@@ -432,14 +310,14 @@ class LiveMarg(Live):
         self._sigma = stated_sigma(found.sigma[None], turned, lasted, p)[0, :3]
         self._bias, self._gain = found.gyro_bias, found.gyro_gain.reshape(3, 3)
         self._q = tuple(found.q_nb.tolist())
-        self._since = self._since[self._n :]
+        self._since = self._since[self._path.n :]
         for since in self._since:
             self._q = self._turned(self._q, *since)
         self._marks = int(self._doubts(found) | (Flag.REST if still else Flag(0)))
 
     def _doubts(self, found: _Step) -> Flag:
         """Flags of the monitor on the last looks."""
-        most = math.ceil(_MONITORED_S / (self._n * self._usual_s))
+        most = math.ceil(_MONITORED_S / (self._path.n * self._usual_s))
         gain = [np.max(np.abs(found.gyro_gain))]
         row = np.concatenate([found.declination, gain, found.travel, found.magnetometer])
         self._looks = np.concatenate([self._looks, row[None]])[-most:]

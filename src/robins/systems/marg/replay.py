@@ -225,10 +225,10 @@ def replay(
     # the run that is smoothed is told too: its innovations are what the smoother can be doubted by
     told = tuple(dict.fromkeys([*wanted, CAUSAL]))
     answers = replaying.navigated([log], told, partial(contender, parameters), smoothers, progress)
-    seen = _without_padding(log, answers[CAUSAL], parameters).updates
+    seen = _as_stated(log, answers[CAUSAL], parameters).updates
     answers = {name: answers[name] for name in wanted}
     q_nb = {name: _by_sample(log, answer) for name, answer in answers.items()}
-    answers = {name: _without_padding(log, a, parameters) for name, a in answers.items()}
+    answers = {name: _as_stated(log, a, parameters) for name, a in answers.items()}
     north = None if parameters.use_magnetometer == "never" else true_north(dataset)
     if north is not None:
         q_nb = {name: _turned_north(q, north) for name, q in q_nb.items()}
@@ -263,14 +263,14 @@ def replay(
             f"North is true north: the field of the Earth is turned by {math.degrees(north):.1f} "
             "deg at the first fix (World Magnetic Model)."
         )
-    lasted = np.asarray(log.world.u.samples.dt_s)[: len(log.rows)]
+    lasted = np.asarray(log.world.u.samples.dt_s)
     warned = monitor.of_samples(log.counts, len(log.time_ns))
     for name, answer in answers.items():
         warned += monitor.sentences(name, doubt[name], answer.mean, lasted)
     predictions = next(iter(answers.values())).tally.counts()
     lost = sum(number for code, number in predictions.items() if code != Code.DONE)
     outcome = replaying.outcome(
-        log.epoch_s[: len(log.rows)],
+        log.epoch_s,
         answers,
         REPORTED,
         metrics=metrics,
@@ -331,14 +331,12 @@ def _by_sample(log: Prepared, answer: Answer) -> np.ndarray:
     return np.concatenate([np.asarray(first)[None], rows])
 
 
-def _without_padding(log: Prepared, answer: Answer, parameters: Replay) -> Answer:
-    """The answer at the blocks that are not padding, as NumPy; attitude as sure as is stated."""
-    mean, sigma, seen = jax.tree_util.tree_map(
-        lambda x: np.asarray(x)[: len(log.rows)], (answer.mean, answer.sigma, answer.updates)
-    )
+def _as_stated(log: Prepared, answer: Answer, parameters: Replay) -> Answer:
+    """The answer as NumPy arrays, its attitude as sure as is stated."""
+    kept = answer.mean, answer.sigma, answer.updates
+    mean, sigma, seen = jax.tree_util.tree_map(np.asarray, kept)
     samples = log.world.u.samples
-    turned, lasted = (np.asarray(a)[: len(log.rows)] for a in (samples.angle, samples.dt_s))
-    sigma = stated_sigma(sigma, turned, lasted, parameters)
+    sigma = stated_sigma(sigma, samples.angle, samples.dt_s, parameters)
     return answer._replace(mean=mean, sigma=sigma, updates=seen)
 
 

@@ -8,22 +8,11 @@ a rest that shows a new one must last longer, unless the log begins with it.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from robins.systems.marg.parameters import Rest
 
 _SHORT = 3  # blocks, below which nothing can be told
-
-
-class RestFound(NamedTuple):
-    """Of K blocks."""
-
-    still: np.ndarray  # (K,) bool
-    sigma: np.ndarray  # (K,) rad/s, of the mean rate of a block, from the spread of the blocks
-    first: np.ndarray | None  # (3,) rad/s, mean rate of the rest that the log begins with
-    first_sigma: float  # rad/s, of that mean
 
 
 class Watch:
@@ -109,23 +98,3 @@ class Watch:
         if self._unbroken and self.first is None:
             self.first, self.first_sigma = mean_rate, sigma
         return True, sigma
-
-
-def at_rest(
-    dt_s: np.ndarray, rate: np.ndarray, force: np.ndarray, field: np.ndarray, rest: Rest
-) -> RestFound:
-    """Which blocks lie still, told causally by a `Watch`; what the log begins with is told too.
-
-    Args:
-        dt_s: (K,) s, lengths of the blocks.
-        rate: (K, 3) rad/s, mean over each block.
-        force: (K, 3) m/s^2, mean specific force over each block.
-        field: (K, 3) T in body axes; NaN where there is none.
-        rest: thresholds.
-    """
-    there = dt_s[dt_s > 0.0]
-    watch = Watch(float(np.median(there)) if len(there) else 0.0, rest)
-    rows = zip(dt_s.tolist(), rate, force, field, strict=True)
-    seen = [watch.look(*row) for row in rows]
-    still, sigma = (np.array(column) for column in zip(*seen, strict=True))
-    return RestFound(still, sigma, watch.first, watch.first_sigma)

@@ -10,12 +10,11 @@ samples. What stays within 0.5 % for d seconds and is more than 5 % lower d befo
 cut off. It has to last 0.08 s, since the peak of a hand's motion can be flatter than a sine, and
 0.4 s at most: a machine that turns at one rate does so for longer.
 
-Levels are found over the whole log: a peak before the first that shows the range is put back too.
+A replay finds levels over the whole log: a peak before the first that shows the range is put back
+too. A live object finds them sample by sample (`Range`).
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
@@ -26,15 +25,8 @@ _OFTEN = 2  # jumps to or from the level
 _PLATEAU_S = (0.08, 0.4)  # s, that a level without jumps may last; a machine turns for longer
 _KEPT_PAIRS = 100  # of samples at the level, more than a peak has
 LONGEST_S = 0.2  # s, of a peak that is bridged
+FLANK = 3  # samples on either side, by which it is
 _MISSED = 0.3  # of what a bridge adds: the share that it may err by
-
-
-class Bridged(NamedTuple):
-    """Rates with their peaks put back."""
-
-    rate: np.ndarray  # (N, 3) rad/s
-    full: np.ndarray  # (N, 3) bool, at the end of the range
-    doubt: np.ndarray  # (N, 3) rad/s, standard deviation of what was put back; NaN where nothing
 
 
 def levels(rate: np.ndarray, step_s: float = 0.0) -> np.ndarray:
@@ -78,15 +70,19 @@ def _has_plateau(x: np.ndarray, top: float, step_s: float) -> bool:
 
 
 class Range:
-    """The end of each gyro's range as the samples so far show it: `levels`, sample by sample."""
+    """The end of each gyro's range as the samples so far show it: `levels`, sample by sample.
 
-    def __init__(self) -> None:
-        """Nothing was read."""
+    Attributes:
+        levels: (3, 2) rad/s, as of `levels`.
+    """
+
+    def __init__(self, levels: np.ndarray | None = None) -> None:
+        """Begin with no levels, or with those of a whole log, which are read from no sample."""
         self._last = np.zeros((0, 3))  # rad/s, the last three
         self._top = np.zeros(6)  # rad/s, largest of each axis, positive; then negative
         # of each: pairs that lie at its top, with the samples before and after
         self._pairs: list[np.ndarray] = [np.zeros((0, 3))] * 6
-        self.levels = np.full((3, 2), np.inf)
+        self.levels = np.full((3, 2), np.inf) if levels is None else levels
 
     def read(self, rate: np.ndarray) -> None:
         """Take the next sample (3,) rad/s."""
@@ -111,39 +107,50 @@ class Range:
             self.levels[k % 3, int(k < 3)] = (1.0 - _LEVEL) * top if jumps >= _OFTEN else np.inf
 
 
+def beyond(rate: np.ndarray, levels: np.ndarray, most: float) -> np.ndarray:
+    """(N, 3) bool: rates (N, 3) [rad/s] at the end of a range.
+
+    Args:
+        rate: to compare.
+        levels: (3, 2) rad/s as of `levels`.
+        most: rad/s, end of the range by the data sheet.
+    """
+    limit = np.minimum(levels, 0.99 * most)
+    return (rate <= -limit[:, 0]) | (rate >= limit[:, 1])
+
+
 def bridged(
-    time_s: np.ndarray, rate: np.ndarray, most: float, known: np.ndarray | None = None
-) -> Bridged:
+    time_ns: np.ndarray, rate: np.ndarray, full: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Put back the peaks that the range cut off.
 
     A peak is the cubic that leaves the last good sample and meets the next good one with the slopes
-    of its flanks. A longer one is left at its level.
+    of its flanks. A longer one than `LONGEST_S` is left at its level.
 
     Args:
-        time_s: (N,).
+        time_ns: (N,) int64.
         rate: (N, 3) rad/s.
-        most: rad/s, the end of the range where it is told.
-        known: (3, 2) rad/s as of `levels`, where they were found before; None: found in `rate`.
+        full: (N, 3) bool, at the end of the range.
+
+    Returns:
+        (N, 3) rad/s, and the standard deviation of what was put back (N, 3); NaN where nothing.
     """
-    if known is None:
-        known = levels(rate, float(np.median(np.diff(time_s))))
-    limit = np.minimum(known, 0.99 * most)
-    full = (rate <= -limit[:, 0]) | (rate >= limit[:, 1])
     out, doubt = rate.copy(), np.full(rate.shape, np.nan)
     for axis in range(3):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], full[:, axis], [False]])))
         for begin, end in edges.reshape(-1, 2):
-            if begin < 3 or end + 3 > len(rate) or np.any(full[begin - 3 : begin, axis]):
+            if begin < FLANK or end + FLANK > len(rate):
                 continue
-            if np.any(full[end : end + 3, axis]):
+            before, after = slice(begin - FLANK, begin), slice(end, end + FLANK)
+            if np.any(full[before, axis]) or np.any(full[after, axis]):
                 continue
-            t0, t1 = time_s[begin - 1], time_s[end]
-            if t1 - t0 > LONGEST_S:
+            t = (time_ns[before.start : after.stop] - time_ns[begin - 1]) * 1e-9
+            h, u = t[-FLANK], t[FLANK:-FLANK] / t[-FLANK]
+            if h > LONGEST_S:
                 continue
             x, sign = rate[:, axis], np.sign(rate[begin, axis])
-            rise = _slope(time_s[begin - 3 : begin], x[begin - 3 : begin])
-            fall = _slope(time_s[end : end + 3][::-1], x[end : end + 3][::-1])
-            h, u = t1 - t0, (time_s[begin:end] - t0) / (t1 - t0)
+            rise = _slope(t[:FLANK], x[before])
+            fall = _slope(t[-FLANK:][::-1], x[after][::-1])
             cubic = (
                 (2.0 * u**3 - 3.0 * u**2 + 1.0) * x[begin - 1]
                 + (3.0 * u**2 - 2.0 * u**3) * x[end]
@@ -153,7 +160,7 @@ def bridged(
             added = np.maximum(sign * (cubic - x[begin:end]), 0.0)
             out[begin:end, axis] += sign * added
             doubt[begin:end, axis] = _MISSED * added
-    return Bridged(out, full, doubt)
+    return out, doubt
 
 
 def _slope(t: np.ndarray, x: np.ndarray) -> float:

@@ -1,0 +1,395 @@
+"""From samples to steps of the filter, chunk by chunk: the path of a replay and of a live object.
+
+Samples are integrated over blocks; what is known at the end of each block becomes its measurements.
+Any chunks of the same samples give the same bits: a replay is one chunk, a live object is chunks of
+one sample. What comes later counts by as much as a stage says:
+
+- a peak of a gyro that the end of its range cut off is put back from both flanks: up to `LONGEST_S`
+  and `FLANK` samples;
+- where the ends of the ranges are given (`saturation.levels` of a whole log), peaks before the
+  first that shows them are put back too; else they are those that the samples so far show;
+- samples that are values at an instant need the next one, and so does a stamp after a long
+  interval, which may be late and not after a gap;
+- the start needs `start.still` of rest or `start.moving` of motion, and `rest.after` of rest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+
+from robins.dataset import ImuTable
+from robins.filters import Belief
+from robins.ins.increments import Increments, after_gap, from_imu, usual_interval
+from robins.manifold import Angle
+from robins.systems.marg import model
+from robins.systems.marg.parameters import Replay
+from robins.systems.marg.rest import Watch
+from robins.systems.marg.saturation import FLANK, LONGEST_S, Range, beyond, bridged
+from robins.systems.marg.start import FirstLook, first_belief, first_look
+
+_FALLING = 0.3  # of gravity: below it nothing holds the unit up, and tilt cannot be seen
+
+
+class Steps(NamedTuple):
+    """Steps of the filter; leading axis K blocks of n samples."""
+
+    u: model.Block
+    y: dict[str, Any]
+    aux: dict[str, Any]
+    still: np.ndarray  # (K,) bool
+    samples: model.Samples  # a block that is not full ends in increments of no length
+
+
+class Path:
+    """Samples to steps of the filter (see the module).
+
+    Attributes:
+        n: samples of a block.
+        counts: `imu_saturated`, `imu_bridged`, `imu_gaps`, `blocks_in_free_fall`.
+        range: ends of the ranges of the gyros.
+    """
+
+    def __init__(
+        self,
+        parameters: Replay,
+        usual_s: float,
+        kind: Literal["rate", "increment"] = "rate",
+        levels: np.ndarray | None = None,
+    ):
+        """Begin.
+
+        Args:
+            parameters: as of a replay.
+            usual_s: s, sampling interval; lost samples are known by it.
+            kind: of the samples, as of `ImuTable`.
+            levels: (3, 2) rad/s, ends of the ranges; None: as the samples so far show.
+        """
+        self._parameters, self._usual_s = parameters, usual_s
+        self._kind: Literal["rate", "increment"] = kind
+        self.n = max(1, round(parameters.update.block / usual_s))
+        # a peak that ends in a block may have begun in those before
+        self._most_context = math.ceil(LONGEST_S / usual_s) + 2 * FLANK
+        self._by_sample = levels is None and kind == "rate"
+        self.range = Range(levels)
+        self._watch, self._pace = Watch(self.n * usual_s, parameters.rest), Pace()
+        self.counts: Counter[str] = Counter()
+        self.time_ns = np.zeros(0, np.int64)  # of the samples kept, and
+        self.rows = np.zeros((0, 9))  # their gyro, accel and field
+        self._context = 0  # of them, those that are in blocks
+        # increments and field up to the start; None once that is found
+        self._begun: list[tuple[np.ndarray, ...]] | None = []
+        self._in_motion = False  # whether the start is one in motion
+
+    @property
+    def waiting(self) -> int:
+        """Number of samples that are in no block yet."""
+        return len(self.rows) - self._context
+
+    def push(self, time_ns: np.ndarray, rows: np.ndarray) -> list[Steps]:
+        """Take samples; the steps that they complete.
+
+        Args:
+            time_ns: (M,) int64, rising.
+            rows: (M, 9) gyro [rad/s], accel [m/s^2], or their increments, and field [T] in body
+                axes; the field is NaN where it was not read since the sample before.
+        """
+        made = []
+        for at in range(0, len(rows), 1 if self._by_sample else max(len(rows), 1)):
+            new = slice(at, at + 1 if self._by_sample else None)
+            if self._by_sample:
+                self.range.read(rows[at, :3])
+            self.time_ns = np.concatenate([self.time_ns, time_ns[new]])
+            self.rows = np.concatenate([self.rows, rows[new]])
+            self._context = max(self._context, 1)  # the first sample of all begins the first block
+            if blocks := self._whole_blocks():
+                made.append(self._cut(self._context + blocks * self.n))
+        return made
+
+    def finish(self) -> list[Steps]:
+        """Steps of the samples that are left, of which the last block need not be full."""
+        return [self._cut(len(self.rows))] if self.waiting > 0 else []
+
+    def start(self, is_whole: bool = False) -> tuple[FirstLook, Belief] | None:
+        """The start and the belief there, once later samples do not change them; None before.
+
+        Args:
+            is_whole: no samples follow.
+        """
+        p = self._parameters
+        if not self._begun:
+            return None
+        increments, field = self.begun
+        lasted = float(np.sum(increments.dt))
+        if not is_whole:
+            if lasted <= (p.start.moving if self._in_motion else p.start.still):
+                return None
+            if not self._watch.settled:
+                return None
+            if not self._in_motion and not first_look(increments, field, p).still:
+                self._in_motion = True
+                return None
+        look, self._begun = first_look(increments, field, p), None
+        return look, first_belief(look, p, self._watch)
+
+    @property
+    def begun(self) -> tuple[Increments, np.ndarray]:
+        """Increments and field (N, 3) of all blocks until the start is found."""
+        dt, theta, dv, field = map(np.concatenate, zip(*(self._begun or ()), strict=True))
+        return Increments(dt, theta, dv), field
+
+    def increments(self, time_ns: np.ndarray, rate: np.ndarray, accel: np.ndarray) -> Increments:
+        """Increments (M - 1,) between samples (M,), in body axes."""
+        table = ImuTable(time_ns, rate, accel, self._kind)
+        if self._parameters.update.samples == "means":
+            table = as_means(table, self._usual_s)
+        return from_imu(table, self._usual_s)[0]
+
+    # ------------------------------------------------------------------------ samples to blocks
+
+    def _whole_blocks(self) -> int:
+        """Number of blocks whose samples are all there, flanks of their peaks included."""
+        count, full = 0, self.full(self.rows[:, :3])
+        while self._is_whole(self._context + count * self.n, full):
+            count += 1
+        return count
+
+    def full(self, rate: np.ndarray) -> np.ndarray:
+        """(M, 3) bool: rates (M, 3) [rad/s] at the end of the range."""
+        if self._kind != "rate":  # increments have no range
+            return np.zeros(rate.shape, bool)
+        return beyond(rate, self.range.levels, self._parameters.gyro.range)
+
+    def hard(self, accel: np.ndarray) -> np.ndarray:
+        """(M,) bool: specific forces (M, 3) [m/s^2] at the end of the range."""
+        if self._kind != "rate":
+            return np.zeros(len(accel), bool)
+        return np.any(np.abs(accel) >= 0.99 * self._parameters.accelerometer.range, axis=1)
+
+    def _is_whole(self, begin: int, full: np.ndarray) -> bool:
+        """True if all that a block depends on is there; it begins after the sample `begin - 1`."""
+        end, time_ns = begin + self.n, self.time_ns
+        needed = end + (self._parameters.update.samples == "instants")
+        more = len(time_ns) - end
+        if len(time_ns) < needed:
+            return False
+        if more == 0 and after_gap(np.diff(time_ns[-2:]) * 1e-9, self._usual_s)[-1]:
+            return False  # the next stamp shows whether samples are missing
+        for axis in np.flatnonzero(np.any(full[begin:needed], axis=0)):
+            column = full[:, axis]
+            last = begin + int(np.flatnonzero(column[begin:needed])[-1])
+            below = np.flatnonzero(~column[:last])
+            first = int(below[-1]) + 1 if len(below) else 0
+            after = last + np.flatnonzero(~column[last:])
+            if len(after) == 0:
+                if (time_ns[-1] - time_ns[first]) * 1e-9 <= LONGEST_S:
+                    return False
+            elif len(column) < after[0] + FLANK and not np.any(column[after[0] :]):
+                return False
+        return True
+
+    def _cut(self, end: int) -> Steps:
+        """Steps of the samples up to a number; what is context of the next block is kept."""
+        p, n, context = self._parameters, self.n, self._context
+        accel, field = self.rows[:, 3:6], self.rows[:, 6:]
+        full, hard = self.full(self.rows[:, :3]), self.hard(accel)
+        rate, doubt = bridged(self.time_ns, self.rows[:, :3], full)
+        made = self.increments(self.time_ns, rate, accel)
+        block, own, ends = slice(context, end), slice(context - 1, end - 1), slice(context - 1, end)
+        dt, theta, dv = (np.asarray(a, float)[own] for a in made[:3])
+        turn, lost_s, gaps = not_sampled(dt, full[ends], doubt[ends], hard[ends], self._usual_s, p)
+        self.counts["imu_gaps"] += gaps
+        self.counts["imu_saturated"] += int(np.sum((np.any(full, axis=1) | hard)[block]))
+        self.counts["imu_bridged"] += int(np.sum(np.any(np.isfinite(doubt), axis=1)[block]))
+        if self._begun is not None:
+            self._begun.append((dt, theta, dv, field[block]))
+        parts = (dt, 0.0), (theta, 0.0), (dv, 0.0), (field[block], np.nan)
+        samples = model.Samples(*(_in_blocks(a, n, blank) for a, blank in parts))
+        lost = (_in_blocks(a, n, 0.0).sum(axis=1) for a in (turn, lost_s))
+        drop = max(0, end - self._most_context)
+        self.time_ns, self.rows = self.time_ns[drop:], self.rows[drop:]
+        self._context = end - drop
+        return self._steps(samples, *lost)
+
+    def _steps(self, samples: model.Samples, lost_turn: np.ndarray, lost_s: np.ndarray) -> Steps:
+        """Integrate blocks, and add what is known at their ends."""
+        p = self._parameters
+        integrals, field_b = model.integrate(samples)
+        rows = np.asarray(integrals.dt_s).tolist(), mean_rate(integrals), mean_force(integrals)
+        seen = [self._watch.look(*row) for row in zip(*rows, field_b, strict=True)]
+        still, sigma = map(np.array, zip(*seen, strict=True))
+        u, falling = inputs(integrals, still, lost_turn, lost_s, p)
+        self.counts["blocks_in_free_fall"] += int(np.sum(falling))
+        y, aux = measurements(integrals, field_b, still, sigma, p, self._pace)
+        return Steps(u, y, aux, still, samples)
+
+
+def joined(steps: Sequence[Steps]) -> Steps:
+    """Steps of chunks, one after another."""
+    return jax.tree_util.tree_map(lambda *rows: np.concatenate(rows), *steps)
+
+
+def _in_blocks(values: np.ndarray, n: int, blank: float) -> np.ndarray:
+    """Rows (M, ...) as (K, n, ...), the last block filled up."""
+    blocks = -(-len(values) // n)
+    pad = np.full((blocks * n - len(values), *values.shape[1:]), blank)
+    return np.concatenate([values, pad]).reshape(blocks, n, *values.shape[1:])
+
+
+def as_means(imu: ImuTable, usual_s: float | None = None) -> ImuTable:
+    """Rates as increments of the sampling intervals that end with them.
+
+    What a MEMS chip puts out is the mean over its last sampling interval, or later still for its
+    filters; to read it as the rate of that instant would run ahead of the motion by half of one.
+
+    Args:
+        imu: rates, or increments, which are returned.
+        usual_s: s, sampling interval; None: that of the table.
+    """
+    if imu.kind == "increment":
+        return imu
+    dt = np.diff(imu.time_ns) * 1e-9
+    usual_s = usual_interval(dt) if usual_s is None else usual_s
+    own = np.where(after_gap(dt, usual_s), usual_s, dt)
+    own = np.concatenate([own[:1], own])[:, None]
+    return replace(imu, gyro=imu.gyro * own, accel=imu.accel * own, kind="increment")
+
+
+def not_sampled(
+    dt: np.ndarray,
+    full: np.ndarray,
+    doubt: np.ndarray,
+    accel_full: np.ndarray,
+    usual: float,
+    parameters: Replay,
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Spread of the turn that intervals did not show (N, 3) [rad], seconds of specific force that
+    they did not show (N,), and how many are gaps.
+
+    Args:
+        dt: (N,) s, intervals between N + 1 samples.
+        full: (N + 1, 3) bool, a gyro at the end of its range, and
+        doubt: (N + 1, 3) rad/s, spread of what was put back; NaN where nothing.
+        accel_full: (N + 1,) bool.
+        usual: s, sampling interval.
+        parameters: of gaps.
+    """
+    p = parameters.update
+    gap = np.where(dt > p.gap * usual, dt, 0.0)
+    known = np.isfinite(doubt)
+    unknown = full & ~known
+    lost = gap + dt * (accel_full[1:] | accel_full[:-1])
+    # what a gyro at its end did not say, about its own axis; what all samples of a gap did not
+    turn = p.gap_rate * (gap[:, None] + dt[:, None] * (unknown[1:] | unknown[:-1]))
+    turn = turn + dt[:, None] * np.where(known, doubt, 0.0)[1:]
+    return turn, lost, int(np.sum(gap > 0.0))
+
+
+def inputs(
+    integrals: model.Integrals,
+    still: np.ndarray,
+    lost_turn: np.ndarray,
+    lost_s: np.ndarray,
+    parameters: Replay,
+) -> tuple[model.Block, np.ndarray]:
+    """What the motion takes of K blocks, and which of them fall freely (K,) bool.
+
+    Args:
+        integrals: of the blocks.
+        still: (K,) bool.
+        lost_turn: (K, 3) rad, spread of the turn that was not sampled.
+        lost_s: (K,) s, for how long the specific force was not sampled.
+        parameters: of gaps, and gravity.
+    """
+    weight = parameters.accelerometer.gravity * np.asarray(integrals.dt_s)
+    falling = np.linalg.norm(np.asarray(integrals.dv), axis=1) < _FALLING * weight
+    fall = np.where(falling, weight, 0.0)
+    u = model.Block(
+        integrals,
+        still=still.astype(float),
+        lost_turn=np.minimum(lost_turn, np.pi),
+        lost_dv=np.hypot(parameters.update.gap_accel * lost_s, fall),
+    )
+    return u, falling
+
+
+class Pace:
+    """When travel and field were seen last, so that they are seen once in an interval."""
+
+    def __init__(self) -> None:
+        """Nothing was seen."""
+        self.clock_s = 0.0  # end of the last block
+        self.due_s = {model.TRAVEL: -np.inf, model.MAGNETOMETER: -np.inf}
+
+    def take(self, name: str, clock_s: np.ndarray, able: np.ndarray, every_s: float) -> np.ndarray:
+        """(K,) bool: which blocks to take so that about `every_s` lies between two."""
+        out = np.zeros(len(clock_s), dtype=bool)
+        for k in np.flatnonzero(able):
+            if clock_s[k] >= self.due_s[name]:
+                out[k] = True
+                self.due_s[name] = clock_s[k] + every_s * (1.0 - 1e-9)
+        return out
+
+
+def measurements(
+    integrals: model.Integrals,
+    field_b: np.ndarray,
+    still: np.ndarray,
+    sigma: np.ndarray,
+    parameters: Replay,
+    pace: Pace,
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Measurements at the end of each of K blocks, and what they depend on; NaN where nothing is.
+
+    Args:
+        integrals: of the blocks.
+        field_b: (K, 3) T, mean field in body axes at the end of each.
+        still: (K,) bool.
+        sigma: (K,) rad/s, of the mean rate at rest.
+        parameters: as of a replay.
+        pace: goes on with these blocks.
+    """
+    p, time = parameters, np.asarray(integrals.dt_s)
+    blocks, clock = len(time), np.cumsum(np.concatenate([[pace.clock_s], time]))[1:]
+    pace.clock_s = float(clock[-1])
+    still = still & (time > 0.0)
+    travel = np.full((blocks, 6), np.nan)
+    travel[still, :3] = 0.0
+    # Noise that lasts is thinned out: it must be new at each reading to be what the filter thinks.
+    travel[pace.take(model.TRAVEL, clock, time > 0.0, p.travel.every)] = 0.0
+    y: dict[str, Any] = {
+        model.TRAVEL: travel,
+        model.REST_RATE: np.where(still[:, None], np.zeros((blocks, 3)), np.nan),
+    }
+    aux: dict[str, Any] = {
+        model.TRAVEL: still.astype(float),
+        model.REST_RATE: np.concatenate([mean_rate(integrals), sigma[:, None]], axis=1),
+    }
+    if p.use_magnetometer != "never":
+        there = np.all(np.isfinite(field_b), axis=1)
+        look = pace.take(model.MAGNETOMETER, clock, there & ~still, p.travel.every)
+        y[model.MAGNETOMETER] = (
+            Angle(np.where(look, 0.0, np.nan)),
+            np.where(look[:, None], np.zeros((blocks, 2)), np.nan),
+        )
+        aux[model.MAGNETOMETER] = np.where(there[:, None], field_b, np.array([1e-5, 0.0, 0.0]))
+    return y, aux
+
+
+def mean_rate(integrals: model.Integrals) -> np.ndarray:
+    """(K, 3) rad/s, mean over each block, from its rotation; meant for rest."""
+    q, dt = np.asarray(integrals.turn), np.asarray(integrals.dt_s)[:, None]
+    vector = 2.0 * q[:, 1:] * np.sign(q[:, :1])
+    return np.where(dt > 0.0, vector / np.where(dt > 0.0, dt, 1.0), 0.0)
+
+
+def mean_force(integrals: model.Integrals) -> np.ndarray:
+    """(K, 3) m/s^2, mean specific force of each block."""
+    dt = np.asarray(integrals.dt_s)[:, None]
+    return np.asarray(integrals.dv) / np.where(dt > 0.0, dt, 1.0)

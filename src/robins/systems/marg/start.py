@@ -1,0 +1,151 @@
+"""Where the filter of a unit begins: level, north by the field, the bias by rest."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation as SciRotation
+
+from robins.filters import Belief
+from robins.ins.alignment import triad
+from robins.ins.increments import Increments
+from robins.program.evaluated import evaluated
+from robins.rotation import Rotation
+from robins.systems.marg import model
+from robins.systems.marg.parameters import Replay
+from robins.systems.marg.rest import Watch
+
+# a unit at rest, by its first samples
+_STILL_RATE = np.radians(8.0)  # rad/s, mean length of the rate
+_STILL_SPREAD = np.radians(1.0)  # rad/s, mean length of its changes
+_STILL_FORCE = 0.5  # m/s^2
+
+
+class FirstLook(NamedTuple):
+    """Where the filter begins."""
+
+    q_nb: np.ndarray  # (4,)
+    field_t: np.ndarray  # (2,) T along the horizontal and down; zeros where no field was seen
+    tilt_rad: float
+    heading_rad: float
+    still: bool
+    sentence: str
+
+
+def attitude_of(force_b: np.ndarray, field_b: np.ndarray | None) -> np.ndarray:
+    """q_nb (4,) for which specific force points up and the field north.
+
+    Without a field, or with one along the vertical, some heading.
+    """
+    level = np.eye(3)[np.argmin(np.abs(force_b))]
+    north = level if field_b is None else field_b
+    across = np.linalg.norm(np.cross(force_b / np.linalg.norm(force_b), north))
+    C_nb = triad(force_b, north if across > 1e-3 * np.linalg.norm(north) else level)
+    return np.asarray(evaluated(Rotation.from_dcm, C_nb).wxyz)
+
+
+def first_look(increments: Increments, field_b: np.ndarray, parameters: Replay) -> FirstLook:
+    """Align on the first samples: a short while of rest, or a longer one of motion.
+
+    In motion the gyros carry specific force and field back to the first sample, so that a swing
+    averages out.
+
+    Args:
+        increments: dt (N,) s, theta (N, 3) rad, dv (N, 3) m/s.
+        field_b: (N, 3) T, NaN where none.
+        parameters: of the start, and gravity.
+    """
+    dt, theta, dv = increments[:3]
+    start, time = parameters.start, np.cumsum(dt)
+    window = max(int(np.searchsorted(time, start.still, side="right")), 1)
+    rate, force = theta[:window] / dt[:window, None], dv[:window] / dt[:window, None]
+    still = bool(
+        np.mean(np.linalg.norm(rate, axis=1)) < _STILL_RATE
+        and np.mean(np.abs(rate - rate.mean(axis=0))) < _STILL_SPREAD
+        and np.max(np.std(force, axis=0)) < _STILL_FORCE
+    )
+    if not still:
+        window = max(int(np.searchsorted(time, start.moving, side="right")), 1)
+    turned = _turned(theta[:window])
+    force = np.sum(turned[:-1].apply(dv[:window]), axis=0) / time[window - 1]
+    there = np.all(np.isfinite(field_b[:window]), axis=1)
+    tilt = start.tilt if still else start.tilt_moving
+    size, how = float(np.linalg.norm(force)), f"over {float(time[window - 1]):.2g} s"
+    if not 0.5 < size / parameters.accelerometer.gravity < 1.5:
+        how += f"; the mean specific force is {size:.2f} m/s^2, so the tilt is hardly known"
+        tilt = np.pi / 2.0
+        force = force if size > 1e-3 else np.array([0.0, 0.0, -1.0])
+    how = f"{'at rest' if still else 'in motion'}, {how}"
+    if not np.any(there):
+        sentence = f"Levelled {how}; there is no field, so the heading is counted from the start."
+        return FirstLook(attitude_of(force, None), np.zeros(2), tilt, np.pi, still, sentence)
+    field = np.mean(turned[1:].apply(np.where(there[:, None], field_b[:window], 0.0)), axis=0)
+    field = field * window / np.sum(there)
+    q_nb = attitude_of(force, field)
+    north, _, down = SciRotation.from_quat(np.roll(q_nb, -1)).apply(field)
+    dip = np.degrees(np.arctan2(down, north))
+    sentence = (
+        f"Aligned {how}: the field there, {np.linalg.norm(field) * 1e6:.1f} uT at a dip of "
+        f"{dip:.1f} deg, is north."
+    )
+    heading = start.heading if still else start.heading_moving
+    return FirstLook(q_nb, np.array([north, down]), tilt, heading, still, sentence)
+
+
+def _turned(theta: np.ndarray) -> SciRotation:
+    """Attitude before each interval and after the last, against the first."""
+    out = [SciRotation.identity()]
+    for step in SciRotation.from_rotvec(theta):
+        out.append(out[-1] * step)
+    return SciRotation.concatenate(out)
+
+
+def first_belief(look: FirstLook, parameters: Replay, rest: Watch | None = None) -> Belief:
+    """The belief at the first sample.
+
+    Only heading and declination are correlated: what the field of the start is turned by against
+    the mean of the places to come, the heading is wrong by.
+
+    Args:
+        look: at the first samples.
+        parameters: of the start and of what was not looked at.
+        rest: where the samples begin with rest, their mean rate is the bias.
+    """
+    p = parameters
+    bias, bias_sigma = jnp.zeros(3), p.gyro.bias
+    if rest is not None and rest.first is not None:
+        bias, bias_sigma = jnp.asarray(rest.first), rest.first_sigma
+    mean = model.MargState(
+        q_nb=Rotation(jnp.asarray(look.q_nb)),
+        v_n=jnp.zeros(3),
+        p_n=jnp.zeros(3),
+        gyro_bias=bias,
+        gyro_gain=jnp.zeros((3, 3)),
+        accel_bias=jnp.zeros(3),
+        declination=jnp.zeros(()),
+        field=jnp.asarray(look.field_t),
+    )
+    known = bool(np.any(look.field_t != 0.0))
+    # where north is the field of the start, its declination is none but for a first noise
+    bend = p.magnetometer.declination
+    if not known or p.start.north == "start":
+        bend = bend / (20.0 if look.still else 2.0)
+    sigma = [
+        [look.tilt_rad, look.tilt_rad, look.heading_rad],
+        [p.rest.velocity * 10.0 if look.still else 2.0 * p.travel.velocity] * 3,
+        [p.travel.place] * 3,
+        [bias_sigma] * 3,
+        [p.gyro.gain] * 9,
+        [p.accelerometer.bias] * 3,
+        [bend],
+        [p.magnetometer.noise if known else p.magnetometer.most] * 2,
+    ]
+    factor = np.diag(np.concatenate([np.asarray(s, dtype=float) for s in sigma]))
+    if known and p.start.north == "mean":
+        heading = float(np.hypot(look.heading_rad, bend))
+        factor[model.HEADING, model.HEADING] = heading
+        factor[model.DECLINATION, model.HEADING] = bend**2 / heading
+        factor[model.DECLINATION, model.DECLINATION] = bend * look.heading_rad / heading
+    return Belief(mean, jnp.asarray(factor))
