@@ -12,7 +12,7 @@ from robins.logs import clean, load_dataset
 from robins.logs.ordering import rows_where
 from robins.systems import replaying
 from robins.systems.ins_gnss import SYSTEM, Drive, LiveInsGnss, Replay, drive_dataset
-from robins.systems.ins_gnss.log import contender, prepare
+from robins.systems.ins_gnss.log import contender, prepare, steps_of
 from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock
 from robins.systems.ins_gnss.robust import navigation
 from robins.systems.streaming import Flag, LiveError
@@ -32,8 +32,8 @@ def log():
     return as_rates(drive_dataset(scenario.parse(Drive, DRIVE), seed=4))
 
 
-def epochs_of_replay(dataset, parameters, name):
-    """Stamps [ns] and vectors (as `vector`) at the epochs of a causal replay."""
+def pieces_of(dataset, parameters):
+    """The log on one clock, and its pieces as a replay takes them."""
     log = on_one_clock(in_body_axes(dataset, parameters.imu.orientation), parameters)
     pieces, _ = replaying.prepared(
         log.time_s,
@@ -41,6 +41,12 @@ def epochs_of_replay(dataset, parameters, name):
         parameters.update.longest_gap,
         partial(prepare, log, parameters),
     )
+    return log, pieces
+
+
+def epochs_of_replay(dataset, parameters, name):
+    """Stamps [ns] and vectors (as `vector`) at the epochs of a causal replay."""
+    log, pieces = pieces_of(dataset, parameters)
     of = partial(contender, parameters, float(np.median(np.diff(log.gnss_s))))
     answer = replaying.navigated(pieces, (name,), of)[name]
     x = navigation(answer.mean)
@@ -126,6 +132,28 @@ def test_epochs_are_those_of_the_replay(live, log, order):
     assert np.mean(started) > 0.6
     assert (live.counts["steps_again"] > 20) == (order != "at once")
     assert live.start.startswith("levelled at rest")
+
+
+def test_steps_have_the_bits_of_those_of_a_replay(live, log, monkeypatch):
+    """Samples one by one, and each fix up to 0.9 s late: the last word on each epoch."""
+    last = {}
+
+    def noted(piece, used, begin_s, epochs, *others):
+        last[round(1e9 * epochs[0])] = steps_of(piece, used, begin_s, epochs, *others)
+        return last[round(1e9 * epochs[0])]
+
+    monkeypatch.setattr("robins.systems.ins_gnss.live.steps_of", noted)
+    for event in events(log, np.random.default_rng(0).uniform(0.0, 0.9, len(log.gnss))):
+        push(live, log, event)
+    _, (piece,) = pieces_of(log, Replay())
+    whole, found = (piece.world.u, piece.world.y, piece.world.aux), 0
+    for k, second in enumerate(piece.epoch_s):
+        if (steps := last.get(round(1e9 * second))) is not None:
+            of = jax.tree_util.tree_map(lambda a, k=k: np.asarray(a)[k], whole)
+            one = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], tuple(steps[:3]))
+            jax.tree_util.tree_map(np.testing.assert_array_equal, one, of)
+            found += 1
+    assert found > 0.9 * len(piece.epoch_s)
 
 
 def test_an_answer_is_the_state_carried_on_over_the_samples_since(live, log):

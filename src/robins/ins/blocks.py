@@ -115,7 +115,7 @@ def cut(
     late = before > 0.0
     if np.any(late):
         turn = SciRotation.from_rotvec(-before[late, None] * theta[parent[late]])
-        piece_dv[late] = turn.apply(piece_dv[late])
+        piece_dv[late] = _applied(turn, piece_dv[late])
 
     block = np.searchsorted(epoch_s, ends - slack)
     count = np.bincount(block, minlength=len(epoch_s))
@@ -154,13 +154,16 @@ def rate_about(
         usual_s: s, sampling interval; None: the median of dt.
     """
     dt, theta = increments[:2]
-    total = np.concatenate([np.zeros((1, 3)), np.cumsum(theta, axis=0)])
-    length = np.concatenate([[0.0], np.cumsum(dt)])
     half = reach_of_rate(float(np.median(dt)) if usual_s is None else usual_s)
     a = np.searchsorted(time_s, at_s - half)
     b = np.minimum(np.maximum(np.searchsorted(time_s, at_s + half), a + 1), len(dt))
     a = np.minimum(a, b - 1)
-    return (total[b] - total[a]) / (length[b] - length[a])[:, None]
+    total, length = np.zeros((len(at_s), 3)), np.zeros(len(at_s))
+    for k in range(int(np.max(b - a, initial=0))):
+        there = a + k < b
+        total[there] += theta[a[there] + k]
+        length[there] += dt[a[there] + k]
+    return total / length[:, None]
 
 
 def gained_in_window(
@@ -198,6 +201,11 @@ def gained_in_window(
         weight = 1.0 - (at_s - 0.5 * (begin + end)) / window_s
         # dv is in the axes at the start of its interval, so the turn over the interval comes first
         turned = turned * SciRotation.from_rotvec(-share[:, None] * increments.theta[k])
-        gained += (weight * share)[:, None] * turned.apply(increments.dv[k])
+        gained += (weight * share)[:, None] * _applied(turned, increments.dv[k])
         age += weight * length
         sample = sample - 1
+
+
+def _applied(turn: SciRotation, v: np.ndarray) -> np.ndarray:
+    """Turned vectors (N, 3), each with the same bits whatever N is."""
+    return np.sum(turn.as_matrix() * v[:, None, :], axis=-1)

@@ -17,25 +17,42 @@ _FEWEST = 5  # samples in the memory, below which nothing can be told
 _CALMER = 0.5  # at rest without fixes: this share of the least unrest seen in motion, or less
 
 
-def moving_statistics(values: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
+def moving_statistics(
+    values: np.ndarray, width: int, first: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation over the `width` samples up to each one.
+
+    Sums are taken within blocks of `width` samples from the first of all on (van Herk 1992), so a
+    piece of a record has the bits of the whole, from its sample ``2 * width`` on.
 
     Args:
         values: (N, axes).
-        width: samples in a window; the first windows are shorter.
+        width: samples in a window; the first windows of a record are shorter.
+        first: number of samples of the record before these.
 
     Returns:
         (N, axes) each.
     """
-    shift = np.mean(values, axis=0)  # keeps the difference of squares well conditioned
-    x = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values - shift, axis=0)])
-    xx = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum((values - shift) ** 2, axis=0)])
-    end = np.arange(1, len(values) + 1)
-    begin = np.maximum(end - width, 0)
-    count = (end - begin)[:, None]
-    mean = (x[end] - x[begin]) / count
-    variance = np.maximum((xx[end] - xx[begin]) / count - mean**2, 0.0)
-    return mean + shift, np.sqrt(variance)
+    count = np.minimum(first + np.arange(1, len(values) + 1), width)[:, None]
+    # a window is a block, or the end of a block and the beginning of the next one
+    lead = first % width
+    rows = np.zeros((-(-(lead + len(values)) // width) * width, values.shape[1]))
+    rows[lead : lead + len(values)] = values
+    mean, square = (
+        _moving_sum(x, width)[lead : lead + len(values)] / count for x in (rows, rows**2)
+    )
+    return mean, np.sqrt(np.maximum(square - mean**2, 0.0))
+
+
+def _moving_sum(rows: np.ndarray, width: int) -> np.ndarray:
+    """Sums (N, axes) over the `width` rows up to each one; N is a multiple of it."""
+    blocks = rows.reshape(-1, width, rows.shape[1])
+    head = np.cumsum(blocks, axis=1).reshape(rows.shape)
+    tail = np.cumsum(blocks[:, ::-1], axis=1)[:, ::-1].reshape(rows.shape)
+    before = np.zeros_like(rows)
+    before[width - 1 :] = tail[: len(rows) - width + 1]
+    before[width - 1 :: width] = 0.0
+    return head + before
 
 
 def _width(dt: np.ndarray, window_s: float, usual_s: float | None) -> int:
@@ -49,6 +66,7 @@ def standstill(
     quiet_rate: float,
     quiet_force: float,
     usual_s: float | None = None,
+    first: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """True where the unit stood still over the window up to each increment.
 
@@ -61,18 +79,19 @@ def standstill(
         quiet_rate: rad/s.
         quiet_force: m/s^2.
         usual_s: s, sampling interval; None: the median of dt.
+        first: number of increments of the record before these.
 
     Returns:
         (N,) bool, and (N, 3) mean gyro rate over the window [rad/s].
     """
     dt, theta, dv = increments[:3]
     width = _width(dt, window_s, usual_s)
-    mean_rate, spread_rate = moving_statistics(theta / dt[:, None], width)
-    _, spread_force = moving_statistics(dv / dt[:, None], width)
+    mean_rate, spread_rate = moving_statistics(theta / dt[:, None], width, first)
+    _, spread_force = moving_statistics(dv / dt[:, None], width, first)
     still = np.all(spread_rate < quiet_rate, axis=1)
     still &= np.all(spread_force < quiet_force, axis=1)
     still &= np.all(np.abs(mean_rate) < 4.0 * quiet_rate, axis=1)
-    still[: width - 1] = False
+    still[: max(width - 1 - first, 0)] = False
     return still, mean_rate
 
 
@@ -82,14 +101,15 @@ def unrest(
     quiet_rate: float,
     quiet_force: float,
     usual_s: float | None = None,
+    first: int = 0,
 ) -> np.ndarray:
     """(N,) spread over the window up to each increment, in thresholds of `standstill`; the axis
-    that is the farthest from still.
+    that is the farthest from still. Arguments as of `standstill`.
     """
     dt, theta, dv = increments[:3]
     width = _width(dt, window_s, usual_s)
-    _, spread_rate = moving_statistics(theta / dt[:, None], width)
-    _, spread_force = moving_statistics(dv / dt[:, None], width)
+    _, spread_rate = moving_statistics(theta / dt[:, None], width, first)
+    _, spread_force = moving_statistics(dv / dt[:, None], width, first)
     each = np.concatenate([spread_rate / quiet_rate, spread_force / quiet_force], axis=1)
     return np.max(each, axis=1)
 

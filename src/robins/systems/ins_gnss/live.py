@@ -36,7 +36,7 @@ from robins.dataset import ImuTable
 from robins.errors import require
 from robins.filters import OnlineFilter
 from robins.filters.machine import usual
-from robins.ins.blocks import cut, rate_about, reach_of_rate, usual_width
+from robins.ins.blocks import cut, reach_of_rate, usual_width
 from robins.ins.increments import Increments, from_imu
 from robins.systems import replaying
 from robins.systems.ins_gnss.live_answers import Navigation, answer_of, kept, predicted
@@ -45,8 +45,7 @@ from robins.systems.ins_gnss.log import (
     SMOOTHED,
     contender,
     first_belief,
-    measured_fixes,
-    measured_rest,
+    steps_of,
 )
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.recording import Log, axes_of, believed_sigmas
@@ -93,7 +92,7 @@ class LiveInsGnss(Live):
 
     _parameters: ClassVar[type[Any]] = Replay
     _kept: ClassVar[tuple[str, ...]] = (
-        "_origin_ns", "_raw_ns", "_raw", "_steps", "_newest", "_fixes", "_field", "_past",
+        "_origin_ns", "_raw_ns", "_raw", "_steps", "_first", "_newest", "_fixes", "_field", "_past",
         "_calmest", "_velocities", "start", "_first_fix_s",
     )  # fmt: skip
     _parts: ClassVar[tuple[str, ...]] = ("_door",)
@@ -134,11 +133,10 @@ class LiveInsGnss(Live):
         self._reach_s = reach_of_rate(self._usual.sample_s)
         self._delay_s = longest_delay_s
         self._width = usual_width(p.update.longest_block, self._usual.sample_s)
-        window_s = p.gnss.velocity_window
-        self._window_s = self._usual.fix_s if window_s is None else window_s
         # what has to be looked back at from the oldest epoch
-        back = max(self._window_s, 2.0 * p.aids.window, 1.5, 4.0 * self._usual.fix_s)
-        self._back_s = longest_delay_s + 2.0 * self._reach_s + back
+        self._settling_s = 2.0 * p.aids.window + 2.0 * self._usual.sample_s  # of moving statistics
+        back = max(p.gnss.velocity_window or 0.0, 1.5, 4.0 * self._usual.fix_s)
+        self._back_s = longest_delay_s + 2.0 * self._reach_s + back + self._settling_s
         asked = contender(p, self._usual.fix_s, filter)
         self._on = partial(online, asked.filter, asked.model, machine=made_with["machine"])
         self._case, self._suspects = asked.case, asked.filter.suspects
@@ -158,7 +156,8 @@ class LiveInsGnss(Live):
         self._origin_ns: int | None = None
         self._raw_ns: list[int] = []  # the last four samples
         self._raw: list[np.ndarray] = []
-        self._steps = np.zeros((0, 8))  # end [s], dt, turn, velocity of each increment
+        self._steps = np.zeros((0, 8))  # end [s], dt, turn, velocity of each increment kept
+        self._first = 0  # number of increments before these
         self._newest = np.zeros((0, 8))  # the last increment, as far as it is known
         self._fixes = np.zeros((0, WIDTH))  # rows of `live_fixes`, by time
         self._field = np.zeros((0, 4))  # time [s] and field [T], until the start
@@ -281,8 +280,13 @@ class LiveInsGnss(Live):
             self._steps = np.concatenate([self._steps, final])
         self._newest = found[-1:]
 
-    def _log(self, rows: np.ndarray) -> Log:
+    def _keep(self, begin: int) -> None:
+        """Drop increments before a row."""
+        self._steps, self._first = self._steps[begin:], self._first + begin
+
+    def _log(self) -> Log:
         """Increments and all fixes as a piece of a log."""
+        rows = self._steps
         f = self._fixes
         table = table_of(f, self._origin_ns or 0, self._velocities)
         gnss = self.parameters.gnss
@@ -297,6 +301,7 @@ class LiveInsGnss(Live):
             None,
             np.zeros(len(f), dtype=bool),
         )
+        log = log._replace(first=self._first)
         if gnss.use_velocity:  # there or not, so that nothing is compiled when the first one comes
             told = table_of(f, self._origin_ns or 0, velocities=True)
             log = log._replace(v_n=f[:, 7:10], sigma_v=believed_sigmas(told, gnss)[1])
@@ -325,7 +330,8 @@ class LiveInsGnss(Live):
         if not len(rows):
             return
         if rows[-1, 0] - rows[0, 0] > _MOST_START_S:
-            self._steps = rows = rows[len(rows) // 2 :]
+            self._keep(len(rows) // 2)
+            rows = self._steps
             self._field = self._field[self._field[:, 0] > rows[0, 0] - 1.0]
         heard = self._fixes[self._fixes[:, 0] <= rows[-1, 0] - self._reach_s]
         given, waits = p.start.known_heading is not None, rows[-1, 0] - self._first_fix_s
@@ -335,7 +341,7 @@ class LiveInsGnss(Live):
             return
         if int(10.0 * rows[-1, 0]) == int(10.0 * (rows[-1, 0] - rows[-1, 1])):
             return  # ten times a second are enough
-        log = self._log(rows)
+        log = self._log()
         within = self._fixes[:, 0] <= rows[-1, 0] - self._reach_s
         log = log._replace(
             gnss=some(log.gnss, within),
@@ -363,32 +369,16 @@ class LiveInsGnss(Live):
         self._past, self._states = [tuple(Epoch(begin_s, begin_s, 0))], [self._online.state]
         self.start = found.sentence
 
-    def _block(self, end_s: float, rows: np.ndarray, origin: Epoch, least: int) -> Block:
-        """Input of a step from an epoch to a time."""
-        inc = Increments(rows[:, 1], rows[:, 2:5], rows[:, 5:8])
-        blocks = cut(inc, rows[:, 0], origin.time_s, np.array([end_s]), least=least)
-        scale = replaying.noise_scale(
-            blocks, rows[:, 1], self.parameters.update.gap_noise, self._usual.sample_s
-        )
-        return Block(jax.tree_util.tree_map(lambda a: a[0], blocks.increments), scale[0])
-
     def _step(self, to: Epoch) -> None:
         """One step of the filter, to an epoch, with what was measured there."""
         assert self._online is not None
-        p, at = self.parameters, Epoch(*self._past[-1])
-        rows = self._steps[self._steps[:, 0] > to.time_s - self._back_s]
-        log, epochs = self._log(rows), np.array([to.time_s])
-        rate = rate_about(log.increments, log.time_s, epochs, self._usual.sample_s)
+        at, log = Epoch(*self._past[-1]), self._log()
         used = np.abs(log.gnss_s - to.time_s) < 1e-9
-        # the window is looked at where there is a velocity alone
-        window_s = self._window_s if np.any(np.isfinite(self._fixes[used, 7:10])) else 0.0
-        y, aux = measured_fixes(log, used, epochs, rate, window_s)
         usual = self._usual._replace(calmest=self._calmest)
-        known, about = measured_rest(log, epochs, rate, p.aids, usual)
-        row = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], (y | known, aux | about))
-        u = self._block(to.time_s, rows, at, self._width)
+        steps = steps_of(log, used, at.time_s, np.array([to.time_s]), self.parameters, usual)
+        u, y, aux = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], tuple(steps[:3]))
         self.counts["blocks_over_imu_gaps"] += int(np.asarray(u.noise_scale) > 1.0)
-        said = np.asarray(self._online.step(row[0], u, row[1], keep=kept))
+        said = np.asarray(self._online.step(y, u, aux, keep=kept))
         self.epoch = self._told(to.time_s, said, Flag(0))
         self.passed.append(self.epoch)
         self._past.append(tuple(to))
@@ -404,13 +394,11 @@ class LiveInsGnss(Live):
         del self._past[:keep], self._states[:keep]
         begin = self._past[0][0] - self._back_s
         if self._steps[0, 0] < begin - self._back_s:
-            log = self._log(self._steps)
-            margin = begin + self.parameters.aids.window + 2.0 * self._usual.sample_s
-            old = int(np.searchsorted(self._fixes[:, 0], margin))
+            old = int(np.searchsorted(self._fixes[:, 0], begin + self._settling_s))
             usual = self._usual._replace(calmest=self._calmest)
-            self._calmest = calmest(log, self.parameters.aids, usual, old + 2)
+            self._calmest = calmest(self._log(), self.parameters.aids, usual, old + 2)
             self._fixes = self._fixes[old:]
-            self._steps = self._steps[self._steps[:, 0] > begin]
+            self._keep(int(np.searchsorted(self._steps[:, 0], begin, side="right")))
 
     def _go_back(self, time_s: float) -> None:
         """Return to the last epoch before a fix was known."""
@@ -440,7 +428,12 @@ class LiveInsGnss(Live):
         last = self._newest[self._newest[:, 0] > final_s]
         rows = np.concatenate([rows, last])
         end_s = float(rows[-1, 0])
-        u = self._block(end_s, rows, at, self._width + 8)
+        inc = Increments(rows[:, 1], rows[:, 2:5], rows[:, 5:8])
+        blocks = cut(inc, rows[:, 0], at.time_s, np.array([end_s]), least=self._width + 8)
+        scale = replaying.noise_scale(
+            blocks, rows[:, 1], self.parameters.update.gap_noise, self._usual.sample_s
+        )
+        u = jax.tree_util.tree_map(lambda a: a[0], Block(blocks.increments, scale))
         found = self._online.look(predicted, u)
         wrong = {} if self.epoch is None else self.epoch.wrong
         told = self._told(end_s, np.asarray(found), mark)

@@ -21,7 +21,7 @@ from robins.earth import Geodetic
 from robins.errors import require_known
 from robins.filters import Belief
 from robins.ins.blocks import cut, epochs_between, gained_in_window, rate_about, usual_width
-from robins.ins.increments import Increments
+from robins.ins.increments import Increments, usual_interval
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsState
 from robins.program.evaluated import evaluated
@@ -87,8 +87,9 @@ def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
         ValueError: no start can be found, or no fix lies in the piece.
     """
     increments = Increments(*(a[rows] for a in whole.increments[:3]))
+    usual = Usual(usual_interval(whole.increments.dt), fix_step_s(whole))
     log = whole._replace(increments=increments, time_s=whole.time_s[rows])
-    start = find_start(log, parameters.start, parameters.aids)
+    start = find_start(log, parameters.start, parameters.aids, usual)
     begin_s, end_s = float(log.gnss_s[start.fix]), float(log.time_s[-1])
     used = (log.gnss_s > begin_s) & (log.gnss_s <= end_s)
     if not np.any(used):
@@ -96,23 +97,62 @@ def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
     # a filter that runs while the log is made does not know when the next fix comes
     longest_s = parameters.update.longest_block
     epochs = epochs_between(begin_s, end_s, log.gnss_s[used], longest_s, even=False)
-    width = usual_width(longest_s, float(np.median(increments.dt)))
-    blocks = cut(increments, log.time_s, begin_s, epochs, least=width)
-    scale = replaying.noise_scale(blocks, increments.dt, parameters.update.gap_noise)
-    rate = rate_about(increments, log.time_s, epochs)
-    y, aux = measured_fixes(log, used, epochs, rate, parameters.gnss.velocity_window)
-    known, about = measured_rest(log, epochs, rate, parameters.aids)
-    belief, u = first_belief(log, start, parameters), Block(blocks.increments, scale)
+    steps = steps_of(log, used, begin_s, epochs, parameters, usual)
     return Stretch(
-        world=Case(belief, u, y | known, aux | about, None),
+        world=Case(first_belief(log, start, parameters), steps.u, steps.y, steps.aux, None),
         begin_s=begin_s,
         epoch_s=epochs,
-        noise_scale=scale,
+        noise_scale=np.asarray(steps.u.noise_scale),
         start=start,
-        rate_b=rate,
+        rate_b=steps.rate_b,
         used=used,
         withheld=parameters.withheld(epochs, log.gnss_s),
     )
+
+
+class Steps(NamedTuple):
+    """Steps of a filter; leading axis E epochs."""
+
+    u: Block
+    y: dict[str, Any]
+    aux: dict[str, Any]
+    rate_b: np.ndarray  # (E, 3) rad/s, mean raw gyro rate about each epoch
+
+
+def steps_of(
+    log: Log,
+    used: np.ndarray,
+    begin_s: float,
+    epochs: np.ndarray,
+    parameters: Replay,
+    usual: Usual,
+) -> Steps:
+    """Steps from epoch to epoch, with what was measured at their ends.
+
+    A piece of a log that reaches back far enough has the bits of the whole log.
+
+    Args:
+        log: increments and fixes.
+        used: (M,) bool, fixes that fall on one of the epochs.
+        begin_s: epoch before the first.
+        epochs: (E,) s.
+        parameters: of the replay.
+        usual: intervals of samples and fixes.
+    """
+    p, increments = parameters, log.increments
+    width = usual_width(p.update.longest_block, usual.sample_s)
+    blocks = cut(increments, log.time_s, begin_s, epochs, least=width)
+    scale = replaying.noise_scale(blocks, increments.dt, p.update.gap_noise, usual.sample_s)
+    rate = rate_about(increments, log.time_s, epochs, usual.sample_s)
+    window_s = p.gnss.velocity_window
+    y, aux = measured_fixes(log, used, epochs, rate, usual.fix_s if window_s is None else window_s)
+    known, about = measured_rest(log, epochs, rate, p.aids, usual)
+    return Steps(Block(blocks.increments, scale), y | known, aux | about, rate)
+
+
+def fix_step_s(log: Log) -> float:
+    """Interval between fixes [s], in the median."""
+    return float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 1.0
 
 
 def first_belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
@@ -138,7 +178,7 @@ def first_belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
 
 
 def measured_fixes(
-    log: Log, used: np.ndarray, epochs: np.ndarray, rate: np.ndarray, window_s: float | None
+    log: Log, used: np.ndarray, epochs: np.ndarray, rate: np.ndarray, window_s: float
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """GNSS measurements by epoch; NaN where there is no fix or it is withheld."""
     given, g = used & ~log.withheld, log.gnss
@@ -152,16 +192,17 @@ def measured_fixes(
     y: dict[str, Any] = {model.POSITION: Geodetic(*map(sorted_in, (g.lat_rad, g.lon_rad, g.alt_m)))}
     aux: dict[str, Any] = {model.POSITION: model.Fix(sorted_in(log.sigma_m, 1.0), rate)}
     if log.v_n is not None and log.sigma_v is not None:
-        if window_s is None:
-            window_s = float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 0.0
-        gained = gained_in_window(log.increments, log.time_s, epochs, window_s)
+        gained = np.zeros((len(epochs), 3)), np.zeros(len(epochs))
+        found = gained_in_window(log.increments, log.time_s, epochs[at], window_s)
+        for all_, some in zip(gained, found, strict=True):
+            all_[at] = some
         y[model.VELOCITY] = sorted_in(log.v_n)
         aux[model.VELOCITY] = model.Velocity(sorted_in(log.sigma_v, 1.0), rate, *gained)
     return y, aux
 
 
 def measured_rest(
-    log: Log, epochs: np.ndarray, rate: np.ndarray, aids: Aids, usual: Usual | None = None
+    log: Log, epochs: np.ndarray, rate: np.ndarray, aids: Aids, usual: Usual
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Measurements of what is known without a receiver: standing still, or not slipping."""
     still, mean_rate = at_rest(log, aids, usual)
@@ -326,8 +367,7 @@ def _opened(dataset: Dataset, parameters: Replay) -> _Opened:
         parameters.update.longest_gap,
         partial(prepare, log, parameters),
     )
-    fix_step_s = float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 1.0
-    return _Opened(parameters, log, pieces, problems, fix_step_s)
+    return _Opened(parameters, log, pieces, problems, fix_step_s(log))
 
 
 def recorded(dataset: Dataset, parameters: Replay) -> Recorded:

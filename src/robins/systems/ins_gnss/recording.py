@@ -39,6 +39,7 @@ class Log(NamedTuple):
     field_s: np.ndarray | None = None  # (K,) of a magnetometer, where there is one
     field_b: np.ndarray | None = None  # (K, 3) T, body axes
     wheels: Wheels | None = None
+    first: int = 0  # number of increments of the record before these
 
 
 def in_body_axes(dataset: Dataset, orientation: Sequence[float]) -> Dataset:

@@ -63,11 +63,11 @@ def calmest(log: Log, aids: Aids, usual: Usual, fixes: int) -> float:
 def _heard(log: Log, aids: Aids, usual: Usual | None) -> tuple[np.ndarray, np.ndarray, _Heard]:
     """Stillness by spread, mean rate, and what `calmest_in_motion` takes."""
     sample_s = None if usual is None else usual.sample_s
-    still, mean_rate = standstill(log.increments, *aids.quiet, sample_s)
+    still, mean_rate = standstill(log.increments, *aids.quiet, sample_s, log.first)
     fix_s, moves = _moving(log, aids.moving_speed)
     between = float(np.median(np.diff(fix_s))) if len(fix_s) > 1 else 1.0
     wait_s = 1.5 * max(1.0, between if usual is None else usual.fix_s)
-    quiet = unrest(log.increments, *aids.quiet, sample_s)
+    quiet = unrest(log.increments, *aids.quiet, sample_s, log.first)
     return still, mean_rate, (quiet, log.time_s, fix_s, moves, wait_s)
 
 
@@ -219,7 +219,7 @@ def find_start(log: Log, start: Start, aids: Aids, usual: Usual | None = None) -
     still, mean_rate = at_rest(log, aids, usual)
     sample_s = float(np.median(dt)) if usual is None else usual.sample_s
     width = max(2, round(2.0 * aids.window / sample_s))
-    mean_force, spread = moving_statistics(dv / dt[:, None], width)
+    mean_force, spread = moving_statistics(dv / dt[:, None], width, log.first)
     # without a course nothing is taken from after the rest that it begins at
     enough = np.append(np.flatnonzero(still)[width : width + 1], len(dt) - 1)[0]
     last = int(enough) if fast is None else int(np.searchsorted(time_s, gnss_s[fast]))
