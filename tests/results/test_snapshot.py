@@ -88,10 +88,10 @@ def test_another_version_class_or_file_is_refused_with_what_to_do(tmp_path, monk
     np.save(tmp_path / "d.npy", np.zeros(3))
     with pytest.raises(ResultError, match="no file of a live state"):
         snapshot.read(tmp_path / "d.npy", "Unit")
-    monkeypatch.setattr(snapshot, "VERSION", 2)
+    monkeypatch.setattr(snapshot, "VERSION", 3)
     snapshot.write(path, "Unit", "", STATE)
     monkeypatch.undo()
-    with pytest.raises(ResultError, match="of version 2 of the format, this robins reads 1"):
+    with pytest.raises(ResultError, match="of version 3 of the format, this robins reads 2"):
         snapshot.read(path, "Unit")
 
 

@@ -1,5 +1,6 @@
 """A live navigation is that of the causal replay, however late the fixes come."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -8,6 +9,7 @@ import pytest
 from short_drive import DRIVE
 
 from robins import scenario
+from robins.filters import Code
 from robins.logs import clean, load_dataset
 from robins.logs.ordering import rows_where
 from robins.systems import replaying
@@ -259,6 +261,24 @@ def test_bad_fixes_and_samples_are_refused_and_counted(live, log):
     assert live.epoch is before
     answers, _ = played(live, log, whole[600:])
     assert answers[-1].flags == Flag(0)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.7])
+def test_a_fix_that_is_far_off_is_flagged_and_counted_once(live, log, late_s):
+    """It is 111 km off; where it comes late the filter takes the steps since then again."""
+    far, count = 20, len(log.gnss)
+    lat = log.gnss.lat_rad + np.radians(1.0) * (np.arange(count) == far)
+    log = replace(log, gnss=replace(log.gnss, lat_rad=lat))
+    late, flagged = np.full(count, 0.1), {}
+    late[far] += late_s
+    for event in events(log, late):
+        push(live, log, event)
+        for epoch in live.passed:
+            flagged[epoch.time_ns] = Flag.OUTLIER in epoch.flags
+            if flagged[epoch.time_ns] and epoch.time_ns == int(log.gnss.time_ns[far]):
+                assert epoch.seen["gnss_position"].code == Code.REFUSED
+    assert flagged[int(log.gnss.time_ns[far])]
+    assert live.counts["outliers_gnss_position"] == sum(flagged.values()) <= 3
 
 
 def test_a_fix_of_the_future_waits(live, log):

@@ -22,7 +22,7 @@ from robins.foreign import arrays_of, decoding
 from robins.results.errors import ResultError, cannot
 from robins.results.folder import sync
 
-FORMAT, VERSION = "robins-live", 1
+FORMAT, VERSION = "robins-live", 2
 _LARGEST = 1 << 30  # bytes of a file
 
 

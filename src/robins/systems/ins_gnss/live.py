@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from itertools import chain
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -39,7 +40,13 @@ from robins.filters.machine import usual
 from robins.ins.blocks import cut, reach_of_rate, usual_width
 from robins.ins.increments import Increments, from_imu
 from robins.systems import replaying
-from robins.systems.ins_gnss.live_answers import Navigation, answer_of, kept, predicted
+from robins.systems.ins_gnss.live_answers import (
+    Navigation,
+    answer_of,
+    kept,
+    outliers_of,
+    predicted,
+)
 from robins.systems.ins_gnss.live_fixes import TOLD, WIDTH, row_of, some, table_of
 from robins.systems.ins_gnss.log import (
     SMOOTHED,
@@ -84,7 +91,8 @@ class LiveInsGnss(Live):
 
     Attributes:
         counts: `imu_...` and `gnss_...`, refused by reason; `begun_anew`, `imu_gaps_declared`,
-            `blocks_over_imu_gaps`, `steps_again` (blocks repeated for late fixes).
+            `blocks_over_imu_gaps`, `steps_again` (blocks repeated for late fixes); `outliers_...`
+            by sensor, measurements that the filter refused (`Flag.OUTLIER`).
         start: the sentence on how the start was found; "" before.
         epoch: what the filter itself said last, with the fixes up to then; None before.
         passed: the same of each epoch that the last sample or fix brought, in order.
@@ -93,7 +101,7 @@ class LiveInsGnss(Live):
     _parameters: ClassVar[type[Any]] = Replay
     _kept: ClassVar[tuple[str, ...]] = (
         "_origin_ns", "_raw_ns", "_raw", "_steps", "_first", "_newest", "_fixes", "_field", "_past",
-        "_calmest", "_velocities", "start", "_first_fix_s",
+        "_outliers", "_calmest", "_velocities", "start", "_first_fix_s",
     )  # fmt: skip
     _parts: ClassVar[tuple[str, ...]] = ("_door",)
 
@@ -163,6 +171,7 @@ class LiveInsGnss(Live):
         self._field = np.zeros((0, 4))  # time [s] and field [T], until the start
         self._past: list[Any] = []  # epochs of the longest delay, as plain tuples
         self._states: list[Any] = []  # of the filter at them
+        self._outliers: list[Any] = []  # counts of what was refused at them
         self._calmest, self._velocities = math.inf, False
         self._first_fix_s = math.inf
         self.start, self.epoch = "", None
@@ -367,6 +376,7 @@ class LiveInsGnss(Live):
         belief = self._case(Case(first_belief(log, found, p), None, {}, {}, None)).start
         self._online = self._on(belief)
         self._past, self._states = [tuple(Epoch(begin_s, begin_s, 0))], [self._online.state]
+        self._outliers = [[]]
         self.start = found.sentence
 
     def _step(self, to: Epoch) -> None:
@@ -378,10 +388,15 @@ class LiveInsGnss(Live):
         steps = steps_of(log, used, at.time_s, np.array([to.time_s]), self.parameters, usual)
         u, y, aux = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], tuple(steps[:3]))
         self.counts["blocks_over_imu_gaps"] += int(np.asarray(u.noise_scale) > 1.0)
-        said = np.asarray(self._online.step(y, u, aux, keep=kept))
-        self.epoch = self._told(to.time_s, said, Flag(0))
+        found = np.asarray(self._online.step(y, u, aux, keep=kept))
+        time_ns = round(to.time_s * 1e9) + (self._origin_ns or 0)
+        answer = answer_of(time_ns, found, Flag(0), sorted(y), self._suspects)
+        outliers = [f"outliers_{name}" for name in outliers_of(answer)]
+        self.counts.update(outliers)
+        self.epoch = answer._replace(flags=Flag.OUTLIER if outliers else Flag(0))
         self.passed.append(self.epoch)
         self._past.append(tuple(to))
+        self._outliers.append(outliers)
         self._states.append(self._online.state)
         self._forget()
 
@@ -391,7 +406,7 @@ class LiveInsGnss(Live):
         first = next(k for k, e in enumerate(self._past) if e[0] >= now - self._delay_s)
         # one epoch before it is where a fix of that age is counted from
         keep = max(first - 1, 0)
-        del self._past[:keep], self._states[:keep]
+        del self._past[:keep], self._states[:keep], self._outliers[:keep]
         begin = self._past[0][0] - self._back_s
         if self._steps[0, 0] < begin - self._back_s:
             old = int(np.searchsorted(self._fixes[:, 0], begin + self._settling_s))
@@ -412,7 +427,8 @@ class LiveInsGnss(Live):
                 keep = k + 1
         if keep < len(self._past):
             self.counts["steps_again"] += len(self._past) - keep
-            del self._past[keep:], self._states[keep:]
+            self.counts.subtract(chain(*self._outliers[keep:]))
+            del self._past[keep:], self._states[keep:], self._outliers[keep:]
             assert self._online is not None
             self._online.state = self._states[-1]
 
@@ -435,13 +451,11 @@ class LiveInsGnss(Live):
         )
         u = jax.tree_util.tree_map(lambda a: a[0], Block(blocks.increments, scale))
         found = self._online.look(predicted, u)
-        wrong = {} if self.epoch is None else self.epoch.wrong
-        told = self._told(end_s, np.asarray(found), mark)
-        return told._replace(time_ns=time_ns, wrong=wrong)
-
-    def _told(self, time_s: float, x: np.ndarray, flags: Flag) -> Navigation:
-        time_ns = round(time_s * 1e9) + (self._origin_ns or 0)
-        return answer_of(time_ns, x, flags, self._suspects)
+        answer = answer_of(time_ns, np.asarray(found), mark)
+        if self.epoch is None:
+            return answer
+        flags = mark | self.epoch.flags
+        return answer._replace(wrong=self.epoch.wrong, seen=self.epoch.seen, flags=flags)
 
     def _compile(self) -> None:
         """Have all compiled by a standstill that is thrown away."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from robins.filters import Code
 from robins.filters.kalman import WRONG
 from robins.filters.run import Step
 from robins.systems.ins_gnss.robust import navigation
@@ -16,6 +17,14 @@ from robins.systems.parts import Block
 from robins.systems.streaming import Flag
 
 _WIDTH = 19  # of the vector: attitude, velocity, place and nine sigmas
+
+
+class Seen(NamedTuple):
+    """Outcome of a measurement in the filter."""
+
+    code: Code
+    nis: float  # normalised innovation squared
+    dof: int  # components that were measured
 
 
 class Navigation(NamedTuple):
@@ -31,6 +40,7 @@ class Navigation(NamedTuple):
     flags: Flag
     # probability that each suspect of a bank is wrong, after the last fix or standstill
     wrong: Mapping[str, float] = {}
+    seen: Mapping[str, Seen] = {}  # by sensor, in the last step of the filter
 
 
 def predicted(filter_: Any, model: Any, state: Any, u: Block) -> jax.Array:
@@ -46,15 +56,45 @@ def _vector(belief: Any) -> jax.Array:
 
 
 def kept(step: Step) -> jax.Array:
-    """The same after what was measured, and what a bank finds wrong."""
+    """The same after what was measured, what became of that, and what a bank finds wrong."""
     last = [info.notes[WRONG] for info in step.info.values() if WRONG in info.notes][-1:]
-    return jnp.concatenate([_vector(step.posterior), *last])
+    seen = [
+        jnp.stack([jnp.asarray(x, float) for x in (info.code, info.nis, info.dof)])
+        for _, info in sorted(step.info.items())
+    ]
+    return jnp.concatenate([_vector(step.posterior), *seen, *last])
 
 
 def answer_of(
-    time_ns: int, x: np.ndarray, flags: Flag, suspects: tuple[str, ...] = ()
+    time_ns: int,
+    x: np.ndarray,
+    flags: Flag,
+    sensors: Sequence[str] = (),
+    suspects: Sequence[str] = (),
 ) -> Navigation:
-    """The answer that such a vector is, of a filter with these suspects."""
+    """The answer that a vector of `predicted` or `kept` is.
+
+    Args:
+        time_ns: its stamp.
+        x: the vector.
+        flags: of the answer.
+        sensors: of `kept`, by name in their order there.
+        suspects: of a bank.
+    """
     lat, lon, alt = x[7:10].tolist()
-    wrong = dict(zip(suspects, x[_WIDTH:].tolist(), strict=False))
-    return Navigation(time_ns, x[:4], x[4:7], lat, lon, alt, x[10:_WIDTH], flags, wrong)
+    rows, rest = np.split(x[_WIDTH:], [3 * len(sensors)])
+    seen = {
+        name: Seen(Code(int(code)), nis, int(dof))
+        for name, (code, nis, dof) in zip(sensors, rows.reshape(-1, 3).tolist(), strict=True)
+    }
+    wrong = dict(zip(suspects, rest.tolist(), strict=False))
+    return Navigation(time_ns, x[:4], x[4:7], lat, lon, alt, x[10:_WIDTH], flags, wrong, seen)
+
+
+def outliers_of(answer: Navigation) -> list[str]:
+    """Sensors whose measurement a filter refused, or a bank took for wrong, in its last step."""
+    return [
+        name
+        for name, one in answer.seen.items()
+        if one.code == Code.REFUSED or (one.dof > 0 and answer.wrong.get(name, 0.0) > 0.5)
+    ]
