@@ -239,7 +239,22 @@ def test_a_bank_and_a_model_made_again_have_the_same_structure():
         assert {np.asarray(leaf).dtype for leaf in one[0]} == {np.dtype(float)}
     bank, other = each[0]
     differ = [a for a, b in zip(bank[0], other[0], strict=True) if np.any(a != b)]
-    assert [np.shape(a) for a in differ] == [(9, 9)]  # the changes
+    assert [np.shape(a) for a in differ] == [(10, 10)]  # the changes
+
+
+def test_a_wild_position_leaves_the_estimate_where_it_was(log):
+    """One fix in motion at another end of the Earth, as a receiver without satellites reports."""
+
+    def place(of):
+        track = replay(of, Replay(), ("robust",)).solution
+        return np.stack([track[f"{x}_rad"].values[0] for x in ("lat", "lon")], axis=1)
+
+    usual = place(log)
+    for off_m in (300.0, 5e6):
+        lat = log.gnss.lat_rad.copy()
+        lat[60] -= off_m / 6.4e6
+        away = 6.4e6 * np.abs(place(replace(log, gnss=replace(log.gnss, lat_rad=lat))) - usual)
+        assert 0.0 < np.nanmax(away) < 0.1
 
 
 def test_hindsight_is_that_of_all_sequences_of_modes():

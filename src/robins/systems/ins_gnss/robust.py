@@ -14,6 +14,7 @@ hypotheses of an interacting multiple model (`robins.filters.composite.imm`):
     begins           from this step on positions are off: o is new, of `OFF_M`
     lasts            they are still off: o stays, but for a walk. Fixes tell the motion, not where
     ends             they are right again, and the state was: o is dropped
+    wild             this position alone says nothing, as one at the other end of the Earth
     strayed          they were right, and the state was off: o is added to the position and dropped
 
 Whether positions that stay away are off or the state is, both are weighed: the stated covariance is
@@ -49,6 +50,8 @@ from robins.systems.study import Case
 SCALES = (1.0, 8.0, 64.0)
 RISE, FALL = 1e-4, 1e-2  # probability in a step that the process noise changes upwards, and back
 OFF_M = 10.0  # m, sigma of what positions are off by when they are
+WILD_M = 1e6  # m, the same of one that says nothing
+WILD_S = 1000.0  # s from one such position to the next, in the mean
 WALK = 0.005  # m/sqrt(s), by which that wanders; more makes `lasts` less likely than `right`
 SELDOM_S = 100.0  # s from one time that positions are off to the next, in the mean
 LATER = math.exp(4.0) - 1.0  # `strayed` is so much rarer than `ends`: as likely after 4 patiences
@@ -71,13 +74,13 @@ class Hypothesis(NamedTuple):
     scale: Any  # of the covariance of the process noise
     read: Any  # 1 where positions are off by o
     kept: Any  # 1 where o lasts
-    new: Any  # 1 where o is drawn anew
+    new: Any  # m, sigma of o where it is drawn anew
     taken: Any  # 1 where the position takes o
 
 
 COUNT = len(SCALES)
 RIGHT, LASTS = slice(COUNT), slice(COUNT, 2 * COUNT)
-BEGINS, ENDS, STRAYED = range(2 * COUNT, 2 * COUNT + 3)
+BEGINS, ENDS, STRAYED, WILD = range(2 * COUNT, 2 * COUNT + 4)
 """Where the modes stand in the bank."""
 
 _IMU, _POSITION = (IMU,), (POSITION,)  # what is wrong
@@ -86,9 +89,11 @@ _ROWS = [
     for off in (0.0, 1.0)
     for s in SCALES
 ] + [
-    Row(Hypothesis(SCALES[1], 1.0, 0.0, 1.0, 0.0), _POSITION),
+    Row(Hypothesis(SCALES[1], 1.0, 0.0, OFF_M, 0.0), _POSITION),
     Row(Hypothesis(SCALES[1], 0.0, 0.0, 0.0, 0.0)),
     Row(Hypothesis(SCALES[1], 0.0, 0.0, 0.0, 1.0), _IMU),
+    # it leads to no mode that keeps its o: so wide a spread would be mixed into what `lasts` knows
+    Row(Hypothesis(SCALES[0], 1.0, 0.0, WILD_M, 0.0), _POSITION),
 ]
 HYPOTHESES = stacked(_ROWS)
 AS_TOLD = Hypothesis(*np.array(_ROWS[0].numbers))
@@ -102,12 +107,13 @@ def changes(step_s: float, patience_s: float) -> np.ndarray:
         patience_s: how long positions are off, in the mean.
     """
     step_s = min(step_s, 0.5 * patience_s)
-    begin, over = (-math.expm1(-step_s / length) for length in (SELDOM_S, patience_s))
+    lengths = SELDOM_S, WILD_S, patience_s
+    begin, wild, over = (-math.expm1(-step_s / length) for length in lengths)
     edges: list[Any] = [(same, same, louder(SCALES, RISE, FALL)) for same in (RIGHT, LASTS)]
-    edges += [(EVERY, BEGINS, begin)]
+    edges += [(EVERY, BEGINS, begin), (EVERY, WILD, wild)]
     for off in (LASTS, BEGINS):
         edges += [(off, ENDS, over), (off, STRAYED, over / LATER)]
-    return transitions(len(_ROWS), edges, rest=[*range(2 * COUNT), COUNT, 0, 0])
+    return transitions(len(_ROWS), edges, rest=[*range(2 * COUNT), COUNT, 0, 0, 0])
 
 
 # ------------------------------------------------------------------------------------ the model
@@ -148,7 +154,7 @@ def _step_linear(motion: Motion, of: Hypothesis, x: Wide, u: Block):
     Phi = block_diagonal(Phi, block_diagonal(unit, of.kept * jnp.eye(3)))
     n = len(Phi)
     takes = jnp.eye(n).at[jnp.arange(6, 9), jnp.arange(n - 3, n)].set(of.taken)
-    drawn = of.new * OFF_M + of.kept * WALK * jnp.sqrt(jnp.sum(u.increments.dt))
+    drawn = of.new + of.kept * WALK * jnp.sqrt(jnp.sum(u.increments.dt))
     noise = block_diagonal(jnp.sqrt(of.scale) * factor, block_diagonal(zero, drawn * jnp.eye(3)))
     return x._replace(ins=ins), Phi @ takes, noise
 
