@@ -39,6 +39,7 @@ from robins.filters import OnlineFilter
 from robins.filters.machine import usual
 from robins.ins.blocks import cut, reach_of_rate, usual_width
 from robins.ins.increments import Increments, from_imu
+from robins.ins.rest import NOTHING, Known
 from robins.systems import replaying
 from robins.systems.ins_gnss.live_answers import (
     Navigation,
@@ -56,7 +57,8 @@ from robins.systems.ins_gnss.log import (
 )
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.recording import Log, axes_of, believed_sigmas
-from robins.systems.ins_gnss.start import Usual, calmest, find_start, turned
+from robins.systems.ins_gnss.rest import WAYS_S, Usual, known_until
+from robins.systems.ins_gnss.start import find_start, turned
 from robins.systems.parts import Block
 from robins.systems.streaming import (
     Door,
@@ -101,7 +103,7 @@ class LiveInsGnss(Live):
     _parameters: ClassVar[type[Any]] = Replay
     _kept: ClassVar[tuple[str, ...]] = (
         "_origin_ns", "_raw_ns", "_raw", "_steps", "_first", "_newest", "_fixes", "_field", "_past",
-        "_outliers", "_calmest", "_velocities", "start", "_first_fix_s",
+        "_outliers", "_known", "_velocities", "start", "_first_fix_s",
     )  # fmt: skip
     _parts: ClassVar[tuple[str, ...]] = ("_door",)
 
@@ -172,7 +174,7 @@ class LiveInsGnss(Live):
         self._past: list[Any] = []  # epochs of the longest delay, as plain tuples
         self._states: list[Any] = []  # of the filter at them
         self._outliers: list[Any] = []  # counts of what was refused at them
-        self._calmest, self._velocities = math.inf, False
+        self._known, self._velocities = tuple(NOTHING), False
         self._first_fix_s = math.inf
         self.start, self.epoch = "", None
         self.passed: list[Navigation] = []
@@ -384,7 +386,7 @@ class LiveInsGnss(Live):
         assert self._online is not None
         at, log = Epoch(*self._past[-1]), self._log()
         used = np.abs(log.gnss_s - to.time_s) < 1e-9
-        usual = self._usual._replace(calmest=self._calmest)
+        usual = self._usual._replace(known=Known(*self._known))
         steps = steps_of(log, used, at.time_s, np.array([to.time_s]), self.parameters, usual)
         u, y, aux = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], tuple(steps[:3]))
         self.counts["blocks_over_imu_gaps"] += int(np.asarray(u.noise_scale) > 1.0)
@@ -409,10 +411,11 @@ class LiveInsGnss(Live):
         del self._past[:keep], self._states[:keep], self._outliers[:keep]
         begin = self._past[0][0] - self._back_s
         if self._steps[0, 0] < begin - self._back_s:
-            old = int(np.searchsorted(self._fixes[:, 0], begin + self._settling_s))
-            usual = self._usual._replace(calmest=self._calmest)
-            self._calmest = calmest(self._log(), self.parameters.aids, usual, old + 2)
-            self._fixes = self._fixes[old:]
+            usual = self._usual._replace(known=Known(*self._known))
+            since_s = begin + self._settling_s
+            self._known = tuple(known_until(self._log(), self.parameters.aids, usual, since_s))
+            oldest = begin - 1.5 * max(1.0, self._usual.fix_s) - 1.5 * WAYS_S[-1]
+            self._fixes = self._fixes[self._fixes[:, 0] > oldest]
             self._keep(int(np.searchsorted(self._steps[:, 0], begin, side="right")))
 
     def _go_back(self, time_s: float) -> None:

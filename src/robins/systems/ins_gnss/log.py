@@ -32,6 +32,7 @@ from robins.systems import replaying
 from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.parameters import Aids, Replay
 from robins.systems.ins_gnss.recording import Log, in_body_axes, on_one_clock, with_lever_arm
+from robins.systems.ins_gnss.rest import Usual, at_rest
 from robins.systems.ins_gnss.robust import (
     AS_TOLD,
     HYPOTHESES,
@@ -45,7 +46,7 @@ from robins.systems.ins_gnss.robust import (
     supposed,
     weighed,
 )
-from robins.systems.ins_gnss.start import StartPoint, Usual, at_rest, find_start
+from robins.systems.ins_gnss.start import StartPoint, find_start
 from robins.systems.ins_gnss.study import NAMES as STUDIED
 from robins.systems.ins_gnss.study import SMOOTHERS, make_filter
 from robins.systems.parts import Block

@@ -9,20 +9,15 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import rotation
-from robins.earth import Geodetic, gravity_n
+from robins.earth import gravity_n
 from robins.earth.magnetic import decimal_year, elements, field_n, wmm_for
 from robins.ins.alignment import level
-from robins.ins.rest import (
-    calmest_in_motion,
-    confirmed,
-    moving_statistics,
-    standstill,
-    unrest,
-)
+from robins.ins.rest import moving_statistics
 from robins.program.evaluated import evaluated
 from robins.program.scanned import named_scan
 from robins.systems.ins_gnss.parameters import Aids, Start
 from robins.systems.ins_gnss.recording import Log
+from robins.systems.ins_gnss.rest import Usual, looks_still
 
 
 class StartPoint(NamedTuple):
@@ -33,75 +28,6 @@ class StartPoint(NamedTuple):
     tilt_sigma_rad: float
     gyro_bias: np.ndarray  # (3,) rad/s, mean rate of a standstill, else zero
     sentence: str  # how it was found, for the reader
-
-
-class Usual(NamedTuple):
-    """What a piece of a log that is too short does not tell of the whole."""
-
-    sample_s: float  # interval between samples
-    fix_s: float  # between fixes
-    calmest: float = np.inf  # least unrest in motion that was known before, as of `confirmed`
-
-
-_Heard = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]
-
-
-def at_rest(log: Log, aids: Aids, usual: Usual | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) whether the vehicle stands still at each increment, by samples and fixes; mean rate."""
-    still, mean_rate, heard = _heard(log, aids, usual)
-    calmest = np.inf if usual is None else usual.calmest
-    return confirmed(still, *heard, calmest), mean_rate
-
-
-def calmest(log: Log, aids: Aids, usual: Usual, fixes: int) -> float:
-    """Least unrest in motion as it is known after so many of the fixes that tell of motion."""
-    least = calmest_in_motion(*_heard(log, aids, usual)[2], usual.calmest)
-    found = float(least[min(fixes, len(least) - 1)])
-    return found if found > 0.0 else np.inf
-
-
-def _heard(log: Log, aids: Aids, usual: Usual | None) -> tuple[np.ndarray, np.ndarray, _Heard]:
-    """Stillness by spread, mean rate, and what `calmest_in_motion` takes."""
-    sample_s = None if usual is None else usual.sample_s
-    still, mean_rate = standstill(log.increments, *aids.quiet, sample_s, log.first)
-    fix_s, moves = _moving(log, aids.moving_speed)
-    between = float(np.median(np.diff(fix_s))) if len(fix_s) > 1 else 1.0
-    wait_s = 1.5 * max(1.0, between if usual is None else usual.fix_s)
-    quiet = unrest(log.increments, *aids.quiet, sample_s, log.first)
-    return still, mean_rate, (quiet, log.time_s, fix_s, moves, wait_s)
-
-
-def _moving(log: Log, speed: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times at which fixes or wheels tell whether the vehicle moves, and what they tell."""
-    time_s, moves = _moving_fixes(log, speed)
-    if log.wheels is None:
-        return time_s, moves
-    turn = np.abs(log.wheels.speed) > np.maximum(speed, 4.0 * log.wheels.sigma)
-    time_s = np.concatenate([time_s, log.wheels.time_s])
-    order = np.argsort(time_s, kind="stable")
-    return time_s[order], np.concatenate([moves, turn])[order]
-
-
-def _moving_fixes(log: Log, speed: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times of the fixes that tell whether the vehicle moves, and what they tell.
-
-    By the velocity, or by the way since the fix a second before where the receiver gives none.
-    """
-    g, given = log.gnss, ~log.withheld
-    if g.v_n is not None and g.sigma_v is not None:
-        size = np.hypot(g.v_n[:, 0], g.v_n[:, 1])
-        noise = np.max(g.sigma_v[:, :2], axis=1)
-        known = given & np.isfinite(size)
-        return log.gnss_s[known], size[known] > np.maximum(speed, 4.0 * noise[known])
-    known = given & np.isfinite(g.lat_rad) & np.isfinite(g.lon_rad)
-    time_s, noise = log.gnss_s[known], np.max(g.sigma_m[known, :2], axis=1)
-    before = np.maximum(np.searchsorted(time_s, time_s - 1.0 + 1e-6, side="right") - 1, 0)
-    place = Geodetic(*map(jnp.asarray, (g.lat_rad[known], g.lon_rad[known], 0.0 * time_s)))
-    there = Geodetic(place.lat[before], place.lon[before], place.alt[before])
-    way = np.hypot(*np.asarray(there.local(place)).T[:2]) if len(time_s) else np.zeros(0)
-    limit = np.maximum(speed * (time_s - time_s[before]), 4.0 * np.hypot(noise, noise[before]))
-    told = time_s[before] < time_s
-    return time_s[told], way[told] > limit[told]
 
 
 def turned(q: np.ndarray, theta: np.ndarray) -> np.ndarray:
@@ -216,7 +142,7 @@ def find_start(log: Log, start: Start, aids: Aids, usual: Usual | None = None) -
         fast, unknown = _fast_fix(log, start)
         if unknown and log.field_b is None:
             raise ValueError(f"the heading at the start is not known: {unknown}")
-    still, mean_rate = at_rest(log, aids, usual)
+    still, mean_rate = looks_still(log, aids, usual)
     sample_s = float(np.median(dt)) if usual is None else usual.sample_s
     width = max(2, round(2.0 * aids.window / sample_s))
     mean_force, spread = moving_statistics(dv / dt[:, None], width, log.first)
