@@ -28,9 +28,14 @@ def unchecked(monkeypatch):
 
 @pytest.fixture
 def sketched(monkeypatch):
-    """Pictures of few dots: that they are drawn counts here, not how they look."""
+    """Pictures of few dots: that they are drawn counts here, not how they look or fit."""
     finer = Figure.set_dpi
-    monkeypatch.setattr(Figure, "set_dpi", lambda figure, dpi: finer(figure, min(dpi, 25)))
+
+    def coarser(figure, dpi):
+        figure.set_layout_engine("none")  # takes longer than the drawing
+        finer(figure, min(dpi, 25))
+
+    monkeypatch.setattr(Figure, "set_dpi", coarser)
 
 
 @pytest.fixture
