@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from in_lanes import each
 
 from robins import scenario
-from robins.campaign import worlds
+from robins.campaign.machine import first_worlds
 from robins.filters import Code, run
 from robins.filters.analysis.consistency import nees
 from robins.manifold import local
@@ -22,8 +23,6 @@ from robins.systems.study import Problem
 RUNS, MANY = 8, 20  # of `make test`, and of the specification, by `make certify`
 STUDY = SYSTEM.studies["navigation"]
 TO_THE_END = ('imu.rate="10 Hz"', 'duration="800 s"')  # of what counts: 200 to 800 s
-QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, some times as fast to run
-OFTEN = ("ukf", "intersection")  # filters with so many, or so slow, flights that it is worth it
 
 
 class Found(NamedTuple):
@@ -72,12 +71,9 @@ class Flights(NamedTuple):
     def found(self, name: str) -> Found:
         """What a filter makes of them."""
         problem = self.problem(name)
-        c = problem.contenders[name]
-        many = len(self.batch.wind) >= MANY
-        program = _program(c.filter, many and name in OFTEN)
-        error, square = program(c.model, c.case, jnp.asarray(c.reported), self.batch)
+        error, square = _program(self.name, self.settings, name)(self.batch)
         counted = slice(problem.count_from, problem.count_to)
-        return Found(np.asarray(error), np.asarray(square), counted)
+        return Found(error, square, counted)
 
 
 def parsed(name: str, settings: tuple[str, ...] = TO_THE_END) -> Airship:
@@ -94,8 +90,7 @@ def problem(name: str, settings: tuple[str, ...], filters: tuple[str, ...]) -> P
 @cache
 def flights(name: str, settings: tuple[str, ...] = TO_THE_END, runs: int = RUNS) -> Flights:
     """Runs of a packaged scenario."""
-    ((batch, _),) = worlds(problem(name, settings, ()), runs)
-    return Flights(name, settings, batch)
+    return Flights(name, settings, first_worlds(problem(name, settings, ()), runs))
 
 
 def beginning(batch: World, epochs: int) -> World:
@@ -120,25 +115,26 @@ def told_by_radar(batch: World, changed: Callable[[Any, Any], Any]) -> World:
 
 def traced(problem: Problem, name: str, world: Any) -> tuple[Any, Any]:
     """Shapes of the error of one run and of its square, without compiling."""
-    c = problem.contenders[name]
-    return jax.eval_shape(_judging(c.filter), c.model, c.case, jnp.asarray(c.reported), world)
+    return jax.eval_shape(_judging(problem.contenders[name]), world)
 
 
-def _judging(filter_: Any):
+def _judging(contender: Any):
     """Error of a filter in one run, (E, 9), and its square by what it states, (E,)."""
+    reported = jnp.asarray(contender.reported)
 
-    def one(model, case, reported, world):
-        it = case(world)
-        steps = run(
-            filter_, model, it.start, it.y, it.u, it.aux, keep=lambda s: (s.posterior, s.prediction)
+    def one(world):
+        it = contender.case(world)
+        posterior, prediction = run(
+            *(contender.filter, contender.model, it.start, it.y, it.u, it.aux),
+            keep=lambda s: (s.posterior, s.prediction),
         ).steps
-        posterior, prediction = steps
 
-        def judged(belief, truth):
+        def judged(row):
+            belief, truth = row
             size = float(belief.factor.shape[-1])
             return reported @ local(belief.mean, truth), nees(belief, truth) / size
 
-        error, square = jax.vmap(judged)(posterior, it.truth)
+        error, square = jax.lax.map(judged, (posterior, it.truth))
         stuck = jnp.cumsum(prediction.code != int(Code.DONE)) > 0
         return jnp.where(stuck[:, None], jnp.nan, error), square
 
@@ -146,9 +142,8 @@ def _judging(filter_: Any):
 
 
 @cache
-def _program(filter_: Any, quick: bool):
-    mapped = jax.vmap(_judging(filter_), in_axes=(None, None, None, 0))
-    return jax.jit(mapped, compiler_options=QUICK if quick else None)
+def _program(name: str, settings: tuple[str, ...], filter_: str):
+    return each(_judging(problem(name, settings, (filter_,)).contenders[filter_]))
 
 
 @cache

@@ -5,9 +5,10 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from in_lanes import each
 
 from robins import scenario
-from robins.campaign import worlds
+from robins.campaign.machine import first_worlds
 from robins.filters import run
 from robins.filters.analysis.consistency import normalised_sq
 from robins.manifold import local
@@ -16,7 +17,6 @@ from robins.systems.rocket.world import PEAK_S, World
 from robins.systems.study import Problem
 
 RUNS, MANY = 8, 20  # of `make test`, and of the specification, by `make certify`
-QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, faster to run many
 SHORT = ('duration="150 s"',)  # of the angles; of the field it takes the whole flight
 
 
@@ -85,27 +85,27 @@ def problem(name: str, settings: tuple[str, ...], filters: tuple[str, ...] = ())
 @cache
 def flights(name: str, settings: tuple[str, ...], runs: int) -> World:
     """Runs of a packaged scenario, changed; leading axis: runs."""
-    ((batch, _),) = worlds(problem(name, settings), runs)
-    return batch
+    return first_worlds(problem(name, settings), runs)
 
 
-@cache
-def _program(filter_: Any, quick: bool):
-    def one(model, case, world):
-        it = case(world)
-        steps = run(filter_, model, it.start, it.y, it.u, it.aux, keep=lambda s: s.posterior).steps
+def _judging(contender: Any):
+    def one(world):
+        it = contender.case(world)
+        steps = run(
+            *(contender.filter, contender.model, it.start, it.y, it.u, it.aux),
+            keep=lambda s: s.posterior,
+        ).steps
 
-        def judged(belief, truth, rows):
+        def judged(row):
+            belief, truth, rows = row
             error, factor = local(belief.mean, truth), belief.factor
             if rows is not None:
                 error, factor = rows @ error, rows @ factor
             return error, normalised_sq(error[:3], factor[:3]) / 3.0
 
-        along = None if it.rows is None else 0
-        return jax.vmap(judged, (0, 0, along))(steps, it.truth, it.rows)
+        return jax.lax.map(judged, (steps, it.truth, it.rows))
 
-    mapped = jax.vmap(one, in_axes=(None, None, 0))
-    return jax.jit(mapped, compiler_options=QUICK if quick else None)
+    return one
 
 
 @cache
@@ -113,8 +113,6 @@ def found(name: str, filter_: str, runs: int = MANY) -> Found:
     """What a filter makes of flights of a scenario."""
     settings = SHORT if name.startswith("a") else ()
     p, burst = problem(name, settings, (filter_,)), parsed(name)[0].magnetometer.disturbance
-    c = p.contenders[filter_]
-    program = _program(c.filter, runs >= MANY)
-    error, square = program(c.model, c.case, flights(name, settings, runs))
+    error, square = each(_judging(p.contenders[filter_]))(flights(name, settings, runs))
     every, length = (np.inf, 0.0) if burst is None else (burst.every, burst.length)
-    return Found(np.degrees(np.asarray(error)), np.asarray(square), p.epoch_s, every, length)
+    return Found(np.degrees(error), square, p.epoch_s, every, length)

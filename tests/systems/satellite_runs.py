@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from in_lanes import each
 
 from robins import scenario
-from robins.campaign import worlds
+from robins.campaign.machine import first_worlds
 from robins.filters import run_closed
 from robins.filters.analysis.consistency import normalised_sq
 from robins.manifold import local
@@ -18,7 +19,6 @@ from robins.systems.study import Problem
 
 RUNS, MANY = 8, 24  # of `make test`, and of the specification, by `make certify`
 ARCSEC = math.pi / 648000.0
-QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, faster to run many
 
 
 class Found(NamedTuple):
@@ -58,47 +58,43 @@ def problem(name: str, filters: tuple[str, ...], settings: tuple[str, ...] = ())
     return study.problem(parsed(name, settings), filters, 0)
 
 
-@cache
-def _program(filter_: Any, quick: bool):
-    def one(model, case, world):
-        it = case(world)
+def _judging(contender: Any):
+    def one(world):
+        it = contender.case(world)
 
         def keep(step):
             return step.posterior, step.info["star"].used
 
-        closed = run_closed(filter_, model, it.start, it.loop, keep)
+        closed = run_closed(contender.filter, contender.model, it.start, it.loop, keep)
         given = closed.readings
 
-        def judged(belief, truth, rows):
+        def judged(row):
+            belief, truth, rows = row
             error, factor = local(belief.mean, truth), belief.factor
             if rows is not None:
                 error, factor = rows @ error, rows @ factor
             sigma = jnp.sqrt(jnp.sum(factor**2, axis=1))
             return error[:3], normalised_sq(error[:3], factor[:3]) / 3.0, sigma[:3]
 
-        along = None if given.rows is None else 0
         posterior, used = closed.steps
-        found = jax.vmap(judged, (0, 0, along))(posterior, given.truth, given.rows)
+        found = jax.lax.map(judged, (posterior, given.truth, given.rows))
         return *found, given.outputs, jnp.any(used, axis=-1)
 
-    return jax.jit(jax.vmap(one, (None, None, 0)), compiler_options=QUICK if quick else None)
+    return one
 
 
 @cache
 def flights(name: str, runs: int, settings: tuple[str, ...]) -> Any:
     """Worlds of a packaged scenario, changed; leading axis: runs."""
-    ((batch, _),) = worlds(problem(name, ("mekf",), settings), runs)
-    return batch
+    return first_worlds(problem(name, ("mekf",), settings), runs)
 
 
 @cache
 def flown(name: str, filter_: str, runs: int, settings: tuple[str, ...] = ()) -> Found:
     """What a filter makes of runs of a packaged scenario, changed."""
     p = problem(name, (filter_,), settings)
-    c = p.contenders[filter_]
-    batch = flights(name, runs, settings)
-    program = _program(c.filter, runs >= MANY)
-    error, nees, sigma, outputs, used = program(c.model, c.case, batch)
+    judged = each(_judging(p.contenders[filter_]))(flights(name, runs, settings))
+    error, nees, sigma, outputs, used = judged
     size = [np.asarray(x) / ARCSEC for x in (error, sigma, outputs["pointing"])]
     return Found(
         size[0],
