@@ -1,13 +1,16 @@
 """The simulated drive: laid out right, consistent when it should be, caught when it is not."""
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
+from in_lanes import each
 from test_replay import DRIVE
 
 from robins import scenario
-from robins.campaign import Statistics, record, worlds
+from robins.campaign import Statistics
+from robins.campaign.machine import first_worlds, one_by_one
+from robins.campaign.monte_carlo import blocks_of, contender, one_record
 from robins.systems.ins_gnss import Drive
 from robins.systems.ins_gnss.study import DRIVE as STUDY
 from robins.systems.ins_gnss.world import lay_out
@@ -25,15 +28,14 @@ SMALL = ("start.tilt=0.5 deg", "start.heading=2 deg", "update.gate=0")
 
 @cache
 def flown():
-    """The runs, whatever is believed of them, and how many."""
-    (runs,) = worlds(STUDY.problem(parsed(*SMALL), (), 1), RUNS, RUNS)
-    return runs
+    """The runs, whatever is believed of them."""
+    return first_worlds(STUDY.problem(parsed(*SMALL), (), 1), RUNS)
 
 
 def campaign(*settings):
     problem = STUDY.problem(parsed(*SMALL, *settings), ("ekf",), 1)
-    statistics = Statistics(problem.blocks)
-    statistics.add(record(problem, "ekf", *flown()))
+    statistics, of = Statistics(problem.blocks), contender(problem, "ekf")
+    statistics.add(each(partial(one_record, blocks_of(problem), of, over=one_by_one))(flown()))
     metrics = problem.metrics(statistics)
     return metrics, {c["id"]: c["verdict"] for c in problem.claims({"ekf": metrics})}
 

@@ -224,15 +224,18 @@ def test_the_linear_motion_of_each_hypothesis_is_the_slope_of_its_step(log):
     start = widened(piece.world.start, True)
     x = start.mean._replace(offset=jnp.array([3.0, -2.0, 1.0]))
     n = manifold.dim(x)
+
+    @jax.jit  # the motions have the same structure
+    def both(motion):
+        stepped, (new, Phi, noise) = motion.step(x, u), motion.linear(x, u)
+        moved = jax.vmap(lambda e: motion.step(manifold.retract(x, 0.1 * e), u))(jnp.eye(n)[-4:])
+        wide = jax.vmap(lambda one: manifold.local(stepped, one) / 0.1)(moved)
+        return manifold.local(stepped, new), Phi, noise, wide
+
     for row in zip(*HYPOTHESES, strict=True):
-        motion = supposed(own, Hypothesis(*row)).motion
-        new, Phi, noise = motion.linear(x, u)
-        assert np.all(np.abs(manifold.local(motion.step(x, u), new)) < 1e-9)
-        wide = [
-            manifold.local(motion.step(x, u), motion.step(manifold.retract(x, 0.1 * e), u)) / 0.1
-            for e in jnp.eye(n)[-4:]
-        ]
-        np.testing.assert_allclose(np.asarray(Phi)[:, -4:], np.stack(wide, -1), atol=1e-5)
+        off, Phi, noise, wide = both(supposed(own, Hypothesis(*row)).motion)
+        assert np.all(np.abs(off) < 1e-9)
+        np.testing.assert_allclose(np.asarray(Phi)[:, -4:], np.asarray(wide).T, atol=1e-5)
         assert noise.shape[0] == n
 
 

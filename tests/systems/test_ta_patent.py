@@ -9,9 +9,9 @@ from functools import cache, partial
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_lanes import each
 from numpy.testing import assert_allclose
 from scipy import integrate
 
@@ -28,7 +28,6 @@ from robins.systems.transfer_alignment.velocity_attitude.study import CLAIMS, ST
 
 FOLDER = Path(transfer_alignment.__file__).parent / "scenarios"
 RUNS = 100
-QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, faster to run
 COUNT_FROM = 300  # t > 30 s
 
 # RMS of attitude errors over all axes ['], t > 30 s, 100 runs
@@ -56,19 +55,20 @@ SIZES = {  # what the scenarios below differ in, by table
 
 @cache
 def simulator_of(name):
-    """Simulates scenarios that differ from this one in `SIZES`; compiles once for all."""
+    """Simulates scenarios that differ from this one in `SIZES`; traced once for all."""
     given = parsed(name)
     course = course_of(name)
 
-    def simulate(sizes, index):
+    @each
+    def batch(given_run):
+        sizes, index = given_run
         parts = {t: getattr(given, t).model_copy(update=size) for t, size in sizes.items()}
         return study.simulate(given.model_copy(update=parts), course, 0, index)
 
-    batch = jax.jit(jax.vmap(simulate, (None, 0)), compiler_options=QUICK)
-
     def of(other):
         sizes = {t: {k: getattr(getattr(other, t), k) for k in keys} for t, keys in SIZES.items()}
-        return batch(jax.tree.map(jnp.asarray, sizes), jnp.arange(RUNS))
+        alike = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], RUNS, axis=0), sizes)
+        return jax.device_put(batch((alike, np.arange(RUNS))))
 
     return of
 
@@ -77,18 +77,14 @@ def kept(step):
     return step.posterior.mean, step.posterior.sigma, step.prediction.code
 
 
-@partial(jax.jit, static_argnames="filter_", compiler_options=QUICK)
-@partial(jax.vmap, in_axes=(None, 0))
-def filtered(filter_, case):
-    return run(filter_, va.MODEL, case.start, case.y, case.u, case.aux, kept).steps
-
-
-_cases = jax.jit(jax.vmap(lambda case, world: case(world), (None, 0)))
+def solved(contender, world):
+    case = contender.case(world)
+    return run(contender.filter, va.MODEL, case.start, case.y, case.u, case.aux, kept).steps
 
 
 def errors_of(contender, world):
     """Errors and sigmas as reported, and the codes of predictions."""
-    mean, sigma, code = filtered(contender.filter, _cases(contender.case, world))
+    mean, sigma, code = each(partial(solved, contender))(world)
     error = np.asarray(world.error - mean) @ contender.reported.T
     return error, np.asarray(sigma) @ contender.reported.T, np.asarray(code)
 
