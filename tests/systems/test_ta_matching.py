@@ -5,7 +5,7 @@ carries them through all runs: checked against the filter itself in the run that
 """
 
 import json
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_lanes import each
 
 import robins.systems
 from robins import rotation, scenario
@@ -54,20 +55,25 @@ def sizes_of(parameters):
     return tables | {"master": {"attitude_noise": parameters.master.attitude_noise}}
 
 
-# slower to compile, faster to run
-@partial(jax.jit, static_argnames="signs", compiler_options={"xla_backend_optimization_level": 1})
-def simulated(sizes, signs):
-    """Sizes are data, so one compilation serves all scenarios of the same signs."""
+@cache
+def simulated(signs):
+    """Sizes are data, so one program serves all scenarios of the same signs."""
     like = given("s0", f"signs={signs}")
-    tables = {k: getattr(like, k).model_copy(update=size) for k, size in sizes.items()}
-    of = like.model_copy(update=tables)
-    return jax.vmap(partial(simulate, of, COURSE, 0))(jnp.arange(RUNS))
+
+    @each
+    def one(run):
+        sizes, index = run
+        tables = {k: getattr(like, k).model_copy(update=size) for k, size in sizes.items()}
+        return simulate(like.model_copy(update=tables), COURSE, 0, index)
+
+    return one
 
 
 def worlds(parameters, **changed):
     """All runs of a scenario, with some numbers changed: ``table={key: value}``."""
-    sizes = sizes_of(parameters)
-    return simulated({k: {**v, **changed.get(k, {})} for k, v in sizes.items()}, parameters.signs)
+    sizes = {k: {**v, **changed.get(k, {})} for k, v in sizes_of(parameters).items()}
+    alike = jax.tree.map(lambda x: np.repeat(np.asarray(x, float)[None], RUNS, axis=0), sizes)
+    return simulated(parameters.signs)((alike, np.arange(RUNS)))
 
 
 def first(tree):
@@ -107,8 +113,7 @@ def carried(K, F, H, z):
 @cache
 def found(name):
     parameters = given(name)
-    world = jax.tree.map(np.asarray, worlds(parameters))
-    return Found(name, world, STUDY.problem(parameters, parameters.filters, 0))
+    return Found(name, worlds(parameters), STUDY.problem(parameters, parameters.filters, 0))
 
 
 @cache

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_lanes import each
 from scipy.spatial.transform import Rotation as SciRotation
 
 from robins.campaign.statistics import Statistics
@@ -258,24 +259,24 @@ CONTENDER = product_contender(PAIR)
 course = cache(partial(lay_out, PAIR))
 
 
-@jax.jit
-@partial(jax.vmap, in_axes=(0, None))
-def runs(index, mounting_error):
+@each
+def runs(one):
     """Errors, sigmas and sigmas before the velocity of "product", and what became of that."""
+    index, mounting_error = one
     world = simulate_pair(with_mounting(PAIR, mounting_error), course(), 0, index)
     case = CONTENDER.case(world)
     y = {**case.y, p.VELOCITY: case.y[p.VELOCITY].at[HALF, 0].set(jnp.nan)}
     keep = lambda s: (s.posterior, s.prediction.belief.sigma, s.info[p.VELOCITY].code)  # noqa: E731
     found = run(kalman(form="joseph"), CONTENDER.model, case.start, y, case.u, case.aux, keep)
     belief, before, code = found.steps
-    return jax.vmap(local)(belief.mean, case.truth), belief.sigma, before, code
+    errors = jax.lax.map(lambda pair: local(*pair), (belief.mean, case.truth))
+    return errors, belief.sigma, before, code
 
 
 @cache
 def aligned(mounting_error_deg):
     course()  # before it is traced
-    error = jnp.full(3, jnp.deg2rad(mounting_error_deg))
-    return [np.asarray(a) for a in runs(jnp.arange(RUNS), error)]
+    return runs((np.arange(RUNS), np.full((RUNS, 3), np.deg2rad(mounting_error_deg))))
 
 
 def settled(mounting_error_deg):
