@@ -338,17 +338,18 @@ def test_without_noise_the_reading_is_the_record():
     contender = product_contender(pair, believed=pair.believed)
     course = lay_out(pair)
 
-    @jax.jit
+    @each
     def apart(index):
         case = contender.case(simulate_pair(pair, course, 3, index))
         return {
-            s.name: jax.vmap(lambda x, y, lag, s=s: local(s.read(x, lag), y))(
-                case.truth, case.y[s.name], case.aux[s.name]
+            s.name: jax.lax.map(
+                lambda row, s=s: local(s.read(row[0], row[2]), row[1]),
+                (case.truth, case.y[s.name], case.aux[s.name]),
             )
             for s in contender.model.sensors
         }
 
-    found = {k: np.asarray(v)[1:] for k, v in apart(0).items()}
+    found = {k: v[0, 1:] for k, v in apart(np.arange(1)).items()}
     assert all(np.all(np.isfinite(v)) for v in found.values())
     assert np.max(np.abs(found[p.ATTITUDE])) < 0.2 * MINUTE
     assert np.max(np.abs(found[p.VELOCITY])) < 3e-3
