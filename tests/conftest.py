@@ -152,6 +152,20 @@ def own_configuration(tmp_path_factory):
     os.environ["XDG_CONFIG_HOME"] = str(tmp_path_factory.mktemp("config"))
 
 
+@pytest.fixture
+def sketched(monkeypatch):
+    """Pictures of few dots: that they are drawn counts here, not how they look or fit."""
+    from matplotlib.figure import Figure
+
+    finer = Figure.set_dpi
+
+    def coarser(figure, dpi):
+        figure.set_layout_engine("none")  # takes longer than the drawing
+        finer(figure, min(dpi, 25))
+
+    monkeypatch.setattr(Figure, "set_dpi", coarser)
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """Real logs: ROBINS_DATA, else ../shared/data beside the repository."""

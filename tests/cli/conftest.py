@@ -6,7 +6,6 @@ from pathlib import Path
 
 import jaxtyping
 import pytest
-from matplotlib.figure import Figure
 
 from robins import report, results
 from robins.cli import main
@@ -24,18 +23,6 @@ def unchecked(monkeypatch):
     A traced program calls some of them a million times.
     """
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
-
-
-@pytest.fixture
-def sketched(monkeypatch):
-    """Pictures of few dots: that they are drawn counts here, not how they look or fit."""
-    finer = Figure.set_dpi
-
-    def coarser(figure, dpi):
-        figure.set_layout_engine("none")  # takes longer than the drawing
-        finer(figure, min(dpi, 25))
-
-    monkeypatch.setattr(Figure, "set_dpi", coarser)
 
 
 @pytest.fixture

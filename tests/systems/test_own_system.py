@@ -13,6 +13,7 @@ from robins.cli import main
 from robins.systems import SYSTEMS, catalogue, trust
 from robins.systems.finding import UnknownSystem, find_system
 
+pytestmark = pytest.mark.usefixtures("sketched")
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "balloon.py"
 
 

@@ -389,6 +389,7 @@ def test_the_attitude_of_the_slave_is_told_as_angles_and_as_a_quaternion(clean, 
     assert (q.inv() * SciRotation.from_euler("ZYX", angles)).magnitude().max() < 1e-9
 
 
+@pytest.mark.usefixtures("sketched")
 def test_two_files_become_a_result_with_figures_and_a_page(files, clean):
     heard, pair = [], (files / "master.csv", files / "slave.csv")
     mine, settings = str(files / "mine.toml"), ('title="Mine"',)
