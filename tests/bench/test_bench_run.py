@@ -346,7 +346,7 @@ def test_faults_are_the_same_however_fast_it_goes(threads):
     )
     fast, slow = (
         run(flight(filter="mekf-gate", seconds=12.0, faults=faults, **more))
-        for more in ({}, {"baud": 115200})
+        for more in ({}, {"baud": 460_800})
     )
     np.testing.assert_array_equal(fast.ran.flown["estimate.q_ib"], slow.ran.flown["estimate.q_ib"])
     np.testing.assert_array_equal(fast.ran.flown["motion.q_ib"], slow.ran.flown["motion.q_ib"])
