@@ -118,7 +118,11 @@ class Node(threading.Thread):
             found = select.select([line, self.killed], [], [], wait_s)[0]
             if self.killed in found:
                 return
-            if found and (answer := station.feed(os.read(line.fileno(), 65536))):
+            if not found:
+                continue
+            if not (data := os.read(line.fileno(), 65536)):
+                return  # the far end is gone
+            if answer := station.feed(data):
                 line.write(answer)
 
     def poll(self) -> int | None:
