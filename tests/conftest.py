@@ -3,9 +3,14 @@
 Loaded by each worker of a parallel run before any test module, so before `robins` is imported.
 """
 
+import os
+
+# Threads of the linear algebra wait by turning in circles, which costs more than they save. Set
+# here, since NumPy reads it when it is imported; processes that tests start inherit it.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import ctypes
 import gc
-import os
 import signal
 import sys
 from pathlib import Path
