@@ -21,6 +21,7 @@ data (`robins.ins.allan_noise`), not on a rule of thumb for white noise.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -287,6 +288,7 @@ def _explained(
     """
     points, count = len(variance), len(index)
 
+    @cache
     def tried(first: int, coloured: bool = True) -> tuple | None:
         rest = Moments(*(part[first:] for part in expected))
         rest = Moments(rest.mean, rest.quadratic[:, first:], rest.ramp[:, first:])
@@ -303,14 +305,13 @@ def _explained(
     whole = tried(0, coloured=False)
     if whole is not None and unlikely(whole) >= _DOUBTED:
         return whole
-    parts = [tried(first) for first in range(points - least)]
-    chance = [unlikely(part) for part in parts]
+    parts = range(points - least)
     for enough in (_EXPLAINED, _BARELY):
-        for first, p in enumerate(chance):
-            if p >= enough:
+        for first in parts:
+            if unlikely(tried(first)) >= enough:
                 # What is explained may still be wrong by as much as does not show: what colour does
                 # beyond C / tau^2 dies away, so on to more than twice the time.
-                further = parts[min(first + _FURTHER, len(parts) - 1)]
+                further = tried(min(first + _FURTHER, parts[-1]))
                 if further is not None:
                     return further
     # without a fit, for what it has to say
