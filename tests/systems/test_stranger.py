@@ -11,13 +11,13 @@ from short_drive import DRIVE
 
 from robins import logs, manifold, scenario
 from robins.dataset import OdometryTable
-from robins.ins.rest import Told, confirmed, standstill
+from robins.ins.rest import standstill
 from robins.logs.mounting import Mounting, turned
 from robins.systems.ins_gnss import SYSTEM, Drive, Replay, drive_dataset, replay
 from robins.systems.ins_gnss.log import prepare
 from robins.systems.ins_gnss.model import ins_gnss_model
 from robins.systems.ins_gnss.recording import TYRES, in_body_axes, on_one_clock
-from robins.systems.ins_gnss.rest import at_rest
+from robins.systems.ins_gnss.rest import Told, Usual, at_rest, confirmed, usual_of
 from robins.systems.ins_gnss.robust import (
     AS_TOLD,
     HYPOTHESES,
@@ -95,6 +95,7 @@ def log():
 
 TIME = np.arange(0.0, 40.0, 0.1)
 QUIET = np.ones(len(TIME), bool)
+USUAL = Usual(0.1, 0.5)
 FIXES = np.arange(0.0, 40.0, 0.5)
 # moves from 10 to 20 s, and from 30 s on
 MOVES = ((FIXES >= 10.0) & (FIXES < 20.0)) | (FIXES >= 30.0)
@@ -106,7 +107,7 @@ def told(fixes=FIXES, moves=MOVES):
 
 
 def asked(unrest, fixes=FIXES, moves=MOVES):
-    return confirmed(QUIET, unrest, TIME, told(fixes, moves), 1.5)
+    return confirmed(QUIET, unrest, TIME, told(fixes, moves), 1.5, USUAL)
 
 
 def test_fixes_say_whether_what_looks_still_is():
@@ -114,7 +115,7 @@ def test_fixes_say_whether_what_looks_still_is():
     moving = ((TIME >= 10.0) & (TIME < 20.0)) | (TIME >= 30.0)
     np.testing.assert_array_equal(found, ~moving)
     assert not np.any(asked(0.0 * TIME, FIXES[:0], MOVES[:0]))
-    assert not np.any(confirmed(~QUIET, 0.0 * TIME, TIME, told(), 1.5))
+    assert not np.any(confirmed(~QUIET, 0.0 * TIME, TIME, told(), 1.5, USUAL))
 
 
 @pytest.mark.parametrize(("calm", "still"), [(0.9, False), (0.6, False), (0.4, True)])
@@ -141,6 +142,7 @@ def test_standstill_uses_nothing_of_the_future():
             TIME[until],
             told(FIXES[heard][fixes], MOVES[heard][fixes]),
             1.5,
+            USUAL,
         )
         np.testing.assert_array_equal(part, whole[until])
 
@@ -154,7 +156,7 @@ def test_a_smooth_road_is_not_taken_for_rest(velocities, sigma, share):
     log = drive_dataset(scenario.parse(Drive, SMOOTH, (f"gnss.sigma={sigma}",)), seed=1)
     given = log if velocities else replace(log, gnss=replace(log.gnss, v_n=None, sigma_v=None))
     whole, aids = on_one_clock(given, Replay()), Replay().aids
-    found, _ = at_rest(whole, aids)
+    found, _ = at_rest(whole, aids, usual_of(whole))
     speed = np.interp(whole.time_s, log.truth.time_ns * 1e-9, np.linalg.norm(log.truth.v_n, axis=1))
     by_spread, _ = standstill(whole.increments, *aids.quiet)
     assert np.sum(by_spread & (speed > 5.0)) > 300, "the spread alone takes it for rest"
@@ -177,8 +179,8 @@ def _with_wheels(log, until_s=np.inf):
 def test_wheels_tell_rest_from_a_smooth_road_where_no_fix_comes(log):
     given, aids = _with_wheels(log, until_s=14.0), Replay().aids
     whole = on_one_clock(given, Replay())
-    found, _ = at_rest(whole, aids)
-    alone, _ = at_rest(whole._replace(wheels=None), aids)
+    found, _ = at_rest(whole, aids, usual_of(whole))
+    alone, _ = at_rest(whole._replace(wheels=None), aids, usual_of(whole))
     speed = np.interp(whole.time_s, log.truth.time_ns * 1e-9, np.linalg.norm(log.truth.v_n, axis=1))
     stands = (speed == 0.0) & (whole.time_s > 14.0)
     assert not np.any(found & (speed > 0.5))

@@ -92,7 +92,7 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
 
 
 def _of_all(bounded: ManyRuns, runs: int) -> tuple[dict[str, Data], np.ndarray, np.ndarray]:
-    """What `_bounded` finds in the first run, and the means of its variance and prior over all."""
+    """Results of `_bounded` for the first run, and means of its variance and prior over all."""
     first: dict[str, Data] = {}
     variance = prior = np.zeros(())
     for begin in range(0, runs, _AT_ONCE):

@@ -3,12 +3,10 @@
 `standstill` looks at the scatter of the samples over a window, as suits a vehicle that stops;
 `still_samples` at their distance from running means, and for how long it has been small, as suits a
 unit in a hand. `robins.ins.alignment.is_static` judges a whole record instead. None of them tells a
-smooth motion at constant speed from rest; `confirmed` asks fixes of it, too.
+smooth motion at constant speed from rest.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +14,6 @@ from robins.ins.increments import Increments
 
 _MEMORY_S = 0.5  # time constant of the running means
 _FEWEST = 5  # samples in the memory, below which nothing can be told
-_CALMER = 0.5  # at rest without fixes: this share of the least unrest seen in motion, or less
 
 
 def moving_statistics(
@@ -114,94 +111,6 @@ def unrest(
     _, spread_force = moving_statistics(dv / dt[:, None], width, first)
     each = np.concatenate([spread_rate / quiet_rate, spread_force / quiet_force], axis=1)
     return np.max(each, axis=1)
-
-
-class Told(NamedTuple):
-    """What M fixes tell of motion; each may prove it, exclude it, or tell nothing."""
-
-    time_s: np.ndarray  # (M,) increasing
-    moves: np.ndarray  # (M,) bool, it moves now, or has within the last second
-    moved_s: np.ndarray  # (M,) beginning of the shortest time in which it has moved; NaN where none
-    rests_s: np.ndarray  # (M,) of the shortest time in which it has not moved; NaN where none
-
-
-class Known(NamedTuple):
-    """What is known of the record before a piece of it."""
-
-    calmest: float = np.inf  # least unrest in motion, by the intervals that begin before `since_s`
-    quiet_s: float = -np.inf  # last time before `since_s` at which the samples were not quiet
-    since_s: float = -np.inf  # before, statistics over windows lack samples
-
-
-NOTHING = Known()
-
-
-def confirmed(
-    still: np.ndarray,
-    unrest: np.ndarray,
-    time_s: np.ndarray,
-    told: Told,
-    wait_s: float,
-    known: Known = NOTHING,
-) -> np.ndarray:
-    """Which samples that look still are: a vehicle on a smooth road looks like one at rest.
-
-    The last fix decides, where it proves motion, or excludes it for a time that began after the
-    samples became quiet. Where it does neither, since it is old or its noise is large, a sample
-    counts as still only if it is plainly calmer than the unit was in any interval before, between
-    two fixes that said, as did the next, that it moves; if there was none, spread alone tells
-    nothing. Nothing of the future is used.
-
-    Args:
-        still: (N,) bool, by the spread of the samples.
-        unrest: (N,) the spread itself, in any unit.
-        time_s: (N,) increasing times of the samples.
-        told: what fixes tell.
-        wait_s: how long a fix tells it.
-        known: what was known before these.
-
-    Returns:
-        (N,) bool.
-    """
-    if len(told.time_s) == 0:
-        return still & (unrest < (0.0 if known.calmest == np.inf else _CALMER * known.calmest))
-    began = quiet_since(still, time_s, known)
-    last = np.searchsorted(told.time_s, time_s + 1e-9, side="right") - 1
-    at = np.maximum(last, 0)
-    recent = (last >= 0) & (time_s - told.time_s[at] <= wait_s)
-    moving = recent & (told.moves[at] | (told.moved_s[at] >= began))
-    rests = recent & (told.rests_s[at] >= began)
-    least = calmest_in_motion(unrest, time_s, told, wait_s, known)
-    return still & ~moving & (rests | (unrest < _CALMER * least[last + 1]))
-
-
-def quiet_since(still: np.ndarray, time_s: np.ndarray, known: Known = NOTHING) -> np.ndarray:
-    """(N,) last time up to each sample at which the samples were not quiet; arguments as above."""
-    quiet = still | (time_s < known.since_s)
-    return np.maximum(np.maximum.accumulate(np.where(quiet, -np.inf, time_s)), known.quiet_s)
-
-
-def calmest_in_motion(
-    unrest: np.ndarray,
-    time_s: np.ndarray,
-    told: Told,
-    wait_s: float,
-    known: Known = NOTHING,
-) -> np.ndarray:
-    """(M + 1,) least unrest in motion as it is known after so many fixes; 0 where it is not.
-
-    Arguments as of `confirmed`.
-    """
-    fix_s, moves = told.time_s, told.moves
-    edges = np.searchsorted(time_s, fix_s)
-    least = np.full(len(fix_s) + 1, known.calmest)
-    for k in range(1, len(fix_s) - 1):
-        begin, end = edges[k - 1], edges[k]
-        is_new = fix_s[k - 1] >= known.since_s and fix_s[k] - fix_s[k - 1] <= wait_s
-        if is_new and begin < end and np.all(moves[k - 1 : k + 2]):
-            least[k + 2] = np.min(unrest[begin:end])
-    least = np.minimum.accumulate(least)
-    return np.where(np.isfinite(least), least, 0.0)
 
 
 def still_samples(

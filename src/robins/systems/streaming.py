@@ -139,6 +139,7 @@ def refuse_units(gyro: np.ndarray, accel: np.ndarray) -> None:
         raise LiveError(what, "accel", "multiply it by 9.80665")
 
 
+Part = Any  # an object with attributes
 LiveT = TypeVar("LiveT", bound="Live")
 
 
@@ -218,7 +219,7 @@ def _made_again(cls: type[LiveT], parameters: str, state: Mapping[str, Any]) -> 
     return made
 
 
-def _state_of(part: Any) -> dict[str, Any]:
+def _state_of(part: Part) -> dict[str, Any]:
     """Attributes of an object and of its parts, but for parameters and counts."""
     return {
         name: _state_of(value) if _is_part(value) else value
@@ -227,7 +228,7 @@ def _state_of(part: Any) -> dict[str, Any]:
     }
 
 
-def _go_on(part: Any, known: Mapping[str, Any]) -> None:
+def _go_on(part: Part, known: Mapping[str, Any]) -> None:
     """Set what `_state_of` found."""
     for name, value in known.items():
         if _is_part(getattr(part, name)):
@@ -236,7 +237,7 @@ def _go_on(part: Any, known: Mapping[str, Any]) -> None:
             setattr(part, name, value)
 
 
-def _is_part(value: Any) -> bool:
+def _is_part(value: Part) -> bool:
     return type(value).__module__.startswith("robins.") and hasattr(value, "__dict__")
 
 

@@ -39,7 +39,6 @@ from robins.filters import OnlineFilter
 from robins.filters.machine import usual
 from robins.ins.blocks import cut, reach_of_rate, usual_width
 from robins.ins.increments import Increments, from_imu
-from robins.ins.rest import NOTHING, Known
 from robins.systems import replaying
 from robins.systems.ins_gnss.live_answers import (
     Navigation,
@@ -174,7 +173,7 @@ class LiveInsGnss(Live):
         self._past: list[Any] = []  # epochs of the longest delay, as plain tuples
         self._states: list[Any] = []  # of the filter at them
         self._outliers: list[Any] = []  # counts of what was refused at them
-        self._known, self._velocities = tuple(NOTHING), False
+        self._known, self._velocities = tuple(self._usual), False
         self._first_fix_s = math.inf
         self.start, self.epoch = "", None
         self.passed: list[Navigation] = []
@@ -386,7 +385,7 @@ class LiveInsGnss(Live):
         assert self._online is not None
         at, log = Epoch(*self._past[-1]), self._log()
         used = np.abs(log.gnss_s - to.time_s) < 1e-9
-        usual = self._usual._replace(known=Known(*self._known))
+        usual = Usual(*self._known)
         steps = steps_of(log, used, at.time_s, np.array([to.time_s]), self.parameters, usual)
         u, y, aux = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], tuple(steps[:3]))
         self.counts["blocks_over_imu_gaps"] += int(np.asarray(u.noise_scale) > 1.0)
@@ -411,8 +410,7 @@ class LiveInsGnss(Live):
         del self._past[:keep], self._states[:keep], self._outliers[:keep]
         begin = self._past[0][0] - self._back_s
         if self._steps[0, 0] < begin - self._back_s:
-            usual = self._usual._replace(known=Known(*self._known))
-            since_s = begin + self._settling_s
+            since_s, usual = begin + self._settling_s, Usual(*self._known)
             self._known = tuple(known_until(self._log(), self.parameters.aids, usual, since_s))
             oldest = begin - 1.5 * max(1.0, self._usual.fix_s) - 1.5 * WAYS_S[-1]
             self._fixes = self._fixes[self._fixes[:, 0] > oldest]

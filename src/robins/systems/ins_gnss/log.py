@@ -21,7 +21,7 @@ from robins.earth import Geodetic
 from robins.errors import require_known
 from robins.filters import Belief
 from robins.ins.blocks import cut, epochs_between, gained_in_window, rate_about, usual_width
-from robins.ins.increments import Increments, usual_interval
+from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsState
 from robins.program.evaluated import evaluated
@@ -32,7 +32,7 @@ from robins.systems import replaying
 from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.parameters import Aids, Replay
 from robins.systems.ins_gnss.recording import Log, in_body_axes, on_one_clock, with_lever_arm
-from robins.systems.ins_gnss.rest import Usual, at_rest
+from robins.systems.ins_gnss.rest import Usual, at_rest, usual_of
 from robins.systems.ins_gnss.robust import (
     AS_TOLD,
     HYPOTHESES,
@@ -88,7 +88,7 @@ def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
         ValueError: no start can be found, or no fix lies in the piece.
     """
     increments = Increments(*(a[rows] for a in whole.increments[:3]))
-    usual = Usual(usual_interval(whole.increments.dt), fix_step_s(whole))
+    usual = usual_of(whole)
     log = whole._replace(increments=increments, time_s=whole.time_s[rows])
     start = find_start(log, parameters.start, parameters.aids, usual)
     begin_s, end_s = float(log.gnss_s[start.fix]), float(log.time_s[-1])
@@ -149,11 +149,6 @@ def steps_of(
     y, aux = measured_fixes(log, used, epochs, rate, usual.fix_s if window_s is None else window_s)
     known, about = measured_rest(log, epochs, rate, p.aids, usual)
     return Steps(Block(blocks.increments, scale), y | known, aux | about, rate)
-
-
-def fix_step_s(log: Log) -> float:
-    """Interval between fixes [s], in the median."""
-    return float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 1.0
 
 
 def first_belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
@@ -349,14 +344,8 @@ def _share_note(answer: Answer, parameters: Replay, fix_step_s: float) -> list[s
     ]
 
 
-class _Opened(NamedTuple):
-    """A log on one clock, cut into what can be navigated, and sentences on what cannot."""
-
-    parameters: Replay
-    log: Log
-    pieces: list[Stretch]
-    problems: list[str]
-    fix_step_s: float  # between fixes, in the median
+# parameters, the log on one clock, pieces to navigate, sentences on others, interval of fixes [s]
+_Opened = tuple[Replay, Log, list[Stretch], list[str], float]
 
 
 def _opened(dataset: Dataset, parameters: Replay) -> _Opened:
@@ -368,7 +357,7 @@ def _opened(dataset: Dataset, parameters: Replay) -> _Opened:
         parameters.update.longest_gap,
         partial(prepare, log, parameters),
     )
-    return _Opened(parameters, log, pieces, problems, fix_step_s(log))
+    return parameters, log, pieces, problems, usual_of(log).fix_s
 
 
 def recorded(dataset: Dataset, parameters: Replay) -> Recorded:
@@ -377,8 +366,8 @@ def recorded(dataset: Dataset, parameters: Replay) -> Recorded:
     Raises:
         ValueError: the log cannot be navigated; the sentence says why and what to do.
     """
-    opened = _opened(dataset, parameters)
-    return Recorded(opened.pieces, partial(contender, opened.parameters, opened.fix_step_s))
+    parameters, _, pieces, _, interval_s = _opened(dataset, parameters)
+    return Recorded(pieces, partial(contender, parameters, interval_s))
 
 
 def replay(
@@ -395,11 +384,11 @@ def replay(
     Raises:
         ValueError: the log cannot be navigated; the sentence says why and what to do.
     """
-    parameters, log, pieces, problems, fix_step_s = _opened(dataset, parameters)
+    parameters, log, pieces, problems, interval_s = _opened(dataset, parameters)
     wanted = filters or parameters.filters
     for name in wanted:
         require_known("filter", name, NAMES, "this system")
-    answers, found, doubts = _answers(pieces, parameters, fix_step_s, wanted, progress)
+    answers, found, doubts = _answers(pieces, parameters, interval_s, wanted, progress)
     epoch_s = replaying.epochs_of(pieces)
     rate, withheld = replaying.end_to_end([(piece.rate_b, piece.withheld) for piece in pieces])
     mount = model.mount_of(parameters.gnss, parameters.aids)

@@ -17,7 +17,7 @@ from robins.program.evaluated import evaluated
 from robins.program.scanned import named_scan
 from robins.systems.ins_gnss.parameters import Aids, Start
 from robins.systems.ins_gnss.recording import Log
-from robins.systems.ins_gnss.rest import Usual, looks_still
+from robins.systems.ins_gnss.rest import Usual, looks_still, usual_of
 
 
 class StartPoint(NamedTuple):
@@ -142,9 +142,9 @@ def find_start(log: Log, start: Start, aids: Aids, usual: Usual | None = None) -
         fast, unknown = _fast_fix(log, start)
         if unknown and log.field_b is None:
             raise ValueError(f"the heading at the start is not known: {unknown}")
+    usual = usual or usual_of(log)
     still, mean_rate = looks_still(log, aids, usual)
-    sample_s = float(np.median(dt)) if usual is None else usual.sample_s
-    width = max(2, round(2.0 * aids.window / sample_s))
+    width = max(2, round(2.0 * aids.window / usual.sample_s))
     mean_force, spread = moving_statistics(dv / dt[:, None], width, log.first)
     # without a course nothing is taken from after the rest that it begins at
     enough = np.append(np.flatnonzero(still)[width : width + 1], len(dt) - 1)[0]
