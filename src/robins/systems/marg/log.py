@@ -9,7 +9,6 @@ import numpy as np
 from robins.dataset import Dataset, ImuTable, MagTable
 from robins.ins.frames import to_ned_frd
 from robins.ins.increments import usual_interval
-from robins.logs.ordering import rows_where
 from robins.systems.marg import model
 from robins.systems.marg.parameters import Magnetometer, Replay
 from robins.systems.marg.path import Path, joined
@@ -67,7 +66,8 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
     """
     table = to_ned_frd(dataset.imu)
     finite = np.all(np.isfinite(table.gyro), axis=1) & np.all(np.isfinite(table.accel), axis=1)
-    imu: ImuTable = rows_where(table, finite)
+    columns = ("time_ns", "gyro", "accel", *(() if table.rows is None else ("rows",)))
+    imu: ImuTable = replace(table, **{name: getattr(table, name)[finite] for name in columns})
     if len(imu) < 2:
         raise ValueError(f"orientation needs two whole inertial samples; this log has {len(imu)}")
     time_ns, gyro = np.asarray(imu.time_ns), np.asarray(imu.gyro, float)
