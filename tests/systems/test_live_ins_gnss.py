@@ -20,6 +20,7 @@ from robins.systems.ins_gnss.robust import navigation
 from robins.systems.streaming import Flag, LiveError
 
 RATE_HZ, FIX_HZ = 50.0, 2.0
+HEADED = Replay.model_validate({"start": {"known_heading": 1.2}})
 
 
 def as_rates(dataset):
@@ -142,7 +143,7 @@ def test_steps_have_the_bits_of_those_of_a_replay(live, log, velocities, monkeyp
     last, parameters = {}, Replay()
     if not velocities:
         log = replace(log, gnss=replace(log.gnss, v_n=None, sigma_v=None))
-        parameters = Replay.model_validate({"start": {"known_heading": 1.2}})
+        parameters = HEADED
         live = LiveInsGnss(parameters, RATE_HZ, FIX_HZ, "ekf")
 
     def noted(piece, used, begin_s, epochs, *others):
@@ -206,6 +207,8 @@ def test_restored_in_between_it_goes_on_to_the_bit(live, log, tmp_path):
     rest, _ = played(again, log, whole[begun:])
     for one, other in zip(rest, answers[begun:], strict=True):
         np.testing.assert_array_equal(vector(one), vector(other))
+        assert (one.flags, one.wrong) == (other.flags, other.wrong)
+        np.testing.assert_equal(one.seen, other.seen)
     assert again.counts == live.counts
     assert again.start == live.start
 
@@ -219,7 +222,11 @@ def test_an_outage_is_bridged_as_the_replay_does(live, log):
     compare(at, stamps, vectors, len(stamps) - 3)
 
 
-def test_nothing_is_compiled_once_it_has_started(live, log):
+@pytest.mark.parametrize("velocities", [True, False])
+def test_nothing_is_compiled_once_it_has_started(live, log, velocities):
+    if not velocities:
+        log = replace(log, gnss=replace(log.gnss, v_n=None, sigma_v=None))
+        live = LiveInsGnss(HEADED, RATE_HZ, FIX_HZ, "ekf")
     whole, compiled = events(log, np.full(len(log.gnss), 0.1)), []
 
     def heard(event, seconds, **told):

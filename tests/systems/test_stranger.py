@@ -107,7 +107,7 @@ def told(fixes=FIXES, moves=MOVES):
 
 
 def asked(unrest, fixes=FIXES, moves=MOVES):
-    return confirmed(QUIET, unrest, TIME, told(fixes, moves), 1.5, USUAL)
+    return confirmed(QUIET, unrest, TIME, [told(fixes, moves)], 1.5, USUAL)
 
 
 def test_fixes_say_whether_what_looks_still_is():
@@ -115,7 +115,7 @@ def test_fixes_say_whether_what_looks_still_is():
     moving = ((TIME >= 10.0) & (TIME < 20.0)) | (TIME >= 30.0)
     np.testing.assert_array_equal(found, ~moving)
     assert not np.any(asked(0.0 * TIME, FIXES[:0], MOVES[:0]))
-    assert not np.any(confirmed(~QUIET, 0.0 * TIME, TIME, told(), 1.5, USUAL))
+    assert not np.any(confirmed(~QUIET, 0.0 * TIME, TIME, [told()], 1.5, USUAL))
 
 
 @pytest.mark.parametrize(("calm", "still"), [(0.9, False), (0.6, False), (0.4, True)])
@@ -140,7 +140,7 @@ def test_standstill_uses_nothing_of_the_future():
             QUIET[until],
             unrest[until],
             TIME[until],
-            told(FIXES[heard][fixes], MOVES[heard][fixes]),
+            [told(FIXES[heard][fixes], MOVES[heard][fixes])],
             1.5,
             USUAL,
         )

@@ -14,6 +14,7 @@ from jaxtyping import Array
 from robins.campaign.machine import with_stack
 from robins.campaign.many_runs import ManyRuns
 from robins.campaign.monte_carlo import contender, reported_rows, whole_case
+from robins.errors import require
 from robins.filters import Belief
 from robins.filters.analysis.bound import bound_along, linearised, used_sensors
 from robins.filters.analysis.observability import (
@@ -93,6 +94,7 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
 
 def _of_all(bounded: ManyRuns, runs: int) -> tuple[dict[str, Data], np.ndarray, np.ndarray]:
     """Results of `_bounded` for the first run, and means of its variance and prior over all."""
+    require(runs > 0, "there must be runs", runs)
     first: dict[str, Data] = {}
     variance = prior = np.zeros(())
     for begin in range(0, runs, _AT_ONCE):

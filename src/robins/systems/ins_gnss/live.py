@@ -12,14 +12,11 @@ at once and a live object has not:
   epoch is a mean about it, and the increment before the last sample is known with the next one. So
   the filter is that much behind, and the answer to a sample is its state carried on over what came
   since, exactly what it predicts; the last increment is made of the samples so far.
-- **The start.** The filter begins as the replay does: level on a quiet window, heading by the
-  course of the first fix that is fast enough or as it is given. With a given heading it waits for
-  rest, at most ten seconds from the first fix on, and then takes the quietest window so far, where
-  a replay takes the quietest of the log. A magnetometer is asked where for 30 s no fix was fast
-  enough; a replay asks it where none of the log is. Answers before are `STARTING`, without numbers.
-- A fix without a number, as of a receiver that sees no satellites, is an epoch, as in a replay.
-- A gap longer than `update.longest_gap` begins anew. `outages` are not looked at: fixes that are
-  not given are not there. Whether velocities are means is a hypothesis of `robust` here as there.
+- **The start.** With a given heading the filter waits for rest, at most ten seconds from the first
+  fix on, and then takes the quietest window so far, where a replay takes the quietest of the log. A
+  magnetometer is asked where for 30 s no fix was fast enough; a replay asks it where none of the
+  log is. Answers before are `STARTING`, without numbers.
+- A gap longer than `update.longest_gap` begins anew. `outages` are not looked at.
 - Rates that a replay takes from the whole log (of samples, of fixes) are told by who makes it.
 """
 
@@ -72,11 +69,9 @@ from robins.systems.streaming import (
 )
 from robins.systems.study import Case
 
-_PATIENCE_S = 0.1
-_AHEAD_S = 10.0  # of the newest sample, by which a fix may be
+_PATIENCE_S, _AHEAD_S = 0.1, 10.0  # of the newest sample, by which a fix may be
 _REST_S, _COURSE_S = 10.0, 30.0  # how long rest is waited for, and a course
-_UNITS_S = 1.0  # of samples, whose size tells their unit
-_MOST_START_S = 600.0  # of samples that the start is sought in
+_UNITS_S, _MOST_START_S = 1.0, 600.0  # of samples: whose size tells their unit, for the start
 
 
 class Epoch(NamedTuple):
@@ -102,7 +97,7 @@ class LiveInsGnss(Live):
     _parameters: ClassVar[type[Any]] = Replay
     _kept: ClassVar[tuple[str, ...]] = (
         "_origin_ns", "_raw_ns", "_raw", "_steps", "_first", "_newest", "_fixes", "_field", "_past",
-        "_outliers", "_known", "_velocities", "start", "_first_fix_s",
+        "_counted", "_told", "_known", "_velocities", "start", "_first_fix_s",
     )  # fmt: skip
     _parts: ClassVar[tuple[str, ...]] = ("_door",)
 
@@ -130,9 +125,12 @@ class LiveInsGnss(Live):
             ValueError: a rate or delay is not positive, or there is no such machine or no causal
                 filter of this name.
         """
-        for what, value in (("rate_hz", rate_hz), ("fix_rate_hz", fix_rate_hz)):
+        positive = {"rate_hz": rate_hz, "fix_rate_hz": fix_rate_hz}
+        for what, value in {**positive, "longest_delay_s": longest_delay_s}.items():
             require(value > 0.0, f"{what} must be positive", value)
-        require(longest_delay_s > 0.0, "longest_delay_s must be positive", longest_delay_s)
+        longest_s = parameters.update.longest_gap
+        what = f"samples at {rate_hz:g} Hz are as far apart as update.longest_gap, {longest_s:g} s"
+        require(rate_hz * longest_s > 1.5, what)
         require(filter not in SMOOTHED, f"{filter} smooths: it needs the whole log")
         made_with = {"fix_rate_hz": fix_rate_hz, "filter": filter, "rate_hz": rate_hz}
         made_with |= {"longest_delay_s": longest_delay_s, "machine": machine or usual()}
@@ -143,9 +141,10 @@ class LiveInsGnss(Live):
         self._delay_s = longest_delay_s
         self._width = usual_width(p.update.longest_block, self._usual.sample_s)
         # what has to be looked back at from the oldest epoch
-        self._settling_s = 2.0 * p.aids.window + 2.0 * self._usual.sample_s  # of moving statistics
+        self._settled = 2 * max(2, round(p.aids.window / self._usual.sample_s)) + 1  # samples
         back = max(p.gnss.velocity_window or 0.0, 1.5, 4.0 * self._usual.fix_s)
-        self._back_s = longest_delay_s + 2.0 * self._reach_s + back + self._settling_s
+        settling_s = 2.0 * p.aids.window + 2.0 * self._usual.sample_s
+        self._back_s = longest_delay_s + 2.0 * self._reach_s + back + settling_s
         asked = contender(p, self._usual.fix_s, filter)
         self._on = partial(online, asked.filter, asked.model, machine=made_with["machine"])
         self._case, self._suspects = asked.case, asked.filter.suspects
@@ -172,7 +171,8 @@ class LiveInsGnss(Live):
         self._field = np.zeros((0, 4))  # time [s] and field [T], until the start
         self._past: list[Any] = []  # epochs of the longest delay, as plain tuples
         self._states: list[Any] = []  # of the filter at them
-        self._outliers: list[Any] = []  # counts of what was refused at them
+        self._counted: list[Any] = []  # by epoch, what was counted there
+        self._told: Any = None  # stamp, vector and sensors of the last step
         self._known, self._velocities = tuple(self._usual), False
         self._first_fix_s = math.inf
         self.start, self.epoch = "", None
@@ -208,8 +208,7 @@ class LiveInsGnss(Live):
         if self._C_bs is not None:
             values = values @ self._C_bs.T
             field = None if field is None else self._C_bs @ field
-        if self._origin_ns is None:
-            self._origin_ns = time
+        self._origin_ns = time if self._origin_ns is None else self._origin_ns
         self._raw_ns, self._raw = [*self._raw_ns, time][-4:], [*self._raw, values.ravel()][-4:]
         if field is not None and not self.start and np.all(np.isfinite(field)):
             self._field = np.concatenate([self._field, [[self._seconds(time), *field]]])
@@ -272,8 +271,7 @@ class LiveInsGnss(Live):
         return "ahead" if row[0] > newest + _AHEAD_S else nothing
 
     def _seconds(self, time_ns: int) -> float:
-        assert self._origin_ns is not None
-        return (time_ns - self._origin_ns) * 1e-9
+        return (time_ns - (self._origin_ns or 0)) * 1e-9
 
     def _integrate(self) -> None:
         """The increment before the last is known with this sample; the last one nearly."""
@@ -316,7 +314,7 @@ class LiveInsGnss(Live):
             told = table_of(f, self._origin_ns or 0, velocities=True)
             log = log._replace(v_n=f[:, 7:10], sigma_v=believed_sigmas(told, gnss)[1])
         if len(self._field):
-            log = log._replace(field_s=self._field[:, 0], field_b=self._field[:, 1:])
+            return log._replace(field_s=self._field[:, 0], field_b=self._field[:, 1:])
         return log
 
     def _advance(self) -> None:
@@ -343,14 +341,15 @@ class LiveInsGnss(Live):
             self._keep(len(rows) // 2)
             rows = self._steps
             self._field = self._field[self._field[:, 0] > rows[0, 0] - 1.0]
+            self._fixes = self._fixes[self._fixes[:, 0] > rows[0, 0]]
+        if int(10.0 * rows[-1, 0]) == int(10.0 * (rows[-1, 0] - rows[-1, 1])):
+            return  # ten times a second are enough
         heard = self._fixes[self._fixes[:, 0] <= rows[-1, 0] - self._reach_s]
         given, waits = p.start.known_heading is not None, rows[-1, 0] - self._first_fix_s
         fast = np.hypot(heard[:, 7], heard[:, 8]) >= p.start.course_speed
         compass = len(self._field) > 0 and waits > _COURSE_S
         if not len(heard) or not (given or compass or np.any(fast)):
             return
-        if int(10.0 * rows[-1, 0]) == int(10.0 * (rows[-1, 0] - rows[-1, 1])):
-            return  # ten times a second are enough
         log = self._log()
         within = self._fixes[:, 0] <= rows[-1, 0] - self._reach_s
         log = log._replace(
@@ -377,7 +376,7 @@ class LiveInsGnss(Live):
         belief = self._case(Case(first_belief(log, found, p), None, {}, {}, None)).start
         self._online = self._on(belief)
         self._past, self._states = [tuple(Epoch(begin_s, begin_s, 0))], [self._online.state]
-        self._outliers = [[]]
+        self._counted = [[]]
         self.start = found.sentence
 
     def _step(self, to: Epoch) -> None:
@@ -388,18 +387,24 @@ class LiveInsGnss(Live):
         usual = Usual(*self._known)
         steps = steps_of(log, used, at.time_s, np.array([to.time_s]), self.parameters, usual)
         u, y, aux = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], tuple(steps[:3]))
-        self.counts["blocks_over_imu_gaps"] += int(np.asarray(u.noise_scale) > 1.0)
         found = np.asarray(self._online.step(y, u, aux, keep=kept))
         time_ns = round(to.time_s * 1e9) + (self._origin_ns or 0)
-        answer = answer_of(time_ns, found, Flag(0), sorted(y), self._suspects)
-        outliers = [f"outliers_{name}" for name in outliers_of(answer)]
-        self.counts.update(outliers)
-        self.epoch = answer._replace(flags=Flag.OUTLIER if outliers else Flag(0))
+        self._told = time_ns, found, sorted(y)
+        self.epoch = self._epoch()
         self.passed.append(self.epoch)
+        counted = [f"outliers_{name}" for name in outliers_of(self.epoch)]
+        counted += ["blocks_over_imu_gaps"] * int(np.asarray(u.noise_scale) > 1.0)
+        self.counts.update(counted)
         self._past.append(tuple(to))
-        self._outliers.append(outliers)
+        self._counted.append(counted)
         self._states.append(self._online.state)
         self._forget()
+
+    def _epoch(self) -> Navigation:
+        """Answer of the last step of the filter."""
+        time_ns, found, sensors = self._told
+        answer = answer_of(time_ns, found, Flag(0), sensors, self._suspects)
+        return answer._replace(flags=Flag.OUTLIER if outliers_of(answer) else Flag(0))
 
     def _forget(self) -> None:
         """Drop what is older than the longest delay, in large pieces."""
@@ -407,14 +412,18 @@ class LiveInsGnss(Live):
         first = next(k for k, e in enumerate(self._past) if e[0] >= now - self._delay_s)
         # one epoch before it is where a fix of that age is counted from
         keep = max(first - 1, 0)
-        del self._past[:keep], self._states[:keep], self._outliers[:keep]
+        del self._past[:keep], self._states[:keep], self._counted[:keep]
         begin = self._past[0][0] - self._back_s
         if self._steps[0, 0] < begin - self._back_s:
-            since_s, usual = begin + self._settling_s, Usual(*self._known)
+            first = int(np.searchsorted(self._steps[:, 0], begin, side="right"))
+            settled = min(first + self._settled, len(self._steps) - 1)
+            since_s, usual = float(self._steps[settled, 0]), Usual(*self._known)
             self._known = tuple(known_until(self._log(), self.parameters.aids, usual, since_s))
-            oldest = begin - 1.5 * max(1.0, self._usual.fix_s) - 1.5 * WAYS_S[-1]
-            self._fixes = self._fixes[self._fixes[:, 0] > oldest]
-            self._keep(int(np.searchsorted(self._steps[:, 0], begin, side="right")))
+            # a way over an outage begins at the last place before it
+            far = self._fixes[:, 0] <= begin - WAYS_S[-1] - 2.0 * max(1.0, self._usual.fix_s)
+            placed = np.flatnonzero(far & np.all(np.isfinite(self._fixes[:, 1:3]), axis=1))
+            self._fixes = self._fixes[placed[-1] if len(placed) else 0 :]
+            self._keep(first)
 
     def _go_back(self, time_s: float) -> None:
         """Return to the last epoch before a fix was known."""
@@ -428,15 +437,15 @@ class LiveInsGnss(Live):
                 keep = k + 1
         if keep < len(self._past):
             self.counts["steps_again"] += len(self._past) - keep
-            self.counts.subtract(chain(*self._outliers[keep:]))
-            del self._past[keep:], self._states[keep:], self._outliers[keep:]
+            self.counts.subtract(chain(*self._counted[keep:]))
+            self.counts = +self.counts  # without what was counted in these alone
+            del self._past[keep:], self._states[keep:], self._counted[keep:]
             assert self._online is not None
             self._online.state = self._states[-1]
 
     def _answer(self, time_ns: int, mark: Flag) -> Navigation:
         if self._online is None or not len(self._newest):
-            none = np.full(9, np.nan)
-            nan = math.nan
+            none, nan = np.full(9, np.nan), math.nan
             starting = mark | Flag.STARTING
             return Navigation(time_ns, none[:4], none[:3], nan, nan, nan, none, starting)
         at = Epoch(*self._past[-1])
@@ -468,10 +477,12 @@ class LiveInsGnss(Live):
         C, self._C_bs = self._C_bs, None
         last = math.ceil((3.0 + 2.0 * p.aids.window + p.update.longest_block) * 1e9 / step)
         try:
-            for k in range(last):
+            for k in range(10 * last):
                 if k and k % second == 0:
                     self.push_fix((k - 1) * step, 0.7, 0.1, 100.0, ones, 0.0 * ones, ones)
                 self.push_imu(k * step, np.zeros(3), np.array([0.0, 0.0, -9.8]))
+                if k >= last and self.epoch is not None:
+                    break
         finally:
             self.parameters, self._C_bs = p, C
             self._compiled_state = None if self._online is None else self._online.state
@@ -486,3 +497,4 @@ class LiveInsGnss(Live):
         like = self._compiled_state
         self._states = [as_before(like, state[k * each : (k + 1) * each]) for k in range(count)]
         self._online = self._on(self._states[-1])
+        self.epoch = None if self._told is None else self._epoch()

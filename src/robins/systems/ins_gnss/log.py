@@ -201,13 +201,12 @@ def measured_rest(
     log: Log, epochs: np.ndarray, rate: np.ndarray, aids: Aids, usual: Usual
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Measurements of what is known without a receiver: standing still, or not slipping."""
-    still, mean_rate = at_rest(log, aids, usual)
-    last = np.minimum(np.searchsorted(log.time_s, epochs - 1e-9), len(log.time_s) - 1)
-    stands = still[last][:, None]
+    still, mean_rate = at_rest(log, aids, usual, epochs)
+    stands = still[:, None]
     y: dict[str, Any] = {}
     if aids.zero_velocity:
         y[model.STANDSTILL] = np.where(stands, np.zeros((len(epochs), 3)), np.nan)
-        y[model.STILL_RATE] = np.where(stands, mean_rate[last], np.nan)
+        y[model.STILL_RATE] = np.where(stands, mean_rate, np.nan)
     if aids.non_holonomic:
         y[model.ROAD] = np.where(stands, np.nan, np.zeros((len(epochs), 2)))
     about: dict[str, Any] = {model.ROAD: rate} if aids.non_holonomic else {}

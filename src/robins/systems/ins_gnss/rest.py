@@ -8,12 +8,12 @@ is beyond its noise, motion is.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from robins.earth import Geodetic
+from robins.earth.wgs84 import A_M, E2
 from robins.ins.increments import usual_interval
 from robins.ins.rest import standstill, unrest
 from robins.systems.ins_gnss.parameters import Aids
@@ -45,85 +45,116 @@ class Told(NamedTuple):
     """Evidence of motion in each of M fixes, which may prove it, exclude it, or tell nothing."""
 
     time_s: np.ndarray  # (M,) increasing
-    moves: np.ndarray  # (M,) bool, it moves now, or has within the last second
+    moves: np.ndarray  # (M,) bool, it moves now, or did within about a second
     moved_s: np.ndarray  # (M,) beginning of the shortest time in which it has moved; NaN where none
     rests_s: np.ndarray  # (M,) of the shortest time in which it has not moved; NaN where none
 
 
 # (N,) bool still by spread, (N, 3) mean rate [rad/s], (N,) unrest, evidence, how long it holds [s]
-_Shown = tuple[np.ndarray, np.ndarray, np.ndarray, Told, float]
+_Shown = tuple[np.ndarray, np.ndarray, np.ndarray, list[Told], float]
 
 
-def at_rest(log: Log, aids: Aids, usual: Usual) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) bool, whether the vehicle certainly stands still at each increment; (N, 3) mean rate."""
+def at_rest(
+    log: Log, aids: Aids, usual: Usual, at_s: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whether the vehicle certainly stands still (E,), and its mean rate (E, 3) [rad/s].
+
+    Args:
+        log: samples and fixes.
+        aids: what rest is.
+        usual: of the whole log.
+        at_s: (E,) times; None: the end of each increment.
+    """
     still, mean_rate, unrest_, told, wait_s = _shown(log, aids, usual)
-    return confirmed(still, unrest_, log.time_s, told, wait_s, usual), mean_rate
+    rows = rows_at(log.time_s, at_s)
+    return confirmed(still, unrest_, log.time_s, told, wait_s, usual, at_s), mean_rate[rows]
 
 
 def looks_still(log: Log, aids: Aids, usual: Usual) -> tuple[np.ndarray, np.ndarray]:
     """As `at_rest`, but where fixes that come say nothing, the spread of the samples decides."""
     still, mean_rate, unrest_, told, wait_s = _shown(log, aids, usual)
-    silent = np.isnan(told.moved_s) & ~told.moves
-    told = told._replace(rests_s=np.where(silent, np.inf, told.rests_s))
+
+    def lenient(one: Told) -> Told:
+        silent = np.isnan(one.moved_s) & ~one.moves
+        return one._replace(rests_s=np.where(silent, np.inf, one.rests_s))
+
+    told = list(map(lenient, told))
     return confirmed(still, unrest_, log.time_s, told, wait_s, usual), mean_rate
 
 
 def known_until(log: Log, aids: Aids, usual: Usual, since_s: float) -> Usual:
     """Numbers of a log of which only the part after a time is kept."""
     still, _, unrest_, told, wait_s = _shown(log, aids, usual)
-    # with the two fixes that the last of these intervals is known by
-    count = int(np.sum(told.time_s < since_s)) + 2
-    old = Told(*(a[:count] for a in told))
-    least = calmest_in_motion(unrest_, log.time_s, old, wait_s, usual)[-1]
+    least = usual.calmest
+    for one in told:
+        # with the two fixes that the last of these intervals is known by
+        old = Told(*(a[: int(np.sum(one.time_s < since_s)) + 2] for a in one))
+        found = calmest_in_motion(unrest_, log.time_s, old, wait_s, usual, since_s)[-1]
+        least = min(least, float(found))
     last = max(int(np.searchsorted(log.time_s, since_s)) - 1, 0)
-    began = quiet_since(still, log.time_s, usual)[last]
-    calmest = float(least) if least > 0.0 else np.inf
-    return usual._replace(calmest=calmest, quiet_s=float(began), since_s=since_s)
+    began = float(quiet_since(still, log.time_s, usual)[last])
+    return usual._replace(calmest=least, quiet_s=began, since_s=since_s)
+
+
+def rows_at(time_s: np.ndarray, at_s: np.ndarray | None) -> np.ndarray:
+    """(E,) rows of the increments, which end at times (N,), that hold times (E,); None: all."""
+    if at_s is None:
+        return np.arange(len(time_s))
+    return np.minimum(np.searchsorted(time_s, at_s - 1e-9), len(time_s) - 1)
 
 
 def _shown(log: Log, aids: Aids, usual: Usual) -> _Shown:
-    args = log.increments, *aids.quiet, usual.sample_s, log.first
-    told, wait_s = told_by(log, aids.moving_speed), 1.5 * max(1.0, usual.fix_s)
-    return *standstill(*args), unrest(*args), told, wait_s
+    args, wait_s = (*aids.quiet, usual.sample_s, log.first), 1.5 * max(1.0, usual.fix_s)
+    told = told_by(log, aids.moving_speed, wait_s)
+    return *standstill(log.increments, *args), unrest(log.increments, *args), told, wait_s
 
 
 def confirmed(
     still: np.ndarray,
     unrest: np.ndarray,
     time_s: np.ndarray,
-    told: Told,
+    told: Sequence[Told],
     wait_s: float,
     usual: Usual,
+    at_s: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Find the samples that look still and are: a smooth road looks like rest.
+    """Find the times at which what looks still is: a smooth road looks like rest.
 
-    The last fix decides, where it proves motion, or excludes it for a time that began after the
-    samples became quiet. Where it does neither, since it is old or its noise is large, a sample
-    counts as still only if it is plainly calmer than the unit was in any interval before, between
-    two fixes that said, as did the next, that it moves; if there was none, spread alone tells
-    nothing. Nothing of the future is used.
+    The last fix of each source decides, where it proves motion, or excludes it for a time that
+    began after the samples became quiet; one that proves motion is enough. Where none does either,
+    since it is old or its noise is large, the unit counts as still only if it is plainly calmer
+    than it was in any interval before, between two fixes that said, as did the next, that it moves;
+    if there was none, spread alone tells nothing. Nothing of the future is used.
 
     Args:
         still: (N,) bool, by the spread of the samples.
         unrest: (N,) the spread itself, in any unit.
         time_s: (N,) increasing times of the samples.
-        told: what fixes tell.
+        told: evidence by source.
         wait_s: how long a fix tells it.
         usual: what was known before these.
+        at_s: (E,) times; None: those of the samples.
 
     Returns:
-        (N,) bool.
+        (E,) bool.
     """
-    if len(told.time_s) == 0:
-        return still & (unrest < (0.0 if usual.calmest == np.inf else _CALMER * usual.calmest))
-    began = quiet_since(still, time_s, usual)
-    last = np.searchsorted(told.time_s, time_s + 1e-9, side="right") - 1
-    at = np.maximum(last, 0)
-    recent = (last >= 0) & (time_s - told.time_s[at] <= wait_s)
-    moving = recent & (told.moves[at] | (told.moved_s[at] >= began))
-    rests = recent & (told.rests_s[at] >= began)
-    least = calmest_in_motion(unrest, time_s, told, wait_s, usual)
-    return still & ~moving & (rests | (unrest < _CALMER * least[last + 1]))
+    rows = rows_at(time_s, at_s)
+    at_s = time_s if at_s is None else at_s
+    began = quiet_since(still, time_s, usual)[rows]
+    moving, rests = np.zeros((2, len(rows)), bool)
+    least = np.full(len(rows), usual.calmest)
+    for one in told:
+        if not len(one.time_s):
+            continue
+        count = np.searchsorted(one.time_s, at_s + 1e-9, side="right")
+        last = np.maximum(count - 1, 0)
+        recent = (count > 0) & (at_s - one.time_s[last] <= wait_s)
+        moving |= recent & (one.moves[last] | (one.moved_s[last] >= began))
+        rests |= recent & (one.rests_s[last] >= began)
+        calmest = calmest_in_motion(unrest, time_s, one, wait_s, usual)
+        least = np.minimum(least, calmest[count])
+    calm = np.isfinite(least) & (unrest[rows] < _CALMER * least)
+    return still[rows] & ~moving & (rests | calm)
 
 
 def quiet_since(still: np.ndarray, time_s: np.ndarray, usual: Usual) -> np.ndarray:
@@ -138,32 +169,40 @@ def calmest_in_motion(
     told: Told,
     wait_s: float,
     usual: Usual,
+    until_s: float = np.inf,
 ) -> np.ndarray:
-    """(M + 1,) least unrest in motion as it is known after so many fixes; 0 where it is not.
+    """(M + 1,) least unrest in motion as it is known after so many fixes; infinite: not known.
 
-    Arguments as of `confirmed`.
+    Arguments are those of `confirmed`. Only intervals that begin before `until_s` count; where it
+    is given, the last one does not wait for the fix after it.
     """
     fix_s, moves = told.time_s, told.moves
-    edges = np.searchsorted(time_s, fix_s)
     least = np.full(len(fix_s) + 1, usual.calmest)
-    for k in range(1, len(fix_s) - 1):
-        begin, end = edges[k - 1], edges[k]
-        is_new = fix_s[k - 1] >= usual.since_s and fix_s[k] - fix_s[k - 1] <= wait_s
-        if is_new and begin < end and np.all(moves[k - 1 : k + 2]):
-            least[k + 2] = np.min(unrest[begin:end])
-    least = np.minimum.accumulate(least)
-    return np.where(np.isfinite(least), least, 0.0)
+    if len(fix_s) < 2:
+        return least
+    edges = np.searchsorted(time_s, fix_s)
+    lowest = np.minimum.reduceat(np.append(unrest, np.inf), edges)[:-1]
+    counts = (edges[:-1] < edges[1:]) & (np.diff(fix_s) <= wait_s) & moves[:-1] & moves[1:]
+    counts &= np.append(moves[2:], until_s < np.inf)  # the next one says so too
+    counts &= (fix_s[:-1] >= usual.since_s) & (fix_s[:-1] < until_s)
+    lowest = np.where(counts, lowest, np.inf)
+    least[3:] = lowest[:-1]  # from the next one on
+    least[-1] = min(least[-1], lowest[-1])
+    return np.minimum.accumulate(least)
 
 
-def told_by(log: Log, speed: float) -> Told:
-    """Evidence of fixes and wheels of motion faster than a speed [m/s]."""
-    told = _by_velocity(log, speed) if log.gnss.v_n is not None else _by_way(log, speed)
-    if log.wheels is None:
-        return told
-    wheels = _by_speed(log.wheels.time_s, np.abs(log.wheels.speed), log.wheels.sigma, speed)
-    both = [np.concatenate(pair) for pair in zip(told, wheels, strict=True)]
-    order = np.argsort(both[0], kind="stable")
-    return Told(*(a[order] for a in both))
+def told_by(log: Log, speed: float, wait_s: float) -> list[Told]:
+    """Evidence of motion faster than a speed [m/s] by velocities, by ways and by wheels."""
+    told = [_by_way(log, speed, wait_s)]
+    if log.v_n is not None and log.sigma_v is not None:
+        known = ~log.withheld & np.all(np.isfinite(log.v_n[:, :2]), axis=1)
+        size = np.hypot(*log.v_n[known, :2].T)
+        noise = np.max(log.sigma_v[known, :2], axis=1)
+        told.append(_by_speed(log.gnss_s[known], size, noise, speed))
+    if log.wheels is not None:
+        w = log.wheels
+        told.append(_by_speed(w.time_s, np.abs(w.speed), w.sigma, speed))
+    return told
 
 
 def _by_speed(time_s: np.ndarray, size: np.ndarray, sigma: np.ndarray, speed: float) -> Told:
@@ -173,33 +212,34 @@ def _by_speed(time_s: np.ndarray, size: np.ndarray, sigma: np.ndarray, speed: fl
     return Told(time_s, moves, *(np.where(x, time_s, np.nan) for x in (moves, rests)))
 
 
-def _by_velocity(log: Log, speed: float) -> Told:
-    """Evidence of the velocities of fixes."""
-    g = log.gnss
-    assert g.v_n is not None
-    assert g.sigma_v is not None
-    size = np.hypot(g.v_n[:, 0], g.v_n[:, 1])
-    known = ~log.withheld & np.isfinite(size)
-    return _by_speed(log.gnss_s[known], size[known], np.max(g.sigma_v[known, :2], axis=1), speed)
-
-
-def _by_way(log: Log, speed: float) -> Told:
-    """Evidence of the ways between fixes, where the receiver gives no velocity."""
+def _by_way(log: Log, speed: float, wait_s: float) -> Told:
+    """Evidence of the ways to fixes without a velocity, from fixes before them."""
     g = log.gnss
     known = ~log.withheld & np.isfinite(g.lat_rad) & np.isfinite(g.lon_rad)
-    time_s, noise = log.gnss_s[known], np.max(g.sigma_m[known, :2], axis=1)
-    place = Geodetic(*map(jnp.asarray, (g.lat_rad[known], g.lon_rad[known], 0.0 * time_s)))
+    time_s, noise = log.gnss_s[known], np.max(log.sigma_m[known, :2], axis=1)
+    lat, lon = g.lat_rad[known], g.lon_rad[known]
     moves = np.zeros(len(time_s), bool)
     moved_s, rests_s = np.full((2, len(time_s)), np.nan)
     for way_s in WAYS_S if len(time_s) else ():
         before = np.searchsorted(time_s, time_s - way_s + 1e-6, side="right") - 1
         before = np.maximum(before, 0)
-        there = Geodetic(place.lat[before], place.lon[before], place.alt[before])
-        way = np.hypot(*np.asarray(there.local(place)).T[:2])
+        way = _distance(lat, lat - lat[before], lon - lon[before])
         lasted, spread = time_s - time_s[before], _SIGMAS * np.hypot(noise, noise[before])
         moved = (lasted > 0.0) & (way > np.maximum(speed * lasted, spread))
         rested = (lasted > 0.0) & ~moved & (way + spread < _SEEN * speed * lasted)
-        moves |= moved & (way_s == WAYS_S[0])
+        if way_s == WAYS_S[0]:
+            moves = moved & (lasted <= way_s + wait_s)
         moved_s = np.fmax(moved_s, np.where(moved, time_s[before], np.nan))
         rests_s = np.fmax(rests_s, np.where(rested, time_s[before], np.nan))
-    return Told(time_s, moves, moved_s, rests_s)
+    alone = np.ones(len(time_s), bool)
+    if log.v_n is not None:
+        alone = ~np.all(np.isfinite(log.v_n[known, :2]), axis=1)
+    return Told(*(a[alone] for a in (time_s, moves, moved_s, rests_s)))
+
+
+def _distance(lat: np.ndarray, dlat: np.ndarray, dlon: np.ndarray) -> np.ndarray:
+    """(M,) m, of places that differ by so little [rad] that their chart is flat."""
+    square = 1.0 - E2 * np.sin(lat) ** 2
+    across = A_M / np.sqrt(square)  # radius of curvature in the prime vertical
+    along = across * (1.0 - E2) / square  # in the meridian
+    return np.hypot(along * dlat, across * np.cos(lat) * np.angle(np.exp(1j * dlon)))

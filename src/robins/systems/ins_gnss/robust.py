@@ -14,7 +14,8 @@ hypotheses of an interacting multiple model (`robins.filters.composite.imm`):
     begins           from this step on positions are off: o is new, of `OFF_M`
     lasts            they are still off: o stays, but for a walk. Fixes tell the motion, not where
     ends             they are right again, and the state was: o is dropped
-    wild             this position alone says nothing, as one at the other end of the Earth
+    wild             this position alone says nothing, as one at the other end of the Earth; what
+                     was known of o is dropped with it
     strayed          they were right, and the state was off: o is added to the position and dropped
 
 Whether positions that stay away are off or the state is, both are weighed: the stated covariance is

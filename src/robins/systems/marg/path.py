@@ -182,13 +182,15 @@ class Path:
         if more == 0 and after_gap(np.diff(time_ns[-2:]) * 1e-9, self._usual_s)[-1]:
             return False  # the next stamp shows whether samples are missing
         for axis in np.flatnonzero(np.any(full[begin:needed], axis=0)):
-            column = full[:, axis]
-            last = begin + int(np.flatnonzero(column[begin:needed])[-1])
-            below = np.flatnonzero(~column[:last])
-            first = int(below[-1]) + 1 if len(below) else 0
+            last = begin + int(np.flatnonzero(full[begin:needed, axis])[-1])
+            # a longer peak is not put back, so no more of it has to be looked at
+            low, high = max(0, last - self._most_context), last + self._most_context + FLANK
+            column = full[:high, axis]
+            below = low + np.flatnonzero(~column[low:last])
+            first = int(below[-1]) + 1 if len(below) else low
             after = last + np.flatnonzero(~column[last:])
             if len(after) == 0:
-                if (time_ns[-1] - time_ns[first]) * 1e-9 <= LONGEST_S:
+                if (time_ns[len(column) - 1] - time_ns[first]) * 1e-9 <= LONGEST_S:
                     return False
             elif len(column) < after[0] + FLANK and not np.any(column[after[0] :]):
                 return False
