@@ -57,7 +57,7 @@ _Shown = tuple[np.ndarray, np.ndarray, np.ndarray, list[Told], float]
 def at_rest(
     log: Log, aids: Aids, usual: Usual, at_s: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether the vehicle certainly stands still (E,), and its mean rate (E, 3) [rad/s].
+    """Tell whether the vehicle certainly stands still (E,), and its mean rate (E, 3) [rad/s].
 
     Args:
         log: samples and fixes.
