@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from test_live_marg import PARAMETERS, RATE_HZ, made_log
 
-from robins.systems.marg.path import Path, joined
+from robins.systems.marg.path import SamplePath, joined
 from robins.systems.marg.saturation import levels
 
 
@@ -39,7 +39,7 @@ def test_chunks_of_any_size_give_the_same_bits(kind, of, known):
     parameters = PARAMETERS.model_copy(update={"update": update})
     ends = levels(rows[:, :3], 1.0 / RATE_HZ) if known else None
     whole, *others = (
-        taken(Path(parameters, 1.0 / RATE_HZ, kind, ends), time_ns, rows, size)
+        taken(SamplePath(parameters, 1.0 / RATE_HZ, kind, ends), time_ns, rows, size)
         for size in (len(rows), 1000, 7, 1)
     )
     assert kind != "rate" or whole[2]["imu_bridged"] > 20

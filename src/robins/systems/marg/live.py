@@ -35,7 +35,7 @@ from robins.ins.increments import Increments
 from robins.linalg.scalars import product
 from robins.systems.marg import model, monitor
 from robins.systems.marg.parameters import Replay
-from robins.systems.marg.path import Path, Steps
+from robins.systems.marg.path import SamplePath, Steps
 from robins.systems.marg.replay import filter_of, stated_sigma
 from robins.systems.marg.start import first_belief, first_look
 from robins.systems.replaying import kept
@@ -158,7 +158,7 @@ class LiveMarg(Live):
         self._starting = True  # until the filter has come to the newest sample
         self._open = 0  # samples without a block, up to the last with a gyro at its end
         self._online = None
-        self._path = Path(self.parameters, self._usual_s)
+        self._path = SamplePath(self.parameters, self._usual_s)
         self._path.counts = self.counts
 
     def _compile(self) -> None:

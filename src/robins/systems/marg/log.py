@@ -11,7 +11,7 @@ from robins.ins.frames import to_ned_frd
 from robins.ins.increments import usual_interval
 from robins.systems.marg import model
 from robins.systems.marg.parameters import Magnetometer, Replay
-from robins.systems.marg.path import Path, joined
+from robins.systems.marg.path import SamplePath, joined
 from robins.systems.marg.saturation import levels
 from robins.systems.marg.start import FirstLook
 from robins.systems.replaying import Piece
@@ -77,7 +77,7 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
         field[1:] = at_samples(time_ns, field_ns, readings)
     dt = np.diff(time_ns) * 1e-9
     ends = levels(gyro, float(np.median(dt))) if imu.kind == "rate" else None
-    path = Path(parameters, usual_interval(dt), imu.kind, ends)
+    path = SamplePath(parameters, usual_interval(dt), imu.kind, ends)
     steps = joined([*path.push(time_ns, np.hstack([gyro, imu.accel, field])), *path.finish()])
     found_start = path.start(is_whole=True)
     assert found_start is not None

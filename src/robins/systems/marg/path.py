@@ -47,7 +47,7 @@ class Steps(NamedTuple):
     samples: model.Samples  # a block that is not full ends in increments of no length
 
 
-class Path:
+class SamplePath:
     """Samples to steps of the filter (see the module).
 
     Attributes:
