@@ -53,8 +53,8 @@ class Flag(IntFlag):
     SATURATED = 8  # a sensor is at the end of its range in this sample
     DISTURBED = 16  # the last look at the magnetometer was refused
     DOUBTFUL = 32  # states or innovations contradict what was assumed
-    OUTLIER = 128  # the filter refused a measurement of its last step
     BEHIND = 64  # the filter waits for what this sample alone cannot say; the gyros carry on
+    OUTLIER = 128  # the filter refused a measurement of its last step
 
 
 class Door:

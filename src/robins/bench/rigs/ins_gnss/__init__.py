@@ -22,7 +22,7 @@ from robins.scenario import Quantity, default
 
 __all__ = ["FLAGS", "RIG", "SUSPECTS", "WIRE"]
 
-FLAGS = ("starting", "refused", "rest", "saturated", "disturbed", "doubtful", "behind")
+FLAGS = ("starting", "refused", "rest", "saturated", "disturbed", "doubtful", "behind", "outlier")
 """Bits of `state.flags`, from the lowest: `robins.systems.streaming.Flag`."""
 SUSPECTS = "imu", "gnss_position"
 """Instruments in `wrong`, as `robins.systems.ins_gnss.model` names them."""
