@@ -17,7 +17,7 @@ from robins.systems.ins_gnss import SYSTEM, Drive, Replay, drive_dataset, replay
 from robins.systems.ins_gnss.log import prepare
 from robins.systems.ins_gnss.model import ins_gnss_model
 from robins.systems.ins_gnss.recording import TYRES, in_body_axes, on_one_clock
-from robins.systems.ins_gnss.rest import Told, Usual, at_rest, confirmed, usual_of
+from robins.systems.ins_gnss.rest import Evidence, Usual, at_rest, confirmed, usual_of
 from robins.systems.ins_gnss.robust import (
     AS_TOLD,
     HYPOTHESES,
@@ -103,7 +103,7 @@ MOVES = ((FIXES >= 10.0) & (FIXES < 20.0)) | (FIXES >= 30.0)
 
 def told(fixes=FIXES, moves=MOVES):
     """Fixes that are certain of each instant."""
-    return Told(fixes, moves, np.where(moves, fixes, np.nan), np.where(moves, np.nan, fixes))
+    return Evidence(fixes, moves, np.where(moves, fixes, np.nan), np.where(moves, np.nan, fixes))
 
 
 def asked(unrest, fixes=FIXES, moves=MOVES):

@@ -97,7 +97,7 @@ class LiveInsGnss(Live):
     _parameters: ClassVar[type[Any]] = Replay
     _kept: ClassVar[tuple[str, ...]] = (
         "_origin_ns", "_raw_ns", "_raw", "_steps", "_first", "_newest", "_fixes", "_field", "_past",
-        "_counted", "_told", "_known", "_velocities", "start", "_first_fix_s",
+        "_counted", "_last_step", "_known", "_velocities", "start", "_first_fix_s",
     )  # fmt: skip
     _parts: ClassVar[tuple[str, ...]] = ("_door",)
 
@@ -129,8 +129,8 @@ class LiveInsGnss(Live):
         for what, value in {**positive, "longest_delay_s": longest_delay_s}.items():
             require(value > 0.0, f"{what} must be positive", value)
         longest_s = parameters.update.longest_gap
-        what = f"samples at {rate_hz:g} Hz are as far apart as update.longest_gap, {longest_s:g} s"
-        require(rate_hz * longest_s > 1.5, what)
+        what = f"update.longest_gap, {longest_s:g} s, must be 1.5 intervals of samples or more, at"
+        require(rate_hz * longest_s > 1.5, f"{what} {rate_hz:g} Hz {1.5 / rate_hz:.3g} s")
         require(filter not in SMOOTHED, f"{filter} smooths: it needs the whole log")
         made_with = {"fix_rate_hz": fix_rate_hz, "filter": filter, "rate_hz": rate_hz}
         made_with |= {"longest_delay_s": longest_delay_s, "machine": machine or usual()}
@@ -172,7 +172,7 @@ class LiveInsGnss(Live):
         self._past: list[Any] = []  # epochs of the longest delay, as plain tuples
         self._states: list[Any] = []  # of the filter at them
         self._counted: list[Any] = []  # by epoch, what was counted there
-        self._told: Any = None  # stamp, vector and sensors of the last step
+        self._last_step: Any = None  # stamp, vector and sensors of the last step
         self._known, self._velocities = tuple(self._usual), False
         self._first_fix_s = math.inf
         self.start, self.epoch = "", None
@@ -389,7 +389,7 @@ class LiveInsGnss(Live):
         u, y, aux = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], tuple(steps[:3]))
         found = np.asarray(self._online.step(y, u, aux, keep=kept))
         time_ns = round(to.time_s * 1e9) + (self._origin_ns or 0)
-        self._told = time_ns, found, sorted(y)
+        self._last_step = time_ns, found, sorted(y)
         self.epoch = self._epoch()
         self.passed.append(self.epoch)
         counted = [f"outliers_{name}" for name in outliers_of(self.epoch)]
@@ -402,7 +402,7 @@ class LiveInsGnss(Live):
 
     def _epoch(self) -> Navigation:
         """Answer of the last step of the filter."""
-        time_ns, found, sensors = self._told
+        time_ns, found, sensors = self._last_step
         answer = answer_of(time_ns, found, Flag(0), sensors, self._suspects)
         return answer._replace(flags=Flag.OUTLIER if outliers_of(answer) else Flag(0))
 
@@ -497,4 +497,4 @@ class LiveInsGnss(Live):
         like = self._compiled_state
         self._states = [as_before(like, state[k * each : (k + 1) * each]) for k in range(count)]
         self._online = self._on(self._states[-1])
-        self.epoch = None if self._told is None else self._epoch()
+        self.epoch = None if self._last_step is None else self._epoch()

@@ -41,7 +41,7 @@ def usual_of(log: Log) -> Usual:
     return Usual(usual_interval(log.increments.dt), fix_s)
 
 
-class Told(NamedTuple):
+class Evidence(NamedTuple):
     """Evidence of motion in each of M fixes, which may prove it, exclude it, or tell nothing."""
 
     time_s: np.ndarray  # (M,) increasing
@@ -51,7 +51,7 @@ class Told(NamedTuple):
 
 
 # (N,) bool still by spread, (N, 3) mean rate [rad/s], (N,) unrest, evidence, how long it holds [s]
-_Shown = tuple[np.ndarray, np.ndarray, np.ndarray, list[Told], float]
+_Observed = tuple[np.ndarray, np.ndarray, np.ndarray, list[Evidence], float]
 
 
 def at_rest(
@@ -65,30 +65,30 @@ def at_rest(
         usual: of the whole log.
         at_s: (E,) times; None: the end of each increment.
     """
-    still, mean_rate, unrest_, told, wait_s = _shown(log, aids, usual)
+    still, mean_rate, unrest_, evidence, wait_s = _observed(log, aids, usual)
     rows = rows_at(log.time_s, at_s)
-    return confirmed(still, unrest_, log.time_s, told, wait_s, usual, at_s), mean_rate[rows]
+    return confirmed(still, unrest_, log.time_s, evidence, wait_s, usual, at_s), mean_rate[rows]
 
 
 def looks_still(log: Log, aids: Aids, usual: Usual) -> tuple[np.ndarray, np.ndarray]:
     """As `at_rest`, but where fixes that come say nothing, the spread of the samples decides."""
-    still, mean_rate, unrest_, told, wait_s = _shown(log, aids, usual)
+    still, mean_rate, unrest_, evidence, wait_s = _observed(log, aids, usual)
 
-    def lenient(one: Told) -> Told:
+    def lenient(one: Evidence) -> Evidence:
         silent = np.isnan(one.moved_s) & ~one.moves
         return one._replace(rests_s=np.where(silent, np.inf, one.rests_s))
 
-    told = list(map(lenient, told))
-    return confirmed(still, unrest_, log.time_s, told, wait_s, usual), mean_rate
+    evidence = list(map(lenient, evidence))
+    return confirmed(still, unrest_, log.time_s, evidence, wait_s, usual), mean_rate
 
 
 def known_until(log: Log, aids: Aids, usual: Usual, since_s: float) -> Usual:
     """Numbers of a log of which only the part after a time is kept."""
-    still, _, unrest_, told, wait_s = _shown(log, aids, usual)
+    still, _, unrest_, evidence, wait_s = _observed(log, aids, usual)
     least = usual.calmest
-    for one in told:
+    for one in evidence:
         # with the two fixes that the last of these intervals is known by
-        old = Told(*(a[: int(np.sum(one.time_s < since_s)) + 2] for a in one))
+        old = Evidence(*(a[: int(np.sum(one.time_s < since_s)) + 2] for a in one))
         found = calmest_in_motion(unrest_, log.time_s, old, wait_s, usual, since_s)[-1]
         least = min(least, float(found))
     last = max(int(np.searchsorted(log.time_s, since_s)) - 1, 0)
@@ -103,17 +103,17 @@ def rows_at(time_s: np.ndarray, at_s: np.ndarray | None) -> np.ndarray:
     return np.minimum(np.searchsorted(time_s, at_s - 1e-9), len(time_s) - 1)
 
 
-def _shown(log: Log, aids: Aids, usual: Usual) -> _Shown:
+def _observed(log: Log, aids: Aids, usual: Usual) -> _Observed:
     args, wait_s = (*aids.quiet, usual.sample_s, log.first), 1.5 * max(1.0, usual.fix_s)
-    told = told_by(log, aids.moving_speed, wait_s)
-    return *standstill(log.increments, *args), unrest(log.increments, *args), told, wait_s
+    evidence = evidence_of(log, aids.moving_speed, wait_s)
+    return *standstill(log.increments, *args), unrest(log.increments, *args), evidence, wait_s
 
 
 def confirmed(
     still: np.ndarray,
     unrest: np.ndarray,
     time_s: np.ndarray,
-    told: Sequence[Told],
+    evidence: Sequence[Evidence],
     wait_s: float,
     usual: Usual,
     at_s: np.ndarray | None = None,
@@ -130,7 +130,7 @@ def confirmed(
         still: (N,) bool, by the spread of the samples.
         unrest: (N,) the spread itself, in any unit.
         time_s: (N,) increasing times of the samples.
-        told: evidence by source.
+        evidence: evidence by source.
         wait_s: how long a fix tells it.
         usual: what was known before these.
         at_s: (E,) times; None: those of the samples.
@@ -143,7 +143,7 @@ def confirmed(
     began = quiet_since(still, time_s, usual)[rows]
     moving, rests = np.zeros((2, len(rows)), bool)
     least = np.full(len(rows), usual.calmest)
-    for one in told:
+    for one in evidence:
         if not len(one.time_s):
             continue
         count = np.searchsorted(one.time_s, at_s + 1e-9, side="right")
@@ -166,7 +166,7 @@ def quiet_since(still: np.ndarray, time_s: np.ndarray, usual: Usual) -> np.ndarr
 def calmest_in_motion(
     unrest: np.ndarray,
     time_s: np.ndarray,
-    told: Told,
+    evidence: Evidence,
     wait_s: float,
     usual: Usual,
     until_s: float = np.inf,
@@ -176,7 +176,7 @@ def calmest_in_motion(
     Arguments are those of `confirmed`. Only intervals that begin before `until_s` count; where it
     is given, the last one does not wait for the fix after it.
     """
-    fix_s, moves = told.time_s, told.moves
+    fix_s, moves = evidence.time_s, evidence.moves
     least = np.full(len(fix_s) + 1, usual.calmest)
     if len(fix_s) < 2:
         return least
@@ -191,28 +191,28 @@ def calmest_in_motion(
     return np.minimum.accumulate(least)
 
 
-def told_by(log: Log, speed: float, wait_s: float) -> list[Told]:
+def evidence_of(log: Log, speed: float, wait_s: float) -> list[Evidence]:
     """Evidence of motion faster than a speed [m/s] by velocities, by ways and by wheels."""
-    told = [_by_way(log, speed, wait_s)]
+    evidence = [_by_way(log, speed, wait_s)]
     if log.v_n is not None and log.sigma_v is not None:
         known = ~log.withheld & np.all(np.isfinite(log.v_n[:, :2]), axis=1)
         size = np.hypot(*log.v_n[known, :2].T)
         noise = np.max(log.sigma_v[known, :2], axis=1)
-        told.append(_by_speed(log.gnss_s[known], size, noise, speed))
+        evidence.append(_by_speed(log.gnss_s[known], size, noise, speed))
     if log.wheels is not None:
         w = log.wheels
-        told.append(_by_speed(w.time_s, np.abs(w.speed), w.sigma, speed))
-    return told
+        evidence.append(_by_speed(w.time_s, np.abs(w.speed), w.sigma, speed))
+    return evidence
 
 
-def _by_speed(time_s: np.ndarray, size: np.ndarray, sigma: np.ndarray, speed: float) -> Told:
+def _by_speed(time_s: np.ndarray, size: np.ndarray, sigma: np.ndarray, speed: float) -> Evidence:
     """Evidence of speeds (M,) with sigmas [m/s], each of its own instant."""
     moves = size > np.maximum(speed, _SIGMAS * sigma)
     rests = ~moves & (size + _SIGMAS * sigma < _SEEN * speed)
-    return Told(time_s, moves, *(np.where(x, time_s, np.nan) for x in (moves, rests)))
+    return Evidence(time_s, moves, *(np.where(x, time_s, np.nan) for x in (moves, rests)))
 
 
-def _by_way(log: Log, speed: float, wait_s: float) -> Told:
+def _by_way(log: Log, speed: float, wait_s: float) -> Evidence:
     """Evidence of the ways to fixes without a velocity, from fixes before them."""
     g = log.gnss
     known = ~log.withheld & np.isfinite(g.lat_rad) & np.isfinite(g.lon_rad)
@@ -234,7 +234,7 @@ def _by_way(log: Log, speed: float, wait_s: float) -> Told:
     alone = np.ones(len(time_s), bool)
     if log.v_n is not None:
         alone = ~np.all(np.isfinite(log.v_n[known, :2]), axis=1)
-    return Told(*(a[alone] for a in (time_s, moves, moved_s, rests_s)))
+    return Evidence(*(a[alone] for a in (time_s, moves, moved_s, rests_s)))
 
 
 def _distance(lat: np.ndarray, dlat: np.ndarray, dlon: np.ndarray) -> np.ndarray:

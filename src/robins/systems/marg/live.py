@@ -13,8 +13,8 @@ What differs from a replay of the whole log:
 - The ends of the ranges of gyros are those that the samples so far show, where `gyro.range` does
   not state them.
 - A gap of more than ten seconds, or a clock that was set, is a new start; a replay bridges it.
-- `DOUBTFUL` is told when the monitor knows it. It marks the looks that led to it in a replay.
-- True north is told by who makes the object (`declination_rad`); a replay takes it from the fixes.
+- `DOUBTFUL` is set when the monitor knows it. It marks the looks that led to it in a replay.
+- True north is given with the object (`declination_rad`); a replay takes it from the fixes.
 """
 
 from __future__ import annotations
@@ -229,7 +229,7 @@ class LiveMarg(Live):
             self.counts["field_implausible"] += 1
 
     def _saturated(self, gyro: np.ndarray, accel: np.ndarray, before: int) -> Flag:
-        """Whether a sample is at the end of a range; `before` it waited so many for a block."""
+        """Flag of a sample at the end of a range; `before` it so many samples waited for a block."""
         full = bool(np.any(self._path.full(gyro[None])))
         if full:
             self._open = before + 1

@@ -2,7 +2,7 @@
 
 Samples are integrated over blocks; what is known at the end of each block becomes its measurements.
 Any chunks of the same samples give the same bits: a replay is one chunk, a live object is chunks of
-one sample. What comes later counts by as much as a stage says:
+one sample. Later samples are used as far as the latency of each stage reaches:
 
 - a peak of a gyro that the end of its range cut off is put back from both flanks: up to `LONGEST_S`
   and `FLANK` samples;
@@ -85,7 +85,7 @@ class SamplePath:
         self._context = 0  # of them, those that are in blocks
         # increments and field up to the start; None once that is found
         self._begun: list[tuple[np.ndarray, ...]] | None = []
-        self._in_motion = False  # whether the start is one in motion
+        self._in_motion = False  # the start is one in motion
 
     @property
     def waiting(self) -> int:
