@@ -130,7 +130,7 @@ def confirmed(
         still: (N,) bool, by the spread of the samples.
         unrest: (N,) the spread itself, in any unit.
         time_s: (N,) increasing times of the samples.
-        evidence: evidence by source.
+        evidence: of motion and rest, by source.
         wait_s: how long a fix tells it.
         usual: what was known before these.
         at_s: (E,) times; None: those of the samples.

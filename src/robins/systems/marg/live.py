@@ -229,7 +229,7 @@ class LiveMarg(Live):
             self.counts["field_implausible"] += 1
 
     def _saturated(self, gyro: np.ndarray, accel: np.ndarray, before: int) -> Flag:
-        """Flag of a sample at the end of a range; `before` it so many samples waited for a block."""
+        """Flag of a sample at the end of a range; so many samples waited for a block before it."""
         full = bool(np.any(self._path.full(gyro[None])))
         if full:
             self._open = before + 1
