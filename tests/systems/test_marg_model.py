@@ -8,21 +8,22 @@ from scipy import stats
 from scipy.spatial.transform import Rotation as SciRotation
 
 from robins import manifold
-from robins.filters import Belief, run
+from robins.filters import Belief, kalman, run
 from robins.manifold import Angle
 from robins.rotation import Rotation
 from robins.systems.marg import Block, Replay, Samples, integrate, model_of
 from robins.systems.marg.model import (
     DIM,
     MAGNETOMETER,
-    REST_RATE,
+    REST,
+    REVISIT,
+    SITES,
     TRAVEL,
     MargState,
     causal_attitudes,
     persistence,
     smoothed_attitudes,
 )
-from robins.systems.marg.replay import marg_filter
 
 MODEL = model_of(Replay())
 
@@ -39,6 +40,8 @@ def some_state(seed=0) -> MargState:
         0.05 * draw(3),
         0.1 * draw(),
         1e-5 * jnp.array([1.8, 4.4]),
+        0.3 * draw(SITES),
+        9.81 + 0.1 * draw(),
     )
 
 
@@ -63,7 +66,7 @@ def slope(function, x):
     columns = []
     for i in range(DIM):
         # every component in units of its own, so that no difference drowns
-        step = 1e-9 if i >= 25 else 1e-5
+        step = 1e-9 if i in (25, 26) else 1e-5
         ends = [function(manifold.retract(x, s * step * jnp.eye(DIM)[i])) for s in (1.0, -1.0)]
         up, down = (np.asarray(manifold.local(value, end)) for end in ends)
         columns.append((up - down) / (2.0 * step))
@@ -82,8 +85,9 @@ def test_jacobian_of_the_motion_is_that_of_differences():
     ("name", "aux"),
     [
         (TRAVEL, jnp.zeros(())),
-        (REST_RATE, jnp.array([0.01, -0.02, 0.005])),
+        (REST, jnp.array([0.01, -0.02, 0.005, 0.001])),
         (MAGNETOMETER, jnp.array([1e-5, 2e-5, -3e-5])),
+        (REVISIT, jnp.array([1e-5, 2e-5, -3e-5, 0.01, 0.0, 1.0, 0.0, 0.0])),
     ],
 )
 def test_jacobians_of_the_sensors_are_those_of_differences_but_for_tilt(name, aux):
@@ -91,10 +95,10 @@ def test_jacobians_of_the_sensors_are_those_of_differences_but_for_tilt(name, au
     read = jax.jit(sensor.read)
     z, H = sensor.linear(x, aux)
     numeric = slope(lambda s: read(s, aux), x)
-    if name == MAGNETOMETER:
+    if name in (MAGNETOMETER, REVISIT):
         assert np.max(np.abs(numeric[:, :2])) > 0.1  # there is something left out
         numeric[:, :2] = 0.0
-        assert isinstance(z[0], Angle)
+        assert isinstance(z[0] if name == MAGNETOMETER else z, Angle)
     np.testing.assert_allclose(np.asarray(H), numeric, atol=1e-8)
 
 
@@ -203,7 +207,7 @@ def test_errors_are_as_large_as_the_filter_says():
     u = Block(whole, none, none, none)
     parts = [
         (2, 0.01), (1, 0.02), (3, 0.1), (3, 0.1), (3, 0.01), (9, 0.005), (3, 0.05), (1, 0.005),
-        (2, 1e-6),
+        (2, 1e-6), (SITES, 0.1), (1, 0.05),
     ]  # fmt: skip
     sigma = jnp.concatenate([jnp.full(n, s) for n, s in parts])
     mean = some_state()._replace(field=jnp.array([2e-5, 0.0]), declination=jnp.zeros(()))
@@ -236,7 +240,7 @@ def test_errors_are_as_large_as_the_filter_says():
             MAGNETOMETER: (Angle(blank), blank[:, None] * jnp.ones((1, 2))),
         }
         aux = {TRAVEL: jnp.zeros(steps), MAGNETOMETER: field_b}
-        end = run(marg_filter(None, weight=1.0), MODEL, start, measured, u, aux).final.belief
+        end = run(kalman(), MODEL, start, measured, u, aux).final.belief
         error = manifold.local(end.mean, jax.tree_util.tree_map(lambda a: a[-1], truth))
         white = jax.scipy.linalg.solve_triangular(end.factor, error, lower=True)
         return white @ white

@@ -1,6 +1,7 @@
 """Filters made of filters: of locals, of modes, of particles; guarded; of late measurements."""
 
 from robins.filters.composite.adaptive import adaptive
+from robins.filters.composite.alternative import alternative
 from robins.filters.composite.channels import Channel, at_master, channel
 from robins.filters.composite.delayed import Late, delayed
 from robins.filters.composite.distributed import distributed, intersecting
@@ -15,6 +16,7 @@ __all__ = [
     "Family",
     "Late",
     "adaptive",
+    "alternative",
     "at_master",
     "channel",
     "covariance_intersection",

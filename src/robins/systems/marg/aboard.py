@@ -155,6 +155,7 @@ def hand(parameters: Replay, seed: int, run: int) -> Hand:
 def case_of(parameters: Replay, of: Hand) -> Case:
     """What a filter on a board is given of a hand, and the truth at the ends of its steps."""
     made: Prepared = prepare(of.log, parameters)
+    p = parameters.accelerometer
     world, samples, count = made.world, made.samples, len(made.rows)
     u = Given(samples.dt_s, samples.theta, samples.dv, *world.u[1:])
     truth = model.MargState(
@@ -166,6 +167,8 @@ def case_of(parameters: Replay, of: Hand) -> Case:
         accel_bias=jnp.tile(of.accel_bias, (count, 1)),
         declination=jnp.zeros(count),
         field=jnp.tile(FIELD_N[[0, 2]], (count, 1)),
+        azimuths=jnp.zeros((count, model.SITES)),
+        gravity=jnp.full(count, p.gravity),
     )
     return Case(world.start, u, world.y, world.aux, truth)
 

@@ -73,13 +73,13 @@ class _Step(NamedTuple):
     gyro_bias: np.ndarray  # (3,)
     gyro_gain: np.ndarray  # (9,)
     declination: np.ndarray  # (1,)
-    sigma: np.ndarray  # (27,)
+    sigma: np.ndarray  # (DIM,)
     code: np.ndarray  # (1,) of the prediction
-    travel: np.ndarray  # (3,) NIS, degrees of freedom, code
-    magnetometer: np.ndarray  # (3,) likewise; none, none, `MISSING` without one
+    travel: np.ndarray  # (8,) innovation, degrees of freedom, code
+    magnetometer: np.ndarray  # (2,) degrees of freedom, code; none and `MISSING` without one
 
 
-_SIZES = np.cumsum([4, 3, 9, 1, model.DIM, 1, 3])
+_SIZES = np.cumsum([4, 3, 9, 1, model.DIM, 1, 8])
 
 
 def _kept(step: Step) -> jax.Array:
@@ -87,11 +87,11 @@ def _kept(step: Step) -> jax.Array:
     mean, sigma, seen = kept(step)
     parts = [mean.q_nb.wxyz, mean.gyro_bias, mean.gyro_gain.reshape(9), mean.declination[None]]
     parts += [sigma, step.prediction.code[None]]
+    parts.append(seen[model.TRAVEL].innovation)
     for name in (model.TRAVEL, model.MAGNETOMETER):
         update = seen.get(name)
-        none = jnp.array([0.0, 0.0, float(Code.MISSING)])
-        parts.append(none if update is None else jnp.stack(
-            [jnp.asarray(x, float) for x in (update.nis, update.dof, update.code)]))  # fmt: skip
+        code = [0.0, int(Code.MISSING)] if update is None else [update.dof, update.code]
+        parts.append(jnp.stack([jnp.asarray(x, float) for x in code]))
     return jnp.concatenate([jnp.asarray(part, float) for part in parts])
 
 
@@ -150,7 +150,7 @@ class LiveMarg(Live):
         """Forget all but the counts and the stamps."""
         self._field = np.full(3, np.nan)  # of a sample that was refused
         self._pending: list[Any] = []  # leaves of steps that wait, and whether the unit lies still
-        self._looks = np.zeros((0, 8))  # what the monitor is shown
+        self._looks = np.zeros((0, 7))  # what the monitor is shown
         self._since: list[Any] = []  # (dt, turn) of the samples after the last step
         self._q = (math.nan,) * 4
         self._sigma, self._bias, self._gain = np.full(3, np.nan), np.zeros(3), np.zeros((3, 3))
@@ -319,22 +319,23 @@ class LiveMarg(Live):
         """Flags of the monitor on the last looks."""
         most = math.ceil(_MONITORED_S / (self._path.n * self._usual_s))
         gain = [np.max(np.abs(found.gyro_gain))]
-        row = np.concatenate([found.declination, gain, found.travel, found.magnetometer])
-        self._looks = np.concatenate([self._looks, row[None]])[-most:]
+        square = [monitor.squared(found.travel[:6], self.parameters)]
+        row = [found.declination, gain, square, found.travel[6:], found.magnetometer]
+        self._looks = np.concatenate([self._looks, np.concatenate(row)[None]])[-most:]
         looks, none = self._looks, np.zeros(len(self._looks))
         updates = {
-            name: Update(none, none, looks[:, k], looks[:, k + 1], looks[:, k + 2])
-            for name, k in ((model.TRAVEL, 2), (model.MAGNETOMETER, 5))
+            name: Update(none, none, looks[:, 2], looks[:, k], looks[:, k + 1])
+            for name, k in ((model.TRAVEL, 3), (model.MAGNETOMETER, 5))
         }
         doubt = monitor.doubts_of(looks[:, 0], looks[:, 1], updates, self.parameters)
         told = bool(doubt.declination[-1] or doubt.gain[-1])
-        for column, k in ((doubt.tilt, 2), (doubt.refused, 5)):
-            refused = looks[:, k + 2] == Code.REFUSED
-            asked = np.flatnonzero((looks[:, k + 1] == np.max(looks[:, k + 1])) | refused)
+        for column, k in ((doubt.tilt, 3), (doubt.refused, 5)):
+            refused = looks[:, k + 1] == Code.REFUSED
+            asked = np.flatnonzero((looks[:, k] == np.max(looks[:, k])) | refused)
             told |= bool(len(asked)) and bool(column[asked[-1]])
         flags = Flag.DOUBTFUL if told else Flag(0)
-        asked = np.flatnonzero((looks[:, 6] > 0) | (looks[:, 7] == Code.REFUSED))
-        disturbed = len(asked) > 0 and looks[asked[-1], 7] == Code.REFUSED
+        asked = np.flatnonzero((looks[:, 5] > 0) | (looks[:, 6] == Code.REFUSED))
+        disturbed = len(asked) > 0 and looks[asked[-1], 6] == Code.REFUSED
         return flags | (Flag.DISTURBED if disturbed else Flag(0))
 
     # ------------------------------------------------------------------------------- the file

@@ -42,19 +42,22 @@ from robins.systems.parts import NED
 from robins.systems.study import SensorAxes, StateBlock
 
 XYZ = ("x", "y", "z")
-TRAVEL, REST_RATE, MAGNETOMETER = "travel", "rest_rate", "magnetometer"
+TRAVEL, REST, MAGNETOMETER, REVISIT = "travel", "rest", "magnetometer", "revisit"
+SITES = 4  # where the unit has lain still; the azimuth of the field of each is a state
 _TRAVELLED = [
     f"{what} {axis} [{u}]" for what, u in (("velocity", "m/s"), ("place", "m")) for axis in NED
 ]
+_AT_REST = [f"velocity {axis} [m/s]" for axis in NED] + [f"rate {axis} [rad/s]" for axis in XYZ]
 SENSORS = {
     TRAVEL: SensorAxes("m/s, m", "NED", tuple(_TRAVELLED)),
-    REST_RATE: SensorAxes("rad/s", "body", XYZ),
+    REST: SensorAxes("m/s, rad/s", "NED, body", tuple(_AT_REST)),
     MAGNETOMETER: SensorAxes("rad, T", "NED", ("azimuth [rad]", "horizontal [T]", "down [T]")),
+    REVISIT: SensorAxes("rad", "NED", ("azimuth",)),
 }
 
 
 class MargState(NamedTuple):
-    """The state; 27 tangent components in this order."""
+    """The state; 32 tangent components in this order."""
 
     q_nb: Rotation  # body to north-east-down, north that of the field at the start
     v_n: Array  # (3,) m/s
@@ -64,9 +67,13 @@ class MargState(NamedTuple):
     accel_bias: Array  # (3,) m/s^2
     declination: Array  # () rad, of the field here and now, clockwise from north
     field: Array  # (2,) T, strength along the horizontal and down
+    azimuths: Array  # (SITES,) rad, of the field at each site, clockwise from north
+    gravity: Array  # () m/s^2, as the accelerometers read it
 
 
-HEADING, DECLINATION, FIELD, DIM = 2, 24, slice(25, 27), 27
+HEADING, GAINS, DECLINATION, FIELD = 2, slice(12, 21), 24, slice(25, 27)
+AZIMUTHS, GRAVITY = slice(27, 27 + SITES), 27 + SITES
+DIM = GRAVITY + 1
 _NINE = tuple(f"{a} from {b}" for a in XYZ for b in XYZ)
 BLOCKS = (
     StateBlock("attitude", slice(0, 3), "rad", "deg", "NED", NED),
@@ -76,6 +83,7 @@ BLOCKS = (
     StateBlock("accel_bias", slice(21, 24), "m/s^2", "mg", "body", XYZ),
     StateBlock("declination", slice(24, 25), "rad", "deg", "NED", ("here",)),
     StateBlock("field", slice(25, 27), "T", "uT", "NED", ("horizontal", "down")),
+    StateBlock("gravity", slice(GRAVITY, GRAVITY + 1), "m/s^2", "m/s^2", "NED", ("read",)),
 )
 
 
@@ -111,7 +119,6 @@ class Noise(NamedTuple):
     declination: ArrayLike  # rad, of the stationary Gauss-Markov process
     declination_time: ArrayLike  # s
     field: ArrayLike  # T/sqrt(s)
-    gravity: ArrayLike  # m/s^2
 
 
 class Seen(NamedTuple):
@@ -145,7 +152,7 @@ def _velocity_gain(x: MargState, block: Block) -> Array:
 def advance(noise: Noise, x: MargState, block: Block) -> MargState:
     """The state after a block."""
     dt = jnp.asarray(block.samples.dt_s)
-    gained = _velocity_gain(x, block) + jnp.array([0.0, 0.0, 1.0]) * noise.gravity * dt
+    gained = _velocity_gain(x, block) + jnp.array([0.0, 0.0, 1.0]) * x.gravity * dt
     turned = rotation.multiply(
         rotation.from_rotvec(correction(x, block)), jnp.asarray(block.samples.turn)
     )
@@ -158,7 +165,7 @@ def advance(noise: Noise, x: MargState, block: Block) -> MargState:
 
 
 def _factor(noise: Noise, x: MargState, block: Block) -> Array:
-    """(27, 27) of the process noise: diagonal, but that a turn is lost about body axes."""
+    """(32, 32) of the process noise: diagonal, but that a turn is lost about body axes."""
     dt, moving = jnp.asarray(block.samples.dt_s), 1.0 - jnp.asarray(block.still)
     root = jnp.sqrt(dt)
     kept = persistence(noise, block)
@@ -179,12 +186,13 @@ def _factor(noise: Noise, x: MargState, block: Block) -> Array:
         jnp.broadcast_to(noise.accel_bias * root, (3,)),
         (noise.declination * drift)[None],
         jnp.broadcast_to(noise.field * root, (2,)),
+        jnp.zeros(SITES + 1),
     ]
     return jnp.diag(jnp.concatenate(parts)).at[0:3, 0:3].set(x.q_nb.as_dcm() * turn[None, :])
 
 
 def advance_linear(noise: Noise, x: MargState, block: Block):
-    """`advance`, its Jacobian (27, 27) between tangent spaces, and the noise factor."""
+    """`advance`, its Jacobian (32, 32) between tangent spaces, and the noise factor."""
     dt, dv = jnp.asarray(block.samples.dt_s), jnp.asarray(block.samples.dv)
     rate_map = jnp.concatenate(
         [-jnp.asarray(block.samples.turn_time), jnp.asarray(block.samples.turn_rates)], axis=1
@@ -200,39 +208,41 @@ def advance_linear(noise: Noise, x: MargState, block: Block):
         F = F.at[rows, 0:3].set(share * tilt)
         F = F.at[rows, 9:21].set(share * push)
         F = F.at[rows, 21:24].set(share * lean)
+        F = F.at[rows.stop - 1, GRAVITY].set(share * dt)
     F = F.at[6:9, 3:6].set(dt * jnp.eye(3))
     F = F.at[DECLINATION, DECLINATION].set(persistence(noise, block))
     return advance(noise, x, block), F, _factor(noise, x, block)
 
 
-def _read_travel(x: MargState, still: Any):
+def _read_travel(x: MargState, _: Any):
     return jnp.concatenate([x.v_n, x.p_n])
 
 
-def _travel_linear(x: MargState, still: Any):
-    return _read_travel(x, still), jnp.eye(6, DIM, 3)
+def _travel_linear(x: MargState, _: Any):
+    return _read_travel(x, None), jnp.eye(6, DIM, 3)
 
 
-def _travel_sigma(seen: Seen, x: MargState, still: Any):
-    velocity = jnp.where(still > 0.0, seen.velocity_still, seen.velocity)
-    place = jnp.asarray(seen.place)
-    return jnp.concatenate([jnp.broadcast_to(velocity, (3,)), jnp.broadcast_to(place, (3,))])
+def _travel_sigma(seen: Seen) -> Array:
+    sigma = jnp.stack([jnp.asarray(seen.velocity), jnp.asarray(seen.place)])
+    return jnp.repeat(sigma, 3)
 
 
-def _read_rest_rate(x: MargState, seen_b: Any):
-    """What the unit, lying still, would seem to turn by."""
+def _read_rest(x: MargState, seen_b: Any):
+    """Velocity, and what the unit, lying still, would seem to turn by."""
     rate_b = seen_b[:3]
-    return rate_b + x.gyro_gain @ rate_b - x.gyro_bias
+    return jnp.concatenate([x.v_n, rate_b + x.gyro_gain @ rate_b - x.gyro_bias])
 
 
-def _rest_rate_linear(x: MargState, seen_b: Any):
+def _rest_linear(x: MargState, seen_b: Any):
     gain = jnp.kron(jnp.eye(3), seen_b[None, :3])
-    H = jnp.zeros((3, DIM)).at[:, 9:12].set(-jnp.eye(3)).at[:, 12:21].set(gain)
-    return _read_rest_rate(x, seen_b), H
+    H = jnp.zeros((6, DIM)).at[0:3, 3:6].set(jnp.eye(3))
+    H = H.at[3:6, 9:12].set(-jnp.eye(3)).at[3:6, 12:21].set(gain)
+    return _read_rest(x, seen_b), H
 
 
-def _rest_rate_sigma(x: MargState, seen_b: Any):
-    return jnp.broadcast_to(jnp.asarray(seen_b)[3], (3,))
+def _rest_sigma(seen: Seen, x: MargState, seen_b: Any):
+    velocity, rate = jnp.asarray(seen.velocity_still), jnp.asarray(seen_b)[3]
+    return jnp.repeat(jnp.stack([velocity, rate]), 3)
 
 
 def _level(x: MargState, field_b: Any):
@@ -261,6 +271,21 @@ def _magnetometer_sigma(seen: Seen, x: MargState, field_b: Any):
     return jnp.stack([azimuth, jnp.asarray(seen.field), jnp.asarray(seen.field)])
 
 
+def _read_site(x: MargState, seen_b: Any):
+    """Azimuth of the field that is read against that of a site; `seen_b` as of "revisit"."""
+    _, m = _level(x, seen_b[:3])
+    return Angle(jnp.arctan2(m[1], m[0]) - seen_b[4:] @ x.azimuths)
+
+
+def _site_linear(x: MargState, seen_b: Any):
+    H = jnp.zeros((1, DIM)).at[0, HEADING].set(1.0).at[0, AZIMUTHS].set(-seen_b[4:])
+    return _read_site(x, seen_b), H
+
+
+def _site_sigma(x: MargState, seen_b: Any):
+    return jnp.asarray(seen_b)[3:4]
+
+
 def model_of(parameters: Replay) -> Model:
     """Gyro and accelerometer carry the state; travel, rest and the magnetometer hold it.
 
@@ -268,10 +293,12 @@ def model_of(parameters: Replay) -> Model:
     attitude, at the price of the little it could tell of tilt.
 
     Returns:
-        A model with sensors, in order: "travel" ((6,) zeros; NaN where nothing is claimed; aux 1
-        at rest, else 0), "rest_rate" ((3,) zeros at rest, else NaN; aux (4,) mean rate read and its
-        spread) and, where it is used, "magnetometer" ((`Angle(0)`, (2,) zeros); aux (3,) field in
-        body axes [T]). The measurement is zero and the reading what the state makes of aux: the
+        A model with sensors, in order: "travel" ((6,) zeros while the unit moves, else NaN), "rest"
+        ((6,) zeros at rest, else NaN; aux (4,) mean rate read and its spread) and, where the field
+        is used, "magnetometer" ((`Angle(0)`, (2,) zeros); aux (3,) field in body axes [T]) and
+        "revisit" (`Angle(0)` where a site is read; aux (4 + SITES,) field [T], sigma of its azimuth
+        [rad] and 1 for the site). The measurement is zero and the reading what the state makes of
+        aux: the
         innovation is minus the reading.
     """
     gyro, accelerometer = parameters.gyro, parameters.accelerometer
@@ -286,17 +313,17 @@ def model_of(parameters: Replay) -> Model:
         declination=magnetometer.declination,
         declination_time=magnetometer.declination_time,
         field=magnetometer.field_walk,
-        gravity=accelerometer.gravity,
     )
     seen = Seen(travel.velocity, travel.place, rest.velocity, magnetometer.noise)
     noise, seen = jax.tree_util.tree_map(lambda x: jnp.asarray(x, float), (noise, seen))
     sensors = [
-        Sensor(_read_travel, Partial(_travel_sigma, seen), 6, TRAVEL, _travel_linear),
-        Sensor(_read_rest_rate, _rest_rate_sigma, 3, REST_RATE, _rest_rate_linear),
+        Sensor(_read_travel, _travel_sigma(seen), 6, TRAVEL, _travel_linear),
+        Sensor(_read_rest, Partial(_rest_sigma, seen), 6, REST, _rest_linear),
     ]
     if parameters.use_magnetometer != "never":
         sigma = Partial(_magnetometer_sigma, seen)
         sensors.append(Sensor(_read_magnetometer, sigma, 3, MAGNETOMETER, _magnetometer_linear))
+        sensors.append(Sensor(_read_site, _site_sigma, 1, REVISIT, _site_linear))
     motion = Motion(
         step=Partial(advance, noise),
         noise=Partial(_factor, noise),

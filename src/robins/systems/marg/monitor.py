@@ -1,8 +1,8 @@
 """What a replay says against itself: states and innovations that its own assumptions forbid.
 
 A filter whose model is wrong goes on with a small sigma. Its states show it: a declination that the
-field of no room has, gains that no gyro is sold with, and a velocity or place that must be refused
-again and again, which is a tilt that does not fit.
+field of no room has, gains that no gyro is sold with, and a velocity or place that is again and
+again beyond what was stated, which is a tilt that does not fit.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from robins.systems.marg.parameters import Replay
 from robins.systems.tables import Update
 
 _SIGMAS = 3.0
-_LOOKS = 20  # of travel, in the mean of its NIS
-_NIS = 1.5  # of a degree of freedom, in that mean
+_LOOKS = 20  # of travel, in the mean of its squares
+_SQUARE = 1.5  # of a component in its stated standard deviations, in that mean
 _LASTING_S = 5.0
 _GAP_SHARE = 0.002  # of samples at the end of their range that nothing could be put back for
 
@@ -48,13 +48,14 @@ def doubts_of(
 
     - declination: further from zero than three of its standard deviations;
     - gain: one of nine beyond three standard deviations;
-    - tilt: the NIS of velocity and place, in the mean over the last 20 looks, above 1.5;
+    - tilt: velocity and place, squared and in the mean over the last 20 looks, beyond 1.5 times
+      the variances that were stated, whatever the filter has learned of them;
     - refused: the magnetometer at ten looks in a row or more.
 
     Args:
         declination: (B,) of the states [rad], and
         gain: (B, ...) of the gyros, each.
-        updates: by sensor, of the filter or of the run that was smoothed.
+        updates: by sensor, of the filter or of the run that was smoothed; of travel as `as_stated`.
         parameters: what was assumed.
     """
     declination = np.abs(declination)
@@ -73,6 +74,19 @@ def doubts_of(
     )
 
 
+def squared(innovation: np.ndarray, parameters: Replay) -> np.ndarray:
+    """Sum of squares of innovations of travel (..., 6) in their stated standard deviations."""
+    travel = parameters.travel
+    return np.sum((innovation / np.repeat([travel.velocity, travel.place], 3)) ** 2, axis=-1)
+
+
+def as_stated(updates: Mapping[str, Update], parameters: Replay) -> dict[str, Update]:
+    """Updates with the squares of travel by its stated deviations in the place of its NIS."""
+    travel = updates[TRAVEL]
+    square = squared(np.asarray(travel.innovation), parameters)
+    return {**updates, TRAVEL: travel._replace(nis=square)}
+
+
 def _too_large(update: Update) -> np.ndarray:
     nis, dof = np.asarray(update.nis), np.asarray(update.dof)
     looks = np.flatnonzero(dof == np.max(dof, initial=0))
@@ -80,7 +94,7 @@ def _too_large(update: Update) -> np.ndarray:
     if len(looks) < _LOOKS or dof[looks[0]] == 0:
         return out
     sums = np.cumsum(np.concatenate([[0.0], nis[looks] / dof[looks]]))
-    over = (sums[_LOOKS:] - sums[:-_LOOKS]) / _LOOKS > _NIS
+    over = (sums[_LOOKS:] - sums[:-_LOOKS]) / _LOOKS > _SQUARE
     for last in np.flatnonzero(over) + _LOOKS - 1:
         out[looks[last - _LOOKS + 1] : looks[last] + 1] = True
     return out

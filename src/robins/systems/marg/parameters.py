@@ -31,6 +31,8 @@ class Gyro(Parameters):
     bias_walk_moving: q.RateWalkSize = default("0.01 deg/s/sqrt(s)")
     # scale factors, misalignment and cross-coupling: each of nine numbers has this spread
     gain: Annotated[float, Quantity("scale factor", least="0 ppm")] = default("3000 ppm")
+    # the same of a chip that nobody calibrated; asked once a gain is beyond three times the other
+    bare_gain: Annotated[float, Quantity("scale factor", least="0 ppm")] = default("3 %")
     # what nine numbers do not explain, as a share of the angle turned
     turn_error: Annotated[float, pydantic.Field(ge=0.0, le=1e6)] = 0.001
     range: q.AngleRate = default("2000 deg/s")
@@ -63,6 +65,8 @@ class Magnetometer(Parameters):
     noise: q.FieldStrength = default("2.5 uT")
     declination: q.Spread = default("2.5 deg")
     declination_time: q.Duration = default("60 s")
+    # azimuth of the field where the unit lies again, beside what a wrong tilt adds
+    site: q.Spread = default("0.3 deg")
     # random walk of strength and dip of the field that counts as undisturbed: spread after 1 s
     field_walk: Annotated[float, Quantity("magnetic field", least="0 uT")] = default("0.01 uT")
     # magnitudes outside are no field of the Earth: not used, counted
@@ -83,7 +87,6 @@ class Travel(Parameters):
     velocity: q.Speed = default("1 m/s")
     place: q.Length = default("0.6 m")
     every: q.Duration = default("1 s")
-    weight: Annotated[float, pydantic.Field(gt=0.0, le=1.0)] = 0.9999  # Huber's; 1: never less
 
 
 class Rest(Parameters):
@@ -126,7 +129,7 @@ class Stated(Parameters):
     """
 
     tilt: q.Spread = default("0.3 deg")
-    heading: q.Spread = default("1 deg")
+    heading: q.Spread = default("2 deg")
     delay: q.Time = default("0.002 s")
 
 

@@ -31,7 +31,8 @@ from robins.manifold import Angle
 from robins.systems.marg import model
 from robins.systems.marg.parameters import Replay
 from robins.systems.marg.rest import Watch
-from robins.systems.marg.saturation import FLANK, LONGEST_S, Range, beyond, bridged
+from robins.systems.marg.saturation import FLANK, LONGEST_S, Frozen, Range, beyond, bridged
+from robins.systems.marg.sites import Look, Sites
 from robins.systems.marg.start import FirstLook, first_belief, first_look
 
 _FALLING = 0.3  # of gravity: below it nothing holds the unit up, and tilt cannot be seen
@@ -52,7 +53,8 @@ class SamplePath:
 
     Attributes:
         n: samples of a block.
-        counts: `imu_saturated`, `imu_bridged`, `imu_gaps`, `blocks_in_free_fall`.
+        counts: `imu_saturated`, `imu_bridged`, `imu_frozen`, `imu_gaps`,
+            `blocks_in_free_fall`.
         range: ends of the ranges of the gyros.
     """
 
@@ -79,6 +81,7 @@ class SamplePath:
         self._by_sample = levels is None and kind == "rate"
         self.range = Range(levels)
         self._watch, self._pace = Watch(self.n * usual_s, parameters.rest), Pace()
+        self._sites, self._frozen = Sites(model.SITES), Frozen()
         self.counts: Counter[str] = Counter()
         self.time_ns = np.zeros(0, np.int64)  # of the samples kept, and
         self.rows = np.zeros((0, 9))  # their gyro, accel and field
@@ -205,7 +208,10 @@ class SamplePath:
         made = self.increments(self.time_ns, rate, accel)
         block, own, ends = slice(context, end), slice(context - 1, end - 1), slice(context - 1, end)
         dt, theta, dv = (np.asarray(a, float)[own] for a in made[:3])
-        turn, lost_s, gaps = not_sampled(dt, full[ends], doubt[ends], hard[ends], self._usual_s, p)
+        unseen = full | self._frozen_blocks(end)[:, None]
+        turn, lost_s, gaps = not_sampled(
+            dt, unseen[ends], doubt[ends], hard[ends], self._usual_s, p
+        )
         self.counts["imu_gaps"] += gaps
         self.counts["imu_saturated"] += int(np.sum((np.any(full, axis=1) | hard)[block]))
         self.counts["imu_bridged"] += int(np.sum(np.any(np.isfinite(doubt), axis=1)[block]))
@@ -219,16 +225,32 @@ class SamplePath:
         self._context = end - drop
         return self._steps(samples, *lost)
 
+    def _frozen_blocks(self, end: int) -> np.ndarray:
+        """(M,) bool of the samples kept: in blocks up to `end` in which the gyros hang."""
+        out = np.zeros(len(self.rows), bool)
+        if self._kind != "rate":
+            return out
+        for at in range(self._context, end, self.n):
+            rows = self.rows[at - 1 : min(at + self.n, end)]
+            if self._frozen.look(rows[:, :3], rows[:, 3:6]):
+                out[at : at + self.n] = True
+        self.counts["imu_frozen"] += int(np.sum(out))
+        return out
+
     def _steps(self, samples: model.Samples, lost_turn: np.ndarray, lost_s: np.ndarray) -> Steps:
         """Integrate blocks, and add what is known at their ends."""
         p = self._parameters
         integrals, field_b = model.integrate(samples)
-        rows = np.asarray(integrals.dt_s).tolist(), mean_rate(integrals), mean_force(integrals)
-        seen = [self._watch.look(*row) for row in zip(*rows, field_b, strict=True)]
-        still, sigma = map(np.array, zip(*seen, strict=True))
+        times, rate = np.asarray(integrals.dt_s).tolist(), mean_rate(integrals)
+        force = mean_force(integrals)
+        still, sigma, looks = np.zeros(len(times), bool), np.zeros(len(times)), []
+        for k, dt in enumerate(times):
+            still[k], sigma[k] = self._watch.look(dt, rate[k], force[k], field_b[k])
+            at_home = self._watch.first is not None
+            looks.append(self._sites.look(dt, bool(still[k]), at_home, force[k], field_b[k]))
         u, falling = inputs(integrals, still, lost_turn, lost_s, p)
         self.counts["blocks_in_free_fall"] += int(np.sum(falling))
-        y, aux = measurements(integrals, field_b, still, sigma, p, self._pace)
+        y, aux = measurements(integrals, field_b, still, sigma, looks, p, self._pace)
         return Steps(u, y, aux, still, samples)
 
 
@@ -344,6 +366,7 @@ def measurements(
     field_b: np.ndarray,
     still: np.ndarray,
     sigma: np.ndarray,
+    looks: Sequence[Look],
     parameters: Replay,
     pace: Pace,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -354,6 +377,7 @@ def measurements(
         field_b: (K, 3) T, mean field in body axes at the end of each.
         still: (K,) bool.
         sigma: (K,) rad/s, of the mean rate at rest.
+        looks: K readings of sites.
         parameters: as of a replay.
         pace: goes on with these blocks.
     """
@@ -362,16 +386,15 @@ def measurements(
     pace.clock_s = float(clock[-1])
     still = still & (time > 0.0)
     travel = np.full((blocks, 6), np.nan)
-    travel[still, :3] = 0.0
     # Noise that lasts is thinned out: it must be new at each reading to be what the filter thinks.
-    travel[pace.take(model.TRAVEL, clock, time > 0.0, p.travel.every)] = 0.0
+    travel[pace.take(model.TRAVEL, clock, (time > 0.0) & ~still, p.travel.every)] = 0.0
     y: dict[str, Any] = {
         model.TRAVEL: travel,
-        model.REST_RATE: np.where(still[:, None], np.zeros((blocks, 3)), np.nan),
+        model.REST: np.where(still[:, None], np.zeros((blocks, 6)), np.nan),
     }
     aux: dict[str, Any] = {
-        model.TRAVEL: still.astype(float),
-        model.REST_RATE: np.concatenate([mean_rate(integrals), sigma[:, None]], axis=1),
+        model.TRAVEL: np.zeros(blocks),
+        model.REST: np.concatenate([mean_rate(integrals), sigma[:, None]], axis=1),
     }
     if p.use_magnetometer != "never":
         there = np.all(np.isfinite(field_b), axis=1)
@@ -381,7 +404,18 @@ def measurements(
             np.where(look[:, None], np.zeros((blocks, 2)), np.nan),
         )
         aux[model.MAGNETOMETER] = np.where(there[:, None], field_b, np.array([1e-5, 0.0, 0.0]))
+        number = np.array([look.site for look in looks])
+        y[model.REVISIT] = Angle(np.where(number >= 0, 0.0, np.nan))
+        aux[model.REVISIT] = np.array([_of_site(look, p) for look in looks])
     return y, aux
+
+
+def _of_site(look: Look, parameters: Replay) -> np.ndarray:
+    """(4 + SITES,) field in body axes, sigma of its azimuth and which site it is."""
+    leaning = np.tan(min(abs(look.dip_rad), 1.5)) * parameters.stated.tilt
+    sigma = np.hypot(parameters.magnetometer.site, leaning)
+    which = np.arange(model.SITES) == look.site
+    return np.concatenate([look.field_b, [sigma], which.astype(float)])
 
 
 def mean_rate(integrals: model.Integrals) -> np.ndarray:

@@ -20,6 +20,7 @@ from robins.dataset import AttitudeTable, Dataset
 from robins.earth.magnetic import MagneticModelError, decimal_year, elements, field_n, wmm_for
 from robins.errors import require_known
 from robins.filters import Belief, Code, Filter, kalman, rules
+from robins.filters.composite.alternative import alternative
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory, Rule
 from robins.filters.trees import select
@@ -34,6 +35,13 @@ from robins.systems.replaying import Answer, Recorded, Reported
 from robins.systems.study import Contender, StateBlock
 from robins.systems.tables import EULER, attitude_array, block_array
 
+# of what is learned of travel: forgetting, and least and most of its variances
+_MEMORY, _TRAVEL_VARIANCE = 0.98, (0.3, 10.0)
+# the same of the field: within that of a room, or as a unit that nobody calibrated reads it
+_FIELD_MEMORY, _FIELD_VARIANCE = 0.95, (1.0, 16.0)
+_TAILS = 4.0  # degrees of freedom of Student's t
+_NATS = 40.0  # for a bare chip; errors of travel last for some looks, so they count several times
+BARE = "gyro_gain"  # what is found wrong where the gyros are those of a bare chip
 CAUSAL, SMOOTHED = FILTERS = ("marg", "marg-smoothed")
 _ESTIMATED = {
     block.name: {"velocity": "v_n"}.get(block.name, block.name) for block in model.BLOCKS[1:]
@@ -96,36 +104,54 @@ def undisturbed(probability: float, patience: int, field_t: float) -> Rule:
 def marg_filter(
     gate: float | None = 0.95,
     patience: int = 20,
-    weight: float = 0.9999,
     field_t: float = 1e-4,
+    sites: bool = True,
 ) -> Filter:
-    """The filter of `marg.model_of`.
+    """The filter of `marg.model_of`, for one prior.
+
+    How far the unit travels, and how much the field of its places scatters, is learned: no constant
+    is right for a hand and a flight, or for a unit that was calibrated and one that was not.
 
     Args:
         gate: share of right magnetometer readings that pass; None believes every reading, and is
             for a model without a magnetometer too.
         patience: readings refused in a row before a field that stays is taken up.
-        weight: share of travel that keeps its weight (`rules.huber`).
         field_t: T, spread of strength and vertical component of a new field.
+        sites: the model reads sites.
     """
-    chain = [  # assumptions, which may be wrong for long: time does not make them right
-        rules.only(model.TRAVEL, rules.huber(weight, patience=None)),
-        rules.only(model.REST_RATE, rules.gate(0.9999, 100, "accept")),
+    chain = [
+        rules.only(model.TRAVEL, rules.sage_husa(_MEMORY, "R", *_TRAVEL_VARIANCE)),
+        # assumptions, which may be wrong for long: time does not make them right
+        rules.only(model.REST, rules.gate(0.9999, 100, "accept")),
     ]
     if gate is not None:
-        chain.append(undisturbed(gate, patience, field_t))
+        learned = rules.sage_husa(_FIELD_MEMORY, "R", *_FIELD_VARIANCE)
+        chain += [
+            rules.only(model.MAGNETOMETER, learned),
+            undisturbed(gate, patience, field_t),
+            rules.only(model.MAGNETOMETER, rules.student_t(_TAILS, patience=None)),
+        ]
+    if sites:
+        chain.append(rules.only(model.REVISIT, rules.student_t(_TAILS, patience=None)))
     return kalman(rules=chain)
 
 
-def filter_of(parameters: Replay) -> Filter:
-    """The filter, with its rules."""
-    m = parameters.magnetometer
+def one_prior(parameters: Replay) -> Filter:
+    """The filter, with its rules, for gyros as `parameters.gyro.gain` says."""
+    m, sees = parameters.magnetometer, parameters.use_magnetometer
     return marg_filter(
-        gate=m.gate if parameters.use_magnetometer == "undisturbed" else None,
+        gate=m.gate if sees == "undisturbed" else None,
         patience=max(1, round(m.patience / parameters.travel.every)),
-        weight=parameters.travel.weight,
         field_t=m.most,
+        sites=sees != "never",
     )
+
+
+def filter_of(parameters: Replay) -> Filter:
+    """The filter of a log, which takes gyros for those of a bare chip once that is likelier."""
+    gyro, spread = parameters.gyro, np.zeros(model.DIM)
+    spread[model.GAINS] = gyro.bare_gain
+    return alternative(one_prior(parameters), spread, [model.TRAVEL], _NATS, BARE)
 
 
 class OrientationErrors(NamedTuple):
@@ -220,12 +246,14 @@ def replay(
         ValueError: the log cannot be used; the sentence says why.
     """
     progress(0.0, "integrating blocks")
-    log, smoothers = prepare(dataset, parameters), {SMOOTHED: CAUSAL}
+    log = prepare(dataset, parameters)
     wanted = filters or parameters.filters
-    # the run that is smoothed is told too: its innovations are what the smoother can be doubted by
-    told = tuple(dict.fromkeys([*wanted, CAUSAL]))
-    answers = replaying.navigated([log], told, partial(contender, parameters), smoothers, progress)
-    seen = _as_stated(log, answers[CAUSAL], parameters).updates
+    # the causal run is asked too: its innovations are what the smoother can be doubted by
+    told = tuple(dict.fromkeys([*(name for name in wanted if name != SMOOTHED), CAUSAL]))
+    answers = replaying.navigated([log], told, partial(contender, parameters), None, progress)
+    seen = monitor.as_stated(_as_stated(log, answers[CAUSAL], parameters).updates, parameters)
+    if SMOOTHED in wanted:
+        answers |= _smoothed(log, answers[CAUSAL], parameters)
     answers = {name: answers[name] for name in wanted}
     q_nb = {name: _by_sample(log, answer) for name, answer in answers.items()}
     answers = {name: _as_stated(log, a, parameters) for name, a in answers.items()}
@@ -280,6 +308,18 @@ def replay(
         origin_ns=int(log.time_ns[0]),
     )
     return replace(outcome, warnings=[*warned, *outcome.warnings])
+
+
+def _smoothed(log: Prepared, causal: Answer, parameters: Replay) -> dict[str, Answer]:
+    """The smoother, for the gyros that the causal run ended with."""
+    start = log.world.start
+    if np.asarray(causal.wrong[BARE])[-1] > 0.5:
+        factor, gains = np.array(start.factor), np.arange(model.DIM)[model.GAINS]
+        factor[gains, gains] = np.hypot(parameters.gyro.gain, parameters.gyro.bare_gain)
+        start = start._replace(factor=jnp.asarray(factor))
+    piece = replace(log, world=log.world._replace(start=start))
+    one = Contender(one_prior(parameters), model.model_of(parameters))
+    return replaying.navigated([piece], [SMOOTHED], lambda _: one, {SMOOTHED: CAUSAL})
 
 
 def true_north(dataset: Dataset) -> float | None:
@@ -369,7 +409,7 @@ REPORTED = Reported(
     causes="Likely causes: a magnetometer without calibration (`robins calibrate`) or beside iron, "
     "axes or units of a sensor that differ from what the log says, or noise of the gyro told too "
     "small.",
-    assumed=(model.TRAVEL, model.REST_RATE, model.MAGNETOMETER),
+    assumed=(model.TRAVEL, model.REST, model.MAGNETOMETER),
     euler=EULER._replace(frame="body to NED"),
 )
 

@@ -26,6 +26,8 @@ _PLATEAU_S = (0.08, 0.4)  # s, that a level without jumps may last; a machine tu
 _KEPT_PAIRS = 100  # of samples at the level, more than a peak has
 LONGEST_S = 0.2  # s, of a peak that is bridged
 FLANK = 3  # samples on either side, by which it is
+_FROZEN_SAMPLES = 5  # of a block, below which repeated numbers say nothing
+_SHAKEN = 0.5  # m/s^2, range of the specific force in a block of a unit that moves
 _MISSED = 0.3  # of what a bridge adds: the share that it may err by
 
 
@@ -167,3 +169,32 @@ def _slope(t: np.ndarray, x: np.ndarray) -> float:
     """Slope at the last of three samples, of the parabola through them."""
     late, early = (x[2] - x[1]) / (t[2] - t[1]), (x[1] - x[0]) / (t[1] - t[0])
     return float(late + (late - early) * (t[2] - t[1]) / (t[2] - t[0]))
+
+
+class Frozen:
+    """Blocks in which the gyros repeat themselves while the accelerometers do not.
+
+    A converter or a driver that hangs hands out its last numbers again, give or take one step of
+    the least digit. A unit at rest does so too, if its steps are coarse; then the specific force is
+    quiet.
+    """
+
+    def __init__(self) -> None:
+        """Begin: no step is known."""
+        self._step = np.full(3, np.inf)  # rad/s, least difference of each axis that is not 0
+
+    def look(self, rate: np.ndarray, accel: np.ndarray) -> bool:
+        """Judge the samples of a block, with the last one before it.
+
+        Args:
+            rate: (n + 1, 3) rad/s.
+            accel: (n + 1, 3) m/s^2.
+        """
+        change = np.abs(np.diff(rate, axis=0))
+        known = self._step
+        least = np.min(np.where(change > 0.0, change, np.inf), axis=0, initial=np.inf)
+        self._step = np.minimum(known, least)
+        if len(change) < _FROZEN_SAMPLES or not np.all(np.isfinite(known)):
+            return False
+        repeats = np.all(np.ptp(rate[1:], axis=0) <= 1.5 * known)
+        return bool(repeats and np.max(np.ptp(accel[1:], axis=0)) > _SHAKEN)

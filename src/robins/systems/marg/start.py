@@ -21,6 +21,8 @@ from robins.systems.marg.rest import Watch
 _STILL_RATE = np.radians(8.0)  # rad/s, mean length of the rate
 _STILL_SPREAD = np.radians(1.0)  # rad/s, mean length of its changes
 _STILL_FORCE = 0.5  # m/s^2
+_BIASES = 3.0  # standard deviations of the bias, beyond which a scale is off
+_SCALE = 0.1  # share of gravity that it may be off by
 
 
 class FirstLook(NamedTuple):
@@ -30,6 +32,7 @@ class FirstLook(NamedTuple):
     field_t: np.ndarray  # (2,) T along the horizontal and down; zeros where no field was seen
     tilt_rad: float
     heading_rad: float
+    gravity: float  # m/s^2, as the accelerometers read it
     still: bool
     sentence: str
 
@@ -78,9 +81,13 @@ def first_look(increments: Increments, field_b: np.ndarray, parameters: Replay) 
         tilt = np.pi / 2.0
         force = force if size > 1e-3 else np.array([0.0, 0.0, -1.0])
     how = f"{'at rest' if still else 'in motion'}, {how}"
+    gravity = parameters.accelerometer.gravity
+    if still and _BIASES * parameters.accelerometer.bias < abs(size - gravity) < _SCALE * gravity:
+        gravity = size  # no bias is so large: the accelerometers have another scale
     if not np.any(there):
+        q_nb = attitude_of(force, None)
         sentence = f"Levelled {how}; there is no field, so the heading is counted from the start."
-        return FirstLook(attitude_of(force, None), np.zeros(2), tilt, np.pi, still, sentence)
+        return FirstLook(q_nb, np.zeros(2), tilt, np.pi, gravity, still, sentence)
     field = np.mean(turned[1:].apply(np.where(there[:, None], field_b[:window], 0.0)), axis=0)
     field = field * window / np.sum(there)
     q_nb = attitude_of(force, field)
@@ -91,7 +98,7 @@ def first_look(increments: Increments, field_b: np.ndarray, parameters: Replay) 
         f"{dip:.1f} deg, is north."
     )
     heading = start.heading if still else start.heading_moving
-    return FirstLook(q_nb, np.array([north, down]), tilt, heading, still, sentence)
+    return FirstLook(q_nb, np.array([north, down]), tilt, heading, gravity, still, sentence)
 
 
 def _turned(theta: np.ndarray) -> SciRotation:
@@ -126,6 +133,8 @@ def first_belief(look: FirstLook, parameters: Replay, rest: Watch | None = None)
         accel_bias=jnp.zeros(3),
         declination=jnp.zeros(()),
         field=jnp.asarray(look.field_t),
+        azimuths=jnp.zeros(model.SITES),
+        gravity=jnp.asarray(look.gravity),
     )
     known = bool(np.any(look.field_t != 0.0))
     # where north is the field of the start, its declination is none but for a first noise
@@ -141,6 +150,8 @@ def first_belief(look: FirstLook, parameters: Replay, rest: Watch | None = None)
         [p.accelerometer.bias] * 3,
         [bend],
         [p.magnetometer.noise if known else p.magnetometer.most] * 2,
+        [np.pi] * model.SITES,
+        [0.0 if look.gravity == p.accelerometer.gravity else p.accelerometer.bias],
     ]
     factor = np.diag(np.concatenate([np.asarray(s, dtype=float) for s in sigma]))
     if known and p.start.north == "mean":
@@ -148,4 +159,6 @@ def first_belief(look: FirstLook, parameters: Replay, rest: Watch | None = None)
         factor[model.HEADING, model.HEADING] = heading
         factor[model.DECLINATION, model.HEADING] = bend**2 / heading
         factor[model.DECLINATION, model.DECLINATION] = bend * look.heading_rad / heading
+    # at the site of the start the field points by its declination
+    factor[model.AZIMUTHS.start] = factor[model.DECLINATION]
     return Belief(mean, jnp.asarray(factor))

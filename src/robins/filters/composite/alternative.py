@@ -1,0 +1,124 @@
+"""A filter and its second run from a wider start, which counts once the measurements are for it.
+
+A prior that most units keep is worth having, and a unit that does not keep it leaves it only in
+small steps: what the prior forbids goes into other states meanwhile. So both are run from the
+beginning, and what the second has found by then is there at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from robins import linalg
+from robins.errors import require
+from robins.filters.belief import Belief
+from robins.filters.kalman import WRONG, Advanced, Filter, FilterState, Prediction, Updated
+from robins.filters.model import Data, Given, Motion, Sensor
+from robins.filters.values import Numbers, kind, value
+from robins.linalg.rows import each_row
+
+T = TypeVar("T")
+
+
+class Two(NamedTuple):
+    """Memory of an `alternative`."""
+
+    states: FilterState  # leading axis of two: of the start given, and of the wider one
+    evidence: Array  # () nats for the second, since it was least
+    taken: Array  # () bool, the second counts, now and for good
+
+
+@value
+class Alternative(Filter):
+    """The filter of `alternative`."""
+
+    inner: Filter
+    spread: Numbers  # (n,)
+    nats: Numbers  # ()
+    judging: tuple[str, ...] = kind()
+    wrong: str = kind()
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        return (self.wrong,)
+
+    def suspicions(self, state: FilterState) -> Array:
+        return state.memory.taken.astype(float)[None]
+
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        wide = linalg.tria(belief.factor, jnp.diag(jnp.asarray(self.spread)))
+        begun = [self.inner.init(b, dims) for b in (belief, belief._replace(factor=wide))]
+        states = jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *begun)
+        return FilterState(belief, Two(states, jnp.zeros(()), jnp.zeros((), bool)))
+
+    def _predict(self, state: FilterState, motion: Motion, u: Data) -> Advanced:
+        def predicted(one: FilterState) -> tuple[FilterState, tuple[Belief, Array]]:
+            one, prediction = self.inner.predict(one, motion, u)
+            return one, (prediction.belief, prediction.code)
+
+        two = state.memory
+        states, found = each_row(predicted, two.states)
+        belief, code = _one(found, two.taken)
+        return FilterState(belief, two._replace(states=states)), Prediction(None, belief, code)
+
+    def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data) -> Updated:
+        def updated(one: FilterState) -> Updated:
+            return self.inner.update(one, sensor, y, aux)
+
+        two = state.memory
+        states, found = each_row(updated, two.states)
+        evidence, taken = two.evidence, two.taken
+        if sensor.name in self.judging:
+            first, second = found.log_likelihood
+            gained = jnp.where(jnp.isfinite(second - first), second - first, 0.0)
+            evidence = jnp.maximum(evidence + gained, 0.0)
+            taken = taken | (evidence > jnp.asarray(self.nats))
+        info = _one(found, two.taken)
+        wrong = taken.astype(float)[None]
+        notes = {**info.notes, "alternative.evidence": evidence, WRONG: wrong}
+        belief = _one(states.belief, taken)
+        return FilterState(belief, Two(states, evidence, taken)), info._replace(notes=notes)
+
+    def reset(self, state: FilterState, belief: Belief) -> FilterState:
+        two = state.memory
+        states = each_row(lambda one: self.inner.reset(one, belief), two.states)
+        return FilterState(belief, two._replace(states=states))
+
+
+def _one(tree: T, second: Array) -> T:
+    return jax.tree_util.tree_map(lambda x: jnp.where(second, x[1], x[0]), tree)
+
+
+def alternative(
+    inner: Filter, spread: Given, judging: Sequence[str], nats: float, wrong: str
+) -> Filter:
+    """A filter of which a second run, from a wider start, takes over once it is the likelier.
+
+    Both take every step. The evidence is the logarithm of the likelihood ratio of their
+    innovations, summed from where it was least (Page's test, Biometrika 41, 1954). Before, the
+    answer is bit for bit that of the first, afterwards that of the second. Updates note
+    ``alternative.evidence`` and, as ``imm.wrong`` (1,), whether what is called `wrong` is. To
+    smooth a run, run `inner` from the start that counts at its end.
+
+    Args:
+        inner: what both run.
+        spread: (n,) standard deviations that the second start has beside those given.
+        judging: names of the sensors whose innovations are compared.
+        nats: evidence at which the second takes over, above 0.
+        wrong: name of what the first start is wrong about (`Filter.suspects`).
+
+    Raises:
+        ValueError: a spread is negative or not finite, nats are not positive, no sensor judges.
+    """
+    spread = np.asarray(spread, float)
+    if spread.ndim != 1 or not np.all(np.isfinite(spread) & (spread >= 0.0)):
+        raise ValueError("spread of an alternative must be a vector of finite numbers from 0 up")
+    require(nats > 0.0, "nats of an alternative must be positive", nats)
+    require(len(judging) > 0, "an alternative needs a sensor that judges")
+    return Alternative(inner, spread, np.asarray(float(nats)), tuple(judging), wrong)
