@@ -90,7 +90,7 @@ def test_errors_are_small_and_as_large_as_stated(moved):
 
 def test_without_gain_states_the_heading_drifts_further(moved):
     log, outcome = moved
-    gyro = PARAMETERS.gyro.model_copy(update={"gain": 0.0})
+    gyro = PARAMETERS.gyro.model_copy(update={"gain": 0.0, "bare_gain": 0.0})
     poor = replay(log, PARAMETERS.model_copy(update={"gyro": gyro}))
     # what the states are for: with them the heading is better, smoothed, by half
     better = outcome.metrics["marg-smoothed"]["heading_rmse_deg"]

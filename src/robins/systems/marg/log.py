@@ -83,7 +83,7 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
     assert found_start is not None
     look, belief = found_start
     rows = np.minimum((np.arange(len(steps.still)) + 1) * path.n, len(dt))
-    counts = ("imu_saturated", "imu_bridged", "imu_gaps", "blocks_in_free_fall")
+    counts = ("imu_saturated", "imu_bridged", "imu_frozen", "imu_gaps", "blocks_in_free_fall")
     return Prepared(
         world=Case(belief, steps.u, steps.y, steps.aux, None),
         begin_s=0.0,

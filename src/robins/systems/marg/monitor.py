@@ -77,7 +77,8 @@ def doubts_of(
 def squared(innovation: np.ndarray, parameters: Replay) -> np.ndarray:
     """Sum of squares of innovations of travel (..., 6) in their stated standard deviations."""
     travel = parameters.travel
-    return np.sum((innovation / np.repeat([travel.velocity, travel.place], 3)) ** 2, axis=-1)
+    ratio = innovation / np.repeat([travel.velocity, travel.place], 3)
+    return np.asarray(np.sum(ratio**2, axis=-1))
 
 
 def as_stated(updates: Mapping[str, Update], parameters: Replay) -> dict[str, Update]:

@@ -208,10 +208,8 @@ class SamplePath:
         made = self.increments(self.time_ns, rate, accel)
         block, own, ends = slice(context, end), slice(context - 1, end - 1), slice(context - 1, end)
         dt, theta, dv = (np.asarray(a, float)[own] for a in made[:3])
-        unseen = full | self._frozen_blocks(end)[:, None]
-        turn, lost_s, gaps = not_sampled(
-            dt, unseen[ends], doubt[ends], hard[ends], self._usual_s, p
-        )
+        turn, lost_s, gaps = not_sampled(dt, full[ends], doubt[ends], hard[ends], self._usual_s, p)
+        turn += p.update.gap_rate * (self._hung(end)[block] * dt)[:, None]
         self.counts["imu_gaps"] += gaps
         self.counts["imu_saturated"] += int(np.sum((np.any(full, axis=1) | hard)[block]))
         self.counts["imu_bridged"] += int(np.sum(np.any(np.isfinite(doubt), axis=1)[block]))
@@ -225,16 +223,20 @@ class SamplePath:
         self._context = end - drop
         return self._steps(samples, *lost)
 
-    def _frozen_blocks(self, end: int) -> np.ndarray:
-        """(M,) bool of the samples kept: in blocks up to `end` in which the gyros hang."""
-        out = np.zeros(len(self.rows), bool)
+    def _hung(self, end: int) -> np.ndarray:
+        """(M,) of the samples kept: weight of the turn that gyros which hang up to `end` missed.
+
+        A unit that hangs for some blocks misses one turn, so spreads of blocks add up, not their
+        squares: that of block k is sqrt(2 k - 1) times the first.
+        """
+        out = np.zeros(len(self.rows))
         if self._kind != "rate":
             return out
         for at in range(self._context, end, self.n):
             rows = self.rows[at - 1 : min(at + self.n, end)]
-            if self._frozen.look(rows[:, :3], rows[:, 3:6]):
-                out[at : at + self.n] = True
-        self.counts["imu_frozen"] += int(np.sum(out))
+            row = self._frozen.look(rows[:, :3], rows[:, 3:6])
+            out[at : at + self.n] = math.sqrt(2.0 * row - 1.0) if row else 0.0
+        self.counts["imu_frozen"] += int(np.sum(out > 0.0))
         return out
 
     def _steps(self, samples: model.Samples, lost_turn: np.ndarray, lost_s: np.ndarray) -> Steps:

@@ -494,7 +494,8 @@ def _sentences(log: Prepared, answers: Mapping[str, Answer]) -> list[str]:
         log.look.sentence,
         f"At rest for {100.0 * float(np.mean(log.still)):.0f} % of the log; "
         f"{c['imu_missing']} inertial samples missing, {c['imu_saturated']} at the end of their "
-        f"range ({c['imu_bridged']} put back from their flanks), {c['imu_gaps']} gaps; "
+        f"range ({c['imu_bridged']} put back from their flanks), {c['imu_frozen']} in which the "
+        f"gyros hang, {c['imu_gaps']} gaps; "
         f"{c['field_missing']} field readings missing, "
         f"{c['field_implausible']} no field of the Earth; {c['blocks_in_free_fall']} blocks in "
         f"free fall.",

@@ -182,9 +182,13 @@ class Frozen:
     def __init__(self) -> None:
         """Begin: no step is known."""
         self._step = np.full(3, np.inf)  # rad/s, least difference of each axis that is not 0
+        self._hung = 0  # blocks in a row, up to the last, that end so
 
-    def look(self, rate: np.ndarray, accel: np.ndarray) -> bool:
+    def look(self, rate: np.ndarray, accel: np.ndarray) -> int:
         """Judge the samples of a block, with the last one before it.
+
+        Returns:
+            Number of blocks in a row in which the gyros hang, up to this one; 0 where they do not.
 
         Args:
             rate: (n + 1, 3) rad/s.
@@ -194,7 +198,11 @@ class Frozen:
         known = self._step
         least = np.min(np.where(change > 0.0, change, np.inf), axis=0, initial=np.inf)
         self._step = np.minimum(known, least)
-        if len(change) < _FROZEN_SAMPLES or not np.all(np.isfinite(known)):
-            return False
-        repeats = np.all(np.ptp(rate[1:], axis=0) <= 1.5 * known)
-        return bool(repeats and np.max(np.ptp(accel[1:], axis=0)) > _SHAKEN)
+        last = rate[-max(_FROZEN_SAMPLES, len(change) // 2) :]
+        before, self._hung = self._hung, 0
+        if len(change) >= len(last) and np.all(np.isfinite(known)):
+            repeats = np.all(np.ptp(last, axis=0) <= 1.5 * known)
+            if repeats and np.max(np.ptp(accel[1:], axis=0)) > _SHAKEN:
+                self._hung = before + 1
+        # the block after the last may begin so
+        return self._hung or (before + 1 if before else 0)
