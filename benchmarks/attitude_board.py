@@ -1,6 +1,7 @@
 """Attitude on public logs with a reference: robins beside VQF and imufusion, trial by trial.
 
-    python benchmarks/attitude_board.py --broad FOLDER --euroc FOLDER --repoimu FOLDER
+    python benchmarks/attitude_board.py --broad FOLDER --euroc FOLDER --repoimu FOLDER \
+        --als FOLDER --ese FOLDER
 
 Every folder is optional, and nothing is fetched. What is read:
 
@@ -16,6 +17,17 @@ Every folder is optional, and nothing is fetched. What is read:
   cameras jumps (more than 20 rad/s between two frames) the longest stretch between jumps counts:
   of Test06_Trial1 all but the last 2.5 s. Errors from the first to the last time that the true
   rate exceeds 0.2 rad/s.
+- ALS (Josef4Sci/AHRS_Filter): ``ALS_dataset.mat``, a flight with a magnetometer that nobody
+  calibrated. Units are g and rad/s; the field is taken for 50 uT in the mean. The reference turns
+  earth axes into axes of its own body, of which x and y are -y and -x of the unit, as the angular
+  rates of both show, and z is down; its north is turned to the mean field.
+- ESE650 (yashv28/Orientation-Estimation-using-Unscented-Kalman-Filter): ``imuRawN.mat`` and
+  ``viconRotN.mat``, a bare chip read by a converter of 10 bit. Scales are those of its data sheet,
+  biases the mean of the first 100 samples at rest. Inclination alone.
+
+What was chosen on a trial cannot be judged on it. Of a set of several trials that came after the
+choices for BROAD, EuRoC and T-stick (today ESE650) the one whose name has the least SHA-256 is kept
+aside: it is read only with --final "why", and the look is added to benchmarks/looks.md.
 
 Columns: total, heading and inclination error (root mean square, deg, as BROAD defines them), mean
 squared heading error over its stated variance (one is right), seconds with a heading or inclination
@@ -28,11 +40,14 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from datetime import date
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.io
 from scipy.spatial.transform import Rotation, Slerp
 
 from robins.dataset import AttitudeTable, Dataset, ImuTable, MagTable
@@ -45,6 +60,12 @@ ENU_TO_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 NWU_TO_ENU = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
 MOVING_RATE = 0.2  # rad/s, of the reference
 LONGEST_OFFSET_S = 0.2
+GRAVITY = 9.81
+FLU_TO_FRD = np.array([1.0, -1.0, -1.0])
+FLU_FRD = NWU_TO_NED = np.array([0.0, 1.0, 0.0, 0.0])  # half a turn about x
+ALS_BODY = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+ESE_G, ESE_DEG_S = 3300.0 / 1023.0 / np.array([330.0, 3.33])  # of a count, by the data sheet
+ESE_DEVELOPMENT = {"1", "3", "6"}
 JUMP_RATE = 20.0  # rad/s between two frames of the reference
 FIELD_T = 50e-6  # of a field that is stored without a unit
 # Trials on which settings were found in releases before, or may be found now.
@@ -297,7 +318,76 @@ def fused(imufusion: Any, step: float, gyro: Any, accel: Any, field: Any) -> np.
     return multiply(NWU_TO_ENU, out)
 
 
-READERS = {"broad": broad, "euroc": euroc, "repoimu": repoimu}
+def als(folder: Path) -> Iterator[Trial]:
+    """The flight of ALS."""
+    for path in sorted(folder.glob("ALS*.mat")):
+        data = scipy.io.loadmat(path)
+        time_ns = np.round(data["time"][:, 0] * 1e9).astype(np.int64)
+        field = data["Magnetometer"] * FLU_TO_FRD
+        field = field * FIELD_T / np.mean(np.linalg.norm(field, axis=1))
+        seen = np.roll(data["qViconReference"][: len(time_ns)], -1, axis=1)
+        q = Rotation.from_quat(seen).inv() * Rotation.from_matrix(ALS_BODY)
+        north, east, _ = np.mean(q.apply(field), axis=0)
+        q = Rotation.from_euler("z", -np.arctan2(east, north)) * q
+        accel = data["Accelerometer"] * FLU_TO_FRD * GRAVITY
+        log = Dataset(
+            name=path.stem,
+            imu=ImuTable(time_ns, data["Gyroscope"] * FLU_TO_FRD, accel, "rate"),
+            mag=MagTable(time_ns, field),
+            attitude=AttitudeTable(time_ns, scalar_first(q)),
+        )
+        yield Trial("ALS", path.stem, log, False, True)
+
+
+def ese(folder: Path) -> Iterator[Trial]:
+    """Trials of ESE650."""
+    for path in sorted(folder.glob("imuRaw*.mat")):
+        number = path.stem.removeprefix("imuRaw")
+        raw, truth = (scipy.io.loadmat(folder / f"{k}{number}.mat") for k in ("imuRaw", "viconRot"))
+        clock, counts = raw["ts"][0], raw["vals"].T.astype(float)
+        zero = counts[:100].mean(axis=0)
+        force = (counts[:, :3] - zero[:3]) * [-1.0, -1.0, 1.0] * ESE_G + [0.0, 0.0, 1.0]
+        rate = np.radians((counts - zero)[:, [4, 5, 3]] * ESE_DEG_S)
+        fresh = np.concatenate([[True], np.diff(clock) > 0.0])
+        time_ns = np.round((clock - clock[0])[fresh] * 1e9).astype(np.int64)
+        turns, seen = np.moveaxis(truth["rots"], 2, 0), truth["ts"][0] - clock[0]
+        seen = seen[: len(turns)]
+        good = np.all(np.isfinite(turns), axis=(1, 2)) & np.concatenate([[True], np.diff(seen) > 0])
+        q = scalar_first(Rotation.from_matrix(turns[good]))
+        q = at_times(time_ns, np.round(seen[good] * 1e9).astype(np.int64), q)
+        log = Dataset(
+            name=path.stem,
+            imu=ImuTable(
+                time_ns, rate[fresh] * FLU_TO_FRD, force[fresh] * FLU_TO_FRD * GRAVITY, "rate"
+            ),
+            attitude=AttitudeTable(time_ns, multiply(NWU_TO_NED, multiply(q, FLU_FRD))),
+        )
+        yield Trial("ESE650", number, log, True, number in ESE_DEVELOPMENT)
+
+
+READERS = {"broad": broad, "euroc": euroc, "repoimu": repoimu, "als": als, "ese": ese}
+CHOSEN_ON = {"BROAD", "EuRoC", "T-stick"}  # before trials were kept aside
+LOOKS = Path(__file__).with_name("looks.md")
+
+
+def aside(trials: Sequence[Trial]) -> set[tuple[str, str]]:
+    """Set and name of the trials that no choice may look at."""
+    out = set()
+    for which in {trial.set for trial in trials} - CHOSEN_ON:
+        names = [trial.name for trial in trials if trial.set == which]
+        if len(names) > 1:
+            out.add(
+                (which, min(names, key=lambda name: sha256(f"{which} {name}".encode()).digest()))
+            )
+    return out
+
+
+def looked(why: str, trials: set[tuple[str, str]]) -> None:
+    """Add a look at the trials kept aside to the list of looks."""
+    names = ", ".join(f"{which} {name}" for which, name in sorted(trials))
+    with LOOKS.open("a") as lines:
+        lines.write(f"- {date.today()}: {names}. {why}\n")
+
 
 # --------------------------------------------------------------------------------------- printing
 
@@ -323,12 +413,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     for name in READERS:
         parser.add_argument(f"--{name}", type=Path, action="append", default=[])
+    parser.add_argument("--final", metavar="WHY", default="", help="read what is kept aside too")
     given = vars(parser.parse_args())
     trials = [
         t for name, reader in READERS.items() for folder in given[name] for t in reader(folder)
     ]
     if not trials:
         parser.error("no trial found: give a folder of logs")
+    kept = aside(trials)
+    if given["final"] and kept:
+        looked(given["final"], kept)
+    elif kept:
+        trials = [trial for trial in trials if (trial.set, trial.name) not in kept]
     head = ["total", "heading", "inclination", "NEES", "beyond_s", "warned", "us"]
     found: dict[tuple[str, bool, str], list[Row]] = {}
     print(f"| trial, estimator | {' | '.join(head)} |\n|{'---|' * (len(head) + 1)}")

@@ -33,7 +33,7 @@ from attitude_board import READERS
 from scipy.stats import kstest
 
 from robins.filters import rts_smoother, run
-from robins.systems.marg import Replay, filter_of, model_of, prepare
+from robins.systems.marg import Replay, model_of, one_prior, prepare
 from robins.systems.marg.model import HEADING
 from robins.systems.marg.replay import orientation_errors, truth_at
 
@@ -79,7 +79,7 @@ def main() -> None:
         for trial in (t for folder in folders for t in READERS[name](folder) if t.development):
             log = prepare(trial.log, p)
             w, count = log.world, len(log.rows)
-            answer = run(filter_of(p), model_of(p), w.start, w.y, w.u, w.aux, machine="vm")
+            answer = run(one_prior(p), model_of(p), w.start, w.y, w.u, w.aux, machine="vm")
             beliefs = answer.steps.posterior, rts_smoother(answer, machine="vm")
             assert trial.log.attitude is not None
             true, counts = truth_at(trial.log.attitude, log.time_ns[log.rows])

@@ -91,7 +91,7 @@ def test_it_names_what_is_wrong_and_goes_on_from_another_belief():
     there = Belief(jnp.ones(2), 2.0 * jnp.eye(2))
     again = FILTER.reset(begun, there)
     np.testing.assert_array_equal(np.asarray(again.belief.mean), np.ones(2))
-    np.testing.assert_array_equal(np.asarray(again.memory.states.belief.mean), np.ones((2, 2)))
+    np.testing.assert_array_equal(np.asarray(again.memory[0].belief.mean), np.ones((2, 2)))
 
 
 @pytest.mark.parametrize(

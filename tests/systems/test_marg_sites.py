@@ -8,7 +8,7 @@ from marg_logs import RATE_HZ, hand, log_of, with_field, with_imu
 from scipy.spatial.transform import Rotation
 
 from robins.systems.marg import Replay, replay
-from robins.systems.marg.saturation import Frozen
+from robins.systems.marg.saturation import Range
 from robins.systems.marg.sites import NONE, Sites
 
 BLOCK_S = 0.1
@@ -36,22 +36,22 @@ def turned(*deg):
 
 def test_the_first_site_is_read_from_the_second_rest_on_whatever_the_attitude():
     found = visits(HOME, turned(70.0, -30.0, 160.0), OTHER, OTHER)
-    assert [[look.site for look in one] for one in found] == [[], [0], [1], [1]]
-    look = found[1][0]
-    np.testing.assert_allclose(look.field_b, turned(70.0, -30.0, 160.0)[0], rtol=1e-12)
-    assert look.dip_rad == pytest.approx(np.arctan2(44.0, 18.0))
+    assert [[site for site, *_ in one] for one in found] == [[], [0], [1], [1]]
+    _, field_b, dip = found[1][0]
+    np.testing.assert_allclose(field_b, turned(70.0, -30.0, 160.0)[0], rtol=1e-12)
+    assert dip == pytest.approx(np.arctan2(44.0, 18.0))
 
 
 def test_a_log_that_begins_in_motion_has_no_first_site():
     found = visits(HOME, HOME, at_home=False)
-    assert [[look.site for look in one] for one in found] == [[1], [1]]
+    assert [[site for site, *_ in one] for one in found] == [[1], [1]]
 
 
 def test_a_unit_that_hardly_moved_is_not_read_again_and_no_more_sites_than_there_is_room_for():
     assert visits(HOME, HOME, apart_s=3.0) == [[], []]
     fields = [HOME * (1.0 + 0.05 * k) for k in range(6)]
     found = visits(*fields, count=3)
-    assert [[look.site for look in one] for one in found] == [[], [1], [2], [], [], []]
+    assert [[site for site, *_ in one] for one in found] == [[], [1], [2], [], [], []]
     assert visits((HOME, 0.01 * DOWN), HOME) == [[], []]  # nothing holds the unit up
 
 
@@ -145,14 +145,14 @@ def test_gyros_that_hang_are_found_by_blocks_and_cost_no_more_than_a_gap():
     step = np.radians(1.0)
     rate = step * np.round(rng.normal(0.0, 3.0, (11, 3)))
     shaken, quiet = rng.normal(0.0, 0.5, (11, 3)), rng.normal(0.0, 0.05, (11, 3))
-    watch, hung = Frozen(), np.tile(rate[-1:], (11, 1))
-    assert watch.look(hung, shaken) == 0  # no step is known yet
-    assert watch.look(rate, shaken) == 0
+    watch, hung = Range(), np.tile(rate[-1:], (11, 1))
+    assert watch.hanging(hung, shaken) == 0  # no step is known yet
+    assert watch.hanging(rate, shaken) == 0
     hung[::3] += step  # the least digit still moves
-    assert watch.look(hung, shaken) == 1
-    assert watch.look(hung, shaken) == 2
-    assert watch.look(hung, quiet) == 3  # it may hang at the beginning
-    assert watch.look(hung, quiet) == 0  # at rest
+    assert watch.hanging(hung, shaken) == 1
+    assert watch.hanging(hung, shaken) == 2
+    assert watch.hanging(hung, quiet) == 3  # it may hang at the beginning
+    assert watch.hanging(hung, quiet) == 0  # at rest
     q, p = hand(40.0, seed=5)
     log = log_of(q, p, gyro_noise=2e-3, accel_noise=0.05, field_noise=5e-7)
     gyro = step / 10.0 * np.round(log.imu.gyro / (step / 10.0))

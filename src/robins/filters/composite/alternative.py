@@ -8,7 +8,7 @@ beginning, and what the second has found by then is there at once.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,17 +26,13 @@ from robins.linalg.rows import each_row
 T = TypeVar("T")
 
 
-class Two(NamedTuple):
-    """Memory of an `alternative`."""
-
-    states: FilterState  # leading axis of two: of the start given, and of the wider one
-    evidence: Array  # () nats for the second, since it was least
-    taken: Array  # () bool, the second counts, now and for good
-
-
 @value
 class Alternative(Filter):
-    """The filter of `alternative`."""
+    """The filter of `alternative`.
+
+    Its memory: states with a leading axis of two, of the start given and of the wider one; () nats
+    for the second, since they were least; () bool, the second counts, now and for good.
+    """
 
     inner: Filter
     spread: Numbers  # (n,)
@@ -49,46 +45,46 @@ class Alternative(Filter):
         return (self.wrong,)
 
     def suspicions(self, state: FilterState) -> Array:
-        return state.memory.taken.astype(float)[None]
+        return state.memory[2].astype(float)[None]
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
         wide = linalg.tria(belief.factor, jnp.diag(jnp.asarray(self.spread)))
         begun = [self.inner.init(b, dims) for b in (belief, belief._replace(factor=wide))]
         states = jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *begun)
-        return FilterState(belief, Two(states, jnp.zeros(()), jnp.zeros((), bool)))
+        return FilterState(belief, (states, jnp.zeros(()), jnp.zeros((), bool)))
 
     def _predict(self, state: FilterState, motion: Motion, u: Data) -> Advanced:
         def predicted(one: FilterState) -> tuple[FilterState, tuple[Belief, Array]]:
             one, prediction = self.inner.predict(one, motion, u)
             return one, (prediction.belief, prediction.code)
 
-        two = state.memory
-        states, found = each_row(predicted, two.states)
-        belief, code = _one(found, two.taken)
-        return FilterState(belief, two._replace(states=states)), Prediction(None, belief, code)
+        states, evidence, taken = state.memory
+        states, found = each_row(predicted, states)
+        belief, code = _one(found, taken)
+        return FilterState(belief, (states, evidence, taken)), Prediction(None, belief, code)
 
     def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data) -> Updated:
         def updated(one: FilterState) -> Updated:
             return self.inner.update(one, sensor, y, aux)
 
-        two = state.memory
-        states, found = each_row(updated, two.states)
-        evidence, taken = two.evidence, two.taken
+        states, evidence, before = state.memory
+        states, found = each_row(updated, states)
+        taken = before
         if sensor.name in self.judging:
             first, second = found.log_likelihood
             gained = jnp.where(jnp.isfinite(second - first), second - first, 0.0)
             evidence = jnp.maximum(evidence + gained, 0.0)
             taken = taken | (evidence > jnp.asarray(self.nats))
-        info = _one(found, two.taken)
+        info = _one(found, before)
         wrong = taken.astype(float)[None]
         notes = {**info.notes, "alternative.evidence": evidence, WRONG: wrong}
         belief = _one(states.belief, taken)
-        return FilterState(belief, Two(states, evidence, taken)), info._replace(notes=notes)
+        return FilterState(belief, (states, evidence, taken)), info._replace(notes=notes)
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
-        two = state.memory
-        states = each_row(lambda one: self.inner.reset(one, belief), two.states)
-        return FilterState(belief, two._replace(states=states))
+        states, *known = state.memory
+        states = each_row(lambda one: self.inner.reset(one, belief), states)
+        return FilterState(belief, (states, *known))
 
 
 def _one(tree: T, second: Array) -> T:

@@ -4,11 +4,12 @@ from pathlib import Path
 
 from robins.errors import moved
 from robins.systems.marg.aboard import aboard
+from robins.systems.marg.filters import filter_of, one_prior
 from robins.systems.marg.live import LiveMarg
 from robins.systems.marg.log import prepare
 from robins.systems.marg.model import Block, Samples, integrate, model_of
 from robins.systems.marg.parameters import Replay
-from robins.systems.marg.replay import FILTERS, filter_of, recorded, replay
+from robins.systems.marg.replay import FILTERS, recorded, replay
 from robins.systems.marg.start import first_belief, first_look
 from robins.systems.study import System
 
@@ -39,6 +40,7 @@ __all__ = [
     "first_look",
     "integrate",
     "model_of",
+    "one_prior",
     "prepare",
     "replay",
 ]

@@ -6,7 +6,8 @@ parameters of the unit allow, in a field that a magnet disturbs twice. From its 
 belief all goes the way of a log (`prepare`).
 
 On the board a step takes the increments of a block as they come, and the code integrates them by
-`model.of_block`, as a replay does beforehand.
+`model.of_block`, as a replay does beforehand. It is the filter of one prior: on a board the gains
+of the gyros are known, or asked of a log (`filters.filter_of`).
 """
 
 from __future__ import annotations
@@ -25,9 +26,10 @@ from robins.dataset import Dataset, ImuTable, MagTable
 from robins.filters import Model, Motion
 from robins.rotation import Rotation
 from robins.systems.marg import model
+from robins.systems.marg.filters import one_prior
 from robins.systems.marg.log import Prepared, prepare
 from robins.systems.marg.parameters import Replay
-from robins.systems.marg.replay import CAUSAL, filter_of
+from robins.systems.marg.replay import CAUSAL
 from robins.systems.parts import NED
 from robins.systems.study import Case, Contender, Problem, StateBlock
 
@@ -39,6 +41,7 @@ FIELD_N = np.array([18e-6, 0.0, 44e-6])  # T, north is where it points
 SHAKE = 0.1  # of what is believed of the field, noise of a reading
 
 PLACE = StateBlock("place", slice(6, 9), "m", "m", "NED", NED)  # from the middle of its places
+_LEARNED = {"ratio": "learned variances, 1 as told", "samples": "that they were learned from"}
 _GATE = {"refused": "readings refused in a row", "ratio": "of the last one, 1 at the gate"}
 
 FIELDS = {
@@ -48,17 +51,24 @@ FIELDS = {
     ("predict_input", "still"): "1 where the unit lies still, else 0",
     ("predict_input", "lost_turn"): "rad, body: spread of the turn that was not sampled, else 0",
     ("predict_input", "lost_dv"): "m/s: spread of the velocity that was not sampled, else 0",
-    ("update_travel_reading", "value"): "zeros; NaN where nothing is claimed",
-    ("update_travel_about", "value"): "1 where the unit lies still, else 0",
-    ("update_rest_rate_reading", "value"): "zeros at rest, else NaN",
-    ("update_rest_rate_about", "value"): "rad/s, body: mean rate read at rest; its sigma",
+    ("update_travel_reading", "value"): "zeros; NaN where nothing is claimed, as at rest",
+    ("update_rest_reading", "value"): "zeros at rest, else NaN",
+    ("update_rest_about", "value"): "rad/s, body: mean rate read at rest; its sigma",
     ("update_magnetometer_reading", "at_0_rad"): "0 to use the field, else NaN",
     ("update_magnetometer_reading", "at_1"): "likewise",
     ("update_magnetometer_about", "value"): "T, body at the end of the step: calibrated field",
-    **{("state", f"memory_1_rest_rate_{k}"): text for k, text in _GATE.items()},
-    **{("state", f"memory_2_magnetometer_{k}"): text for k, text in _GATE.items()},
-    ("state", "memory_2_magnetometer_residual"): "innovations of the last ones",
-    ("state", "memory_2_magnetometer_known"): "which of them are there",
+    ("update_revisit_reading", "rad"): "0 where a site is read, else NaN",
+    ("update_revisit_about", "value"): "T, body: mean field; rad, sigma of its azimuth; 1 for the "
+    "site",
+    **{("state", f"memory_1_rest_{k}"): text for k, text in _GATE.items()},
+    **{("state", f"memory_3_magnetometer_{k}"): text for k, text in _GATE.items()},
+    ("state", "memory_3_magnetometer_residual"): "innovations of the last ones",
+    ("state", "memory_3_magnetometer_known"): "which of them are there",
+    **{
+        ("state", f"memory_{k}_{name}_{of}"): text
+        for k, name in (("0_0", "travel"), ("2_0", "magnetometer"))
+        for of, text in _LEARNED.items()
+    },
 }
 """What the fields of the exported library are, beside those that the model declares."""
 
@@ -192,7 +202,7 @@ def aboard(parameters: Replay, seed: int) -> Problem:
         blocks=(*model.BLOCKS[:2], PLACE, *model.BLOCKS[2:]),
         sensors={name: model.SENSORS[name] for name in known.dims},
         simulate=simulate,
-        contenders={CAUSAL: Contender(filter_of(parameters), known)},
+        contenders={CAUSAL: Contender(one_prior(parameters), known)},
         claims=lambda metrics: [],
         count_from=int(np.searchsorted(end_s, COUNTED_S - 1e-9)),
         fields=FIELDS,

@@ -34,9 +34,10 @@ from robins.filters.run import Step
 from robins.ins.increments import Increments
 from robins.linalg.scalars import product
 from robins.systems.marg import model, monitor
+from robins.systems.marg.filters import filter_of
 from robins.systems.marg.parameters import Replay
 from robins.systems.marg.path import SamplePath, Steps
-from robins.systems.marg.replay import filter_of, stated_sigma
+from robins.systems.marg.replay import stated_sigma
 from robins.systems.marg.start import first_belief, first_look
 from robins.systems.replaying import kept
 from robins.systems.streaming import (

@@ -83,6 +83,7 @@ BLOCKS = (
     StateBlock("accel_bias", slice(21, 24), "m/s^2", "mg", "body", XYZ),
     StateBlock("declination", slice(24, 25), "rad", "deg", "NED", ("here",)),
     StateBlock("field", slice(25, 27), "T", "uT", "NED", ("horizontal", "down")),
+    StateBlock("azimuths", AZIMUTHS, "rad", "deg", "NED", tuple(f"site {k}" for k in range(SITES))),
     StateBlock("gravity", slice(GRAVITY, GRAVITY + 1), "m/s^2", "m/s^2", "NED", ("read",)),
 )
 
@@ -108,7 +109,7 @@ class Block(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """Process noise of a second."""
+    """Process noise of a second, and how sure what is known of the motion and the field is."""
 
     gyro: ArrayLike  # rad/sqrt(s)
     turn_error: ArrayLike  # rad per rad turned
@@ -118,16 +119,11 @@ class Noise(NamedTuple):
     accel_bias: ArrayLike  # m/s^2/sqrt(s)
     declination: ArrayLike  # rad, of the stationary Gauss-Markov process
     declination_time: ArrayLike  # s
-    field: ArrayLike  # T/sqrt(s)
-
-
-class Seen(NamedTuple):
-    """How sure what is known of the motion is."""
-
+    field_walk: ArrayLike  # T/sqrt(s)
     velocity: ArrayLike  # m/s, moving
     place: ArrayLike  # m, moving
     velocity_still: ArrayLike  # m/s
-    field: ArrayLike  # T
+    field: ArrayLike  # T, of a reading
 
 
 def correction(x: MargState, block: Block) -> Array:
@@ -185,7 +181,7 @@ def _factor(noise: Noise, x: MargState, block: Block) -> Array:
         jnp.zeros(9),
         jnp.broadcast_to(noise.accel_bias * root, (3,)),
         (noise.declination * drift)[None],
-        jnp.broadcast_to(noise.field * root, (2,)),
+        jnp.broadcast_to(noise.field_walk * root, (2,)),
         jnp.zeros(SITES + 1),
     ]
     return jnp.diag(jnp.concatenate(parts)).at[0:3, 0:3].set(x.q_nb.as_dcm() * turn[None, :])
@@ -222,26 +218,26 @@ def _travel_linear(x: MargState, _: Any):
     return _read_travel(x, None), jnp.eye(6, DIM, 3)
 
 
-def _travel_sigma(seen: Seen) -> Array:
-    sigma = jnp.stack([jnp.asarray(seen.velocity), jnp.asarray(seen.place)])
+def _travel_sigma(noise: Noise) -> Array:
+    sigma = jnp.stack([jnp.asarray(noise.velocity), jnp.asarray(noise.place)])
     return jnp.repeat(sigma, 3)
 
 
-def _read_rest(x: MargState, seen_b: Any):
+def _read_rest(x: MargState, seen_b: Array):
     """Velocity, and what the unit, lying still, would seem to turn by."""
     rate_b = seen_b[:3]
     return jnp.concatenate([x.v_n, rate_b + x.gyro_gain @ rate_b - x.gyro_bias])
 
 
-def _rest_linear(x: MargState, seen_b: Any):
+def _rest_linear(x: MargState, seen_b: Array):
     gain = jnp.kron(jnp.eye(3), seen_b[None, :3])
     H = jnp.zeros((6, DIM)).at[0:3, 3:6].set(jnp.eye(3))
     H = H.at[3:6, 9:12].set(-jnp.eye(3)).at[3:6, 12:21].set(gain)
     return _read_rest(x, seen_b), H
 
 
-def _rest_sigma(seen: Seen, x: MargState, seen_b: Any):
-    velocity, rate = jnp.asarray(seen.velocity_still), jnp.asarray(seen_b)[3]
+def _rest_sigma(noise: Noise, x: MargState, seen_b: Array):
+    velocity, rate = jnp.asarray(noise.velocity_still), jnp.asarray(seen_b)[3]
     return jnp.repeat(jnp.stack([velocity, rate]), 3)
 
 
@@ -264,25 +260,25 @@ def _magnetometer_linear(x: MargState, field_b: Any):
     return _read_magnetometer(x, field_b), H.at[1:, FIELD].set(-jnp.eye(2))
 
 
-def _magnetometer_sigma(seen: Seen, x: MargState, field_b: Any):
+def _magnetometer_sigma(noise: Noise, x: MargState, field_b: Any):
     strength, _ = _level(x, field_b)
     # A field that points down has no azimuth: half a turn is as little as can be known.
-    azimuth = jnp.pi * jnp.tanh(seen.field / jnp.maximum(strength, 1e-3 * seen.field) / jnp.pi)
-    return jnp.stack([azimuth, jnp.asarray(seen.field), jnp.asarray(seen.field)])
+    azimuth = jnp.pi * jnp.tanh(noise.field / jnp.maximum(strength, 1e-3 * noise.field) / jnp.pi)
+    return jnp.stack([azimuth, jnp.asarray(noise.field), jnp.asarray(noise.field)])
 
 
-def _read_site(x: MargState, seen_b: Any):
+def _read_site(x: MargState, seen_b: Array):
     """Azimuth of the field that is read against that of a site; `seen_b` as of "revisit"."""
     _, m = _level(x, seen_b[:3])
     return Angle(jnp.arctan2(m[1], m[0]) - seen_b[4:] @ x.azimuths)
 
 
-def _site_linear(x: MargState, seen_b: Any):
+def _site_linear(x: MargState, seen_b: Array):
     H = jnp.zeros((1, DIM)).at[0, HEADING].set(1.0).at[0, AZIMUTHS].set(-seen_b[4:])
     return _read_site(x, seen_b), H
 
 
-def _site_sigma(x: MargState, seen_b: Any):
+def _site_sigma(x: MargState, seen_b: Array):
     return jnp.asarray(seen_b)[3:4]
 
 
@@ -312,16 +308,19 @@ def model_of(parameters: Replay) -> Model:
         accel_bias=accelerometer.bias_walk,
         declination=magnetometer.declination,
         declination_time=magnetometer.declination_time,
-        field=magnetometer.field_walk,
+        field_walk=magnetometer.field_walk,
+        velocity=travel.velocity,
+        place=travel.place,
+        velocity_still=rest.velocity,
+        field=magnetometer.noise,
     )
-    seen = Seen(travel.velocity, travel.place, rest.velocity, magnetometer.noise)
-    noise, seen = jax.tree_util.tree_map(lambda x: jnp.asarray(x, float), (noise, seen))
+    noise = jax.tree_util.tree_map(lambda x: jnp.asarray(x, float), noise)
     sensors = [
-        Sensor(_read_travel, _travel_sigma(seen), 6, TRAVEL, _travel_linear),
-        Sensor(_read_rest, Partial(_rest_sigma, seen), 6, REST, _rest_linear),
+        Sensor(_read_travel, _travel_sigma(noise), 6, TRAVEL, _travel_linear),
+        Sensor(_read_rest, Partial(_rest_sigma, noise), 6, REST, _rest_linear),
     ]
     if parameters.use_magnetometer != "never":
-        sigma = Partial(_magnetometer_sigma, seen)
+        sigma = Partial(_magnetometer_sigma, noise)
         sensors.append(Sensor(_read_magnetometer, sigma, 3, MAGNETOMETER, _magnetometer_linear))
         sensors.append(Sensor(_read_site, _site_sigma, 1, REVISIT, _site_linear))
     motion = Motion(

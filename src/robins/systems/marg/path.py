@@ -31,7 +31,7 @@ from robins.manifold import Angle
 from robins.systems.marg import model
 from robins.systems.marg.parameters import Replay
 from robins.systems.marg.rest import Watch
-from robins.systems.marg.saturation import FLANK, LONGEST_S, Frozen, Range, beyond, bridged
+from robins.systems.marg.saturation import FLANK, LONGEST_S, Range, beyond, bridged
 from robins.systems.marg.sites import Look, Sites
 from robins.systems.marg.start import FirstLook, first_belief, first_look
 
@@ -81,7 +81,7 @@ class SamplePath:
         self._by_sample = levels is None and kind == "rate"
         self.range = Range(levels)
         self._watch, self._pace = Watch(self.n * usual_s, parameters.rest), Pace()
-        self._sites, self._frozen = Sites(model.SITES), Frozen()
+        self._sites = Sites(model.SITES)
         self.counts: Counter[str] = Counter()
         self.time_ns = np.zeros(0, np.int64)  # of the samples kept, and
         self.rows = np.zeros((0, 9))  # their gyro, accel and field
@@ -234,7 +234,7 @@ class SamplePath:
             return out
         for at in range(self._context, end, self.n):
             rows = self.rows[at - 1 : min(at + self.n, end)]
-            row = self._frozen.look(rows[:, :3], rows[:, 3:6])
+            row = self.range.hanging(rows[:, :3], rows[:, 3:6])
             out[at : at + self.n] = math.sqrt(2.0 * row - 1.0) if row else 0.0
         self.counts["imu_frozen"] += int(np.sum(out > 0.0))
         return out
@@ -395,7 +395,6 @@ def measurements(
         model.REST: np.where(still[:, None], np.zeros((blocks, 6)), np.nan),
     }
     aux: dict[str, Any] = {
-        model.TRAVEL: np.zeros(blocks),
         model.REST: np.concatenate([mean_rate(integrals), sigma[:, None]], axis=1),
     }
     if p.use_magnetometer != "never":
@@ -406,7 +405,7 @@ def measurements(
             np.where(look[:, None], np.zeros((blocks, 2)), np.nan),
         )
         aux[model.MAGNETOMETER] = np.where(there[:, None], field_b, np.array([1e-5, 0.0, 0.0]))
-        number = np.array([look.site for look in looks])
+        number = np.array([site for site, *_ in looks])
         y[model.REVISIT] = Angle(np.where(number >= 0, 0.0, np.nan))
         aux[model.REVISIT] = np.array([_of_site(look, p) for look in looks])
     return y, aux
@@ -414,10 +413,10 @@ def measurements(
 
 def _of_site(look: Look, parameters: Replay) -> np.ndarray:
     """(4 + SITES,) field in body axes, sigma of its azimuth and which site it is."""
-    leaning = np.tan(min(abs(look.dip_rad), 1.5)) * parameters.stated.tilt
+    site, field_b, dip = look
+    leaning = np.tan(min(abs(dip), 1.5)) * parameters.stated.tilt
     sigma = np.hypot(parameters.magnetometer.site, leaning)
-    which = np.arange(model.SITES) == look.site
-    return np.concatenate([look.field_b, [sigma], which.astype(float)])
+    return np.concatenate([field_b, [sigma], (np.arange(model.SITES) == site).astype(float)])
 
 
 def mean_rate(integrals: model.Integrals) -> np.ndarray:

@@ -72,7 +72,7 @@ def _has_plateau(x: np.ndarray, top: float, step_s: float) -> bool:
 
 
 class Range:
-    """The end of each gyro's range as the samples so far show it: `levels`, sample by sample.
+    """The end of each gyro's range and its least step, as the samples so far show them.
 
     Attributes:
         levels: (3, 2) rad/s, as of `levels`.
@@ -85,6 +85,8 @@ class Range:
         # of each: pairs that lie at its top, with the samples before and after
         self._pairs: list[np.ndarray] = [np.zeros((0, 3))] * 6
         self.levels = np.full((3, 2), np.inf) if levels is None else levels
+        self._step = np.full(3, np.inf)  # rad/s, least difference of each axis that is not 0
+        self._hung = 0  # blocks in a row, up to the last, that end in gyros that hang
 
     def read(self, rate: np.ndarray) -> None:
         """Take the next sample (3,) rad/s."""
@@ -107,6 +109,33 @@ class Range:
             found = self._pairs[k] = found[found[:, 0] > (1.0 - _LEVEL) * top]
             jumps = np.sum(found[:, 1:] < (1.0 - _JUMP) * top)
             self.levels[k % 3, int(k < 3)] = (1.0 - _LEVEL) * top if jumps >= _OFTEN else np.inf
+
+    def hanging(self, rate: np.ndarray, accel: np.ndarray) -> int:
+        """Judge the samples of a block: whether the gyros repeat themselves while it is shaken.
+
+        A converter or a driver that hangs hands out its last numbers again, give or take one step
+        of the least digit. A unit at rest does so too, if its steps are coarse; then the specific
+        force is quiet.
+
+        Returns:
+            Number of blocks in a row in which the gyros hang, up to this one; 0 where they do not.
+
+        Args:
+            rate: (n + 1, 3) rad/s, with the last sample before the block.
+            accel: (n + 1, 3) m/s^2.
+        """
+        change = np.abs(np.diff(rate, axis=0))
+        known = self._step
+        least = np.min(np.where(change > 0.0, change, np.inf), axis=0, initial=np.inf)
+        self._step = np.minimum(known, least)
+        last = rate[-max(_FROZEN_SAMPLES, len(change) // 2) :]
+        before, self._hung = self._hung, 0
+        if len(change) >= len(last) and np.all(np.isfinite(known)):
+            repeats = np.all(np.ptp(last, axis=0) <= 1.5 * known)
+            if repeats and np.max(np.ptp(accel[1:], axis=0)) > _SHAKEN:
+                self._hung = before + 1
+        # the block after the last may begin so
+        return self._hung or (before + 1 if before else 0)
 
 
 def beyond(rate: np.ndarray, levels: np.ndarray, most: float) -> np.ndarray:
@@ -169,40 +198,3 @@ def _slope(t: np.ndarray, x: np.ndarray) -> float:
     """Slope at the last of three samples, of the parabola through them."""
     late, early = (x[2] - x[1]) / (t[2] - t[1]), (x[1] - x[0]) / (t[1] - t[0])
     return float(late + (late - early) * (t[2] - t[1]) / (t[2] - t[0]))
-
-
-class Frozen:
-    """Blocks in which the gyros repeat themselves while the accelerometers do not.
-
-    A converter or a driver that hangs hands out its last numbers again, give or take one step of
-    the least digit. A unit at rest does so too, if its steps are coarse; then the specific force is
-    quiet.
-    """
-
-    def __init__(self) -> None:
-        """Begin: no step is known."""
-        self._step = np.full(3, np.inf)  # rad/s, least difference of each axis that is not 0
-        self._hung = 0  # blocks in a row, up to the last, that end so
-
-    def look(self, rate: np.ndarray, accel: np.ndarray) -> int:
-        """Judge the samples of a block, with the last one before it.
-
-        Returns:
-            Number of blocks in a row in which the gyros hang, up to this one; 0 where they do not.
-
-        Args:
-            rate: (n + 1, 3) rad/s.
-            accel: (n + 1, 3) m/s^2.
-        """
-        change = np.abs(np.diff(rate, axis=0))
-        known = self._step
-        least = np.min(np.where(change > 0.0, change, np.inf), axis=0, initial=np.inf)
-        self._step = np.minimum(known, least)
-        last = rate[-max(_FROZEN_SAMPLES, len(change) // 2) :]
-        before, self._hung = self._hung, 0
-        if len(change) >= len(last) and np.all(np.isfinite(known)):
-            repeats = np.all(np.ptp(last, axis=0) <= 1.5 * known)
-            if repeats and np.max(np.ptp(accel[1:], axis=0)) > _SHAKEN:
-                self._hung = before + 1
-        # the block after the last may begin so
-        return self._hung or (before + 1 if before else 0)

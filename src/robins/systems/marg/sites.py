@@ -9,8 +9,6 @@ and the filter's noise of heavy tails answers it.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 _STRENGTH_T, _DIP_RAD = 0.5e-6, 0.01  # that two rests at one site differ by at most
@@ -19,15 +17,11 @@ _READ_S = 1.0  # of rest, over which a site is read
 _APART_S = 5.0  # of motion between two readings: after less the unit may lie as it lay
 
 
-class Look(NamedTuple):
-    """Reading of a site at the end of a block."""
+Look = tuple[int, np.ndarray, float]
+"""A site read at the end of a block: its number, field (3,) [T] in body axes and dip [rad]."""
 
-    site: int  # its number, or -1: none is read here
-    field_b: np.ndarray  # (3,) T, mean over the rest
-    dip_rad: float
-
-
-NONE = Look(-1, np.array([1e-5, 0.0, 0.0]), 0.0)
+NONE: Look = (-1, np.array([1e-5, 0.0, 0.0]), 0.0)
+"""None is read."""
 
 
 class Sites:
@@ -84,7 +78,7 @@ class Sites:
             if at_home:
                 return NONE
         site = self._number(seen)
-        return Look(site, mean, dip) if site >= 0 else NONE
+        return (site, mean, dip) if site >= 0 else NONE
 
     def _number(self, seen: np.ndarray) -> int:
         """Number of a site by its strength and dip; a new one is added; -1 where none is left."""
