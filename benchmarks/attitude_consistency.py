@@ -51,7 +51,8 @@ def drawn(steps: Any, count: int, rng: np.random.Generator) -> tuple[np.ndarray,
     S = np.asarray(steps.posterior.factor)[:count]
     L = np.asarray(steps.prediction.belief.factor)[:count]
     spread = np.asarray(steps.prediction.transition.spread)[:count]
-    after, before = np.linalg.solve(L, S), np.linalg.solve(L, spread)
+    known = np.linalg.pinv(L)  # gravity may be known exactly
+    after, before = known @ S, known @ spread
     back = before.transpose(0, 2, 1) @ after
     fresh, fresh_back = left_over(back), left_over(before)
     z = rng.standard_normal((S.shape[1], DRAWS))
