@@ -42,6 +42,11 @@ def test_the_first_site_is_read_from_the_second_rest_on_whatever_the_attitude():
     assert dip == pytest.approx(np.arctan2(44.0, 18.0))
 
 
+def test_a_field_as_strong_with_another_dip_is_another_site():
+    steeper = Rotation.from_euler("Y", -2.0, degrees=True).apply(HOME)
+    assert [[site for site, *_ in one] for one in visits(HOME, steeper)] == [[], [1]]
+
+
 def test_a_log_that_begins_in_motion_has_no_first_site():
     found = visits(HOME, HOME, at_home=False)
     assert [[site for site, *_ in one] for one in found] == [[1], [1]]
