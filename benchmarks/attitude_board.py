@@ -65,7 +65,7 @@ FLU_TO_FRD = np.array([1.0, -1.0, -1.0])
 FLU_FRD = NWU_TO_NED = np.array([0.0, 1.0, 0.0, 0.0])  # half a turn about x
 ALS_BODY = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 ESE_G, ESE_DEG_S = 3300.0 / 1023.0 / np.array([330.0, 3.33])  # of a count, by the data sheet
-ESE_DEVELOPMENT = {"1", "3", "6"}
+ESE_DEVELOPMENT = {"1", "3"}  # and 6 until 2026-11-30
 JUMP_RATE = 20.0  # rad/s between two frames of the reference
 FIELD_T = 50e-6  # of a field that is stored without a unit
 # Trials on which settings were found in releases before, or may be found now.

@@ -65,6 +65,7 @@ def test_it_is_the_first_run_until_the_second_is_likelier_and_then_the_second(of
     both, one, other = ran(FILTER, START, y), ran(kalman(), START, y), ran(kalman(), WIDE, y)
     info = both.info["level"]
     taken = np.asarray(info.notes[WRONG])[:, 0] > 0.0
+    assert np.all(np.diff(taken.astype(int)) >= 0)
     assert taken[-1] == found
     for steps, where in ((one, ~taken), (other, taken)):
         np.testing.assert_array_equal(
@@ -106,3 +107,12 @@ def test_it_names_what_is_wrong_and_goes_on_from_another_belief():
 def test_bad_arguments_are_named(spread, judging, nats, word):
     with pytest.raises(ValueError, match=word):
         alternative(kalman(), spread, judging, nats, "offset")
+
+
+@pytest.mark.parametrize(
+    ("spread", "judging", "word"),
+    [([0.0, 1.0], ["depth"], "no such sensor"), ([1.0], ["level"], "needs 2 numbers")],
+)
+def test_what_does_not_fit_the_model_is_named(spread, judging, word):
+    with pytest.raises(ValueError, match=word):
+        alternative(kalman(), spread, judging, NATS, "offset").init(START, MODEL.dims)

@@ -84,8 +84,11 @@ def test_a_moment_is_no_contradiction():
 
 
 def test_samples_lost_at_the_end_of_a_range_are_said():
-    assert of_samples({"imu_saturated": 100, "imu_bridged": 100}, 1000) == []
-    assert "50 samples" in of_samples({"imu_saturated": 150, "imu_bridged": 100}, 1000)[0]
+    good = {"imu_saturated": 100, "imu_bridged": 100, "imu_frozen": 2}
+    assert of_samples(good, 1000) == []
+    lost, hung = of_samples(good | {"imu_saturated": 150, "imu_frozen": 30}, 1000)
+    assert lost.startswith("50 samples")
+    assert "over 30 samples" in hung
 
 
 def test_north_is_true_north_where_a_place_and_a_date_are_known():

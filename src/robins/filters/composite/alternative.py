@@ -48,6 +48,10 @@ class Alternative(Filter):
         return state.memory[2].astype(float)[None]
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        missing = [name for name in self.judging if name not in dims]
+        require(not missing, f"alternative: no such sensor; this model has {sorted(dims)}", missing)
+        n = belief.factor.shape[0]
+        require(len(self.spread) == n, f"spread of an alternative needs {n} numbers", self.spread)
         wide = linalg.tria(belief.factor, jnp.diag(jnp.asarray(self.spread)))
         begun = [self.inner.init(b, dims) for b in (belief, belief._replace(factor=wide))]
         states = jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *begun)
@@ -100,7 +104,8 @@ def alternative(
     innovations, summed from where it was least (Page's test, Biometrika 41, 1954). Before, the
     answer is bit for bit that of the first, afterwards that of the second. Updates note
     ``alternative.evidence`` and, as ``imm.wrong`` (1,), whether what is called `wrong` is. To
-    smooth a run, run `inner` from the start that counts at its end.
+    smooth a run, run `inner` from the start that counts at its end. A `reset` has both go on from
+    one belief, so that nothing speaks for the second any more.
 
     Args:
         inner: what both run.

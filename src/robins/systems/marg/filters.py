@@ -96,8 +96,10 @@ def marg_filter(
         field_t: T, spread of strength and vertical component of a new field.
         sites: the model reads sites.
     """
+    tails = rules.student_t(_TAILS, patience=None)
     chain = [
         rules.only(model.TRAVEL, rules.sage_husa(_MEMORY, "R", *_TRAVEL_VARIANCE)),
+        rules.only(model.TRAVEL, tails),
         # assumptions, which may be wrong for long: time does not make them right
         rules.only(model.REST, rules.gate(0.9999, 100, "accept")),
     ]
@@ -106,10 +108,10 @@ def marg_filter(
         chain += [
             rules.only(model.MAGNETOMETER, learned),
             undisturbed(gate, patience, field_t),
-            rules.only(model.MAGNETOMETER, rules.student_t(_TAILS, patience=None)),
+            rules.only(model.MAGNETOMETER, tails),
         ]
     if sites:
-        chain.append(rules.only(model.REVISIT, rules.student_t(_TAILS, patience=None)))
+        chain.append(rules.only(model.REVISIT, tails))
     return kalman(rules=chain)
 
 

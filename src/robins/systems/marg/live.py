@@ -29,6 +29,7 @@ import numpy as np
 
 from robins.errors import require
 from robins.filters import Code, OnlineFilter
+from robins.filters.kalman import WRONG
 from robins.filters.machine import usual
 from robins.filters.run import Step
 from robins.ins.increments import Increments
@@ -76,11 +77,12 @@ class _Step(NamedTuple):
     declination: np.ndarray  # (1,)
     sigma: np.ndarray  # (DIM,)
     code: np.ndarray  # (1,) of the prediction
+    bare: np.ndarray  # (1,) 1 where the gyros are taken for those of a bare chip
     travel: np.ndarray  # (8,) innovation, degrees of freedom, code
     magnetometer: np.ndarray  # (2,) degrees of freedom, code; none and `MISSING` without one
 
 
-_SIZES = np.cumsum([4, 3, 9, 1, model.DIM, 1, 8])
+_SIZES = np.cumsum([4, 3, 9, 1, model.DIM, 1, 1, 8])
 
 
 def _kept(step: Step) -> jax.Array:
@@ -88,7 +90,8 @@ def _kept(step: Step) -> jax.Array:
     mean, sigma, seen = kept(step)
     parts = [mean.q_nb.wxyz, mean.gyro_bias, mean.gyro_gain.reshape(9), mean.declination[None]]
     parts += [sigma, step.prediction.code[None]]
-    parts.append(seen[model.TRAVEL].innovation)
+    travel = seen[model.TRAVEL]
+    parts += [travel.notes[WRONG], travel.innovation]
     for name in (model.TRAVEL, model.MAGNETOMETER):
         update = seen.get(name)
         code = [0.0, int(Code.MISSING)] if update is None else [update.dof, update.code]
@@ -102,7 +105,7 @@ class LiveMarg(Live):
     Attributes:
         counts: `imu_nan`, `imu_inf`, `imu_absurd`, `imu_duplicate`, `imu_backward`, `imu_ahead`
             (refused), `begun_anew`, `field_missing`, `field_implausible`, `imu_saturated`,
-            `imu_bridged`, `imu_gaps`, `blocks_in_free_fall`, `steps_not_taken`.
+            `imu_bridged`, `imu_frozen`, `imu_gaps`, `blocks_in_free_fall`, `steps_not_taken`.
     """
 
     _parameters: ClassVar[type[Replay]] = Replay
@@ -151,7 +154,7 @@ class LiveMarg(Live):
         """Forget all but the counts and the stamps."""
         self._field = np.full(3, np.nan)  # of a sample that was refused
         self._pending: list[Any] = []  # leaves of steps that wait, and whether the unit lies still
-        self._looks = np.zeros((0, 7))  # what the monitor is shown
+        self._looks = np.zeros((0, 8))  # what the monitor is shown
         self._since: list[Any] = []  # (dt, turn) of the samples after the last step
         self._q = (math.nan,) * 4
         self._sigma, self._bias, self._gain = np.full(3, np.nan), np.zeros(3), np.zeros((3, 3))
@@ -321,14 +324,15 @@ class LiveMarg(Live):
         most = math.ceil(_MONITORED_S / (self._path.n * self._usual_s))
         gain = [np.max(np.abs(found.gyro_gain))]
         square = [monitor.squared(found.travel[:6], self.parameters)]
-        row = [found.declination, gain, square, found.travel[6:], found.magnetometer]
+        row = [found.declination, gain, square, found.travel[6:], found.magnetometer, found.bare]
         self._looks = np.concatenate([self._looks, np.concatenate(row)[None]])[-most:]
         looks, none = self._looks, np.zeros(len(self._looks))
         updates = {
             name: Update(none, none, looks[:, 2], looks[:, k], looks[:, k + 1])
             for name, k in ((model.TRAVEL, 3), (model.MAGNETOMETER, 5))
         }
-        doubt = monitor.doubts_of(looks[:, 0], looks[:, 1], updates, self.parameters)
+        bare = looks[:, 7] > 0.0
+        doubt = monitor.doubts_of(looks[:, 0], looks[:, 1], updates, self.parameters, bare)
         told = bool(doubt.declination[-1] or doubt.gain[-1])
         for column, k in ((doubt.tilt, 3), (doubt.refused, 5)):
             refused = looks[:, k + 1] == Code.REFUSED

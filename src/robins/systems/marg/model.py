@@ -5,6 +5,7 @@ With q body to NED, C = C(q), f the specific force, w the rate that is read::
     q' = q (w + M w - b) / 2,   v' = C (f - b_a) + g,   p' = v
     b' = white,   M' = 0,   b_a' = white,   field' = white
     declination' = -declination / T + white while moving,   0 at rest
+    azimuths' = 0,   gravity g' = 0
 
 A step is a block of samples, integrated beforehand (`Block`); F = exp of the linear form of these
 stands in `advance_linear`, Q in `_factor`. What is peculiar to it:
@@ -294,8 +295,7 @@ def model_of(parameters: Replay) -> Model:
         is used, "magnetometer" ((`Angle(0)`, (2,) zeros); aux (3,) field in body axes [T]) and
         "revisit" (`Angle(0)` where a site is read; aux (4 + SITES,) field [T], sigma of its azimuth
         [rad] and 1 for the site). The measurement is zero and the reading what the state makes of
-        aux: the
-        innovation is minus the reading.
+        aux: the innovation is minus the reading.
     """
     gyro, accelerometer = parameters.gyro, parameters.accelerometer
     magnetometer, travel, rest = parameters.magnetometer, parameters.travel, parameters.rest

@@ -19,6 +19,7 @@ from robins.systems.tables import Update
 
 _SIGMAS = 3.0
 _LOOKS = 20  # of travel, in the mean of its squares
+_LEAST_LOOKS = 10  # of a log that has no more
 _SQUARE = 1.5  # of a component in its stated standard deviations, in that mean
 _LASTING_S = 5.0
 _GAP_SHARE = 0.002  # of samples at the end of their range that nothing could be put back for
@@ -43,6 +44,7 @@ def doubts_of(
     gain: np.ndarray,
     updates: Mapping[str, Update],
     parameters: Replay,
+    bare: np.ndarray | bool = False,
 ) -> Doubt:
     """Where the states of a filter or a smoother, or its innovations, contradict the parameters.
 
@@ -57,7 +59,10 @@ def doubts_of(
         gain: (B, ...) of the gyros, each.
         updates: by sensor, of the filter or of the run that was smoothed; of travel as `as_stated`.
         parameters: what was assumed.
+        bare: (B,) bool, the gyros are taken for those of a bare chip.
     """
+    gyro = parameters.gyro
+    usual = np.where(bare, np.hypot(gyro.gain, gyro.bare_gain), gyro.gain)
     declination = np.abs(declination)
     gain = np.max(np.abs(gain.reshape(len(declination), -1)), axis=1)
     none = np.zeros(len(declination), dtype=bool)
@@ -68,7 +73,7 @@ def doubts_of(
         refused = _in_a_row(updates[MAGNETOMETER], 10)
     return Doubt(
         declination > _SIGMAS * parameters.magnetometer.declination,
-        gain > _SIGMAS * parameters.gyro.gain,
+        gain > _SIGMAS * usual,
         tilt,
         refused,
     )
@@ -92,12 +97,13 @@ def _too_large(update: Update) -> np.ndarray:
     nis, dof = np.asarray(update.nis), np.asarray(update.dof)
     looks = np.flatnonzero(dof == np.max(dof, initial=0))
     out = np.zeros(len(nis), dtype=bool)
-    if len(looks) < _LOOKS or dof[looks[0]] == 0:
+    count = min(_LOOKS, len(looks))
+    if count < _LEAST_LOOKS or dof[looks[0]] == 0:
         return out
     sums = np.cumsum(np.concatenate([[0.0], nis[looks] / dof[looks]]))
-    over = (sums[_LOOKS:] - sums[:-_LOOKS]) / _LOOKS > _SQUARE
-    for last in np.flatnonzero(over) + _LOOKS - 1:
-        out[looks[last - _LOOKS + 1] : looks[last] + 1] = True
+    over = (sums[count:] - sums[:-count]) / count > _SQUARE
+    for last in np.flatnonzero(over) + count - 1:
+        out[looks[last - count + 1] : looks[last] + 1] = True
     return out
 
 
@@ -155,11 +161,12 @@ def sentences(name: str, doubt: Doubt, mean: MargState, dt_s: np.ndarray) -> lis
 
 
 def of_samples(counts: Mapping[str, int], samples: int) -> list[str]:
-    """A warning where gyros or accelerometers were at the end of their range too often."""
-    lost = counts["imu_saturated"] - counts["imu_bridged"]
-    if lost <= _GAP_SHARE * samples:
-        return []
-    return [
-        f"{lost} samples are at the end of their range and could not be put back: the attitude may "
-        "be off by more than is stated after them."
-    ]
+    """Warnings where sensors were at the end of their range, or gyros hung, too often."""
+    lost, off = counts["imu_saturated"] - counts["imu_bridged"], []
+    if lost > _GAP_SHARE * samples:
+        off.append(f"{lost} samples are at the end of their range and could not be put back")
+    if counts["imu_frozen"] > _GAP_SHARE * samples:
+        off.append(
+            f"the gyros repeat one turn over {counts['imu_frozen']} samples, as if they hang"
+        )
+    return [f"{what}: the attitude may be off by more than is stated after them." for what in off]

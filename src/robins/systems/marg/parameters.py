@@ -31,7 +31,7 @@ class Gyro(Parameters):
     bias_walk_moving: q.RateWalkSize = default("0.01 deg/s/sqrt(s)")
     # scale factors, misalignment and cross-coupling: each of nine numbers has this spread
     gain: Annotated[float, Quantity("scale factor", least="0 ppm")] = default("3000 ppm")
-    # the same of a chip that nobody calibrated; asked once a gain is beyond three times the other
+    # the same of a chip that nobody calibrated, taken once the motion is likelier with it
     bare_gain: Annotated[float, Quantity("scale factor", least="0 ppm")] = default("3 %")
     # what nine numbers do not explain, as a share of the angle turned
     turn_error: Annotated[float, pydantic.Field(ge=0.0, le=1e6)] = 0.001
@@ -80,8 +80,8 @@ class Magnetometer(Parameters):
 class Travel(Parameters):
     """What is known of the motion: it does not run away.
 
-    Seen once in `every`, velocity and place are zero with these spreads. For a vehicle give its
-    speed, and a large place.
+    Seen once in `every` of motion, velocity and place are zero with these spreads. For a vehicle
+    give its speed, and a large place.
     """
 
     velocity: q.Speed = default("1 m/s")

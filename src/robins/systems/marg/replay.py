@@ -29,7 +29,7 @@ from robins.systems.marg.log import Prepared, prepare
 from robins.systems.marg.parameters import Replay
 from robins.systems.replaying import Answer, Recorded, Reported
 from robins.systems.study import Contender, StateBlock
-from robins.systems.tables import EULER, attitude_array, block_array
+from robins.systems.tables import EULER, Update, attitude_array, block_array
 
 CAUSAL, SMOOTHED = FILTERS = ("marg", "marg-smoothed")
 _ESTIMATED = {
@@ -133,12 +133,13 @@ def replay(
     progress(0.0, "integrating blocks")
     log = prepare(dataset, parameters)
     wanted = filters or parameters.filters
-    # the causal run is asked too: its innovations are what the smoother can be doubted by
+    # the causal run is asked too: it finds out what gyros these are
     told = tuple(dict.fromkeys([*(name for name in wanted if name != SMOOTHED), CAUSAL]))
     answers = replaying.navigated([log], told, partial(contender, parameters), None, progress)
-    seen = monitor.as_stated(_as_stated(log, answers[CAUSAL], parameters).updates, parameters)
+    seen = {CAUSAL: answers[CAUSAL].updates}
     if SMOOTHED in wanted:
-        answers |= _smoothed(log, answers[CAUSAL], parameters)
+        smoothed = _smoothed(log, answers[CAUSAL], parameters, progress)
+        answers[SMOOTHED], seen[SMOOTHED] = smoothed
     answers = {name: answers[name] for name in wanted}
     q_nb = {name: _by_sample(log, answer) for name, answer in answers.items()}
     answers = {name: _as_stated(log, a, parameters) for name, a in answers.items()}
@@ -148,7 +149,11 @@ def replay(
         answers = {name: _turned_answer(answer, north) for name, answer in answers.items()}
     doubt = {
         name: monitor.doubts_of(
-            np.asarray(answer.mean.declination), np.asarray(answer.mean.gyro_gain), seen, parameters
+            np.asarray(answer.mean.declination),
+            np.asarray(answer.mean.gyro_gain),
+            monitor.as_stated(seen[name], parameters),
+            parameters,
+            np.asarray(answer.wrong[BARE]) > 0.5,
         )
         for name, answer in answers.items()
     }
@@ -195,16 +200,21 @@ def replay(
     return replace(outcome, warnings=[*warned, *outcome.warnings])
 
 
-def _smoothed(log: Prepared, causal: Answer, parameters: Replay) -> dict[str, Answer]:
-    """The smoother, for the gyros that the causal run ended with."""
-    start = log.world.start
-    if np.asarray(causal.wrong[BARE])[-1] > 0.5:
+def _smoothed(
+    log: Prepared, causal: Answer, parameters: Replay, progress: Progress
+) -> tuple[Answer, Mapping[str, Update]]:
+    """The smoother, for the gyros the causal run ended with, and the updates of what it smooths."""
+    start, bare = log.world.start, bool(np.asarray(causal.wrong[BARE])[-1] > 0.5)
+    if bare:
         factor, gains = np.array(start.factor), np.arange(model.DIM)[model.GAINS]
         factor[gains, gains] = np.hypot(parameters.gyro.gain, parameters.gyro.bare_gain)
         start = start._replace(factor=jnp.asarray(factor))
     piece = replace(log, world=log.world._replace(start=start))
     one = Contender(one_prior(parameters), model.model_of(parameters))
-    return replaying.navigated([piece], [SMOOTHED], lambda _: one, {SMOOTHED: CAUSAL})
+    names, smoothers = (SMOOTHED, CAUSAL), {SMOOTHED: CAUSAL}
+    found = replaying.navigated([piece], names, lambda _: one, smoothers, progress)
+    wrong = {BARE: np.full(len(log.epoch_s), float(bare))}
+    return found[SMOOTHED]._replace(wrong=wrong), found[CAUSAL].updates
 
 
 def true_north(dataset: Dataset) -> float | None:
@@ -294,7 +304,7 @@ REPORTED = Reported(
     causes="Likely causes: a magnetometer without calibration (`robins calibrate`) or beside iron, "
     "axes or units of a sensor that differ from what the log says, or noise of the gyro told too "
     "small.",
-    assumed=(model.TRAVEL, model.REST, model.MAGNETOMETER),
+    assumed=tuple(model.SENSORS),
     euler=EULER._replace(frame="body to NED"),
 )
 

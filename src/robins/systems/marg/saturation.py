@@ -27,6 +27,8 @@ _KEPT_PAIRS = 100  # of samples at the level, more than a peak has
 LONGEST_S = 0.2  # s, of a peak that is bridged
 FLANK = 3  # samples on either side, by which it is
 _FROZEN_SAMPLES = 5  # of a block, below which repeated numbers say nothing
+_TURNS = np.radians(10.0)  # rad/s, more than a bias
+_OF_CHANGE = 0.02  # weight of a block in the usual difference of two samples
 _SHAKEN = 0.5  # m/s^2, range of the specific force in a block of a unit that moves
 _MISSED = 0.3  # of what a bridge adds: the share that it may err by
 
@@ -86,6 +88,7 @@ class Range:
         self._pairs: list[np.ndarray] = [np.zeros((0, 3))] * 6
         self.levels = np.full((3, 2), np.inf) if levels is None else levels
         self._step = np.full(3, np.inf)  # rad/s, least difference of each axis that is not 0
+        self._change = np.full(3, np.nan)  # rad/s, usual difference of two samples
         self._hung = 0  # blocks in a row, up to the last, that end in gyros that hang
 
     def read(self, rate: np.ndarray) -> None:
@@ -111,29 +114,35 @@ class Range:
             self.levels[k % 3, int(k < 3)] = (1.0 - _LEVEL) * top if jumps >= _OFTEN else np.inf
 
     def hanging(self, rate: np.ndarray, accel: np.ndarray) -> int:
-        """Judge the samples of a block: whether the gyros repeat themselves while it is shaken.
+        """Judge the samples of a block: whether the gyros repeat one turn while the unit is shaken.
 
         A converter or a driver that hangs hands out its last numbers again, give or take one step
-        of the least digit. A unit at rest does so too, if its steps are coarse; then the specific
-        force is quiet.
-
-        Returns:
-            Number of blocks in a row in which the gyros hang, up to this one; 0 where they do not.
+        of the least digit. So does a unit that does not turn, and one whose noise is less than a
+        step: gyros hang only where they read a turn, and changed from sample to sample before.
 
         Args:
             rate: (n + 1, 3) rad/s, with the last sample before the block.
             accel: (n + 1, 3) m/s^2.
+
+        Returns:
+            Number of blocks in a row in which the gyros hang, up to this one; 0 where they do not.
         """
         change = np.abs(np.diff(rate, axis=0))
-        known = self._step
+        known, usual = self._step, self._change
         least = np.min(np.where(change > 0.0, change, np.inf), axis=0, initial=np.inf)
         self._step = np.minimum(known, least)
         last = rate[-max(_FROZEN_SAMPLES, len(change) // 2) :]
         before, self._hung = self._hung, 0
         if len(change) >= len(last) and np.all(np.isfinite(known)):
             repeats = np.all(np.ptp(last, axis=0) <= 1.5 * known)
-            if repeats and np.max(np.ptp(accel[1:], axis=0)) > _SHAKEN:
+            turns = np.linalg.norm(last.mean(axis=0)) > _TURNS
+            shaken = np.max(np.ptp(accel[1:], axis=0)) > _SHAKEN
+            if repeats and turns and shaken and np.all(usual > 0.5 * known):
                 self._hung = before + 1
+        if not self._hung and len(change):
+            share = 1.0 if np.any(np.isnan(usual)) else _OF_CHANGE
+            self._change = np.where(np.isnan(usual), 0.0, usual) * (1.0 - share)
+            self._change = self._change + share * change.mean(axis=0)
         # the block after the last may begin so
         return self._hung or (before + 1 if before else 0)
 

@@ -40,7 +40,7 @@ class Sites:
         """
         self._count = count
         self._known = np.full((count, 2), np.nan)  # strength [T] and dip [rad] of each
-        self._moved_s, self._rest_s = np.inf, 0.0
+        self._moved_s, self._rest_s, self._rests = np.inf, 0.0, False
         self._sums = np.zeros((2, 3))  # of field and specific force over this rest, times time
 
     def look(
@@ -56,14 +56,18 @@ class Sites:
             field: (3,) T in body axes; NaN where there is none.
         """
         if not still:
+            if self._rests and np.all(np.isnan(self._known)):
+                self._known[0] = np.inf  # the first rest was too short to be read
+            self._rests = False
             self._moved_s += dt_s
             self._rest_s, self._sums = 0.0, np.zeros((2, 3))
             return NONE
-        if not np.all(np.isfinite(field)) or self._rest_s >= _READ_S:
+        self._rests = True
+        if not np.all(np.isfinite(field)) or self._rest_s >= _READ_S * (1.0 - 1e-9):
             return NONE
         self._rest_s += dt_s
         self._sums += dt_s * np.stack([field, force])
-        if self._rest_s < _READ_S or self._moved_s < _APART_S:
+        if self._rest_s < _READ_S * (1.0 - 1e-9) or self._moved_s < _APART_S:
             return NONE
         mean, up = self._sums / self._rest_s
         strength, weight = float(np.linalg.norm(mean)), float(np.linalg.norm(up))

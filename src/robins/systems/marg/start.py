@@ -84,6 +84,7 @@ def first_look(increments: Increments, field_b: np.ndarray, parameters: Replay) 
     gravity = parameters.accelerometer.gravity
     if still and _BIASES * parameters.accelerometer.bias < abs(size - gravity) < _SCALE * gravity:
         gravity = size  # no bias is so large: the accelerometers have another scale
+        how += f", with a specific force of {size:.2f} m/s^2 that is taken for gravity"
     if not np.any(there):
         q_nb = attitude_of(force, None)
         sentence = f"Levelled {how}; there is no field, so the heading is counted from the start."
