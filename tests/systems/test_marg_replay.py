@@ -246,7 +246,7 @@ def test_a_live_filter_gives_the_numbers_of_the_replay(moved):
     for k in range(120):
         online.predict(row(log.u, k))
         for sensor in model.dims:
-            online.update(row(log.y[sensor], k), sensor, row(log.aux[sensor], k))
+            online.update(row(log.y[sensor], k), sensor, row(log.aux.get(sensor), k))
     sigma = outcome.solution["sigma_attitude"].sel(filter="marg").values[119]
     # what is stated holds, beside what the filter knows, what no state carries
     stated, samples = PARAMETERS.stated, log.u.samples
