@@ -89,7 +89,7 @@ MOVED: dict[str, dict[str, tuple[str, str]]] = {
         "information_sum": ("robins.filters", "fuse"),
     },
     "robins.systems.marg": {
-        "marg_filter": ("robins.systems.marg.replay", "marg_filter"),
+        "marg_filter": ("robins.systems.marg.filters", "marg_filter"),
         "causal_attitudes": ("robins.systems.marg.model", "causal_attitudes"),
         "smoothed_attitudes": ("robins.systems.marg.model", "smoothed_attitudes"),
     },
