@@ -163,7 +163,7 @@ def hand(parameters: Replay, seed: int, run: int) -> Hand:
 
 
 def case_of(parameters: Replay, of: Hand) -> Case:
-    """What a filter on a board is given of a hand, and the truth at the ends of its steps."""
+    """Inputs and measurements of a filter on a board, and the truth at the ends of its steps."""
     made: Prepared = prepare(of.log, parameters)
     p = parameters.accelerometer
     world, samples, count = made.world, made.samples, len(made.rows)

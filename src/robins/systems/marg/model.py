@@ -90,7 +90,7 @@ BLOCKS = (
 
 
 class Integrals(NamedTuple):
-    """What the raw samples of a block integrate to, in body axes at its start."""
+    """Integrals of the raw samples of a block, in body axes at its start."""
 
     dt_s: ArrayLike  # ()
     turn: ArrayLike  # (4,) quaternion, body axes at the end to those at the start
@@ -344,7 +344,7 @@ class Samples(NamedTuple):
 
 
 def of_block(samples: Samples) -> tuple[Integrals, Array]:
-    """What one block integrates to, leading axis n, and its mean field as in `integrate`."""
+    """Integrals of one block, leading axis n, and its mean field as in `integrate`."""
 
     def add(q, row):
         dt, theta, dv, field_b = row
@@ -367,7 +367,7 @@ def of_block(samples: Samples) -> tuple[Integrals, Array]:
 
 
 def integrate(samples: Samples) -> tuple[Integrals, np.ndarray]:
-    """What every block integrates to, leading axis K, and its mean field; in NumPy.
+    """Integrals of every block, leading axis K, and its mean field; in NumPy.
 
     The field is in body axes at the end of the block, (K, 3) T; NaN where there is none.
     """

@@ -26,7 +26,7 @@ _GAP_SHARE = 0.002  # of samples at the end of their range that nothing could be
 
 
 class Doubt(NamedTuple):
-    """Of B blocks."""
+    """Doubts of B blocks."""
 
     declination: np.ndarray  # (B,) bool
     gain: np.ndarray  # (B,) bool
@@ -46,7 +46,7 @@ def doubts_of(
     parameters: Replay,
     bare: np.ndarray | bool = False,
 ) -> Doubt:
-    """Where the states of a filter or a smoother, or its innovations, contradict the parameters.
+    """Contradictions of states or innovations of a filter or a smoother with the parameters.
 
     - declination: further from zero than three of its standard deviations;
     - gain: one of nine beyond three standard deviations;

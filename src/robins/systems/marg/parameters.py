@@ -78,7 +78,7 @@ class Magnetometer(Parameters):
 
 
 class Travel(Parameters):
-    """What is known of the motion: it does not run away.
+    """Prior knowledge of the motion: it does not run away.
 
     Seen once in `every` of motion, velocity and place are zero with these spreads. For a vehicle
     give its speed, and a large place.
@@ -108,7 +108,7 @@ class Rest(Parameters):
 
 
 class Start(Parameters):
-    """How well the first attitude is known, when it is found at rest and when not."""
+    """Uncertainty of the first attitude, found at rest and in motion."""
 
     still: q.Duration = default("0.5 s")
     moving: q.Duration = default("3 s")

@@ -38,7 +38,6 @@ class Sites:
         Args:
             count: the most that are kept.
         """
-        self._count = count
         self._known = np.full((count, 2), np.nan)  # strength [T] and dip [rad] of each
         self._moved_s, self._rest_s, self._rests = np.inf, 0.0, False
         self._sums = np.zeros((2, 3))  # of field and specific force over this rest, times time
