@@ -6,7 +6,7 @@ Errors of an orientation are those that BROAD defines (Laidig, Caruso, Cereatti 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -32,9 +32,9 @@ from robins.systems.study import Contender, StateBlock
 from robins.systems.tables import EULER, Update, attitude_array, block_array
 
 CAUSAL, SMOOTHED = FILTERS = ("marg", "marg-smoothed")
-_ESTIMATED = {
-    block.name: {"velocity": "v_n"}.get(block.name, block.name) for block in model.BLOCKS[1:]
-}
+# the azimuth of a site that was never visited is not known, and those of others are in the heading
+_BLOCKS = tuple(block for block in model.BLOCKS if block.name != "azimuths")
+_ESTIMATED = {block.name: {"velocity": "v_n"}.get(block.name, block.name) for block in _BLOCKS[1:]}
 _HEADING = StateBlock("heading", slice(2, 3), "rad", "deg", "NED", ("heading",))
 _INCLINATION = StateBlock("inclination", slice(0, 2), "rad", "deg", "NED", ("north", "east"))
 
@@ -133,30 +133,14 @@ def replay(
     progress(0.0, "integrating blocks")
     log = prepare(dataset, parameters)
     wanted = filters or parameters.filters
-    # the causal run is asked too: it finds out what gyros these are
-    told = tuple(dict.fromkeys([*(name for name in wanted if name != SMOOTHED), CAUSAL]))
-    answers = replaying.navigated([log], told, partial(contender, parameters), None, progress)
-    seen = {CAUSAL: answers[CAUSAL].updates}
-    if SMOOTHED in wanted:
-        smoothed = _smoothed(log, answers[CAUSAL], parameters, progress)
-        answers[SMOOTHED], seen[SMOOTHED] = smoothed
-    answers = {name: answers[name] for name in wanted}
+    answers, seen = _answers(log, parameters, wanted, progress)
     q_nb = {name: _by_sample(log, answer) for name, answer in answers.items()}
     answers = {name: _as_stated(log, a, parameters) for name, a in answers.items()}
     north = None if parameters.use_magnetometer == "never" else true_north(dataset)
     if north is not None:
         q_nb = {name: _turned_north(q, north) for name, q in q_nb.items()}
         answers = {name: _turned_answer(answer, north) for name, answer in answers.items()}
-    doubt = {
-        name: monitor.doubts_of(
-            np.asarray(answer.mean.declination),
-            np.asarray(answer.mean.gyro_gain),
-            monitor.as_stated(seen[name], parameters),
-            parameters,
-            np.asarray(answer.wrong[BARE]) > 0.5,
-        )
-        for name, answer in answers.items()
-    }
+    doubt = {name: _doubt(answer, seen[name], parameters) for name, answer in answers.items()}
     variables, errors = _variables(log, answers, doubt) | _attitudes(log, q_nb), {}
     if dataset.attitude is not None:
         errors = {name: _errors(dataset.attitude, log, q) for name, q in q_nb.items()}
@@ -198,6 +182,33 @@ def replay(
         origin_ns=int(log.time_ns[0]),
     )
     return replace(outcome, warnings=[*warned, *outcome.warnings])
+
+
+def _answers(
+    log: Prepared, parameters: Replay, wanted: Sequence[str], progress: Progress
+) -> tuple[dict[str, Answer], dict[str, Mapping[str, Update]]]:
+    """Estimates of filters and smoother by name, and the updates that each can be doubted by."""
+    # the causal run is asked too: it finds out what gyros these are
+    causal = dict.fromkeys([*wanted, CAUSAL])
+    causal.pop(SMOOTHED, None)
+    make = partial(contender, parameters)
+    answers = replaying.navigated([log], tuple(causal), make, None, progress)
+    seen = {CAUSAL: answers[CAUSAL].updates}
+    if SMOOTHED in wanted:
+        smoothed = _smoothed(log, answers[CAUSAL], parameters, progress)
+        answers[SMOOTHED], seen[SMOOTHED] = smoothed
+    return {name: answers[name] for name in wanted}, seen
+
+
+def _doubt(answer: Answer, seen: Mapping[str, Update], parameters: Replay) -> monitor.Doubt:
+    """Contradictions of an answer with the parameters."""
+    return monitor.doubts_of(
+        np.asarray(answer.mean.declination),
+        np.asarray(answer.mean.gyro_gain),
+        monitor.as_stated(seen, parameters),
+        parameters,
+        np.asarray(answer.wrong[BARE]) > 0.5,
+    )
 
 
 def _smoothed(
@@ -298,7 +309,7 @@ def _estimates(mean: model.MargState) -> Mapping[str, Any]:
 
 
 REPORTED = Reported(
-    blocks=model.BLOCKS,
+    blocks=_BLOCKS,
     sensors=model.SENSORS,
     estimates=_estimates,
     causes="Likely causes: a magnetometer without calibration (`robins calibrate`) or beside iron, "
