@@ -84,7 +84,8 @@ class Replay(Believed):
 
     system: Literal["gnss"] = "gnss"
     title: str = "Tight GNSS replay"
-    filters: Names = ("delays", "delays+rts")
+    # the smoother states sigmas that are too small (docs/systems/gnss.md)
+    filters: Names = ("delays",)
 
 
 class Satellites(Parameters):

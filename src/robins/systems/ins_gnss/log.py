@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -30,6 +30,7 @@ from robins.results import Outcome, Progress, array, silent, variable
 from robins.rotation import Rotation
 from robins.systems import replaying
 from robins.systems.ins_gnss import model
+from robins.systems.ins_gnss.lasting import with_lasting
 from robins.systems.ins_gnss.parameters import Aids, Replay
 from robins.systems.ins_gnss.recording import Log, in_body_axes, on_one_clock, with_lever_arm
 from robins.systems.ins_gnss.rest import Usual, at_rest, usual_of
@@ -170,6 +171,7 @@ def first_belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
         tilt_rad=start.tilt_sigma_rad,
         heading_rad=parameters.start.heading,
         gyro_bias=start.gyro_bias,
+        fix_sigma_m=np.nan_to_num(log.sigma_m[row]),
     )
 
 
@@ -224,7 +226,7 @@ def bank_step_s(parameters: Replay, fix_step_s: float) -> float:
     return min(fix_step_s, parameters.update.longest_block)
 
 
-_CASES = {asked: partial(case, asked) for asked in (False, True)}
+_case = cache(partial)
 
 
 def contender(parameters: Replay, fix_step_s: float, name: str) -> Contender:
@@ -237,11 +239,13 @@ def contender(parameters: Replay, fix_step_s: float, name: str) -> Contender:
     """
     believed = model.ins_gnss_model(parameters.imu, parameters.gnss, parameters.aids)
     asked = parameters.gnss.velocity_window is None
-    if name == ROBUST:
-        bank = robust(believed, bank_step_s(parameters, fix_step_s), parameters.update.patience)
-        return Contender(bank, supposed(believed, AS_TOLD), _CASES[asked])
-    if name == WEIGHED:
-        return Contender(weighed(), supposed(believed, AS_TOLD), _CASES[asked])
+    if name in (ROBUST, WEIGHED):
+        share, time_s = parameters.gnss.lasting_share, parameters.gnss.lasting_time
+        lasting = jnp.array([share, time_s]) if share else None
+        start = _case(case, asked, (share, time_s) if share else None, parameters.start.position)
+        step_s, patience_s = bank_step_s(parameters, fix_step_s), parameters.update.patience
+        bank = weighed() if name == WEIGHED else robust(believed, step_s, patience_s, lasting)
+        return Contender(bank, supposed(believed, AS_TOLD, lasting), start)
     told = fresh(believed) if asked else believed
     return Contender(make_filter(name, parameters.update.gate), told)
 
@@ -343,20 +347,22 @@ def _share_note(answer: Answer, parameters: Replay, fix_step_s: float) -> list[s
     ]
 
 
-# parameters, the log on one clock, pieces to navigate, sentences on others, interval of fixes [s]
-_Opened = tuple[Replay, Log, list[Stretch], list[str], float]
+# parameters, the log on one clock, pieces to navigate, sentences on others, interval of fixes [s],
+# notes
+_Opened = tuple[Replay, Log, list[Stretch], list[str], float, list[str]]
 
 
 def _opened(dataset: Dataset, parameters: Replay) -> _Opened:
     parameters = with_lever_arm(parameters, dataset.lever_arm_b_m)
     log = on_one_clock(in_body_axes(dataset, parameters.imu.orientation), parameters)
+    parameters, notes = with_lasting(parameters, log)
     pieces, problems = replaying.prepared(
         log.time_s,
         log.increments.dt,
         parameters.update.longest_gap,
         partial(prepare, log, parameters),
     )
-    return parameters, log, pieces, problems, usual_of(log).fix_s
+    return parameters, log, pieces, problems, usual_of(log).fix_s, notes
 
 
 def recorded(dataset: Dataset, parameters: Replay) -> Recorded:
@@ -365,7 +371,7 @@ def recorded(dataset: Dataset, parameters: Replay) -> Recorded:
     Raises:
         ValueError: the log cannot be navigated; the sentence says why and what to do.
     """
-    parameters, _, pieces, _, interval_s = _opened(dataset, parameters)
+    parameters, _, pieces, _, interval_s, _ = _opened(dataset, parameters)
     return Recorded(pieces, partial(contender, parameters, interval_s))
 
 
@@ -383,7 +389,7 @@ def replay(
     Raises:
         ValueError: the log cannot be navigated; the sentence says why and what to do.
     """
-    parameters, log, pieces, problems, interval_s = _opened(dataset, parameters)
+    parameters, log, pieces, problems, interval_s, notes = _opened(dataset, parameters)
     wanted = filters or parameters.filters
     for name in wanted:
         require_known("filter", name, NAMES, "this system")
@@ -410,6 +416,7 @@ def replay(
         variables=variables,
         counts=dict(dataset.counts) | counts,
         notes=[f"Start: {piece.start.sentence}." for piece in pieces]
+        + notes
         + found
         + [f"Not navigated, {problem}." for problem in problems],
         origin_ns=int(dataset.imu.time_ns[0]),

@@ -224,14 +224,22 @@ def ins_gnss_model(imu: Imu, gnss: Gnss, aids: Aids) -> Model:
 
 
 def start_belief(
-    nav: Nav, imu: Imu, start: Start, tilt_rad: Any, heading_rad: Any, gyro_bias: Any = None
+    nav: Nav,
+    imu: Imu,
+    start: Start,
+    tilt_rad: Any,
+    heading_rad: Any,
+    gyro_bias: Any = None,
+    fix_sigma_m: Any = (0.0, 0.0, 0.0),
 ) -> Belief:
     """The belief at the start, uncorrelated, about attitude, velocity and position of the IMU.
 
-    Sigmas are of `imu` and `start`, of roll and pitch `tilt_rad`, of the heading `heading_rad`.
+    Sigmas are of `imu` and `start`, of roll and pitch `tilt_rad`, of the heading `heading_rad`; to
+    that of the position is added `fix_sigma_m` (3,) of the fix that it is taken from.
     `gyro_bias` (3,) rad/s is given where it is known from rest; else it is zero.
     """
-    sigma = [[tilt_rad, tilt_rad, heading_rad], [start.velocity] * 3, [start.position] * 3]
+    place = [(start.position**2 + s**2) ** 0.5 for s in fix_sigma_m]
+    sigma = [[tilt_rad, tilt_rad, heading_rad], [start.velocity] * 3, place]
     sigma += [imu.gyro_bias, imu.accel_bias]
     sigma += [imu.gyro_scale, imu.accel_scale] if imu.scale_states else []
     mean = InsState.start(nav, imu.scale_states)

@@ -47,6 +47,10 @@ class Gnss(Parameters):
     sigma_factor: dict[str, Positive] = pydantic.Field(default_factory=dict)
     least_sigma: Annotated[float, Quantity("length", least="0 m")] = default("0 m")
     least_velocity_sigma: q.SpeedSize = default("0 m/s")
+    # `robust`: share of the variance of positions that lasts from fix to fix; not given: a replay
+    # finds it from the scatter of the fixes, a live filter takes it for 0
+    lasting_share: Annotated[float, pydantic.Field(ge=0.0, lt=1.0)] | None = None
+    lasting_time: q.Duration = default("100 s")
 
 
 class Start(Parameters):

@@ -4,8 +4,10 @@ Every measurement has a weight of its own, that of noise with Student's t (`rule
 answers a single one that is off. What the files of a log do not say is in the state, or is asked as
 hypotheses of an interacting multiple model (`robins.filters.composite.imm`):
 
-    x = (ins, share, o)      ins: the navigation state; tangent components behind its 15 or 21
+    x = (ins, z, share, o)   ins: the navigation state; tangent components behind its 15 or 21
 
+    z       (3,) NED: the part of the error of positions that lasts, over its sigma: first-order
+            Gauss-Markov (`robins.systems.ins_gnss.lasting`); where the log shows such a part
     share   what a velocity is: that of the fix (0), or the mean since the last one (1); constant
     o       (3,) m, NED: by how much positions are off, as multipath makes them
 
@@ -44,7 +46,7 @@ from robins.filters.values import Numbers, as_data, value
 from robins.ins.state import InsState
 from robins.linalg import block_diagonal
 from robins.program.evaluated import evaluated
-from robins.systems.ins_gnss.model import IMU, POSITION, VELOCITY, Velocity
+from robins.systems.ins_gnss.model import IMU, POSITION, VELOCITY, Fix, Velocity
 from robins.systems.parts import Block, moved_by
 from robins.systems.study import Case
 
@@ -65,6 +67,7 @@ class Wide(NamedTuple):
     """The navigation state and what is not known of its receiver."""
 
     ins: InsState
+    lasting: Array | None  # (3,) NED, of unit variance; None where errors of positions are white
     share: Array | None  # (1,); None where the configuration says it
     offset: Array  # (3,) m, NED
 
@@ -120,15 +123,32 @@ def changes(step_s: float, patience_s: float) -> np.ndarray:
 # ------------------------------------------------------------------------------------ the model
 
 
-def widened(start: Belief, asked: bool) -> Belief:
-    """A belief about the navigation state with what the bank adds to it."""
+def widened(
+    start: Belief, asked: bool, lasting: Array | None = None, start_m: float | Array = 0.0
+) -> Belief:
+    """A belief about the navigation state with what the bank adds to it.
+
+    Args:
+        start: at the place of the first fix; sigmas of position S, uncorrelated with the rest.
+        asked: with a state for what velocities are.
+        lasting: (2,) share of the variance of positions that lasts, and its time constant [s].
+        start_m: the part of S that is not the first fix's. The rest is: where the fix is off by
+            s z, so is the start, by cov(p, z) = -s with s^2 = share (S^2 - start_m^2).
+    """
     mean, sigma = _SHARE
     share = jnp.full(1, mean) if asked else None
     spread = np.zeros((3 + asked, 3 + asked))
     if asked:
         spread[0, 0] = sigma
-    factor = block_diagonal(jnp.asarray(start.factor, float), jnp.asarray(spread))
-    return Belief(Wide(start.mean, share, jnp.zeros(3)), factor)
+    factor = jnp.asarray(start.factor, float)
+    z = None
+    if lasting is not None:
+        z, n, own = jnp.zeros(3), len(factor), jnp.diagonal(factor)[6:9] ** 2
+        tied = jnp.sqrt(lasting[0] * (1.0 - start_m**2 / own))
+        factor = block_diagonal(factor, jnp.diag(jnp.sqrt(1.0 - tied**2)))
+        factor = factor.at[n + jnp.arange(3), 6 + jnp.arange(3)].set(-tied)
+    factor = block_diagonal(factor, jnp.asarray(spread))
+    return Belief(Wide(start.mean, z, share, jnp.zeros(3)), factor)
 
 
 def navigation(x: Any) -> InsState:
@@ -136,27 +156,38 @@ def navigation(x: Any) -> InsState:
     return x.ins if isinstance(x, Wide) else x
 
 
-def _moved(of: Hypothesis, x: Wide) -> Wide:
+def _left(lasting: Array | None, u: Block) -> Any:
+    """The share of z that a step leaves; 0 where there is none."""
+    return 0.0 if lasting is None else jnp.exp(-jnp.sum(u.increments.dt) / lasting[1])
+
+
+def _moved(of: Hypothesis, left: Any, x: Wide) -> Wide:
     place = x.ins.position.retract(of.taken * x.offset)
-    return x._replace(ins=x.ins._replace(position=place), offset=of.kept * x.offset)
+    z = None if x.lasting is None else left * x.lasting
+    return x._replace(ins=x.ins._replace(position=place), lasting=z, offset=of.kept * x.offset)
 
 
-def _step(motion: Motion, of: Hypothesis, x: Wide, u: Block) -> Wide:
-    x = _moved(of, x)
+def _step(motion: Motion, of: Hypothesis, lasting: Array | None, x: Wide, u: Block) -> Wide:
+    x = _moved(of, _left(lasting, u), x)
     return x._replace(ins=motion.step(x.ins, u))
 
 
-def _step_linear(motion: Motion, of: Hypothesis, x: Wide, u: Block):
+def _step_linear(motion: Motion, of: Hypothesis, lasting: Array | None, x: Wide, u: Block):
     assert motion.linear is not None
-    x = _moved(of, x)
+    left = _left(lasting, u)
+    x = _moved(of, left, x)
     ins, Phi, factor = motion.linear(x.ins, u)
+    factor = jnp.sqrt(of.scale) * factor
+    if x.lasting is not None:
+        Phi = block_diagonal(Phi, left * jnp.eye(3))
+        factor = block_diagonal(factor, jnp.sqrt(1.0 - left**2) * jnp.eye(3))
     free = 0 if x.share is None else 1
     unit, zero = jnp.eye(free), jnp.zeros((free, free))
     Phi = block_diagonal(Phi, block_diagonal(unit, of.kept * jnp.eye(3)))
     n = len(Phi)
     takes = jnp.eye(n).at[jnp.arange(6, 9), jnp.arange(n - 3, n)].set(of.taken)
     drawn = of.new + of.kept * WALK * jnp.sqrt(jnp.sum(u.increments.dt))
-    noise = block_diagonal(jnp.sqrt(of.scale) * factor, block_diagonal(zero, drawn * jnp.eye(3)))
+    noise = block_diagonal(factor, block_diagonal(zero, drawn * jnp.eye(3)))
     return x._replace(ins=ins), Phi @ takes, noise
 
 
@@ -166,6 +197,16 @@ def _read(read: Any, x: Wide, aux: Any):
 
 def _read_off(read: Any, off: Any, x: Wide, aux: Any):
     return read(x.ins, aux).retract(off * x.offset)
+
+
+def _read_lasting(read: Any, off: Any, lasting: Array, x: Wide, fix: Fix):
+    assert x.lasting is not None
+    error = jnp.sqrt(lasting[0]) * jnp.asarray(fix.sigma) * x.lasting
+    return read(x.ins, fix).retract(off * x.offset + error)
+
+
+def _white(sigma: Any, lasting: Array, x: Wide, fix: Fix):
+    return jnp.sqrt(1.0 - lasting[0]) * sigma(x.ins, fix)
 
 
 def _aged(fix: Velocity, share: Any) -> Velocity:
@@ -191,16 +232,20 @@ def fresh(model: Model) -> Model:
     return Model(model.motion, tuple(map(sensor, model.sensors)))
 
 
-def supposed(model: Model, of: Hypothesis) -> Model:
+def supposed(model: Model, of: Hypothesis, lasting: Array | None = None) -> Model:
     """The model of the wide state under a hypothesis.
 
     Args:
         model: from `ins_gnss_model`.
         of: its numbers.
+        lasting: as in `widened`.
     """
 
     def sensor(s: Sensor) -> Sensor:
         own = as_data(s.read)
+        if s.name == POSITION and lasting is not None:
+            white = Partial(_white, as_data(s.noise), lasting)
+            return Sensor(Partial(_read_lasting, own, of.read, lasting), white, s.dim, s.name)
         if s.name == POSITION:
             read = Partial(_read_off, own, of.read)
         else:
@@ -209,12 +254,19 @@ def supposed(model: Model, of: Hypothesis) -> Model:
         return Sensor(read, noise, s.dim, s.name)
 
     sensors = tuple(map(sensor, model.sensors))
-    return Model(moved_by(_step, _step_linear, model.motion, of), sensors)
+    return Model(moved_by(_step, _step_linear, model.motion, of, lasting), sensors)
 
 
-def case(asked: bool, world: Case) -> Case:
-    """The case of a world whose start is about the navigation state alone."""
-    return world._replace(start=evaluated(partial(widened, asked=asked), world.start))
+def case(asked: bool, lasting: tuple[float, float] | None, start_m: float, world: Case) -> Case:
+    """The case of a world whose start is about the navigation state alone, as in `widened`."""
+    if lasting is None:
+        return world._replace(start=evaluated(partial(widened, asked=asked), world.start))
+
+    def wide(start: Belief, lasting: Array, start_m: Array) -> Belief:
+        return widened(start, asked, lasting, start_m)
+
+    numbers = jnp.asarray(lasting), jnp.asarray(start_m)
+    return world._replace(start=evaluated(wide, world.start, *numbers))
 
 
 # ----------------------------------------------------------------------------- in hindsight
@@ -283,22 +335,23 @@ def weighed() -> Filter:
     return kalman(taylor(), [student_t(_TAILS)])
 
 
-def _mode(model: Model, rule: Rule, row: Hypothesis) -> Mode:
-    own = supposed(model, row)
+def _mode(model: Model, rule: Rule, lasting: Array | None, row: Hypothesis) -> Mode:
+    own = supposed(model, row, lasting)
     mine = tuple(s for s in own.sensors if s.name == POSITION)
     return Mode(kalman(taylor(), [rule]), own.motion, mine)
 
 
-def robust(model: Model, step_s: float, patience_s: float) -> Filter:
+def robust(model: Model, step_s: float, patience_s: float, lasting: Array | None = None) -> Filter:
     """The bank over the hypotheses, for a model.
 
     Args:
-        model: from `ins_gnss_model`; the filter runs on `supposed` of it, begun by `widened`.
+        model: from `ins_gnss_model`; the filter runs on `supposed` of it, from `widened`.
         step_s: between fixes, or of the longest block where that is shorter.
         patience_s: how long positions are off where they are, in the mean.
+        lasting: as in `widened`.
     """
     start = np.zeros(len(_ROWS))
     start[RIGHT] = 1.0 / COUNT
     # a position that may be off by `OFF_M` is seldom expected, and would hide what is
-    make = Partial(_mode, model, tails())
+    make = Partial(_mode, model, tails(), lasting)
     return bank(make, _ROWS, changes(step_s, patience_s), start, likeliest=True)

@@ -1,0 +1,85 @@
+"""The part of the errors of positions that lasts from fix to fix, found from a log.
+
+A receiver states the sigma of a position. Where its positions scatter by far less about the motion,
+either the sigma is too large or most of the error lasts: orbits, the ionosphere, reflections, the
+receiver's own smoothing. The second is what a filter must expect, since no fix shows it: an error
+that is taken for white is averaged away on paper, and the stated sigma of the estimate with it.
+The error of a position is then s (sqrt(share) z + sqrt(1 - share) w), with the stated sigma s,
+white w, and z first-order Gauss-Markov (Brown & Hwang 2012, ch. 4), both of unit variance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from robins.earth import curvature_radii
+from robins.systems.ins_gnss.parameters import Replay
+from robins.systems.ins_gnss.recording import Log
+
+LEAST = 0.3  # share of the variance from which on it is taken to last; less may be chance
+MOST = 0.99  # the rest is white, however small the scatter
+_FEWEST = 100  # differences that scatter is estimated from, in each axis
+_QUANTILE, _NORMAL = (
+    0.8,
+    1.2816,
+)  # of absolute values; the smaller ones are those of a receiver at rest
+_THIRD = np.sqrt(20.0)  # sigma of a third difference of white noise, over its own
+
+
+def scatter(log: Log) -> np.ndarray | None:
+    """Scatter (3,) of positions about the motion over their stated sigmas, north, east, down.
+
+    Third differences of positions, or differences less what velocities say where these are known,
+    whichever scatter less: a bound from above, as both contain some motion. None where there are
+    too few fixes at even intervals.
+    """
+    g = log.gnss
+    place = np.stack([g.lat_rad, g.lon_rad, g.alt_m], -1)
+    rows = np.flatnonzero(np.isfinite(place).all(axis=1) & ~log.withheld)
+    if len(rows) < _FEWEST + 3:
+        return None
+    lat, lon, alt = place[rows].T
+    meridian, transverse = (np.asarray(r) for r in curvature_radii(lat))
+    r_n = np.stack(
+        [(lat - lat[0]) * meridian, (lon - lon[0]) * transverse * np.cos(lat), -alt], axis=-1
+    )
+    step_s, sigma = np.diff(log.gnss_s[rows]), log.sigma_m[rows]
+    even = np.abs(step_s / np.median(step_s) - 1.0) < 0.5
+    third = np.diff(r_n, 3, axis=0) / _THIRD
+    found = [_spread(third / sigma[1:-2], even[:-2] & even[1:-1] & even[2:])]
+    if log.v_n is not None:
+        v = log.v_n[rows]
+        rest = np.diff(r_n, axis=0) - 0.5 * (v[1:] + v[:-1]) * step_s[:, None]
+        found.append(_spread(rest / np.sqrt(2.0) / sigma[1:], even))
+    least = np.fmin.reduce(found)
+    return least if np.all(np.isfinite(least)) else None
+
+
+def _spread(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Sigma (3,) of normal values by a quantile; NaN where too few are finite."""
+    out = np.full(3, np.nan)
+    for k, column in enumerate(values.T):
+        finite = column[chosen & np.isfinite(column)]
+        if len(finite) >= _FEWEST:  # the median: velocities may be those of the fix before
+            out[k] = np.quantile(np.abs(finite - np.median(finite)), _QUANTILE) / _NORMAL
+    return out
+
+
+def with_lasting(parameters: Replay, log: Log) -> tuple[Replay, list[str]]:
+    """The parameters with the share that lasts, and a note where it was found from the log."""
+    if parameters.gnss.lasting_share is not None:
+        return parameters, []
+    found = scatter(log)
+    share = 0.0 if found is None else float(1.0 - np.max(found) ** 2)
+    share = min(share, MOST) if share >= LEAST else 0.0
+    gnss = parameters.gnss.model_copy(update={"lasting_share": share})
+    parameters = parameters.model_copy(update={"gnss": gnss})
+    if found is None or not share:
+        return parameters, []
+    return parameters, [
+        f"Positions scatter from fix to fix by {np.max(found):.2g} of their stated sigma. So "
+        f"{share:.0%} of the variance is taken to last (gnss.lasting_share; first-order "
+        f"Gauss-Markov of {gnss.lasting_time:g} s, gnss.lasting_time), and the stated sigma of the "
+        "estimate does not fall below that of the fixes. With gnss.lasting_share = 0 all of it is "
+        "taken for white."
+    ]
