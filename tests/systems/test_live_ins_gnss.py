@@ -12,6 +12,7 @@ from robins import scenario
 from robins.filters import Code
 from robins.logs import clean, load_dataset
 from robins.logs.ordering import rows_where
+from robins.results import ResultError
 from robins.systems import replaying
 from robins.systems.ins_gnss import SYSTEM, Drive, LiveInsGnss, Replay, drive_dataset
 from robins.systems.ins_gnss.log import contender, prepare, steps_of
@@ -119,6 +120,17 @@ def made():
 def live(made, tmp_path):
     made.save(tmp_path / "fresh.live")
     return LiveInsGnss.load(tmp_path / "fresh.live")
+
+
+def test_a_file_of_another_filter_is_refused(live, log, tmp_path):
+    """As one that an earlier version wrote, whose state had fewer components."""
+    for event in events(log, np.zeros(len(log.gnss)))[:900]:
+        push(live, log, event)
+    assert live.epoch is not None
+    live._states = [s._replace(belief=None) for s in live._states]
+    live.save(tmp_path / "old.live")
+    with pytest.raises(ResultError, match=r"components.*use the robins that wrote it"):
+        LiveInsGnss.load(tmp_path / "old.live")
 
 
 @pytest.mark.parametrize("order", ["at once", "late", "out of order"])

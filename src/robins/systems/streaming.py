@@ -22,7 +22,7 @@ import numpy as np
 from robins.errors import RobinsError
 from robins.filters import Belief, Filter, FilterState, Model, OnlineFilter
 from robins.program.evaluated import evaluated
-from robins.results import snapshot
+from robins.results import ResultError, snapshot
 from robins.scenario import Parameters
 from robins.scenario.text import mapping_of, text_of
 
@@ -184,7 +184,12 @@ class Live:
             ResultError: the file cannot be read, is damaged, or of another version or class.
         """
         found = snapshot.read(path, cls.__name__)
-        return _made_again(cls, found.parameters, found.state)
+        try:
+            return _made_again(cls, found.parameters, found.state)
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            what = f"it does not hold what a {cls.__name__} of this robins keeps ({error})"
+            fix = "use the robins that wrote it, or start without it"
+            raise ResultError(path, what, fix) from error
 
     def __reduce__(self) -> Any:
         """To be pickled as it is saved: what was compiled is compiled again."""
@@ -242,8 +247,15 @@ def _is_part(value: Part) -> bool:
 
 
 def as_before(like: Any, leaves: list[Any]) -> Any:
-    """A state of the structure of another, with these leaves."""
-    return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(like), leaves)
+    """A state of the structure of another, with these leaves.
+
+    Raises:
+        ValueError: the leaves of the other have other shapes.
+    """
+    own, structure = jax.tree_util.tree_flatten(like)
+    if [np.shape(x) for x in own] != [np.shape(x) for x in leaves]:
+        raise ValueError("the filter's state has other components")
+    return jax.tree_util.tree_unflatten(structure, leaves)
 
 
 def _plain(value: Any) -> Any:
