@@ -242,7 +242,8 @@ def contender(parameters: Replay, fix_step_s: float, name: str) -> Contender:
     if name in (ROBUST, WEIGHED):
         share, time_s = parameters.gnss.lasting_share, parameters.gnss.lasting_time
         lasting = jnp.array([share, time_s]) if share else None
-        start = _case(case, asked, (share, time_s) if share else None, parameters.start.position)
+        own = ((share, time_s), parameters.start.position) if share else (None, 0.0)
+        start = _case(case, asked, *own)
         step_s, patience_s = bank_step_s(parameters, fix_step_s), parameters.update.patience
         bank = weighed() if name == WEIGHED else robust(believed, step_s, patience_s, lasting)
         return Contender(bank, supposed(believed, AS_TOLD, lasting), start)
