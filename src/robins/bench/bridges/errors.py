@@ -1,4 +1,4 @@
-"""What goes wrong at a bridge to another program."""
+"""Errors of a bridge to another program."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class BridgeError(RobinsError, ValueError):
 
 
 class BridgeClosed(RobinsError, ConnectionError):
-    """There is nobody at the other end, or no longer."""
+    """No program is connected at the other end, or no longer."""
 
     bad_input = False
 

@@ -28,11 +28,11 @@ class Told(NamedTuple):
 
 
 class History:
-    """What went out to a part since it put its memory aside last.
+    """Frames sent to a part since it last saved its memory.
 
     Attributes:
-        told: so far.
-        since: the step after which the memory was put aside; -1: never.
+        told: those frames.
+        since: the step after which the memory was saved; -1: never.
     """
 
     def __init__(self, is_there: Callable[[int], bool]):
@@ -50,7 +50,7 @@ class History:
         self.told.append(Told(step, raw))
 
     def forget(self) -> None:
-        """Begin anew: the part has lost its memory, and was told nothing."""
+        """Start again: the part has lost its memory and has received nothing."""
         self.told.clear()
         self.since = -1
 
@@ -71,11 +71,11 @@ def catch_up(
     glance: Callable[[], None],
     idle_s: Callable[[], float] = lambda: math.inf,
 ) -> None:
-    """Wait for the hello of a part that was started anew, and bring it to where the old one was.
+    """Wait for the hello of a restarted part, and bring it to the state of the old one.
 
     Args:
         link: its link; nothing else reads or writes it meanwhile.
-        told: all that was sent to the old one since the memory of this one, in order.
+        told: all frames sent to the old one since the memory of this one, in order.
         begin: the frame that begins the run.
         answered: the last step whose tick the old one answered; ticks beyond are sent, but their
             answers are left to the broker. -1: none.

@@ -38,7 +38,7 @@ class Events:
             self.kept = latest([*self.kept, event], lambda one: one["level"], EVENTS)
 
     def waiting(self) -> list[dict[str, Any]]:
-        """Alarms that nobody has acknowledged."""
+        """Alarms that are not acknowledged."""
         alarms = (one for one in self.kept if one["level"] == "alarm")
         return [one for one in alarms if "acknowledged" not in one]
 

@@ -33,7 +33,7 @@ class Signal(NamedTuple):
 
     An attitude is four signals that follow one another, w, x, y, z of the quaternion from body to
     reference, scalar first, with the same `of`. A plot of attitudes is drawn in three dimensions:
-    the first is solid, others are ghosts beside it.
+    the first is solid, others are shown transparent.
     """
 
     name: str
@@ -108,7 +108,7 @@ EVENTS = 200  # lines of the same
 
 
 class Kind(IntEnum):
-    """What a body is."""
+    """Type of the body of a frame."""
 
     HELLO = 0
     SAMPLE = 1

@@ -26,7 +26,7 @@ HISTORY_HEAD = struct.Struct("<6I")
 
 
 class History:
-    """What samples were; see above.
+    """Least and greatest values of the samples of a run, in buckets; see above.
 
     Attributes:
         samples: how many.
@@ -59,7 +59,7 @@ class History:
 
     @classmethod
     def unpack(cls, packed: bytes) -> History:
-        """What was packed."""
+        """Restore a packed history."""
         _, _, n, signals, per, samples = HISTORY_HEAD.unpack_from(packed)
         made = cls(signals)
         made.per, made.samples = per, samples

@@ -18,7 +18,7 @@ class Line:
     """One direction of a serial line.
 
     It holds at most ``most`` bytes; what is sent beyond is dropped, the newest first, as by a
-    transmitter whose buffer is full. A frame that was cut so is told by its check.
+    transmitter whose buffer is full. The check of a frame that was cut so fails.
 
     Attributes:
         dropped: bytes so far that found no room.

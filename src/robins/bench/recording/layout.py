@@ -41,7 +41,7 @@ _EVENT = {
 
 
 class RecordingError(RobinsError, ValueError):
-    """A record that cannot be begun or read; says what, where and the mend."""
+    """A record that cannot be created or read; names the cause, the place and the fix."""
 
 
 class Entry(NamedTuple):
@@ -63,7 +63,7 @@ class Event(NamedTuple):
 
 
 def schemas(wire: Wire) -> tuple[Schema, Schema]:
-    """Of frames and of events."""
+    """MCAP schemas of frames and of events."""
     table, event = wire.markdown().encode(), json.dumps(_EVENT, sort_keys=True).encode()
     return (
         Schema(FRAMES_SCHEMA, table, "text/markdown", f"{ENCODING}{VERSION}"),

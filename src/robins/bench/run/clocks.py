@@ -28,7 +28,7 @@ class LockStep:
         return None
 
     def over(self, step: int) -> bool:
-        """Whether the step has missed its deadline: there is none."""
+        """False: in lock-step there is no deadline to miss."""
         return False
 
     def behind(self, step: int) -> str:
@@ -103,7 +103,7 @@ class RealTime:
         return f"the run is {late_s:.1f} s behind its clock: {self._rate_hz:g} Hz is too fast"
 
     def over(self, step: int) -> bool:
-        """Whether the step that is just done has missed the deadline of the next one.
+        """True if the step that is just done has missed the deadline of the next one.
 
         Raises:
             BenchError: it has, and the policy is to abort.

@@ -1,4 +1,4 @@
-"""What is ordered while a run goes: faults, by label, and messages of the operator."""
+"""Commands during a run: faults, by label, and messages of the operator."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from robins.bench.run.setup import Flight
 
 
 class Due(NamedTuple):
-    """A message that the operator says now."""
+    """An operator message that is due."""
 
     message: str
     payload: bytes
@@ -23,11 +23,11 @@ class Orders:
     """Faults and messages of a run.
 
     Attributes:
-        said: what went out.
+        said: messages sent.
     """
 
     def __init__(self, flight: Flight, injector: Injector, step_ns: int):
-        """Take the faults of a run, and what its scenario says."""
+        """Take the faults of a run, and the operator messages of its scenario."""
         self.said: list[Spoken] = []
         self._rig, self._injector, self._step_ns = flight.rig, injector, step_ns
         self._labels: list[tuple[str, LinkFault]] = []
@@ -64,15 +64,15 @@ class Orders:
     # ---------------------------------------------------------------------------------- messages
 
     def say(self, message: str, values: Mapping[str, Any]) -> None:
-        """Have something said before the next step; before the first one, it waits for its end.
+        """Queue a message for the next step; before the first one, it waits for its end.
 
         Raises:
-            SayError: it cannot be said.
+            SayError: it cannot be sent.
         """
         self._ordered.append(Due(message, self._rig.desk.payload(message, values), False))
 
     def due(self, step: int) -> list[Due]:
-        """What goes out before a step, in its order: of the same message the last one stands."""
+        """Messages sent before a step, in order: of the same message the last one stands."""
         if step == 0:
             return []
         planned = [one for at, one in self._planned if at <= step]
@@ -85,7 +85,7 @@ class Orders:
 
 
 def in_words(message: str, values: Mapping[str, Any]) -> str:
-    """What was said, for people."""
+    """Text of an operator message for the user."""
     told = ((name, [float(x) for x in _flat(value)]) for name, value in values.items())
     return f"'{message}': " + "; ".join(
         f"{name} {' '.join(f'{x:.6g}' for x in some)}" for name, some in told

@@ -73,12 +73,12 @@ class Ran(NamedTuple):
     events: list[Event]
     deaths: int
     failure: str  # empty: the run came to its end
-    stopped: bool  # by whoever looked on
+    stopped: bool  # by an observer
     said: tuple[Spoken, ...] = ()  # by the operator
 
 
 class _DiedAgainError(Exception):
-    """A part that was started anew has died before it was where the old one was."""
+    """A restarted part has died before it reached the state of the old one."""
 
     def __init__(self, death: Death):
         super().__init__(str(death))
@@ -86,18 +86,18 @@ class _DiedAgainError(Exception):
 
 
 class Session:
-    """A run; `run` does it.
+    """A run; `run` executes it.
 
     Attributes:
-        flight: what was asked for.
+        flight: its setup.
         latencies: so far.
         telemetry: so far.
         injector: its faults; more may be added while it runs.
-        kit: what its parts are made from.
+        kit: input of its parts.
         crew: the processes.
-        clock: when a step begins.
+        clock: decides when a step begins.
         done: steps so far.
-        step_ms: how long the last step took.
+        step_ms: duration of the last step.
         pace: steps a second, of late.
         deaths: of processes, so far.
     """
@@ -116,9 +116,9 @@ class Session:
         Args:
             flight: the run.
             record: where to write the record; None: none.
-            watch: who looks on.
-            progress: told of the share that is done, and what is going on.
-            paused: whether it waits for a "start" of whoever looks on.
+            watch: the observer.
+            progress: called with the share that is done, and the present activity.
+            paused: whether it waits for a "start" of the observer.
             kit: of the same run, if it has been made before.
 
         Raises:
@@ -149,9 +149,9 @@ class Session:
         self.run_number = int.from_bytes(os.urandom(4), "little") or 1
         self.done = 0
         self.step_ms = self.pace = 0.0
-        self._histories: dict[str, History] = {}  # of parts that are started anew if they die
+        self._histories: dict[str, History] = {}  # of parts that are restarted if they die
         self._died: dict[str, list[float]] = {}  # when, of late, by part; not of those killed
-        self._barred: set[tuple[str, str]] = set()  # links and messages that were told of
+        self._barred: set[tuple[str, str]] = set()  # links and messages that were reported
         self._paused, self._stop = paused, False
         self._speaks: dict[str, str] = {}  # by part: the port that its process opens
         self._passed: deque[tuple[Entry, int]] = deque()  # not written yet
@@ -162,7 +162,7 @@ class Session:
     # --------------------------------------------------------------------------------- going
 
     def run(self) -> Ran:
-        """Do it; a run that fails is told in `Ran.failure`, with all that there was until then.
+        """Execute the run; a failure is in `Ran.failure`, with all results until then.
 
         Raises:
             KeyboardInterrupt: after all processes have ended and the record is whole.
@@ -186,7 +186,7 @@ class Session:
             finally:
                 seconds = time.monotonic() - began
                 self.broker.stop()
-                with contextlib.suppress(BenchError):  # whose failure has been told, or is next
+                with contextlib.suppress(BenchError):  # whose failure has been reported, or is next
                     self._catch_up()
                 if self._watch is not None:
                     self._watch.over(self, bool(failure))
@@ -241,7 +241,7 @@ class Session:
         return self.steps
 
     def _obey(self, step: int) -> None:
-        """Do what whoever looks on wants; wait while it is paused."""
+        """Execute the commands of the observer; wait while it is paused."""
         time_ns = (step + 1) * self.kit.step_ns
         switch(self, time_ns, self._speaks, self._bury)
         if self._watch is not None:
@@ -274,10 +274,10 @@ class Session:
         self.event("command", f"{what} {label or ''}".strip())
 
     def say(self, message: str, **values: Any) -> None:
-        """Say something to the parts before the next step; a field left out is missing or 0.
+        """Send the parts a message before the next step; a field left out is missing or 0.
 
         Raises:
-            SayError: it is not for the bench to say, has no such field, or one beyond its limits.
+            SayError: the bench does not send it, it has no such field, or one beyond its limits.
         """
         self._orders.say(message, values)
 
@@ -402,7 +402,7 @@ class Session:
             self._passed.append((Entry(self._wall_ns(), link, direction, data), time_ns))
 
     def _refused(self, link: str, message: str, why: Unsound) -> None:
-        """Tell of a frame that cannot be; of those like it that follow, their count tells.
+        """Report a frame that contradicts its table; those like it that follow are only counted.
 
         Raises:
             BenchError: it is the truth, without which nothing is to be judged.
@@ -445,7 +445,7 @@ class Session:
             self._bury()
 
     def _bury(self, until: str | None = None) -> None:
-        """Look for processes that have ended, and do what the setup says.
+        """Handle processes that have ended, by the policy of the setup.
 
         Raises:
             BenchError: one has, and the run is to fail.
@@ -483,7 +483,7 @@ class Session:
             return self.event("restarted", f"'{part}' was started anew and told {told} again")
 
     def _still_lives(self, part: str) -> None:
-        """Look whether a part that was started anew has died at once; others wait for their turn.
+        """Check that a restarted part has not died at once; others wait for their turn.
 
         Raises:
             _DiedAgainError: it has.

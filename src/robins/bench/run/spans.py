@@ -1,6 +1,6 @@
-"""When faults were on, for the live page.
+"""Times at which faults were active, for the live page.
 
-It hears of the bench each half second, and some faults are shorter.
+It gets the state of the bench each half second, and some faults are shorter.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Faults of the star simulator, beside those of the satellite."""
+"""Faults of the star simulator, in addition to those of the satellite."""
 
 from __future__ import annotations
 
@@ -45,5 +45,5 @@ def said() -> tuple[Mapping[str, Said], Mapping[str, Any]]:
 
 
 def view() -> View:
-    """What the page shows: that of the satellite, with these faults."""
+    """Page of the satellite, with these faults."""
     return VIEW._replace(offered=(*VIEW.offered, *_OFFERED))

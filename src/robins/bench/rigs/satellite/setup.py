@@ -1,4 +1,4 @@
-"""The rate table, as a run on the bench may say it."""
+"""Parameters of the rate table of a run on the bench."""
 
 from __future__ import annotations
 

@@ -22,19 +22,19 @@ HELD = 1  # steps for which what came last stands for what did not come
 
 
 class Held(NamedTuple):
-    """What came last, and for how many steps nothing has come since."""
+    """Last values received, and the number of steps without any since."""
 
     values: Any
     age: int = 0
 
 
 def renew(held: Held, came: Any) -> Held:
-    """What is to be acted on in this step; `trusted` says for how long."""
+    """Values to act on in this step; `trusted` limits for how long."""
     return Held(held.values, held.age + 1) if came is None else Held(came, 0)
 
 
 def trusted(held: Held) -> bool:
-    """Whether what came last still stands."""
+    """True if the last values are still valid."""
     return held.age <= HELD
 
 
@@ -56,7 +56,7 @@ def rest() -> dict[str, np.ndarray]:
 
 
 def acting(held: Held, came: Any, wheels: int) -> tuple[Held, Any, Any]:
-    """What acts in this step: torques and dipole that came, or came last, or none."""
+    """Torques and dipole that act in this step: those that came, the last ones, or none."""
     held = renew(held, came)
     use = held.values if trusted(held) else rest()
     return held, use["wheel_torque"][:wheels], use["dipole_b"]
@@ -171,7 +171,7 @@ def gyro(kit: Kit) -> Part:
 
 
 def star(kit: Kit) -> Part:
-    """The star sensor; a camera is told where to look for its stars."""
+    """The star sensor; a camera is given the direction in which to look for its stars."""
     lens = kit.given.lens
     # An image has no place in a program.
     sees = driven(kit if lens is None else kit._replace(machine="jax"), nodes.star)
