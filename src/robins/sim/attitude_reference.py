@@ -1,4 +1,4 @@
-"""Where a spacecraft is to point: attitudes with their exact rates and angular accelerations.
+"""Target attitudes of a spacecraft, with their exact rates and angular accelerations.
 
 A reference is a motion of reference axes d, to which the body axes b are to be brought: q_id, and
 omega_id and its derivative in the axes d. Turning about one axis after another keeps all three

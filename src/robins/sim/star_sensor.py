@@ -126,7 +126,7 @@ class StarCamera:
 
 
 class StarImage(NamedTuple):
-    """What a camera reports of a moment, brightest first; M = most_stars + false_stars rows."""
+    """Report of a camera at a moment, brightest first; M = most_stars + false_stars rows."""
 
     vectors_b: Any  # (M, 3) unit vectors, body axes; NaN: none
     sigma_rad: Any  # (M,) of each of the two angles of a direction
@@ -199,10 +199,10 @@ def show(
 
 
 def turned(shown: Shown, camera: StarCamera, turn_rad: Float[Array, "3"]) -> Shown:
-    """What a camera has before it that is turned a little [rad], sensor axes, from what is shown.
+    """Stars before a camera that is turned a little [rad], sensor axes, from those shown.
 
-    It is what `show` says of the turned camera, to rounding, if the margin of what is shown exceeds
-    the turn.
+    They are the result of `show` for the turned camera, to rounding, if the margin of what is shown
+    exceeds the turn.
     """
     vectors_s = rotate(conjugate(from_rotvec(turn_rad)), shown.vectors_s)
     return _in_field(shown._replace(vectors_s=vectors_s), camera, camera.most_stars)

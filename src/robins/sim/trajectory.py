@@ -52,7 +52,7 @@ class Kinematics(NamedTuple):
     omega_nb_b: np.ndarray  # (N, 3) rad/s, body relative to NED
 
     def rates(self) -> tuple[np.ndarray, np.ndarray]:
-        """What an ideal IMU feels: omega_ib_b [rad/s] and specific force f_b [m/s^2]."""
+        """Input of an ideal IMU: omega_ib_b [rad/s] and specific force f_b [m/s^2]."""
         omega_ie = np.zeros_like(self.v_n)
         omega_ie[:, 0], omega_ie[:, 2] = OMEGA_E * np.cos(self.lat), -OMEGA_E * np.sin(self.lat)
         meridian, transverse = _radii(self.lat)
