@@ -1,4 +1,4 @@
-"""How many runs a chunk has and how many chunks are computed at once, so that memory has a bound.
+"""Number of runs of a chunk and of chunks computed at once, so that memory has a bound.
 
 A chunk is as wide as the histories of its runs allow, by what the stages of a run hold at once. The
 width depends on the problem and not on the machine's cores: results that JAX sums in batches have

@@ -1,4 +1,4 @@
-"""Where a campaign keeps what it has computed: objects that are put once and read by anybody.
+"""Store of a campaign's results: objects that are put once and read by any worker.
 
 An object appears whole or not at all, and the first one under a name stays. So workers need no
 agreement: what two of them compute is the same, and the second is thrown away.
