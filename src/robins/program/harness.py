@@ -135,12 +135,12 @@ class Recorded(NamedTuple):
             axis of calls.
         tolerances: of fields, in parts of their size, the largest number that each has; `TOLERANCE`
             of the others.
-        codes_off: how many calls may return another code, count or flag.
+        codes_off: number of calls that may return another code, count or flag.
         sizes: of fields, the least size by which a difference is judged, where the numbers of the
             field may be nothing but rounding.
         ends: of each entry point that is called once after the last step, its arguments after the
             state.
-        ruined: why the library is not to be used, however well it was compiled; its test says so
+        ruined: why the library is not to be used, however well it was compiled; its test prints it
             and fails.
     """
 

@@ -1,8 +1,8 @@
 """Equations of a jaxpr that go along one axis, as rounds of one loop.
 
 A scan goes along its axis; so does an operation on arrays whose first axis is as long, if it does
-to each row the same by itself; and so do random numbers, as the generator can be told the number of
-an entry. What goes along the same axis is one loop: a row that the next equation needs is never
+to each row the same by itself; and so do random numbers, as the generator can be given the number
+of an entry. What goes along the same axis is one loop: a row that the next equation needs is never
 written to memory. What a round leaves for the next is carried.
 """
 

@@ -2,7 +2,7 @@
 
 The jaxpr of the function is cut into *stages*: what goes along one axis is a loop
 (`robins.program.loops`), what lies between loops are arrays (`robins.program.arrays`). What depends
-on no run is computed once. What has no place in a program stays with JAX, which is said.
+on no run is computed once. What has no place in a program stays with JAX, which is reported.
 """
 
 from __future__ import annotations

@@ -312,7 +312,7 @@ def trace_steps(
 
 
 def positive_zeros(a: np.ndarray) -> np.ndarray:
-    """Which entries of an array are reals, and zero."""
+    """Mask of the entries of an array that are reals and +0."""
     if a.dtype != np.float64:
         return np.zeros(a.shape, bool)
     return np.asarray((a == 0.0) & ~np.signbit(a))
