@@ -27,7 +27,7 @@ _LARGEST = 1 << 30  # bytes of a file
 
 
 class Snapshot(NamedTuple):
-    """What a file says."""
+    """Contents of a file."""
 
     parameters: str  # TOML
     state: Any  # as it was given to `write`, tuples as tuples, arrays as NumPy's
