@@ -1,4 +1,4 @@
-"""What tuning found: factors with their intervals, and the parts held out before and after."""
+"""Figures of tuning: factors with their intervals, and the parts held out before and after."""
 
 from __future__ import annotations
 
