@@ -43,15 +43,15 @@ from robins.workbench.scenarios import check_filters, find_scenario, read_scenar
 from robins.workbench.single_precision import Cost, cost, differences, in_floats
 
 STEPS = 60  # of a run, recorded for the test
-RUNS = 3  # by which the cost of single precision is told
+RUNS = 3  # by which the cost of single precision is measured
 NIS = 1e-7  # tolerance: it squares what is left of readings far larger than their sigma
 MARGIN, LEAST = 4.0, 1e-6  # of its differences in the test: other compilers round otherwise
-RESET = "reset"  # the entry point that begins anew
+RESET = "reset"  # the entry point that starts again
 SMALL = 200  # scalar operations up to which a loop is written out where the code is to be small
 
 
 class Exported(NamedTuple):
-    """What was written."""
+    """Files written, and remarks on them."""
 
     folder: Path
     files: tuple[str, ...]
@@ -94,8 +94,8 @@ def export_filter(
             the folder holds something; or no part of a rig is made of such a filter.
         robins.program.ProgramError: the filter does what has no place in C yet; the message names
             the line of the model or the rule.
-        robins.program.BuildError: single precision is asked for, and there is no compiler here by
-            which to tell what it costs.
+        robins.program.BuildError: single precision is requested, and there is no compiler here by
+            which to measure its cost.
     """
     _float64.require()
     if to.exists() and (not to.is_dir() or any(to.iterdir())):
@@ -182,7 +182,7 @@ def _built(folder: Path, part: str) -> Path:
 
 
 class _Asked(NamedTuple):
-    """What is exported."""
+    """Request of an export."""
 
     problem: Problem  # by which the filter is tried
     filter: str
@@ -289,7 +289,7 @@ def _record(run: BoardRun, functions: Mapping[str, Any], anew: Any) -> Recorded:
 
 
 def _sizes(made: Calls) -> dict[Key, float]:
-    """Numbers beside which a billionth is no difference, by struct and field.
+    """Sizes against which a billionth is no difference, by struct and field.
 
     They are the largest sigma of what is in the units of a sigma, and the degrees of freedom of a
     NIS.
@@ -314,7 +314,7 @@ def _largest(numbers: np.ndarray) -> float:
 
 
 def _compared(library: Library, record: Recorded, singles: Calls) -> Recorded:
-    """With how far off floats may be: a margin beside what they are."""
+    """Record with the tolerances of floats: their differences times a margin."""
     parts: dict[Key, float] = {}
     off = 0
     for entry in library.entries:

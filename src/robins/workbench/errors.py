@@ -14,7 +14,7 @@ class InputError(RobinsError, ValueError):
 
 @contextlib.contextmanager
 def refusing(what: object) -> Iterator[None]:
-    """Say of a ValueError what it is about.
+    """Add to a ValueError what it is about.
 
     Raises:
         InputError: in its place.

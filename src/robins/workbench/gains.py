@@ -22,7 +22,7 @@ _MISSING = "robins[design]"  # in the sentence of a method whose packages are no
 
 
 def as_text(gammas: Sequence[float]) -> list[str]:
-    """Gammas with as few digits as tell them apart, four at least."""
+    """Gammas with as few digits as distinguish them, four at least."""
     for digits in range(4, 18):
         texts = [f"{gamma:.{digits}g}" for gamma in gammas]
         if len(set(texts)) == len(texts):
@@ -31,7 +31,7 @@ def as_text(gammas: Sequence[float]) -> list[str]:
 
 
 def cell(attempt: Attempt) -> Any:
-    """What a table says where a method has no design."""
+    """Entry of a table where a method has no design."""
     if np.isfinite(attempt.least):
         return f"cannot, least {attempt.least:.4g}"
     return "not certified"
@@ -119,7 +119,7 @@ def table_of(found: TradeOff) -> str:
 
 
 def advice(problem: Problem, found: TradeOff) -> list[str]:
-    """What the numbers say, in sentences."""
+    """Conclusions from the numbers, in sentences."""
     own, gain = found.kalman, _unit(problem.unit_gain)
     least = found.least
     reach = f"the least Hinf of {_whose(found)} is {least.reached:.4g}{gain}"

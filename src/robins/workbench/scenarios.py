@@ -26,7 +26,7 @@ def find_scenario(
     """System, name and text of a scenario.
 
     Args:
-        name: "system/name" of a packaged one; a path that ends in .toml, which says its system in
+        name: "system/name" of a packaged one; a path that ends in .toml, which names its system by
             the key ``system``; or a system of the user's own, "file.py:study" or the name of an
             installed one, whose parameters then have their defaults.
         recorded: a recorded pair takes the place of the simulation.
@@ -99,7 +99,7 @@ class Simulated(NamedTuple):
     text: str  # TOML, as it stands
     study: Study
     parameters: Any  # with the settings
-    source: str  # how it was asked for
+    source: str  # how it was requested
 
     @property
     def own(self) -> tuple[str, ...]:

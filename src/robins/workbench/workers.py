@@ -76,7 +76,7 @@ class _Process:
 
     @property
     def said(self) -> str:
-        """What it told of its errors."""
+        """Text of its error output."""
         self._errors.seek(0)
         return self._errors.read().decode("utf-8", "replace").strip()
 
