@@ -56,7 +56,7 @@ def deliver(
         if not as_json:
             _answer(outcome)
             click.echo("\nWriting the report ...")
-    except OSError:  # nobody reads: what was computed is kept all the same
+    except OSError:  # no reader: what was computed is kept all the same
         write()
         raise
     with only_json(as_json), writing:
