@@ -101,7 +101,7 @@ RADAR = Instrument(
 
 
 class Early(NamedTuple):
-    """What sights before the end of an epoch need besides the state."""
+    """Inputs of sights before the end of an epoch, besides the state."""
 
     turned_b: ArrayLike  # (S - 1, 3) rad, raw turn of the body from each to the end
     age_s: ArrayLike  # (S - 1,)
@@ -187,7 +187,7 @@ def _measure_air(given: Airship, course: Course, key: Keys, world: World) -> Arr
 
 
 def _wind(world: World, wind: Array, air_b: Array) -> tuple[Array, Array]:
-    """What is taken for the wind, NaN where no air data come, and for the velocity in the air."""
+    """Wind, NaN where no air data come, and velocity in the air, as filters take them."""
     there = jnp.isfinite(world.readings[WIND][:, :1])
     return jnp.where(there, wind, jnp.nan), jnp.where(there, air_b, 0.0)
 
@@ -277,7 +277,7 @@ def printed_attitude_rows(
 def printed_constraint(
     heading_rad: ArrayLike, air_speed_error: ArrayLike
 ) -> tuple[Float[Array, "2 9"], Float[Array, "2"]]:
-    """D and d of (49), (50) to the letter, but for the error of the wind in d, which nobody knows.
+    """D and d of (49), (50) to the letter, but for the error of the wind in d, which is unknown.
 
     dv_E and dv_N are components already, and yet are multiplied by sine and cosine of the heading;
     d has these two the other way round. D loses a row wherever the heading is cardinal. The air

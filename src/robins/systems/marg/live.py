@@ -122,11 +122,11 @@ class LiveMarg(Live):
         declination_rad: float = 0.0,
         machine: str | None = None,
     ):
-        """Begin; programs are made before the first sample.
+        """Start; programs are made before the first sample.
 
         Args:
             parameters: as of a replay.
-            rate_hz: of the samples, as the data sheet says; lost ones are told by it.
+            rate_hz: of the samples, by the data sheet; lost ones are detected by it.
             declination_rad: of the Earth's field here, clockwise from true north.
             machine: the machine that steps the filter, as for `OnlineFilter`; default: `usual()`.
                 Programs of "vm" are kept in the user's cache, "c" is compiled for minutes once.

@@ -1,8 +1,8 @@
-"""What a replay says against itself: states and innovations that its own assumptions forbid.
+"""Self-contradictions of a replay: states and innovations that its own assumptions forbid.
 
 A filter whose model is wrong goes on with a small sigma. Its states show it: a declination that the
 field of no room has, gains that no gyro is sold with, and a velocity or place that is again and
-again beyond what was stated, which is a tilt that does not fit.
+again beyond the stated sigma, which means a wrong tilt.
 """
 
 from __future__ import annotations

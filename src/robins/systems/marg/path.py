@@ -76,7 +76,7 @@ class SamplePath:
         self._parameters, self._usual_s = parameters, usual_s
         self._kind: Literal["rate", "increment"] = kind
         self.n = max(1, round(parameters.update.block / usual_s))
-        # a peak that ends in a block may have begun in those before
+        # a peak that ends in a block may have started in those before
         self._most_context = math.ceil(LONGEST_S / usual_s) + 2 * FLANK
         self._by_sample = levels is None and kind == "rate"
         self.range = Range(levels)
@@ -311,7 +311,7 @@ def not_sampled(
     known = np.isfinite(doubt)
     unknown = full & ~known
     lost = gap + dt * (accel_full[1:] | accel_full[:-1])
-    # what a gyro at its end did not say, about its own axis; what all samples of a gap did not
+    # turn that a gyro at its end did not report, about its own axis; that of all samples in a gap
     turn = p.gap_rate * (gap[:, None] + dt[:, None] * (unknown[1:] | unknown[:-1]))
     turn = turn + dt[:, None] * np.where(known, doubt, 0.0)[1:]
     return turn, lost, int(np.sum(gap > 0.0))
@@ -324,7 +324,7 @@ def inputs(
     lost_s: np.ndarray,
     parameters: Replay,
 ) -> tuple[model.Block, np.ndarray]:
-    """What the motion takes of K blocks, and which of them fall freely (K,) bool.
+    """Inputs of the motion for K blocks, and mask of those in free fall (K,) bool.
 
     Args:
         integrals: of the blocks.

@@ -45,7 +45,7 @@ _VECTOR, _ANGLES, _DISTURBED, _INTEGRATED = range(4)
 
 
 class Course(NamedTuple):
-    """What is the same in all runs; E steps."""
+    """Data that all runs share; E steps."""
 
     time_s: np.ndarray  # (E,) at the end of each step
     field_n: np.ndarray  # (E, 3) T, launch north-east-down, which is inertial
@@ -166,7 +166,7 @@ def _felt(course: Course, rows: Array) -> Array:
 
 
 def instruments(given: Flight) -> tuple[Instrument, ...]:
-    """Those whose readings are measurements; in "field-vector" the gyro drives the motion."""
+    """Instruments whose readings are measurements; in "field-vector" the gyro drives the motion."""
     if isinstance(given, MagneticAttitude):
         return (RATE_GYRO if given.gyro_reads == "rate" else INTEGRATED_GYRO, MAGNETIC_ATTITUDE)
     taken = taken_field(given.magnetometer.full_scale)
