@@ -30,7 +30,7 @@ Refuse = Callable[[str], RobinsError]
 
 
 def largest(present: int) -> int:
-    """Most bytes that so many packed ones may unpack to."""
+    """Largest number of bytes that so many packed ones may unpack to."""
     return FREE + RATIO * present
 
 

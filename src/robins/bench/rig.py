@@ -263,7 +263,7 @@ class Rig:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Its parts, without the bench."""
+        """Names of its parts, without the bench."""
         return self.wire.parts[1:]
 
     @cached_property

@@ -1,4 +1,4 @@
-"""On what a campaign runs: programs on all cores, interpreted or compiled, or batches of JAX.
+"""Machines of a campaign: programs on all cores, interpreted or compiled, or batches of JAX.
 
 All have the same random numbers and, to rounding, the same results; JAX is the reference. The two
 kinds of programs have the same bits. The interpreter (`robins.program.interpreter`) begins at once

@@ -53,7 +53,7 @@ def said(bytes_of_run: int, width: int) -> list[str]:
 
 
 def give_back() -> None:
-    """Have the C library of Linux return what is free, between two chunks.
+    """Return free memory of the C library to Linux, between two chunks.
 
     Threads of lanes allocate in arenas of their own, which otherwise grow by 60 MB a chunk of the
     airship, to three times what a chunk needs.

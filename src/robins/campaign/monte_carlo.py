@@ -168,7 +168,7 @@ def batch_of(problem: Problem) -> Any:
 
 
 def bytes_of_batch(problem: Problem, batch: Any, width: int) -> int:
-    """About the most memory that JAX needs at once for a chunk of so many runs.
+    """Approximate peak memory of JAX for a chunk of so many runs.
 
     What is traced for it serves again when a chunk of this width is computed.
 

@@ -35,7 +35,7 @@ class Shard(NamedTuple):
 
     @property
     def stem(self) -> str:
-        """Its name without group and ending."""
+        """Name of the shard without group and ending."""
         return PurePosixPath(self.name).stem
 
 

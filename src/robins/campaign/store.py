@@ -211,7 +211,7 @@ class Objects:
             self._tried(f"remove {name}", lambda: self._obstore.delete(self._store, name))
 
     def sweep(self) -> None:
-        """Nothing half-written is ever seen here."""
+        """Do nothing: object storage never shows half-written objects."""
 
     def _tried(self, what: str, function: Callable[[], Any]) -> Any:
         try:

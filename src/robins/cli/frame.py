@@ -22,7 +22,7 @@ class Status(enum.IntEnum):
 
 @contextlib.contextmanager
 def only_json(wanted: bool) -> Iterator[None]:
-    """While a command works, turn what anything prints to standard error if JSON is wanted."""
+    """Redirect all prints of a command to standard error if JSON is wanted."""
     with contextlib.ExitStack() as stack:
         if wanted:
             stack.enter_context(contextlib.redirect_stdout(sys.stderr))

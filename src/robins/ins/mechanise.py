@@ -54,7 +54,7 @@ def step(nav: Nav, inc: Increments) -> Nav:
 
 
 def step_each(nav: Nav, inc: Increments) -> Nav:
-    """As `step`, for N states and an increment each, in NumPy: there is nothing to compile."""
+    """Step of N states by an increment each, as `step`, in NumPy: there is nothing to compile."""
     p = nav.position
     columns = [*nav.q_nb.wxyz.T, *nav.v_n.T, p.lat, p.lon, p.alt]
     return unpacked(np.stack(_advanced(columns, rows(inc, np).T, np), -1))
@@ -81,7 +81,7 @@ def _run(nav: Nav, increments: Increments) -> tuple[Nav, Nav]:
 
 
 def mechanise_chunked(nav: Nav, increments: Increments, chunk: int = 16384) -> Nav:
-    """As `mechanise`, on the host: NumPy arrays in and out, `chunk` increments at a time.
+    """Navigate as `mechanise`, on the host: NumPy arrays in and out, `chunk` increments at a time.
 
     The device holds one chunk whatever the length of the run, and one compilation serves all
     lengths, the last chunk being padded.

@@ -298,7 +298,7 @@ def _alike(index: PairIndex, star, magnitude, tolerance):
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> Any:
-    """Between unit vectors, exact for small angles too."""
+    """Angle between unit vectors [rad], exact for small angles too."""
     return 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(a - b, axis=-1), 1.0))
 
 

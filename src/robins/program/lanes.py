@@ -86,7 +86,7 @@ class Rounds:
         self._scan, self.lanes = engine(program)
 
     def hand_over(self, engine: RoundsEngine) -> None:
-        """Have another engine carry out the program; calls under way end as they began."""
+        """Change the engine of the program; calls under way end as they began."""
         self._scan, self.lanes = engine(self.program)
 
     def holds_for(self, begin: Sequence[Given]) -> bool:

@@ -55,7 +55,7 @@ class Entry(NamedTuple):
 
     @property
     def symbol(self) -> str:
-        """Its name as a part of names in C."""
+        """Name of the entry as a part of names in C."""
         return symbol(self.name)
 
 
@@ -286,7 +286,7 @@ def _text(lines: Sequence[str]) -> str:
 def _copied(
     fields: Sequence[Field], struct: str, reals: str, others: str, inwards: bool
 ) -> list[str]:
-    """Between a struct and the arrays of a program."""
+    """Lines of C that copy between a struct and the arrays of a program."""
     lines = []
     for f in fields:
         if f.is_real:

@@ -106,7 +106,7 @@ def _by_rows(e: Equation, name: str, p: Any, length: int) -> bool:
 
 
 def operations(e: Equation) -> int:
-    """About how many scalar operations of a scan an equation is worth to JAX."""
+    """Approximate cost of an equation to JAX, in scalar operations of a scan."""
     name = e.primitive.name
     if name == "scan":
         return e.params["length"] * size_of(e.params["jaxpr"].jaxpr)

@@ -1,4 +1,4 @@
-"""From a function of JAX to a program: its jaxpr, walked with arrays of nodes for values.
+"""Tracing of a function of JAX to a program: its jaxpr, walked with arrays of nodes for values.
 
 Each primitive has a rule, in `robins.program.primitives`: arrays of nodes in, arrays of nodes out.
 A rule that only moves data moves nodes, and so leaves no code.

@@ -92,7 +92,7 @@ def _lock(folder: Path) -> ExitStack | None:
 
 
 def _claim(target: Path) -> ExitStack:
-    """Be the one writer of a target until the stack is closed.
+    """Claim a target as its only writer until the stack is closed.
 
     Raises:
         Busy: another one is.

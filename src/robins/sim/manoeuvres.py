@@ -188,7 +188,7 @@ def _slope(waves: Sequence[Wave], t: np.ndarray) -> np.ndarray:
 
 
 def _ease(u: np.ndarray) -> np.ndarray:
-    """From 0 to 1 over u in [0, 1] with two continuous derivatives."""
+    """Rise from 0 to 1 over u in [0, 1] with two continuous derivatives."""
     s = np.clip(u, 0.0, 1.0)
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 

@@ -122,7 +122,7 @@ def from_waypoints(
     q_nb: Values | None = None,
     vehicle: Vehicle = "ground",
 ) -> Motion:
-    """Through given points at given times.
+    """Motion through given points at given times.
 
     Args:
         time_s: (K,) increasing, at least four; taken from the first one on.
@@ -131,7 +131,7 @@ def from_waypoints(
         alt_m: (K,) above the ellipsoid.
         q_nb: (K, 4) attitude at the points, NED/FRD. Without it the vehicle points where it goes;
             an aircraft banks so that its turns are coordinated.
-        vehicle: who moves, if `q_nb` is not given.
+        vehicle: kind of vehicle, if `q_nb` is not given.
 
     Raises:
         ValueError: too few points, time that does not increase, shapes that do not match, values
@@ -171,10 +171,9 @@ def from_waypoints(
 
 
 def from_velocity(time_s: np.ndarray, v_n: np.ndarray, start: Geodetic, q_nb: np.ndarray) -> Motion:
-    """From velocity (K, 3) NED [m/s] and attitude (K, 4) at dense, increasing times from zero [s].
-
-    Between the knots the path follows splines of sixth degree, whose rates are those of the
-    velocity at the knots.
+    """Motion of velocity (K, 3) NED [m/s] and attitude (K, 4) at dense times (K,) from zero [s].
+    The times increase. Between the knots the path follows splines of sixth degree, whose rates are
+    those of the velocity at the knots.
 
     Raises:
         ValueError: the start is too near a pole.

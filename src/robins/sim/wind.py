@@ -293,7 +293,7 @@ def _check(count, step_s, airspeed_m_s, direction_rad):
 
 
 def _turned(pair, direction_rad):
-    """From along and to the right of a direction to north and east."""
+    """Components north and east of vectors given along and to the right of a direction."""
     cos, sin = jnp.cos(direction_rad), jnp.sin(direction_rad)
     along, right = pair[:, 0], pair[:, 1]
     return jnp.stack([cos * along - sin * right, sin * along + cos * right], 1)

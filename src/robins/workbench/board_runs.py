@@ -58,7 +58,7 @@ class BoardRun(NamedTuple):
         return len(jax.tree_util.tree_leaves(self.given)[0])
 
     def cut(self, steps: int) -> BoardRun:
-        """Its first steps."""
+        """The same run, cut to its first steps."""
         given = jax.tree_util.tree_map(lambda a: a[:steps], self.given)
         return self._replace(given=given)
 

@@ -9,7 +9,7 @@ from robins.errors import RobinsError
 
 
 class InputError(RobinsError, ValueError):
-    """Something a command was given cannot be used."""
+    """An input of a command that cannot be used."""
 
 
 @contextlib.contextmanager

@@ -155,7 +155,7 @@ def advice(problem: Problem, found: TradeOff) -> list[str]:
 
 
 def _whose(found: TradeOff) -> str:
-    """Whose least gamma it is."""
+    """Set of gains that the least gamma refers to."""
     return "any gain" if found.least.exact or found.least.reached == 0.0 else "the gains found"
 
 

@@ -1,4 +1,4 @@
-"""From an outcome to a result folder with its report: for every command the same way."""
+"""Publication of an outcome as a result folder with its report, the same for every command."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ class Simulated(NamedTuple):
             return self.study.problem(self.parameters, filters, seed)
 
     def parsed(self, settings: Sequence[str]) -> Any:
-        """Its parameters with other settings.
+        """Parameters of the scenario with other settings.
 
         Raises:
             robins.scenario.ScenarioError: they do not fit.

@@ -110,7 +110,7 @@ class Cost(NamedTuple):
         return "Single precision costs nothing that shows in the errors."
 
     def as_data(self) -> dict[str, Any]:
-        """For scripts; what is not finite is None."""
+        """Figures for scripts; None where one is not finite."""
 
         def sound(x: float) -> float | None:
             return x if math.isfinite(x) else None

@@ -13,7 +13,7 @@ from robins.errors import RobinsError
 
 
 class BridgeError(RobinsError, ValueError):
-    """Something that a protocol cannot carry, or bytes that are none of its messages."""
+    """A value that a protocol cannot carry, or bytes that are none of its messages."""
 
 
 class BridgeClosed(RobinsError, ConnectionError):

@@ -13,9 +13,9 @@ from robins.scenario import Parameters, Quantity, default
 
 Direction = Literal["from", "to"]
 Stage = Literal["sensed", "repeated", "said", "blind"]
-"""When the content of a frame is changed, in this order: what a sensor measures, what it says again
-and again in its place, what it says of it, and that it says nothing of it. What a blind sensor had
-lost it does not repeat."""
+"""Stage at which a fault changes the content of a frame, in this order: the measurement itself, its
+repetition in later frames, the values that are sent, and values that are missing. A blind sensor
+does not repeat its lost values."""
 
 _PLACE = ("link", "direction", "message", "share")
 _LINE: dict[str, tuple[str, ...]] = {
@@ -80,7 +80,7 @@ class Table(NamedTuple):
 
 
 class LinkFault(Parameters):
-    """Something goes wrong on a link from `begin` (included) to `end` (not; left out: for good).
+    """A fault on a link from `begin` (included) to `end` (excluded; left out: for good).
 
     Times are those of the clock of the run: a step has that of its end.
 

@@ -120,7 +120,7 @@ def sayings_of(desk: Desk) -> type[Saying]:
 
 
 def _type(f: Field) -> Any:
-    """As a scenario gives a field: with a unit where the wire's is one of the SI."""
+    """Type of a field in a scenario: with a unit where the wire's is one of the SI."""
     one: Any = float if f.kind == "f64" else int
     if f.unit in _KINDS and f.unit != "1":
         of = one if f.length == 1 else tuple[(one,) * f.length]

@@ -157,7 +157,7 @@ def _plain(value: Any) -> Any:
 
 
 def latest(events: Sequence[Any], kind: Callable[[Any], Hashable], most: int) -> list[Any]:
-    """As many of the latest events as there is room for, in their order.
+    """Latest events, as many as there is room for, in their order.
 
     Each kind has the same room, and what one does not need is for the others; so a thousand
     warnings leave the alarm that came before them.
@@ -165,7 +165,7 @@ def latest(events: Sequence[Any], kind: Callable[[Any], Hashable], most: int) ->
     Args:
         events: the oldest first.
         kind: of an event.
-        most: how many there is room for.
+        most: number that there is room for.
     """
     if len(events) <= most:
         return list(events)

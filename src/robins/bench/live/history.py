@@ -48,7 +48,7 @@ class History:
             self._take_in()
 
     def pack(self, run: int) -> bytes:
-        """As it is sent; empty: there is none."""
+        """Bytes of the history as sent; empty where there is none."""
         self._take_in()
         n, signals = -(-self.samples // self.per), self._least.shape[1]
         if not n:

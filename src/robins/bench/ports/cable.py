@@ -63,7 +63,7 @@ def _carry(one: Pair, other: Pair, wake: int) -> None:
 
 
 def main() -> None:
-    """Be a cable until interrupted."""
+    """Run a cable until interrupted."""
     with cable() as ends, contextlib.suppress(KeyboardInterrupt):
         print(f"bench: {ends.bench}\nboard: {ends.board}\nCtrl-C ends it.", flush=True)
         threading.Event().wait()

@@ -78,7 +78,7 @@ class Line:
 
     @property
     def next_ns(self) -> int | None:
-        """When the next byte is through; None: the line is empty."""
+        """Time at which the next byte is through [ns]; None: the line is empty."""
         if not self._bursts:
             return None
         return -(-(self._bursts[0][0] + self._byte) // self._baud)

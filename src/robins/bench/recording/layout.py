@@ -54,7 +54,7 @@ class Entry(NamedTuple):
 
 
 class Event(NamedTuple):
-    """Something that happened."""
+    """Event of a run."""
 
     received_ns: int
     kind: str

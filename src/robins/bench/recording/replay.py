@@ -34,8 +34,9 @@ _HELLO, _TICK, _DONE, _STOP, _BEGIN = (
 _DONE_SIZE = BARE.size_of("done")
 
 Start = Callable[[str], AbstractContextManager[Any]]
-"""From the path of a port to a context within which the part runs there. What the context gives may
-have ``poll()``, as `subprocess.Popen` has, which tells a part that has died from a slow one."""
+"""Function from the path of a port to a context within which the part runs there. The value of the
+context may have ``poll()``, as `subprocess.Popen` has, to distinguish a dead part from a slow
+one."""
 
 
 class ReplayError(RobinsError, RuntimeError):
@@ -61,9 +62,9 @@ class Replayed(NamedTuple):
 
 
 class _Row(NamedTuple):
-    """Something that was on the line of a part."""
+    """Bytes on the line of a part."""
 
-    life: int  # which start of the part, from 0
+    life: int  # number of the part's start, from 0
     begin: Frame  # of it
     to: bool  # the part, or from it
     data: bytes

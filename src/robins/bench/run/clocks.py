@@ -1,7 +1,7 @@
-"""When a step begins: as soon as it can, or at its time.
+"""Clocks that start each step: as soon as possible, or at its time.
 
-Soft real time: an ordinary kernel wakes us late now and then, and Python collects garbage. It is
-counted, not promised.
+Soft real time: an ordinary kernel wakes us late now and then, and Python collects garbage. Lateness
+is counted, not excluded.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class RealTime:
         self._began_ns: int | None = None
 
     def deadline_ns(self, step: int) -> int:
-        """When a step is to begin."""
+        """Time at which a step is to begin [ns of the wall clock]."""
         assert self._began_ns is not None
         return self._began_ns + round((step + self.skipped) * 1e9 / self._rate_hz)
 

@@ -171,7 +171,7 @@ def text(told: dict[str, Any], said: Judged, ran: Ran) -> str:
 
 
 def refusals(ran: Ran) -> list[str]:
-    """Whose frames were refused."""
+    """Sentences on refused frames, by link."""
     return [
         f"'{name}': {h.refused} frames were refused, which cannot be what they say"
         for name, h in ran.health.items()

@@ -46,7 +46,7 @@ class Watch(Protocol):
     """Observer of a run, such as the live page; its calls must return at once."""
 
     def event(self, kind: str, time_s: float, text: str) -> None:
-        """Something happened."""
+        """Take an event."""
 
     def step(self, session: Session, step: int) -> None:
         """A step is over."""

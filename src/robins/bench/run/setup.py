@@ -124,7 +124,7 @@ class Flight(NamedTuple):
 
     @property
     def timing(self) -> Timing:
-        """Its steps, if it is flown to the end."""
+        """Steps of a complete run."""
         return self.rig.timing(self.given)
 
 

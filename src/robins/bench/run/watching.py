@@ -72,7 +72,7 @@ class Looking:
             self._page.poll()
 
     def event(self, kind: str, time_s: float, text: str) -> None:
-        """Something happened."""
+        """Take an event."""
         if self._page is not None and (kind != "command" or (text := self._shown(text))):
             level = "alarm" if kind in ALARMS else "warning" if kind in WARNINGS else "info"
             self._page.event(level, time_s, text)

@@ -47,7 +47,7 @@ class Channel:
 
     @property
     def name(self) -> str:
-        """Its sensors, for messages."""
+        """Names of its sensors, for messages."""
         return "+".join(self.sensors)
 
 

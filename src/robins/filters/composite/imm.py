@@ -141,7 +141,9 @@ class Family:
         return self.of(_at(jax.tree_util.tree_map(np.asarray, self.numbers), i))
 
     def every(self, of: Of, states: Data, *rows: Data) -> Every:
-        """As `Several.every`; one mode is traced, for all, and states have a leading axis."""
+        """Step of all modes, as `Several.every`; one mode is traced, for all, and states have a
+        leading axis.
+        """
         numbers = jax.tree_util.tree_map(jnp.asarray, self.numbers)
         after, found, notes = each_row(
             lambda row, *part: of(self.of(row), *part), numbers, states, *rows

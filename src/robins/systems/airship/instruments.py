@@ -74,7 +74,7 @@ def read_sar(datum: Datum, x: Any, aux: Any) -> tuple[Array, Angle, Array]:
 
 
 def _measure_sar(given: Airship, course: Course, key: Keys, world: World):
-    """As `read_sar`, (E, 2), (E,), (E, 1)."""
+    """Measurements as `read_sar`: (E, 2) position, (E,) heading, (E, 1) height."""
     s, b, (q, _, position) = given.sar, given.barometer, world.truth
     errors = SarErrorModel(s.position, s.heading, s.outlier_share, s.outlier_factor)
     seen, heard = (jnp.asarray(present(course.epoch_s, of)) for of in (s, b))

@@ -232,7 +232,7 @@ def gnss_model(believed: Believed, kind: Kind, place: Place, member: np.ndarray)
 def start_belief(
     believed: Believed, kind: Kind, fix: Any, place: Place, systems: int, u: Travel
 ) -> Belief:
-    """About the first fix; nothing is known of the heading.
+    """Belief about the first fix; nothing is known of the heading.
 
     Args:
         believed: of clock, wheels and delays.

@@ -166,7 +166,7 @@ class LiveMarg(Live):
         self._path.counts = self.counts
 
     def _compile(self) -> None:
-        """Have all compiled by blocks that are thrown away."""
+        """Compile all programs by blocks that are thrown away."""
         count = 2 + math.ceil(self.parameters.start.still / self._usual_s) + 2 * self._path.n
         gravity = self.parameters.accelerometer.gravity
         rows = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -gravity, 2e-5, 2e-5, 2e-5], (count, 1))

@@ -1,4 +1,4 @@
-"""From samples to steps of the filter, chunk by chunk: the path of a replay and of a live object.
+"""Path from samples to steps of the filter, chunk by chunk, of a replay and of a live object.
 
 Samples are integrated over blocks; what is known at the end of each block becomes its measurements.
 Any chunks of the same samples give the same bits: a replay is one chunk, a live object is chunks of
@@ -346,15 +346,15 @@ def inputs(
 
 
 class Pace:
-    """When travel and field were seen last, so that they are seen once in an interval."""
+    """Times of the last use of travel and field, so that they are used once in an interval."""
 
     def __init__(self) -> None:
-        """Nothing was seen."""
+        """Start without any use."""
         self.clock_s = 0.0  # end of the last block
         self.due_s = {model.TRAVEL: -np.inf, model.MAGNETOMETER: -np.inf}
 
     def take(self, name: str, clock_s: np.ndarray, able: np.ndarray, every_s: float) -> np.ndarray:
-        """(K,) bool: which blocks to take so that about `every_s` lies between two."""
+        """Mask (K,) of the blocks to take so that about `every_s` lies between two."""
         out = np.zeros(len(clock_s), dtype=bool)
         for k in np.flatnonzero(able):
             if clock_s[k] >= self.due_s[name]:

@@ -106,7 +106,7 @@ def lay_out(given: Flight) -> Course:
 
 
 def _disturbed(given: Flight, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """When disturbances begin, and (E,) the time since the end of the last; infinite before one."""
+    """Start times of disturbances, and (E,) time since the end of the last; infinite before one."""
     burst, since = given.magnetometer.disturbance, np.full(len(time_s), np.inf)
     if burst is None:
         return np.zeros(0), since
@@ -118,7 +118,7 @@ def _disturbed(given: Flight, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def faults(given: Flight, time_s: np.ndarray, name: str) -> dict[str, np.ndarray]:
-    """When the magnetometer, of this name, is disturbed; whether filters believe a wrong motion."""
+    """Masks (E,) of the disturbed magnetometer, by its name, and of a wrongly believed motion."""
     burst = given.magnetometer.disturbance
     disturbed = np.zeros(len(time_s), bool)
     if burst is not None:

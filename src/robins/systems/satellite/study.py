@@ -237,7 +237,7 @@ CLAIMS = ratio_claims(_RATIOS, _TEXTS)
 
 
 def faults(given: AttitudeLoop, time_s: np.ndarray) -> dict[str, np.ndarray]:
-    """When gyro and star sensor are other than the filters believe.
+    """Masks (E,) of the epochs at which gyro and star sensor differ from the filters' belief.
 
     Noise, drift as believed and false stars are no faults.
     """

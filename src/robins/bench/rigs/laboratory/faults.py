@@ -20,7 +20,7 @@ def _dark(said: Mapping[str, Any], *_: Any) -> dict[str, Any]:
 
 
 def _hidden(said: Mapping[str, Any], fault: Any, _: int) -> Mapping[str, Any]:
-    """Without the brightest stars."""
+    """Stars without the brightest."""
     said["vectors_s"][: 3 * fault.stars] = np.nan
     said["magnitude"][: fault.stars] = np.nan
     return said

@@ -25,7 +25,7 @@ from robins.scenario import Quantity, default
 __all__ = ["MOTORS", "RIG", "WIRE"]
 
 MOTORS = ("front right", "rear left", "front left", "rear right")
-"""As PX4 and ArduPilot number those of a quadrotor in X, from 0 here."""
+"""Motors in the order of PX4 and ArduPilot for a quadrotor in X, from 0 here."""
 _RATE, _FORCE, _SPEED, _FAR = 1e4, 1e4, 1e3, 1e5  # rad/s, m/s^2, m/s, m: far beyond any flight
 
 WIRE = Wire(

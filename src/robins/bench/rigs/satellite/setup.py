@@ -18,5 +18,5 @@ class Carrier(Parameters):
     )
 
     def table(self) -> RateTable:
-        """As the simulation has it."""
+        """Rate table of the simulation."""
         return rate_table(self.lag, self.rate_limit, self.acceleration_limit)

@@ -241,7 +241,7 @@ def navigate(start: Nav, increments: Increments) -> tuple[Nav, Flight]:
         return x, x
 
     def average(x: Array) -> Array:
-        """Over blocks, of something given at both ends of each sample."""
+        """Mean over blocks of a quantity given at both ends of each sample."""
         middle = 0.5 * (x[1:] + x[:-1])
         return jnp.mean(middle.reshape(E, K, *x.shape[1:]), 1)
 
