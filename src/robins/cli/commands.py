@@ -346,7 +346,7 @@ def export(scenario: str, to: Path, small: bool, as_json: bool, **options: Any) 
 
 
 @app.command(
-    short_help="Compare two results: what was asked, what was found.",
+    short_help="Compare two results: their requests and figures.",
     epilog=examples("robins compare results/before results/after"),
 )
 @click.argument("first", type=LOGS)

@@ -138,7 +138,7 @@ def _told(error: Exception) -> Status:
     if isinstance(error, click.UsageError):
         _tell(error.format_message())
         command = error.ctx.command_path if error.ctx else "robins"
-        _tell(f"`{command} --help` tells what can be given.")
+        _tell(f"`{command} --help` lists what can be given.")
         return Status.BAD_INPUT
     if isinstance(error, click.ClickException):
         _tell(error.format_message())

@@ -23,7 +23,7 @@ from robins.cli.tell import carry_out
 
 
 @click.command(
-    short_help="Find what a filter should be told, and judge it on data held out.",
+    short_help="Find parameters of a filter, and judge them on data held out.",
     epilog=examples(
         "robins tune ins-gnss/drive --filter ekf --vary believed.r_factor=4",
         "robins tune imu.csv gnss.pos unit.toml --filter ekf --vary imu.gyro_noise "

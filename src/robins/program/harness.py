@@ -25,7 +25,7 @@ TOLERANCE = 1e-9  # of the size of a field; of a library of doubles
 
 MAKEFILE = """\
 # make check   compiles {name}.c and a test of it, and runs the test on recorded steps
-# make stack   says how much stack each function uses (gcc, clang)
+# make stack   lists the stack of each function (gcc, clang)
 CC ?= cc
 CFLAGS ?= -std=c99 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Wpedantic -Wdouble-promotion
 

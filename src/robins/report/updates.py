@@ -121,7 +121,7 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
     name = words(sensor)
     caption = (
         "Measured minus predicted. They should look like white noise "
-        "between the lines; runs to one side tell of an error the filter does not model."
+        "between the lines; runs to one side show an error the filter does not model."
     )
     if any(axes.get_yscale() == "symlog" for axes in stack):
         caption += " Far from zero the scale is logarithmic."

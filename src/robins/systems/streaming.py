@@ -120,7 +120,7 @@ def numbers(name: str, values: Any, size: int) -> np.ndarray:
             raise TypeError
     except (TypeError, ValueError):
         what = f"must be {size} real numbers, got {values!r:.80}"
-        raise LiveError(what, name, "NaN says that a number is missing") from None
+        raise LiveError(what, name, "NaN means that a number is missing") from None
     return found.astype(float)
 
 

@@ -241,7 +241,7 @@ def _library(
     about = (
         f"Filter '{name}' of {label}, by robins {__version__}; program {identity[:16]}.",
         "SI units and radians. NaN is missing, for each component of a reading.",
-        *(["Single precision: README.md says what that costs."] if single else []),
+        *(["Single precision: README.md states the cost."] if single else []),
         *components(axes),
     )
     library = library._replace(about=about)
@@ -261,7 +261,7 @@ def _entry(name: str, program: Program) -> Entry:
     if name == "predict":
         return Entry(name, program, ("input",), "Moves on by one step.")
     if name == RESET:
-        return Entry(name, program, ("belief",), "Begins anew from a belief, all else as by init.")
+        return Entry(name, program, ("belief",), "Starts again from a belief, all else as by init.")
     return Entry(name, program, ("reading", "about"), f"Uses a reading of {name[7:]}.")
 
 
@@ -346,9 +346,9 @@ By robins {__version__}. C99, no allocation, no global state, no recursion, no l
 one thread may use one state, several threads several states.
 
     make check     compiles the library and a test, replays recorded steps, compares all outputs
-    make stack     says how much stack each function uses
+    make stack     lists the stack of each function
 
-`{n}.h` names all fields; `{n}.c` needs nothing else. What the model was told (noise, axes,
+`{n}.h` names all fields; `{n}.c` needs nothing else. The numbers of the model (noise, axes,
 constants) is in the code: export again to change it.
 
     void {n}_init({n}_state *state);
@@ -364,8 +364,8 @@ is missing is NaN, so the header refuses `-ffast-math`. Each call returns a code
 Where a reading was used, `sigma` of the result is the standard deviation of each component of the
 innovation: a reading is suspicious where the innovation exceeds three of them.
 
-`{n}_init` begins where the recorded run does. `{n}_reset` begins anew from a mean and the factor of
-a covariance, in any state: whatever else the filter has learned is then as after `{n}_init`. A
+`{n}_init` begins where the recorded run does. `{n}_reset` starts again from a mean and the factor
+of a covariance, in any state: whatever else the filter has learned is then as after `{n}_init`. A
 belief that is not finite is not taken (code {int(Code.NOT_FINITE)}). Read the state, copy it, but
 change it by `{n}_init` and the calls only.
 {_costs(found)}"""

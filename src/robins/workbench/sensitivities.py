@@ -133,7 +133,7 @@ def sensitivity(
                 "decides the motion or what else all runs share, so it cannot vary with the rest "
                 "of the world",
                 f"--vary {one.key}",
-                "`robins sweep` lays out the scenario anew for each of its values.",
+                "`robins sweep` lays out the scenario again for each of its values.",
             )
     budget = Budget(study, given, course, view, contender, seed, tuple(ranges))
     points = sobol_points(len(every), samples, seed)

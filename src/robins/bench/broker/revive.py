@@ -136,7 +136,7 @@ class _Talk:
             if min(time.monotonic() - began, self._idle_s()) > self._patience_s:
                 what = name if step is None else f"answer to the tick of step {step}"
                 raise BenchError(
-                    f"'{self._link.name}' was started anew, but there is no {what} from it in "
+                    f"'{self._link.name}' was restarted, but there is no {what} from it in "
                     f"{self._patience_s:g} s"
                 )
             self._glance()

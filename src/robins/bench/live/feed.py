@@ -57,7 +57,7 @@ def check(signals: Sequence[Signal]) -> None:
     units: dict[str, str] = {}
     for s in signals:
         if s.name in by_name:
-            raise ValueError(f"two signals are named '{s.name}'; names tell them apart")
+            raise ValueError(f"two signals are named '{s.name}'; names distinguish them")
         if s.role not in get_args(Role):
             roles = ", ".join(get_args(Role))
             raise ValueError(f"signal '{s.name}': role '{s.role}' is none of {roles}")

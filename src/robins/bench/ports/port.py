@@ -86,7 +86,7 @@ def obstacle(path: str) -> str:
     if not os.access(path, os.R_OK | os.W_OK):
         return (
             f"no permission to read and write it; it belongs to the group '{_group(path)}': "
-            f"add yourself (sudo usermod -aG {_group(path)} $USER) and log in anew"
+            f"add yourself (sudo usermod -aG {_group(path)} $USER) and log in again"
         )
     return ""
 

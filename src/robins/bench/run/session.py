@@ -34,7 +34,7 @@ from robins.bench.wire.records import Unsound
 
 HELLO_S = 120.0  # for the hello of a part that does not compute
 REVIVED_S = 60.0
-_ANEW = '; on_death = "restart" would start it anew'
+_ANEW = '; on_death = "restart" would restart it'
 _LONG_S = 9.0  # of waiting for a hello, before it is an event
 _TELL_S = 0.2  # between two words on how far it is
 _MOST_DEATHS, _MINUTE_S = 3, 60.0  # of one part, by itself, until the run fails
@@ -480,7 +480,7 @@ class Session:
                 death, by_itself = again.death, True
                 continue
             told = "all" if since < 0 else f"all since step {since}"
-            return self.event("restarted", f"'{part}' was started anew and told {told} again")
+            return self.event("restarted", f"'{part}' was restarted and sent {told} again")
 
     def _still_lives(self, part: str) -> None:
         """Check that a restarted part has not died at once; others wait for their turn.

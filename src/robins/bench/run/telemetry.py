@@ -103,7 +103,7 @@ def know_truth(rig: Rig, flown: Flown, counted: slice, time_s: float) -> None:
     known = first[counted]
     if len(known) and not np.any(np.all(np.isfinite(known.reshape(len(known), -1)), axis=-1)):
         speaker = next(part for part, sent in rig.sends.items() if truth in sent)
-        raise BenchError(f"no true {truth} was heard from '{speaker}' up to {time_s:.1f} s")
+        raise BenchError(f"no true {truth} was received from '{speaker}' up to {time_s:.1f} s")
 
 
 def difference(flown: Flown, inside: Mapping[str, np.ndarray]) -> float:

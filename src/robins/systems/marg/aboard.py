@@ -41,7 +41,7 @@ FIELD_N = np.array([18e-6, 0.0, 44e-6])  # T, north is where it points
 SHAKE = 0.1  # of what is believed of the field, noise of a reading
 
 PLACE = StateBlock("place", slice(6, 9), "m", "m", "NED", NED)  # from the middle of its places
-_LEARNED = {"ratio": "learned variances, 1 as told", "samples": "that they were learned from"}
+_LEARNED = {"ratio": "learned variances, 1 as given", "samples": "that they were learned from"}
 _GATE = {"refused": "readings refused in a row", "ratio": "of the last one, 1 at the gate"}
 
 FIELDS = {

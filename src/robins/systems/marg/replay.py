@@ -312,8 +312,8 @@ REPORTED = Reported(
     blocks=_BLOCKS,
     sensors=model.SENSORS,
     estimates=_estimates,
-    causes="Likely causes: a magnetometer without calibration (`robins calibrate`) or beside iron, "
-    "axes or units of a sensor that differ from what the log says, or noise of the gyro told too "
+    causes="Likely causes: a magnetometer without calibration (`robins calibrate`) or near iron, "
+    "axes or units of a sensor that differ from those stated, or noise of the gyro stated too "
     "small.",
     assumed=tuple(model.SENSORS),
     euler=EULER._replace(frame="body to NED"),

@@ -224,7 +224,7 @@ _TEXTS = {
         "a Kalman filter with more noise on the bias", "mekf-tuned"
     ),
     "improves-on-informed": _IMPROVES.format(
-        "a Kalman filter told the true drift", "mekf-informed"
+        "a Kalman filter with the true drift", "mekf-informed"
     ),
     "steadier": "The mixed filter's error varies less from run to run (ours); value: the spread of "
     "its RMS error over that of the nominal MEKF",

@@ -243,7 +243,7 @@ REPORTED = Reported(
     estimates=_estimates,
     causes="Likely causes: a delay of the master that is not stated, a sign or frame of its "
     "velocity or attitude (down for up, heading counterclockwise), a nominal mounting or lever arm "
-    "that is wrong, flexure without states for it, or noise of master and slave told too small.",
+    "that is wrong, flexure without states for it, or noise of master and slave stated too small.",
 )
 _FOUND = ("gyro_bias", "accel_bias", "mounting")  # what an alignment is for, besides the attitude
 _UNKNOWN = 0.7  # of the sigma at the start; what keeps more of it was hardly seen

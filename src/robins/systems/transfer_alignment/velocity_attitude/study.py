@@ -372,10 +372,10 @@ _RATIOS = {
 }
 _TEXTS = {
     "beats-kf": "Under noise that is unknown and not Gaussian the adaptive H-infinity filter "
-    "aligns more accurately than a Kalman filter that is told of the stated noise alone (the "
+    "aligns more accurately than a Kalman filter that assumes the stated noise alone (the "
     "patent); value: ratio of their attitude RMS over all axes",
-    "kf-suffers": "Not told of the noise that is there, a Kalman filter loses accuracy (the "
-    "patent); value: its attitude RMS over that of one told of it",
+    "kf-suffers": "Without knowledge of the noise, a Kalman filter loses accuracy (the "
+    "patent); value: its attitude RMS over that of one that knows it",
     "beats-fixed": "A bound that adapts to the environment serves better than a fixed one (the "
     "patent), here 1.05 times the least there is; value: ratio of attitude RMS",
     "compensation": "Compensating P where the bound does not hold raises the accuracy (the "
