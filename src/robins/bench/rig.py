@@ -1,4 +1,4 @@
-"""A vehicle on the bench, as data: its parts, messages and wiring, its faults, what is looked at.
+"""A vehicle on the bench, as data: its parts, messages and wiring, its faults, its page.
 
 A rig needs a wire, parts, who sends what, and how a run of it is prepared; all else has a default
 that follows from its messages.

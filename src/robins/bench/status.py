@@ -95,7 +95,7 @@ class Status:
         return time.monotonic() - self._told >= EACH_S
 
     def tell(self, said: Mapping[str, Any]) -> None:
-        """Report the state; neither a full disk nor a folder of somebody else stops a run."""
+        """Report the state; neither a full disk nor a folder of another user stops a run."""
         self._told = time.monotonic()
         content = json.dumps({**said, "pid": os.getpid(), "at": time.time()})
         new = f"{self._name}.{secrets.token_hex(4)}.new"

@@ -131,7 +131,7 @@ def bound_sigma(problem: Problem, name: str, world: Any, machine: str = "vm") ->
 
 
 def _left(rows: np.ndarray, L: np.ndarray, D: np.ndarray) -> np.ndarray:
-    """(r,) share of the prior that is left of what is reported of the start; NaN if known."""
+    """(r,) share of the prior that is left of the reported start; NaN if known."""
     begun = np.linalg.norm(rows * D, axis=1)
     known = begun == 0.0
     share = np.linalg.norm(rows @ (D[:, None] * L), axis=1) / np.where(known, 1.0, begun)

@@ -1,4 +1,4 @@
-"""A campaign's shards joined: how far it is, and the statistics of all its runs."""
+"""A campaign's shards joined: its progress, and the statistics of all its runs."""
 
 from __future__ import annotations
 

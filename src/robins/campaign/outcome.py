@@ -102,7 +102,7 @@ def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray
 
 
 def _finds(problem: Problem, name: str, s: Statistics) -> list[str]:
-    """Sentences on what a filter finds wrong, and since when."""
+    """Sentences on the instruments that a filter finds wrong, with the time."""
     if s.runs == 1:
         return sentences(name, problem.epoch_s, s.first_run.get("wrong", {}))
     said, suspects = [], s.suspects

@@ -234,7 +234,7 @@ class Statistics:
 
     @property
     def mean(self) -> np.ndarray:
-        """(E, r) mean error over the runs: what a filter errs in all of them alike."""
+        """(E, r) mean error over the runs, the bias of a filter."""
         return self.sums["error"] / self.runs
 
     @property

@@ -1,4 +1,4 @@
-"""The command `doctor`: what a log holds and what is wrong with it, in colours."""
+"""The command `doctor`: contents of a log and findings on it, in colours."""
 
 from __future__ import annotations
 

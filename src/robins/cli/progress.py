@@ -32,7 +32,7 @@ class Progress:
         self._timer.daemon = True
 
     def __call__(self, share: float, what: str) -> None:
-        """Note how far it is.
+        """Note the progress.
 
         Raises:
             KeyboardInterrupt: it was requested, and got lost.

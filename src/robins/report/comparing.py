@@ -1,4 +1,4 @@
-"""Filters side by side by their metrics; designs by what a bound on the worst case costs."""
+"""Filters side by side by their metrics; designs by the cost of a bound on the worst case."""
 
 from __future__ import annotations
 

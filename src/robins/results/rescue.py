@@ -27,7 +27,7 @@ class NotWritten(RobinsError, RuntimeError):
 
 @contextmanager
 def keeping(tree: Any) -> Generator[None, None, None]:
-    """Let any error that leaves this block take along what was computed, for `rescued` to write.
+    """Attach computed arrays to any error that leaves this block, for `rescued` to write.
 
     Args:
         tree: of arrays; in blocks inside each other that of the inner one counts.

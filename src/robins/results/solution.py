@@ -19,7 +19,7 @@ from robins.results.errors import ResultError
 def variable(
     dims: str | Sequence[str], values: Any, unit: str, long_name: str, frame: str = "", **attrs: Any
 ) -> xr.Variable:
-    """Numbers with what a reader must know about them: a coordinate, such as the time.
+    """Numbers with their unit, name and frame: a coordinate, such as the time.
 
     Args:
         dims: names of the axes of `values`.

@@ -90,7 +90,7 @@ def _packer(layout: tuple[str, ...], lengths: tuple[int, ...]) -> struct.Struct:
 
 
 def decode(kind: type[Message], data: bytes) -> Stamped:
-    """A message from its bytes; what follows its last field is not looked at.
+    """A message from its bytes; bytes after its last field are ignored.
 
     Raises:
         RosError: there are too few bytes, or they are not in XCDR1.

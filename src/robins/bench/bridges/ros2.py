@@ -166,7 +166,7 @@ class Ros2Topics:
         self._session.close()
 
     def publish(self, topic: str, message: Message, time_ns: int, frame_id: str = "") -> None:
-        """Send a message, with the time and frame of its header; who does not listen yet misses it.
+        """Send a message, with the time and frame of its header; later subscribers miss it.
 
         Raises:
             BridgeError: the topic has no full name, or had another type before.

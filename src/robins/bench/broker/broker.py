@@ -1,4 +1,4 @@
-"""Passes messages between the parts, step by step, over the links whose far ends it holds.
+"""Broker of messages between the parts, step by step, over the links whose far ends it holds.
 
 In each step it ticks a part as soon as all parts whose data of this step it needs are done, and the
 step is over when all are. Nothing here depends on how long anything took: only the clock decides
@@ -60,7 +60,7 @@ class Ticked(NamedTuple):
 
 
 class Broker:
-    """The middle of the star.
+    """Hub of the star of links.
 
     Attributes:
         links: by part.

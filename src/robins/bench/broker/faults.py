@@ -138,12 +138,12 @@ class LinkFault(Parameters):
 
     @property
     def begin_ns(self) -> int:
-        """First time of the run at which it is there."""
+        """First time of the run at which it is active [ns]."""
         return round(self.begin * 1e9)
 
     @property
     def end_ns(self) -> float | int:
-        """First time at which it is there no more; infinite: never."""
+        """First time at which it is no longer active [ns]; infinite: never."""
         return math.inf if self.end is None else round(self.end * 1e9)
 
     def holds(self, now_ns: int) -> bool:

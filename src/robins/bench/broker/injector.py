@@ -43,7 +43,7 @@ class _Held(NamedTuple):
 
 
 class _Fault(NamedTuple):
-    """A fault as frames meet it."""
+    """A fault with its number, its times and the type of its message."""
 
     number: int
     begin_ns: int
@@ -103,7 +103,7 @@ class Injector:
         self._added += 1
 
     def clear(self) -> None:
-        """No fault any more; frames that are held back are due now."""
+        """Remove all faults; frames that are held back are due now."""
         self._faults.clear()
         for held in self._held.values():
             held[:] = [one._replace(due_ns=-math.inf, fault=None) for one in held]
@@ -113,7 +113,7 @@ class Injector:
         self._faults = [one for one in self._faults if one.is_ is not fault]
 
     def active(self, now_ns: int) -> list[LinkFault]:
-        """The faults that are there at that time of the run."""
+        """Faults that are active at that time of the run."""
         return [fault.is_ for fault in self._faults if fault.is_.holds(now_ns)]
 
     def killed(self, now_ns: int) -> list[str]:

@@ -1,4 +1,4 @@
-"""The bench's end of a link: frames out of bytes, bytes out of frames, and what is wrong with them.
+"""The bench's end of a link: frames to bytes and back, with counts of all that is wrong.
 
 What leaves gets its header here, then what goes wrong on purpose happens to it, then the line
 takes its time. What arrives goes the same way back. So a receiver that counts frames at the other
@@ -263,7 +263,7 @@ class Link:
         return True
 
     def _counts(self, frame: Frame, now_ns: int) -> bool:
-        """Count the number of a frame; whether it is new and in its order."""
+        """Count the number of a frame; true if it is new and in its order."""
         here = now_ns if frame.header.time_ns == now_ns else None
         most = self._sequence.REMEMBERED + self._most_lost
         self._most_lost = 0

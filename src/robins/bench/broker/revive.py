@@ -36,7 +36,7 @@ class History:
     """
 
     def __init__(self, is_there: Callable[[int], bool]):
-        """Begin with a run.
+        """Start with a run.
 
         Args:
             is_there: whether the memory of a step has been written.
@@ -55,7 +55,7 @@ class History:
         self.since = -1
 
     def answered(self, step: int) -> None:
-        """Forget what is in the memory of a step that the part was done with."""
+        """Drop frames up to a step whose memory the part has saved."""
         if is_due(step) and step > self.since and self._is_there(step):
             first = next(k for k, one in enumerate(self.told) if one.step == step)
             del self.told[: first + 1]

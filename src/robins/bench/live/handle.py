@@ -128,7 +128,7 @@ class Live:
         self._pump()
 
     def status(self, status: Mapping[str, Any]) -> None:
-        """Show how the bench is; the latest counts. The keys are those of docs/live.md.
+        """Show the state of the bench; the latest counts. The keys are those of docs/live.md.
 
         Raises:
             TypeError: something in it is no number, text, list or mapping.

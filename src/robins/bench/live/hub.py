@@ -35,7 +35,7 @@ class Client:
         self._some = asyncio.Event()
 
     def greet(self, hello: str, history: bytes, recent: deque[bytes]) -> None:
-        """All from the beginning: what waits is of no more interest."""
+        """Start with a full greeting; drop all that waits."""
         self._lines.clear()
         self._latest.clear()
         self._history = history
@@ -123,13 +123,13 @@ class Hub:
         return None
 
     def join(self, client: Client) -> None:
-        """A page that came."""
+        """Add a page."""
         client.greet(*self._greeting())
         self.clients.add(client)
         self.beat()
 
     def leave(self, client: Client) -> None:
-        """A page that went."""
+        """Remove a page."""
         self.clients.discard(client)
 
     def acknowledge(self, alarms: list[int]) -> None:

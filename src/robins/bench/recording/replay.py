@@ -57,7 +57,7 @@ class Replayed(NamedTuple):
 
     @property
     def same(self) -> bool:
-        """Every byte of every frame; but how long computing took."""
+        """True if every byte of every frame is equal, apart from computing times."""
         return self.first_difference is None
 
 
@@ -190,7 +190,7 @@ def _rows(entries: Iterable[Entry], part: str) -> Iterator[_Row]:
 
 
 class _Replay:
-    """One life of a part, lived again."""
+    """Replay of one life of a part."""
 
     def __init__(
         self, wire: Wire, part: str, pair: Pair, process: Any, patience_s: float, life: _Life

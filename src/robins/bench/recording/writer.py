@@ -1,4 +1,4 @@
-"""Writes the record of a run: raw frames with their times of arrival, in an MCAP file.
+"""Writer of the record of a run: raw frames with their times of arrival, in an MCAP file.
 
 Messages go to the disk in chunks of 512 messages, of 64 KiB or of a quarter of a second, whichever
 comes first, each in one write. So a file that was cut anywhere lacks what came in the last quarter
@@ -124,7 +124,7 @@ class Recorder:
             self._add(channel, received_ns, made.time_ns, made.data)
 
     def event(self, event: layout.Event) -> None:
-        """Take what happened.
+        """Take an event.
 
         Raises:
             RecordingError: JSON cannot hold its fields.

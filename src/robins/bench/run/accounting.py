@@ -33,7 +33,7 @@ class Histogram:
         self._cells: dict[int, int] = {}
 
     def add(self, ns: int) -> None:
-        """One more."""
+        """Add a number [ns]."""
         ns = max(ns, 0)
         shift = max(ns.bit_length() - _BITS, 0)
         cell = (shift << _BITS) + (ns >> shift)

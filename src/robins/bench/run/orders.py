@@ -40,14 +40,14 @@ class Orders:
     def inject(
         self, label: str, fault: Mapping[str, Any], begin_s: float, length_s: float | None
     ) -> None:
-        """One more fault."""
+        """Add a fault."""
         end = {} if length_s is None else {"end": begin_s + length_s}
         made = self._rig.fault.model_validate({**fault, "begin": begin_s, **end})
         self._injector.add(made)
         self._labels.append((label, made))
 
     def clear(self, label: str | None) -> None:
-        """The faults of that label no more, or none at all."""
+        """Remove the faults of a label, or all."""
         for one, fault in self._labels:
             if label in (None, one):
                 self._injector.remove(fault)
@@ -56,7 +56,7 @@ class Orders:
         self._labels = [x for x in self._labels if label is not None and x[0] != label]
 
     def active(self, now_ns: int) -> list[tuple[str, LinkFault]]:
-        """Faults that are there at a time of the run, with what they are called."""
+        """Faults that are active at a time of the run, with their labels."""
         names = {id(fault): label for label, fault in self._labels}
         active = self._injector.active(now_ns)
         return [(names.get(id(f), f"{f.kind} at {f.link or 'all links'}"), f) for f in active]

@@ -289,7 +289,7 @@ class Session:
             self.event("said", in_words(one.message, values), one.planned)
 
     def active_faults(self) -> list[tuple[str, LinkFault]]:
-        """Faults that are there now, with what they are called."""
+        """Faults that are active now, with their labels."""
         return self._orders.active(self.broker.time_ns)
 
     def state_of(self, part: str) -> str:
@@ -370,7 +370,7 @@ class Session:
 
     @property
     def broker(self) -> Broker:
-        """The middle, once the links are open."""
+        """Broker, once the links are open."""
         assert self._broker is not None
         return self._broker
 
@@ -385,7 +385,7 @@ class Session:
         return self._paused
 
     def event(self, kind: str, text: str, shown: bool = True) -> None:
-        """Write down that something happened."""
+        """Record an event."""
         self._catch_up()  # what passed before it stands before it
         one = Event(self._wall_ns(), kind, text, {"time_s": round(self.time_s, 9)})
         self.events.append(one)

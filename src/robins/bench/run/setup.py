@@ -223,7 +223,7 @@ def _text(name: str) -> tuple[str, Rig]:
 
 
 def _flies(rig: Rig, setup: Setup) -> Parameters:
-    """The parameters of what flies."""
+    """Parameters of the vehicle and its flight."""
     packaged, flies = rig.flies(), setup.flies
     if flies in packaged:
         text = packaged[flies].read_text("utf-8")

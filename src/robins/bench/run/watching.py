@@ -36,10 +36,10 @@ class Page(Protocol):
         """Show a sample."""
 
     def status(self, status: Mapping[str, Any]) -> None:
-        """Show how the bench is."""
+        """Show the state of the bench."""
 
     def event(self, level: Any, time_s: float, text: str) -> None:
-        """Show that something happened."""
+        """Show an event."""
 
     def commands(self) -> list[dict[str, Any]]:
         """Commands of the user."""

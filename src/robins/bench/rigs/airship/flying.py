@@ -37,7 +37,7 @@ _ARCSEC = math.pi / 648000.0
 
 
 class Kit(NamedTuple):
-    """A flight, to the last number; E epochs."""
+    """Complete input of a flight; E epochs."""
 
     step_ns: int
     filter: str

@@ -1,4 +1,4 @@
-"""The journey, its three parts, and what came of a run."""
+"""The journey, its three parts, and its evaluation."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Journey(Replay):
 
 
 class Kit(NamedTuple):
-    """A run, to the last number."""
+    """Complete input of a run."""
 
     step_ns: int
     given: Replay

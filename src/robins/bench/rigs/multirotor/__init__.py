@@ -1,4 +1,4 @@
-"""A multirotor on the bench, flown by an unchanged PX4 or ArduPilot, or by our autopilot.
+"""A multirotor on the bench, flown by PX4 or ArduPilot, unchanged, or by our autopilot.
 
 The craft, its inertial unit with compass and barometer, its receiver and its autopilot, each on its
 own line. The part `autopilot` is ours, or the end of a socket that PX4's or ArduPilot's SITL is at.

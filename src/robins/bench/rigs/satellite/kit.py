@@ -26,7 +26,7 @@ _BLOCK = 1024  # rows of a run that a part has as vectors at a time
 
 
 class Kit(NamedTuple):
-    """A run of the satellite, to the last number; E steps."""
+    """Complete input of a run of the satellite; E steps."""
 
     step_ns: int
     due: np.ndarray  # (E,) bool, whether a step ends with a star frame

@@ -155,7 +155,7 @@ def wanted_after(kit: Kit, flown: Mapping[str, np.ndarray], steps: int) -> Wante
 
 
 def reference_q_ib(kit: Kit, flown: Mapping[str, np.ndarray], steps: int) -> np.ndarray:
-    """(steps, 4) where the craft is to point at the end of each step."""
+    """Target attitudes (steps, 4) at the end of each step."""
     if not (said := said_in(flown, steps)):
         return np.asarray(kit.rows.course.ref_end_q_ib)[:steps]
     return np.array([at.q_ib for at in followed(kit, said)[1 : steps + 1]])

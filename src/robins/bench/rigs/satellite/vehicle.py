@@ -39,7 +39,7 @@ def trusted(held: Held) -> bool:
 
 
 def stale(held: Held) -> Held:
-    """The same, come so long ago that it no longer stands."""
+    """The same values, marked as no longer valid."""
     return held._replace(age=HELD + 1)
 
 
@@ -51,7 +51,7 @@ def padded(torque: Any) -> np.ndarray:
 
 
 def rest() -> dict[str, np.ndarray]:
-    """A command, or what comes of it, that does nothing."""
+    """A command, or an actuation, of zero."""
     return {"wheel_torque": np.zeros(WHEELS), "dipole_b": np.zeros(3)}
 
 

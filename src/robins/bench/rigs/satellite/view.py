@@ -140,7 +140,7 @@ class Alarms:
 
 
 def _turned(flown: Flown, kit: Kit, step: int, turn_rad: np.ndarray) -> tuple[str, dict[str, Any]]:
-    """An attitude that is turned from where the craft is to point now; it stays inertial."""
+    """Attitude turned from the present target; it stays inertial."""
     now = wanted_after(kit, flown, step + 1).q_ib
     return "reference", {"q_ib": np.asarray(multiply(now, from_rotvec(jnp.asarray(turn_rad))))}
 
