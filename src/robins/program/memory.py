@@ -1,4 +1,4 @@
-"""A state that stays in the memory of C from call to call, and programs that step it.
+"""A state that stays in the memory of C between calls, and programs that step it.
 
 `Native` takes a function's arguments apart and puts its results together at every call. Here the
 state is never taken apart: every program has it at the head of its arguments and of its results,

@@ -360,7 +360,7 @@ class Staged:
 
     @property
     def refused(self) -> list[ProgramError | BuildError]:
-        """Reasons for which some of it stays with JAX, once it was called."""
+        """Reasons why parts stay with JAX, once it was called."""
         arrays = (one for one in self._stages if isinstance(one, Arrays))
         loops = [loop.refused for loop in self.loops if loop.refused]
         return [*self._known_refused, *(why for one in arrays for why in one.refused), *loops]

@@ -1,4 +1,4 @@
-"""An inertial measurement unit: what its gyros and accelerometers report of a true motion.
+"""An inertial measurement unit: reports of its gyros and accelerometers along a true motion.
 
 In go the ideal increments, the angle and the change of velocity of each sampling interval; out come
 those of a unit with the errors of an `ImuErrorModel`. Every process is discretised exactly, for the

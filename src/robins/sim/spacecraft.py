@@ -48,7 +48,7 @@ class Spacecraft(NamedTuple):
 
 
 class CraftState(NamedTuple):
-    """State of motion: attitude, momenta and what else changes in a step."""
+    """State of motion: attitude, angular momentum of the craft, momenta of the wheels."""
 
     q_ib: Any  # (4,) body to inertial, scalar first
     momentum_i: Any  # (3,) N m s, total angular momentum in inertial axes

@@ -240,7 +240,7 @@ def photograph(
 
 
 def expose(key: Array, shown: Shown, camera: StarCamera) -> StarImage:
-    """The image of what is before a camera: each star with its error, some missed, false ones.
+    """Image of the stars before a camera: each with its error, some missed, false ones.
 
     Args:
         key: of the frame.
@@ -292,7 +292,7 @@ def measure_attitude(
     q_ib_prior: Any = None,
     tolerance_rad: Any = None,
 ) -> tuple[Float[Array, "4"], Float[Array, "3 3"], Int[Array, ""]]:
-    """A frame of a star sensor: photograph, know the stars again, QUEST. Pure JAX.
+    """A frame of a star sensor: photograph, identify the stars, QUEST. Pure JAX.
 
     Args:
         key: of the frame.

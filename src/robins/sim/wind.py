@@ -1,4 +1,4 @@
-"""Wind that comes in gusts, and a vehicle that it carries.
+"""Gusts and turbulence, and a vehicle carried by the wind.
 
 Horizontal vectors are north, east. `gusts` draws a wind that is held for some seconds at a time.
 `carry` moves a point mass, whose drag is linear in its velocity through the air, in such a wind

@@ -1,4 +1,4 @@
-"""Runs of a filter by its entry points: what a board is given, and what JAX makes of it."""
+"""Runs of a filter by its entry points: inputs of a board, and the results of JAX."""
 
 from __future__ import annotations
 

@@ -337,7 +337,7 @@ def _compared(library: Library, record: Recorded, singles: Calls) -> Recorded:
 
 
 def _readme(library: Library, name: str, label: str, found: Cost | None) -> str:
-    """One page for who compiles it."""
+    """README of the exported folder."""
     n, calls = library.name, "\n".join(f"    {library.signature(e)};" for e in library.entries)
     codes = "\n".join(f"| {int(code)} | {sentence} |" for code, sentence in SENTENCES.items())
     return f"""# Filter `{name}` of `{label}` in C

@@ -1,4 +1,4 @@
-"""The command `design`: filters with constant gains, and what a bound on the worst case costs."""
+"""The command `design`: filters with constant gains, and the cost of a bound on the worst case."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def solution_of(problem: Problem, found: TradeOff) -> xr.Dataset:
 
 
 def gains_of(problem: Problem, found: TradeOff) -> dict[str, Any]:
-    """Every gain with full digits, and what could not be had."""
+    """Every gain with full digits, and the methods without one."""
     made = [("kalman", found.kalman)]
     made += [(o.method, o.design) for o in found.attempts if o.design is not None]
     refused = [o for o in found.attempts if o.design is None]
@@ -184,7 +184,7 @@ def design(
     methods: Sequence[str] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Constant-gain filters for a problem, and what a bound on the worst case costs.
+    """Constant-gain filters for a problem, and the cost of a bound on the worst case.
 
     Args:
         given: the path of a problem, or the name of an example.

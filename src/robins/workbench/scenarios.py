@@ -1,4 +1,4 @@
-"""Scenarios and configurations: found by name, and what is recorded of them in a result."""
+"""Scenarios and configurations: found by name, and recorded in a result."""
 
 from __future__ import annotations
 
@@ -157,6 +157,6 @@ def beside(one: Simulated) -> tuple[str, ...]:
 
 
 def asked(text: str, settings: Sequence[str]) -> dict[str, Any]:
-    """Fields of an outcome: the scenario as it was run, and what ran it."""
+    """Fields of an outcome: the scenario as it was run, and the machine that ran it."""
     effective = scenario.text_of(scenario.override(scenario.mapping_of(text), settings))
     return {"parameters": effective if settings else text, "device": jax.devices()[0].device_kind}

@@ -1,4 +1,4 @@
-"""The command `sensitivity`: which uncertain parameter the variance of the error comes from."""
+"""The command `sensitivity`: the variance of the error by uncertain parameter."""
 
 from __future__ import annotations
 

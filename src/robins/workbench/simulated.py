@@ -1,4 +1,4 @@
-"""The commands `run` and `bound`: a scenario simulated, and what its sensors allow at best."""
+"""The commands `run` and `bound`: a scenario simulated, and the best that its sensors allow."""
 
 from __future__ import annotations
 

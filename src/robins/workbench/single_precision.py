@@ -92,7 +92,7 @@ class Cost(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """A sentence for who decides."""
+        """Sentence that sums up the cost."""
         if not self.finite:
             return "Single precision RUINS this filter: its state does not stay finite."
         worst = max(self.blocks, key=lambda b: b.growth)

@@ -1,4 +1,4 @@
-"""The airship's instruments: how each is drawn, what of it a filter takes, h(x) and R it believes.
+"""The airship's instruments: simulation of each, measurements for a filter, its h(x) and R.
 
 By the errors of `model`, true minus estimated, at heading psi (clockwise from north) and pitch
 theta, with v_air = C_b^n v_air_b:
@@ -173,7 +173,7 @@ EARLY_STARS = Instrument(STAR_EARLY, _EULER, None, _believed_early, _taken_early
 
 
 def read_wind(x: Any, v_air_b: ArrayLike) -> Array:
-    """(2,) m/s north east, what should be thought to be the wind: (22)."""
+    """Assumed wind (2,) [m/s], north and east: (22)."""
     q_nb, v_n, _ = navigation(x)
     thought = (v_n - q_nb.apply(jnp.asarray(v_air_b)))[:2]
     return thought + x.wind_error if isinstance(x, WithWind) else thought

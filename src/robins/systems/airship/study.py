@@ -1,4 +1,4 @@
-"""The airship's study: its filters and the instruments they take, what is reported, the claims.
+"""The airship's study: filters and the instruments they take, report, claims.
 
 The paper's filters have two local ones, for radar with barometer and for stars, fused by its (51);
 the locals go on from their own means and covariances (`distributed`). What it does not state is

@@ -1,4 +1,4 @@
-"""The study "city": what is reported of the filters and what is claimed of them."""
+"""The study "city": report of the filters, and claims."""
 
 from __future__ import annotations
 

@@ -147,7 +147,7 @@ class Update(Parameters):
 
 
 class Replay(Parameters):
-    """A recorded nine-axis log: what cannot be read from the files themselves."""
+    """Parameters of a recorded nine-axis log that its files do not contain."""
 
     system: Literal["marg"] = "marg"
     title: str = "Orientation from gyro, accelerometer and magnetometer"

@@ -1,4 +1,4 @@
-"""The replay of a nine-axis log: how far it is from the truth, if that is known.
+"""The replay of a nine-axis log, and its errors where the truth is known.
 
 Errors of an orientation are those that BROAD defines (Laidig, Caruso, Cereatti & Seel 2021).
 """

@@ -1,4 +1,4 @@
-"""The two studies of the rocket: the filters that are compared, what each believes and is given.
+"""The two studies of the rocket: filters, their assumptions and their inputs.
 
 The paper's filter is "federated-vector-stukf": two local unscented filters, for gyro and
 magnetometer, each with strong tracking in its simplified (lumped) form; shares by the observability

@@ -1,4 +1,4 @@
-"""The filters of the satellite: their states, and what they believe of gyro and star sensor.
+"""The filters of the satellite: their states, and their models of gyro and star sensor.
 
 The attitude q_ib maps body to inertial, its error is seen in the body: q = q^ exp(dtheta). Over a
 sample of length T the gyro reports theta, and of attitude and bias b

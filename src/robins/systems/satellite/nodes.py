@@ -266,7 +266,7 @@ def react(
     move: Callable = _MOVES,
     look: Callable = _LOOKS,
 ):
-    """The loop one step on: control acts on what is believed, sensors see what comes of it.
+    """Move the loop on by a step: control acts on the estimate, sensors observe the result.
 
     Args:
         form: how the state of the filter is read.

@@ -1,4 +1,4 @@
-"""The study "attitude-loop": each filter with what it believes in the loop, and what is claimed.
+"""The study "attitude-loop": each filter with its assumptions in the loop, and claims.
 
 Claims are the document's, and those of robins marked so.
 """
