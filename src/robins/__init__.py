@@ -2,7 +2,7 @@
 
 Conventions, everywhere unless a name says otherwise:
 
-- SI units and radians inside; names that cross an edge carry their unit (``lat_rad``, ``alt_m``).
+- SI units and radians inside; names at an interface carry their unit (``lat_rad``, ``alt_m``).
 - ``q_nb``, ``C_nb`` map body coordinates to navigation coordinates. Quaternions are unit, scalar
   first, Hamilton. Heading is clockwise from north.
 - Navigation frames: NED with body forward-right-down (FRD) for logs and INS/GNSS, ENU with body

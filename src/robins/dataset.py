@@ -1,8 +1,7 @@
-"""What a run starts from: tables of samples, fixes or a master INS, and any known truth.
-
-Readers of real logs and simulators both produce a `Dataset`; nothing downstream knows which. The
-tables are NumPy, float64, time in integer nanoseconds, SI and radians, and each states its frames.
-They are plain records: the *doctor* (`robins.logs.doctor`) judges them, the systems use them.
+"""Input of a run: tables of samples, fixes or a master INS, and any known truth.  Readers of real
+logs and simulators both produce a `Dataset`; nothing downstream depends on which. The tables are
+NumPy, float64, time in integer nanoseconds, SI and radians, and each states its frames. They are
+plain records: the *doctor* (`robins.logs.doctor`) judges them, the systems use them.
 """
 
 from __future__ import annotations
@@ -108,10 +107,10 @@ class AttitudeTable(_Rows):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing worth saying about a log.
+    """One remark on a log.
 
     An *error* means a run on these data would be wrong or meaningless, a *warning* that it will be
-    worse than it could be or that samples were refused, a *note* that someone should know.
+    worse than it could be or that samples were refused, a *note* is information.
     """
 
     severity: Severity
@@ -139,10 +138,10 @@ class Dataset:
     odometry: OdometryTable | None = None  # speed of the wheels, from Python only
     counts: dict[str, int] = field(default_factory=dict)  # refused samples by reason
     findings: list[Finding] = field(default_factory=list)  # of the readers: what they left out
-    time_unit_known: tuple[str, ...] = ()  # files that say in which unit their stamps are
+    time_unit_known: tuple[str, ...] = ()  # files that state the unit of their stamps
     imu_gaps: list[tuple[int, int]] = field(default_factory=list)  # (start_ns, end_ns), by `clean`
     master_delay_s: float = 0.0  # by how much records of the master are older than their stamps
-    # from the IMU to the GNSS antenna, forward, right, down; None where nobody told it
+    # from the IMU to the GNSS antenna, forward, right, down; None where it is not given
     lever_arm_b_m: tuple[float, float, float] | None = None
     mounted: bool = False  # the sensor's axes were turned to the vehicle's when it was loaded
 
@@ -192,7 +191,7 @@ class PlaceTable(_Rows):
 
 @dataclass(frozen=True)
 class RangeLog:
-    """What a run of tight GNSS starts from."""
+    """Input of a run of tight GNSS."""
 
     name: str
     ranges: RangeTable

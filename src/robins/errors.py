@@ -1,4 +1,4 @@
-"""What robins raises when it cannot use what it was given, or cannot do what it was asked."""
+"""Errors of robins where it cannot use its input, or cannot fulfil a request."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class RobinsError(Exception):
     Attributes:
         what: what is wrong.
         where: file and line, folder, option or part; empty where `what` names it.
-        fix: what to do about it; empty where `what` says it.
+        fix: what to do about it; empty where `what` contains it.
         bad_input: whether what was given is wrong; otherwise doing it failed, as on a full disk.
     """
 

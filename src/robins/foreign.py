@@ -4,7 +4,7 @@ Decoders of other packages raise what they like on damaged bytes. `decoding` sta
 each call of one and turns every exception into the error of the room that reads; what robins does
 with the result stands outside of it, so that a fault of robins is not taken for a damaged file.
 
-A size that a file declares is compared with the bytes that are there before memory is asked for. An
+A size that a file declares is compared with the bytes that are there before memory is allocated. An
 unpacked size may be `FREE` and `RATIO` times the packed one: measured logs pack 2 to 30 times, and
 what packs better than `RATIO` holds no measurements.
 """
@@ -30,7 +30,7 @@ Refuse = Callable[[str], RobinsError]
 
 
 def largest(present: int) -> int:
-    """Most bytes that so many packed ones may unpack to."""
+    """Largest number of bytes that so many packed ones may unpack to."""
     return FREE + RATIO * present
 
 
@@ -75,14 +75,14 @@ def unpacked(packed: bytes, compression: str, size: int, refuse: Refuse) -> byte
     Args:
         packed: the block.
         compression: "zstd", "lz4", or "" where it is plain.
-        size: declared; `within` has been asked.
+        size: declared, and checked by `within`.
         refuse: makes the error.
 
     Raises:
         RobinsError: as `refuse` makes it: it is damaged, or of another size.
     """
     if compression in ("zstd", "lz4"):
-        # no more than the declared size is asked of the decoders, whose own headers declare another
+        # no more than the declared size is requested of the decoders, whose own headers may differ
         with decoding(refuse):
             if compression == "zstd":
                 import zstandard

@@ -51,7 +51,7 @@ class Angle:
 
 
 def is_element(leaf) -> bool:
-    """Whether a leaf brings its own `retract` and `local`."""
+    """True if a leaf brings its own `retract` and `local`."""
     return hasattr(leaf, "retract") and hasattr(leaf, "local")
 
 
@@ -65,7 +65,7 @@ def leaves(x: State) -> list[Any]:
 
 
 def _form(leaf):
-    """What two leaves must share: the class of an element, the shape of an array."""
+    """Form that two leaves must share: the class of an element, the shape of an array."""
     return type(leaf).__name__ if is_element(leaf) else jnp.shape(leaf)
 
 

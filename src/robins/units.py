@@ -1,10 +1,10 @@
 """Units of navigation: text such as ``"0.1 deg/sqrt(h)"`` to SI numbers and back, by kind.
 
-A quantity has a *kind*: angle rate, angle random walk, length. Whoever reads a number says which
-kind is wanted, and a unit of another kind is refused, so deg/h never passes as Hz and deg/h never
+A quantity has a *kind*: angle rate, angle random walk, length. The reader of a number states the
+kind, and a unit of another kind is refused, so deg/h never passes as Hz and deg/h never
 as deg/sqrt(h). Kinds rather than dimensions decide: rad/s and Hz have the same dimension.
 
-Noise is told in either of two forms that are the same quantity, since sqrt(Hz) = 1/sqrt(s):
+Noise is stated in either of two forms that are the same quantity, since sqrt(Hz) = 1/sqrt(s):
 a random walk (deg/sqrt(h), data sheets) and a density (deg/s/sqrt(Hz), Kalibr and most MEMS);
 1 deg/s/sqrt(Hz) = 60 deg/sqrt(h). The density is that of the two-sided spectrum, as in IEEE Std
 952 and in the discrete noise sigma = density/sqrt(dt).
@@ -128,7 +128,7 @@ _TABLE: dict[str, dict[str, float]] = {
     "pressure": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3, "mbar": 1e2},
     "temperature": {"K": 1.0, "degC": 1.0},
 }
-# The same units under another name, so that messages speak of what is wanted.
+# The same units under another name, so that messages name the quantity that is wanted.
 _TABLE["specific force"] = _TABLE["acceleration"]
 _TABLE["scale factor"] = _TABLE["ratio"]
 _OFFSETS = {"degC": 273.15}  # SI value of zero, where it is not zero
@@ -285,7 +285,7 @@ def from_si(value_si, unit_: str | Unit):
 
 
 def convert(value, from_unit: str, into_unit: str):
-    """A number (or an array of them) told in another unit of the same kind.
+    """A number (or an array of them) in another unit of the same kind.
 
     Raises:
         UnitError: unknown unit, or units of different kinds.

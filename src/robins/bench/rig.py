@@ -1,4 +1,4 @@
-"""A vehicle on the bench, as data: its parts, messages and wiring, its faults, what is looked at.
+"""A vehicle on the bench, as data: its parts, messages and wiring, its faults, its page.
 
 A rig needs a wire, parts, who sends what, and how a run of it is prepared; all else has a default
 that follows from its messages.
@@ -36,7 +36,7 @@ class RigError(RobinsError, ValueError):
 
 
 def named(where: str) -> Any:
-    """What has a name in a module: "package.module:name".
+    """Object with a name in a module: "package.module:name".
 
     So processes of parts import what they need alone, and start sooner.
     """
@@ -50,14 +50,14 @@ def later(where: str) -> Callable[..., Any]:
 
 
 def packaged(file: str) -> Callable[[], dict[str, Path]]:
-    """The scenarios of the bench in the folder beside a file, by name."""
+    """The scenarios of the bench in the folder next to a file, by name."""
     found = sorted((Path(file).parent / "scenarios").glob("*.toml"))
     return lambda: {path.stem: path for path in found}
 
 
 @runtime_checkable
 class Kit(Protocol):
-    """What the parts of a run are given, so that processes can have a copy; pickled."""
+    """Input of the parts of a run, pickled so that processes can have a copy."""
 
     @property
     def step_ns(self) -> int:
@@ -71,7 +71,7 @@ class Kit(Protocol):
 
 
 class Timing(NamedTuple):
-    """The steps that the parameters of a rig ask for."""
+    """Steps of a run, by the parameters of a rig."""
 
     step_s: float
     steps: int
@@ -79,13 +79,13 @@ class Timing(NamedTuple):
 
 
 def timing(given: Any) -> Timing:
-    """Of parameters with ``duration``, ``step`` and perhaps ``counted_from``, in seconds."""
+    """Steps by parameters with ``duration``, ``step`` and perhaps ``counted_from``, in seconds."""
     steps = round(given.duration / given.step)
     return Timing(given.step, steps, round(getattr(given, "counted_from", 0.0) / given.step))
 
 
 class Judged(NamedTuple):
-    """What a rig says of a run.
+    """Evaluation of a run by its rig.
 
     Attributes:
         metrics: figures of merit by name, which ends in the unit.
@@ -103,7 +103,7 @@ class Judged(NamedTuple):
 
 
 class Told(NamedTuple):
-    """Something to tell people; levels are those of the page."""
+    """A notice for the user; levels are those of the page."""
 
     level: Any
     text: str
@@ -114,7 +114,7 @@ class Alarms(Protocol):
     """Listens to one step after another."""
 
     def hear(self, flown: Flown, step: int) -> list[Told]:
-        """What there is to say of a step."""
+        """Notices of a step."""
         ...
 
 
@@ -123,16 +123,16 @@ Offer = dict[str, Any]
 
 
 class View(NamedTuple):
-    """What the page of a rig shows.
+    """Contents of the page of a rig.
 
     Attributes:
-        signals: what is drawn, of the parameters of what flies.
+        signals: plotted signals, by the parameters of the vehicle.
         sample: (arrays, kit, first step since the last sample, step) -> their values.
         alarms: a listener for a run.
         counts: (arrays, steps done) -> what was counted, by name.
         offered: faults that can be injected, each with its label; left out: those of every line,
             and those of sensors and actuators that need no parameter.
-        says: what the operator can say, by label: (arrays, kit, last step that was done) -> the
+        says: operator messages, by label: (arrays, kit, last step that was done) -> the
             message and its values.
     """
 
@@ -147,12 +147,12 @@ class View(NamedTuple):
 
 
 class Aboard(NamedTuple):
-    """What a program is made of that stands for the exported part.
+    """Sources of a program that replaces the exported part.
 
     Attributes:
         problem: a `robins.systems.study.Problem` of one contender, whose filter is exported.
         library: name of the C of the filter, by which its loop calls it.
-        files: of the loop, by name, beside those of the wire.
+        files: of the loop, by name, in addition to those of the wire.
     """
 
     problem: Any
@@ -161,9 +161,9 @@ class Aboard(NamedTuple):
 
 
 class Spoken(NamedTuple):
-    """What the operator said through the bench."""
+    """A message that the operator sent through the bench."""
 
-    step: int  # the first whose parts heard it
+    step: int  # the first whose parts received it
     message: str
     values: Mapping[str, Any]
 
@@ -178,10 +178,10 @@ class Rig:
         build: how a part is made of a kit, by part.
         sends: messages by part, each of one part alone.
         takes: messages by part.
-        console: messages that no part sends: the operator says them through the bench, and parts
+        console: messages that no part sends: the operator sends them through the bench, and parts
             take them, if they do, with a lag of one.
-        refuses: (message, values) -> why the operator cannot say this, though each number is within
-            its limits; "": it can be said.
+        refuses: (message, values) -> why the operator cannot send this, though each number is
+            within its limits; "": it can be sent.
         parameters: () -> the class of what flies.
         prepare: (setup, parameters) -> the kit of a run; the same for the same.
         truth: the message without which nothing can be judged; "": there is none.
@@ -196,10 +196,10 @@ class Rig:
         topics: (kit) -> what viewers and ROS 2 get of its messages, in the record; JSON of those
             that it leaves out.
         inside: (kit, steps) -> arrays of so many first steps of the same run inside one program,
-            named as `Flown` names them. With a console: (kit, steps, what was said) -> the same, or
+            named as `Flown` names them. With a console: (kit, steps, messages sent) -> the same, or
             None where it cannot be compared.
         judge: figures of merit of a run; left out: none, and all numbers in its arrays.
-        once: (setup, part) -> why what the part was told cannot be told to it again, from a record
+        once: (setup, part) -> why the input of the part cannot be sent to it again, from a record
             or after its death; "": it can.
         example: the part with which commands are shown; left out: its last.
         exported: the part that an exported filter can be, by the loop of that name among the files
@@ -240,7 +240,7 @@ class Rig:
         """Check that its tables agree.
 
         Raises:
-            RigError: they do not; says how.
+            RigError: they do not; names the contradiction.
         """
         parts = self.parts
         for what, table in (("build", self.build), ("sends", self.sends), ("takes", self.takes)):
@@ -263,12 +263,12 @@ class Rig:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Its parts, without the bench."""
+        """Names of its parts, without the bench."""
         return self.wire.parts[1:]
 
     @cached_property
     def table(self) -> Table:
-        """What its faults may be."""
+        """Faults that it can have."""
         from robins.bench.broker.faults import Table
 
         return Table(self.wire, self.sends, self.takes, self.said()[0])
@@ -282,14 +282,14 @@ class Rig:
 
     @cached_property
     def desk(self) -> Desk:
-        """What its operator may say."""
+        """Operator messages that it takes."""
         from robins.bench.broker.says import Desk
 
         return Desk(self.wire, self.console, self.refuses)
 
     @cached_property
     def saying(self) -> type[Saying]:
-        """The parameters of something that is said."""
+        """Parameters of an operator message."""
         from robins.bench.broker.says import sayings_of
 
         return sayings_of(self.desk)
@@ -303,7 +303,7 @@ class Rig:
 
     @cached_property
     def shown(self) -> View:
-        """What its page shows."""
+        """Contents of its page."""
         from robins.bench.run.numbers import faults_of, view_of
 
         view = self.view() if self.view is not None else view_of(self)

@@ -16,11 +16,11 @@ from typing import Any
 from robins.errors import RobinsError
 
 EACH_S = 1.0
-_OLD_S = 10.0  # after which a bench that says nothing hangs
+_OLD_S = 10.0  # after which a silent bench counts as hanging
 _LARGEST = 1 << 20  # characters of a report
 _REPORT = re.compile(r"[1-9][0-9]{0,9}\.(json|[0-9a-f]{8}\.new)")
 Report = dict[str, Any]
-STARTING = "starting"  # its state until the first step: it may compile for long, and says nothing
+STARTING = "starting"  # its state until the first step: it may compile for long, without a report
 
 
 def _refused(what: str, path: Path, fix: str) -> RobinsError:
@@ -91,11 +91,11 @@ class Status:
 
     @property
     def due(self) -> bool:
-        """Whether it is time to tell again."""
+        """True if the next report is due."""
         return time.monotonic() - self._told >= EACH_S
 
     def tell(self, said: Mapping[str, Any]) -> None:
-        """Report the state; neither a full disk nor a folder of somebody else stops a run."""
+        """Report the state; neither a full disk nor a folder of another user stops a run."""
         self._told = time.monotonic()
         content = json.dumps({**said, "pid": os.getpid(), "at": time.time()})
         new = f"{self._name}.{secrets.token_hex(4)}.new"

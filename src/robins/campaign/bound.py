@@ -35,7 +35,7 @@ from robins.systems.tables import block_array
 
 _AT_ONCE = 128  # runs: histories of the information of each are held
 FEW = 1.0  # eigenvalue of the Gramian below which the prior still knows more of a direction
-_FEWEST, _MOST = 3, 6  # directions that are told
+_FEWEST, _MOST = 3, 6  # directions that are reported
 
 
 def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = ()) -> xr.Dataset:
@@ -43,9 +43,9 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
 
     Args:
         problem: what to simulate.
-        name: which contender's model and start to take; its filter plays no part, but for steering
+        name: contender whose model and start are taken; its filter plays no part, but for steering
             the vehicle where the problem is a closed loop.
-        runs: how many trajectories; variances are averaged over them.
+        runs: number of trajectories; variances are averaged over them.
         without: sensors to leave out altogether.
 
     Returns:
@@ -55,7 +55,7 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
         ``bound_left_BLOCK`` (axis_BLOCK), the share of the prior that the measurements leave of the
         start, process noise aside. Of the first run ``information`` (state, time), the bits gained
         about the start, see `robins.filters.observability`; ``gramian`` (direction), the least
-        eigenvalues, with a coordinate that says in words what each direction is made of; and
+        eigenvalues, with a coordinate that describes in words what each direction is made of; and
         ``gramian_rank``. The attribute ``filter`` is the name.
 
     Raises:
@@ -131,7 +131,7 @@ def bound_sigma(problem: Problem, name: str, world: Any, machine: str = "vm") ->
 
 
 def _left(rows: np.ndarray, L: np.ndarray, D: np.ndarray) -> np.ndarray:
-    """(r,) share of the prior that is left of what is reported of the start; NaN if known."""
+    """(r,) share of the prior that is left of the reported start; NaN if known."""
     begun = np.linalg.norm(rows * D, axis=1)
     known = begun == 0.0
     share = np.linalg.norm(rows @ (D[:, None] * L), axis=1) / np.where(known, 1.0, begun)
@@ -150,7 +150,7 @@ def _reported(rows: Array | None, factor: Array) -> Array:
 
 
 def _bounded(c: Contender, subsets: Array, world: Data) -> dict[str, Data]:
-    """Bound of one run, and what it is made of.
+    """Bound of one run, and its parts.
 
     Args:
         c: whose model and start are believed.
@@ -159,8 +159,8 @@ def _bounded(c: Contender, subsets: Array, world: Data) -> dict[str, Data]:
 
     Returns:
         variance (V, E, r) by subset; prior (r,) variances; mean of the start; L (E, n, n) of the
-        Gramian with the first subset, and D (n,) its units; spoke (S,) which sensors ever measured
-        anything; rows (r, n) what is reported of the start, or None.
+        Gramian with the first subset, and D (n,) its units; spoke (S,) true for sensors that ever
+        measured anything; rows (r, n) the reported combinations of the start, or None.
     """
     it = whole_case(c.filter, c.model, c.case(world))
     start = jax.tree_util.tree_map(jnp.asarray, _start(it))

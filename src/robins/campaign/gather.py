@@ -1,4 +1,4 @@
-"""A campaign's shards joined: how far it is, and the statistics of all its runs."""
+"""A campaign's shards joined: its progress, and the statistics of all its runs."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class State(NamedTuple):
 
     Attributes:
         found: statistics by filter of all shards that are there and whole, joined in the order of
-            the runs: sums have the same bits whoever computed them, and when.
-        done: how many runs of each filter these are.
+            the runs: sums have the same bits on every worker, at any time.
+        done: number of runs of each filter among these.
         damaged: shards whose checksum does not fit.
-        lacking: how many shards are not there or damaged.
+        lacking: number of shards that are not there or damaged.
     """
 
     found: dict[str, Statistics]
@@ -39,7 +39,7 @@ class State(NamedTuple):
 
 
 def blank(problem: Problem | None) -> Statistics:
-    """Statistics of no runs; without a problem such as can be joined, not asked."""
+    """Statistics of no runs; without a problem they can be joined, and give no figures."""
     if problem is None:
         return Statistics(())
     return Statistics.of(problem)

@@ -1,8 +1,7 @@
-"""When the interpreter of a campaign gives way to compiled lanes, which have the same bits.
-
+"""Change from the interpreter of a campaign to compiled lanes, which have the same bits.
 Interpreting begins at once and takes about twice as long as compiled lanes. The compiler runs in a
-thread of its own, beside the campaign, as soon as the runs that are left would save more than it
-takes; each loop changes over when its lanes are there.
+thread of its own, along with the campaign, as soon as the runs that are left would save more than
+it takes; each loop changes over when its lanes are there.
 """
 
 from __future__ import annotations

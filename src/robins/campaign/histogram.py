@@ -1,7 +1,7 @@
 """Percentiles of many numbers by counting: whole numbers, which join exactly in any order.
 
 Bins have equal ratios, 32 of them a decade, from 1e-18 to 1e18; what is below or above has a bin of
-its own. A percentile is told as the geometric middle of its bin, and so to 3.7 % at worst. Only
+its own. A percentile is reported as the geometric middle of its bin, and so to 3.7 % at worst. Only
 bins that hold something are kept, as a table (2, M): a row of increasing numbers, each of a place
 and a bin, and a row of how many are there. A table grows with what differs, not with what is
 counted.
@@ -17,7 +17,7 @@ A_DECADE = 32
 EDGES = 10.0 ** (np.arange(-18 * A_DECADE, 18 * A_DECADE + 1) / A_DECADE)
 WORST = 10.0 ** (0.5 / A_DECADE) - 1.0  # largest relative error of a percentile
 _BINS = len(EDGES) + 1
-# What is told of a bin: nothing of what is below all, infinity of what is above.
+# Value reported of a bin: zero below all edges, infinity above them.
 _TOLD = np.concatenate([[0.0], np.sqrt(EDGES[:-1] * EDGES[1:]), [np.inf]])
 
 

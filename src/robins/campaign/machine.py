@@ -1,4 +1,4 @@
-"""On what a campaign runs: programs on all cores, interpreted or compiled, or batches of JAX.
+"""Machines of a campaign: programs on all cores, interpreted or compiled, or batches of JAX.
 
 All have the same random numbers and, to rounding, the same results; JAX is the reference. The two
 kinds of programs have the same bits. The interpreter (`robins.program.interpreter`) begins at once
@@ -58,7 +58,7 @@ from robins.systems.study import Problem
 
 MACHINES = ("vm", "c", "jax")
 BETWEEN_S = 1.0  # between two times that memory is given back
-COMPILERS = 3  # at once, beside that of the worlds: some take a gigabyte
+COMPILERS = 3  # at once, in addition to that of the worlds: some take a gigabyte
 NUMBER = jax.ShapeDtypeStruct((), int)  # shape of the number of a run
 STACK = 1 << 28  # bytes of a thread's stack, on which lanes hold all that a step computes
 
@@ -94,10 +94,10 @@ class ByJax:
         return width
 
     def chunks(self, runs: int, chunk: int = 0, taken: Taken = whole) -> Iterator[Simulated]:
-        """Simulate a chunk; its filters run when they are asked for.
+        """Simulate a chunk; its filters run when their results are requested.
 
         Args:
-            runs: how many.
+            runs: number of runs.
             chunk: runs at a time; not given, by the memory that they need.
             taken: what is kept of the record of a filter.
         """
@@ -202,10 +202,10 @@ class InLanes:
         return min(width_of(self.bytes_of_run, CHUNK_BYTES), -(-runs // LEAST) * LEAST)
 
     def chunks(self, runs: int, chunk: int = 0, taken: Taken = whole) -> Iterator[Simulated]:
-        """Simulate chunks and run their filters, on all cores, ahead of what is asked for.
+        """Simulate chunks and run their filters, on all cores, ahead of the requests.
 
         Args:
-            runs: how many.
+            runs: number of runs.
             chunk: runs at a time; not given, by the memory that they need.
             taken: what is kept of the record of a filter, found in the thread that computed it.
                 What figures show of one run has a leading axis of one there.
@@ -364,7 +364,7 @@ def machine_for(problem: Problem, name: str = "") -> ByJax | InLanes:
         name: one of `MACHINES`; not given, the interpreter, or JAX where that cannot be.
 
     Raises:
-        RobinsError: the machine asked for is not there, or a filter calls Python at its steps.
+        RobinsError: the machine is not available, or a filter calls Python at its steps.
     """
     check_machine(name)
     if name == "jax":

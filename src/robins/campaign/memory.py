@@ -1,4 +1,4 @@
-"""How many runs a chunk has and how many chunks are computed at once, so that memory has a bound.
+"""Number of runs of a chunk and of chunks computed at once, so that memory has a bound.
 
 A chunk is as wide as the histories of its runs allow, by what the stages of a run hold at once. The
 width depends on the problem and not on the machine's cores: results that JAX sums in batches have
@@ -53,7 +53,7 @@ def said(bytes_of_run: int, width: int) -> list[str]:
 
 
 def give_back() -> None:
-    """Have the C library of Linux return what is free, between two chunks.
+    """Return free memory of the C library to Linux, between two chunks.
 
     Threads of lanes allocate in arenas of their own, which otherwise grow by 60 MB a chunk of the
     airship, to three times what a chunk needs.

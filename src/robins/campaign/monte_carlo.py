@@ -58,7 +58,7 @@ def _judged(
 
 
 def reported_rows(reported: Any, case: Case) -> tuple[Array | None, int | None]:
-    """Rows that make of a tangent error what is reported, and their axis of time if they have one.
+    """Rows that map a tangent error to the reported components, and their axis of time if any.
 
     (r, n) or (E, r, n); None: all of the error is reported.
     """
@@ -168,7 +168,7 @@ def batch_of(problem: Problem) -> Any:
 
 
 def bytes_of_batch(problem: Problem, batch: Any, width: int) -> int:
-    """About the most memory that JAX needs at once for a chunk of so many runs.
+    """Approximate peak memory of JAX for a chunk of so many runs.
 
     What is traced for it serves again when a chunk of this width is computed.
 
@@ -225,7 +225,7 @@ def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, An
 
 
 def blocks_of(problem: Problem) -> Blocks:
-    """The blocks of a problem as what is compiled takes them."""
+    """The blocks of a problem as arguments of compiled code."""
     return tuple((b.name, b.where.start, b.where.stop) for b in problem.blocks)
 
 

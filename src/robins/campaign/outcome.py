@@ -32,13 +32,13 @@ def simulate(
 
     Args:
         problem: what to simulate.
-        runs: how many runs of each filter.
+        runs: number of runs of each filter.
         chunk: runs at a time; not given, by the memory that they need.
         progress: called with the share done in 0..1 and what is being done.
         machine: one of `robins.campaign.MACHINES`, or made already; not given, as `machine_for`.
 
     Raises:
-        RobinsError: the machine asked for is not there.
+        RobinsError: the machine is not available.
 
     An error while something is made of the statistics takes their arrays along, by filter, for
     `robins.results.rescued` to write.
@@ -56,7 +56,7 @@ def simulate(
         return of_chunk
 
     def stage(what: str, step: int) -> None:
-        """Tell of a step of a chunk: its worlds are simulated first, then every filter is run."""
+        """Report a step of a chunk: its worlds are simulated first, then every filter is run."""
         last = min(done + chunk, runs)
         share = (done + (last - done) * step / (1 + len(names))) / max(runs, 1)
         verb = "compiling, " if done == 0 else ""
@@ -102,7 +102,7 @@ def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray
 
 
 def _finds(problem: Problem, name: str, s: Statistics) -> list[str]:
-    """Sentences on what a filter finds wrong, and since when."""
+    """Sentences on the instruments that a filter finds wrong, with the time."""
     if s.runs == 1:
         return sentences(name, problem.epoch_s, s.first_run.get("wrong", {}))
     said, suspects = [], s.suspects

@@ -1,4 +1,4 @@
-"""What a campaign computes: a scenario, its filters and runs, cut into shards under fixed names."""
+"""Plan of a campaign: a scenario, its filters and runs, cut into shards under fixed names."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from robins.systems.catalogue import is_file
 
 NAME = "campaign.json"
 SCHEMA = 1
-KEPT = ("keep", "keep_diverged")  # say what is kept of the runs
+KEPT = ("keep", "keep_diverged")  # decide what is kept of the runs
 _WANTED = ("runs", "filters", "claims", "title", *KEPT)  # change no run of a filter
 _SOURCES = {".py", ".h", ".cc", ".toml", ".csv", ".json"}
 
@@ -35,7 +35,7 @@ class Shard(NamedTuple):
 
     @property
     def stem(self) -> str:
-        """Its name without group and ending."""
+        """Name of the shard without group and ending."""
         return PurePosixPath(self.name).stem
 
 
@@ -49,16 +49,16 @@ class Chunk(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """A campaign, as `campaign.json` says it.
+    """A campaign, as written in `campaign.json`.
 
     Attributes:
-        asked: how its system is found: a name of `robins list`, or a file.
+        asked: address of its system: a name of `robins list`, or a file.
         scenario: its name.
         text: TOML, with what the command line changed.
         seed: of all noise.
-        runs: how many.
+        runs: their number.
         filters: their names.
-        machine: what computes it, "vm", "c" or "jax".
+        machine: that computes it, "vm", "c" or "jax".
         width: runs of a chunk; what JAX sums in batches depends on it.
         code: hash of robins, of a user's own system, and of the packages that compute.
     """
@@ -87,7 +87,7 @@ class Plan:
 
     @property
     def shards(self) -> dict[Chunk, list[Shard]]:
-        """Of each chunk the shards of all filters."""
+        """Shards of all filters, by chunk."""
         return {c: [self.shard(c, name) for name in self.filters] for c in self.chunks}
 
     @property
@@ -97,7 +97,7 @@ class Plan:
 
     @property
     def keep_diverged(self) -> int | None:
-        """Of how many diverged runs of each filter the histories are kept; None: of all."""
+        """Number of diverged runs of each filter whose histories are kept; None: all."""
         most = scenario.mapping_of(self.text).get("keep_diverged", 0)
         return None if most == "all" else most
 
@@ -196,7 +196,7 @@ def code_of(asked: str, text: str) -> str:
     """Hash of all code that a shard depends on.
 
     Args:
-        asked: how the system is found; a file of a user's own counts with the local modules that
+        asked: address of the system; a file of a user's own counts with the local modules that
             it imports.
         text: of the scenario, which may name such a file.
     """
@@ -214,7 +214,7 @@ def check_code(store: Store, plan: Plan) -> None:
     """Refuse to go on with other code: half of the runs would be of one version, half of another.
 
     Raises:
-        RobinsError: the campaign was begun by other code.
+        RobinsError: the campaign was started by other code.
     """
     here = code_of(plan.asked, plan.text)
     if here != plan.code:

@@ -40,12 +40,12 @@ def by_stem(shards: Mapping[Chunk, list[Shard]]) -> dict[str, Shard]:
 
 
 def histories(store: Store, group: str, shards: Mapping[str, Shard]) -> dict[str, list[History]]:
-    """What is there of a group, by filter, in the order of the runs.
+    """Histories that a group holds, by filter, in the order of the runs.
 
     Args:
         store: of the campaign.
         group: `NAMED` or `DIVERGED`.
-        shards: `by_stem`; what belongs to others is of no run of this campaign.
+        shards: `by_stem`; histories of others are of no run of this campaign.
     """
     found: dict[str, list[History]] = {}
     for name in store.names(group):
@@ -63,7 +63,7 @@ def trim(store: Store, shards: Mapping[str, Shard], name: str, most: int) -> Non
 
 
 def kept(store: Store, shards: Mapping[str, Shard]) -> dict[str, list[int]]:
-    """By filter the numbers of the runs whose histories are there."""
+    """Numbers of the runs whose histories are there, by filter."""
     groups = [histories(store, group, shards) for group in (NAMED, DIVERGED)]
     return {
         name: sorted({h.run for of in groups for h in of.get(name, [])})

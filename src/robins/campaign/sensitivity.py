@@ -1,4 +1,4 @@
-"""Which share of the variance of an error comes from which uncertain parameter.
+"""Shares of the variance of an error that come from each uncertain parameter.
 
 Let Y = f(p_1 .. p_d) be an error and the parameters independent. With X ~ p_i all of them but one,
 
@@ -54,7 +54,7 @@ class Between(NamedTuple):
 
     @property
     def by_logarithm(self) -> bool:
-        """Whether the logarithm is uniform: the ends have one sign and are more than 10 apart."""
+        """True if the logarithm is uniform: the ends have one sign and differ more than tenfold."""
         pairs = zip(self.low, self.high, strict=True)
         return all(a * b > 0.0 and max(a / b, b / a) > DECADE * (1.0 + 1e-9) for a, b in pairs)
 
@@ -69,7 +69,7 @@ class Between(NamedTuple):
 
 
 def between(low: Any, high: Any) -> Between:
-    """What differs between two sets of parameters.
+    """Differences between two sets of parameters.
 
     Raises:
         ValueError: nothing differs, or something that is not a number.
@@ -157,11 +157,11 @@ def _believed(start: Any) -> Array:
 
 
 def depends(before: Any, course: Any, after: Any) -> bool:
-    """Whether a course differs from another, by all that can be compared of it.
+    """True if a course differs from another, by all that can be compared of it.
 
     Args:
         before: a course.
-        course: of the same parameters, laid out again: what differs here tells nothing.
+        course: of the same parameters, laid out again: what differs here does not count.
         after: of other parameters.
     """
     first, again, other = (list(_parts(x)) for x in (before, course, after))
@@ -248,7 +248,7 @@ def sobol_points(d: int, samples: int, seed: int) -> np.ndarray:
 
 
 class Indices(NamedTuple):
-    """Of each output (s) and parameter (d), with bounds of 95 % confidence; NaN: no variance."""
+    """Indices (s, d) of each output and parameter, with 95 % bounds; NaN: no variance."""
 
     first: np.ndarray  # (s, d)
     first_low: np.ndarray
@@ -261,13 +261,13 @@ class Indices(NamedTuple):
 def indices(squares: np.ndarray, seed: int, resamples: int = RESAMPLES) -> Indices:
     """Sobol indices of the RMS over runs, at the points of `sobol_points`.
 
-    The bounds are of a percentile bootstrap that draws points and runs anew, so they tell how far
+    The bounds are of a percentile bootstrap that resamples points and runs, so they show how far
     chance in either may have moved an index.
 
     Args:
         squares: (d + 2, n, runs, s) mean squares of each run.
         seed: of the bootstrap.
-        resamples: of it.
+        resamples: their number.
     """
     _, n, runs, _ = squares.shape
     rng = np.random.default_rng(seed)

@@ -23,7 +23,7 @@ _COUNTS = ("runs", "diverged", "n")
 
 
 class Damaged(RobinsError):
-    """What was read is not what was written."""
+    """A shard whose content differs from what was written."""
 
 
 def pack(about: Mapping[str, Any], statistics: Statistics) -> bytes:

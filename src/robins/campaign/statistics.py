@@ -25,7 +25,7 @@ from robins.systems.suspects import HELD, edges
 
 @dataclass
 class Statistics:
-    """Of the runs of one filter: `add` chunks, or `merge` those of each chunk in their order.
+    """Running statistics of one filter: `add` chunks, or `merge` those of each chunk in order.
 
     Attributes:
         runs: added so far.
@@ -103,7 +103,7 @@ class Statistics:
     def merge(self, other: Statistics) -> None:
         """Join the statistics of the runs that follow, as if their records had been added here.
 
-        Chunks that are joined in one order give the same bits, whoever computed them and when.
+        Chunks that are joined in one order give the same bits on every worker, at any time.
         """
         self.runs += other.runs
         self.diverged += other.diverged
@@ -118,7 +118,7 @@ class Statistics:
             self._count(name, table)
 
     def blank(self) -> Statistics:
-        """Of no runs yet, with the settings of these: for a chunk, to be merged."""
+        """Statistics of no runs yet, with the settings of these: for a chunk, to be merged."""
         return Statistics(
             *(self.blocks, self.count_from, self.limits, self.count_to, self.norms, self.windows),
             self.faults,
@@ -165,7 +165,7 @@ class Statistics:
             self._each(f"worst of {name}", worst)
 
     def _scatter(self, error: np.ndarray) -> None:
-        """How the errors of each block lie together, and how long they are, at some epochs."""
+        """Add products and lengths of the errors of each block, at some epochs."""
         some = error[:, thinned(error.shape[1])]
         for block in self.blocks:
             of = some[:, :, block.where]
@@ -234,7 +234,7 @@ class Statistics:
 
     @property
     def mean(self) -> np.ndarray:
-        """(E, r) mean error over the runs: what a filter errs in all of them alike."""
+        """(E, r) mean error over the runs, the bias of a filter."""
         return self.sums["error"] / self.runs
 
     @property
@@ -357,7 +357,7 @@ class Statistics:
 
     @property
     def tally(self) -> Tally:
-        """How the steps went; leading axis of runs."""
+        """Tally of the steps; leading axis of runs."""
         found: dict[str, dict[str, np.ndarray]] = {field: {} for field in Tally._fields}
         for name in self.each:
             what, _, sensor = name.partition(TALLY)

@@ -1,4 +1,4 @@
-"""Where a campaign keeps what it has computed: objects that are put once and read by anybody.
+"""Store of a campaign's results: objects that are put once and read by any worker.
 
 An object appears whole or not at all, and the first one under a name stays. So workers need no
 agreement: what two of them compute is the same, and the second is thrown away.
@@ -211,7 +211,7 @@ class Objects:
             self._tried(f"remove {name}", lambda: self._obstore.delete(self._store, name))
 
     def sweep(self) -> None:
-        """Nothing half-written is ever seen here."""
+        """Do nothing: object storage never shows half-written objects."""
 
     def _tried(self, what: str, function: Callable[[], Any]) -> Any:
         try:

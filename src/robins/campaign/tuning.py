@@ -1,4 +1,4 @@
-"""Parameters of a filter that make its runs best, with how well the data say so.
+"""Parameters of a filter that make its runs best, with the confidence that the data allow.
 
 Parameters are tuned by a factor each: x is the natural logarithm of the factors, zero where they
 are as written. What is measured of a filter comes in independent *parts*, the runs of a campaign or
@@ -26,12 +26,12 @@ from robins.errors import RobinsError
 from robins.results import Progress, silent
 
 FARTHEST = math.log(1000.0)  # of a factor, either way
-TOO_WIDE = math.log(3.0)  # of a 95 % interval, either way: the data say too little
+TOO_WIDE = math.log(3.0)  # of a 95 % interval, either way: the data do not determine it
 FEWEST_PARTS = 6
 Tree = Any  # a pytree of arrays
 Measure = Callable[[Tree, Tree], Array]
 _STEP = 0.01  # of differences of runs
-_COARSE = 0.1  # where a run may leap, or is traced anew
+_COARSE = 0.1  # where a run may leap, or is traced again
 _CURVED = 0.05  # of differences of gradients
 _LOST = 1e6  # objective where a filter is lost
 
@@ -41,7 +41,7 @@ class Trial(NamedTuple):
 
     Attributes:
         kind: where it differs, what is measured may leap, as by another threshold.
-        numbers: pytree of arrays; of another structure it is traced anew.
+        numbers: pytree of arrays; of another structure it is traced again.
     """
 
     kind: Hashable
@@ -49,14 +49,14 @@ class Trial(NamedTuple):
 
 
 class Data(NamedTuple):
-    """What is measured on: arrays with a leading axis of runs, and which of the parts count."""
+    """Data of the measurement: arrays with a leading axis of runs, and the parts that count."""
 
     arrays: Any
     rows: np.ndarray | None = None  # numbers of parts; None: all
 
 
 class Objective(NamedTuple):
-    """What is to be small.
+    """Objective to be minimised.
 
     Attributes:
         trial: ``x (p,) -> Trial``; raises a ValueError where there is no such filter.
@@ -70,7 +70,7 @@ class Objective(NamedTuple):
 
 
 class Tuned(NamedTuple):
-    """What was found.
+    """Result of the tuning.
 
     Attributes:
         x: (p,) log factors.
@@ -96,12 +96,12 @@ class Tuned(NamedTuple):
 
     @property
     def better(self) -> bool:
-        """Whether it is better on data that it was not chosen on, beyond chance."""
+        """True if it is better on data that it was not chosen on, beyond chance."""
         return self.gain_low > 0.0
 
 
 class TooLittle(RobinsError, ValueError):
-    """The data do not say what a parameter should be."""
+    """The data do not determine a parameter."""
 
     bad_input = True
 
@@ -292,7 +292,7 @@ def _sigma(slopes: Slopes, x: np.ndarray, names: Sequence[str]) -> np.ndarray:
     curve = np.array([(a.mean(axis=0) - b.mean(axis=0)) / (2.0 * step) for a, b in ends])
     curve = 0.5 * (curve + curve.T)
     value, axes = np.linalg.eigh(curve)
-    # along an axis that is not curved upwards the data say nothing
+    # along an axis that is not curved upwards the data determine nothing
     scale = 1.0 / np.where(value > 1e-9 * max(value.max(), 0.0), value, np.nan)
     within = np.atleast_2d(np.cov(each, rowvar=False)) / len(each)
     turned = axes.T @ within @ axes * np.outer(scale, scale)
@@ -330,7 +330,7 @@ def _times(factor: float) -> str:
 def _gain(
     total: Callable[[np.ndarray], float], before: np.ndarray, after: np.ndarray
 ) -> tuple[float, float]:
-    """By how much the objective fell, and its lower bound of 95 %: the parts left out in turn."""
+    """Decrease of the objective, and its lower bound of 95 %: the parts left out in turn."""
     if not np.all(np.isfinite(after)):
         return -math.inf, -math.inf
     if not np.all(np.isfinite(before)):

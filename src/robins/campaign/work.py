@@ -1,7 +1,8 @@
 """A worker of a campaign: it takes the next shards that are missing, computes them, puts them.
 
-Workers agree on nothing. A claim only tells others what somebody is at; what is claimed for long,
-since its worker died, is computed by another, and if both end, one of two equal shards is kept.
+Workers agree on nothing. A claim only shows others what a worker computes; what is claimed for
+long, since its worker died, is computed by another, and if both end, one of two equal shards is
+kept.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ POLL_S = 0.2
 
 
 class Missing(NamedTuple):
-    """A chunk, and its shards that nobody has put yet."""
+    """A chunk, and its shards that are not in the store yet."""
 
     chunk: Chunk
     shards: list[Shard]
@@ -65,7 +66,7 @@ class Worker:
         self._stems = by_stem(self._shards)
         self._seen: dict[str, float] = {}  # when a claim was first seen
         self._took = 0.0
-        self._left = 0  # runs that nobody has computed yet
+        self._left = 0  # runs that are not computed yet
 
     def work(self) -> Iterator[int]:
         """Compute until nothing is missing; yields how many shards are, before each chunk."""
@@ -106,7 +107,7 @@ class Worker:
     def runs_of(
         self, chunk: Chunk, names: list[str], runs: Sequence[int]
     ) -> dict[str, dict[int, Statistics]]:
-        """Of filters the statistics of some runs of a chunk, each alone with its histories.
+        """Statistics of some runs of a chunk by filter, each alone with its histories.
 
         The chunk is computed as it was, so that the runs have the same bits.
         """
@@ -121,7 +122,7 @@ class Worker:
         return one
 
     def packed(self, shard: Shard, chunk: Chunk, statistics: Statistics) -> bytes:
-        """A shard as it is stored: equal ones are equal files, since none tells who made it."""
+        """A shard as it is stored: equal ones are equal files, since none names its worker."""
         about = {"filter": shard.filter, "begin": chunk.begin, "code": self.plan.code}
         return pack(about, statistics)
 
@@ -143,7 +144,7 @@ class Worker:
             trim(self.store, self._stems, shard.filter, most)
 
     def _next(self, lack: list[Missing]) -> Missing | None:
-        """What nobody claims; else what was claimed for long; else nothing for now."""
+        """Chunk that is not claimed; else one claimed for long; else none for now."""
         claimed = self.store.names("claims")
         who = {"host": socket.gethostname(), "process": os.getpid()}
         for one in lack:

@@ -175,7 +175,7 @@ def ports(as_json: bool) -> None:
 @TRUST
 @DEBUG
 def node(part: str, port: str, scenario: str, **options: Any) -> None:
-    """Run PART of SCENARIO at PORT until the bench says stop, as its process would.
+    """Run PART of SCENARIO at PORT until the bench sends stop, as its process would.
 
     Use it for a part on another machine, at the other end of a serial cable: there `robins bench
     up SCENARIO --node PART=PORT` runs with the same seed.
@@ -199,7 +199,7 @@ def header(rig: str, to: Path | None) -> None:
     """Print robins_wire.h of RIG: every message, frames, a receiver; C99 or C++11, no heap.
 
     RIG is one that comes with robins, by default the satellite, or "file.py:rig". With --to it goes
-    into a folder, with what a board needs beside it, and examples where there are some.
+    into a folder, with all else that a board needs, and examples where there are some.
     """
     from robins.bench.rigs import rig_of
     from robins.bench.wire.c_header import c_header, firmware

@@ -28,7 +28,7 @@ except (ImportError, AttributeError):
     jax.jit(abs)(1.0)
 """
 _TRIAL_S = 60.0
-_UNKNOWN = b"Unknown flag"  # what XLA says before it ends the process
+_UNKNOWN = b"Unknown flag"  # message of XLA before it ends the process
 _REFUSED = (
     "robins: note: this jaxlib ({}) does not take the settings that halve the time to compile; "
     "it will take longer. Nothing else changes."

@@ -138,9 +138,9 @@ def work(where: str, as_json: bool) -> None:
 @_WHERE
 @answers
 def status(where: str, as_json: bool) -> None:
-    """Read and check every shard of the campaign in DIR, and say what is done, missing, damaged.
+    """Read and check every shard of the campaign in DIR, and report what is done, missing, damaged.
 
-    Of a sweep it says so for the campaign of each point.
+    Of a sweep it reports the campaign of each point.
     """
     with only_json(as_json):
         found = _workbench().status(where)
@@ -223,7 +223,7 @@ def show(where: str, number: int, out: Path | None, as_json: bool) -> None:
 
 
 def _result(where: str, what: str) -> Path:
-    """Where a result goes that is not in the folder of its campaign."""
+    """Path of a result that is not in the folder of its campaign."""
     return Path("results") / f"{where.rstrip('/').rpartition('/')[2]}-{what}"
 
 

@@ -202,7 +202,7 @@ def bound(scenario: str, filters: tuple[str, ...], out: Path | None, **options: 
 def replay(log: tuple[Path, ...], runs: int | None, out: Path | None, **options: Any) -> None:
     """Navigate a recorded log: LOG... are its files, inertial samples and GNSS fixes.
 
-    A file that ends in .toml says what the log does not: noise, mounting, lever arm. The file of
+    A file that ends in .toml adds what the log lacks: noise, mounting, lever arm. The file of
     --columns declares the columns of a log that is in no known format.
 
     --export writes files into exports/ of the result folder: csv has all estimates, tum is t x y z
@@ -229,10 +229,10 @@ def doctor(
 ) -> int:
     """Examine a log as an engineer would: units, axes, gravity, rates, gaps, time, sigmas.
 
-    The exit status is 2 if a run on it would be wrong, 0 otherwise. A .toml file among LOG... says
-    how the sensor is mounted, as for `robins replay`.
+    The exit status is 2 if a run on it would be wrong, 0 otherwise. A .toml file among LOG... gives
+    the mounting of the sensor, as for `robins replay`.
 
-    With --write, what the log tells of the unit and the receiver (mounting, latency, window of the
+    With --write, what the log shows of the unit and the receiver (mounting, latency, window of the
     velocities, noise at rest) becomes a configuration for `robins replay`.
     """
     return judge(log, columns, as_json, write)
@@ -272,8 +272,8 @@ def calibrate(log: tuple[Path, ...], out: Path | None, **options: Any) -> None:
     """Calibrate hard and soft iron from a log in which the sensor is turned about all its axes.
 
     It finds the offset and the matrix of ``matrix (measured - offset)``, whose size is that of the
-    Earth's field wherever the sensor points. A .toml file among LOG... says how the sensor is
-    mounted, as for `robins replay`, which takes the calibration.toml of the result.
+    Earth's field wherever the sensor points. A .toml file among LOG... gives the mounting of the
+    sensor, as for `robins replay`, which takes the calibration.toml of the result.
     """
     out = out or RESULTS / f"calibrate-{log_name(log)}"
     carry_out("calibrate", log, out=out, **options)
@@ -335,18 +335,18 @@ def export(scenario: str, to: Path, small: bool, as_json: bool, **options: Any) 
     """Write a filter of SCENARIO as C99, with a test of it for your own compiler.
 
     DIR gets one file of C that needs math.h alone, a header that names all fields with their units,
-    a page that says how to call it, and `make check`: it replays recorded steps and compares each
-    state and each code with those of this program. With --float32 it runs the scenario in single
-    precision too, and tells what that costs against the simulated truth. With --board it builds a
-    program that stands for a part of the bench: the satellite's attitude determination, or the
-    navigation computer of INS/GNSS. A number named by --adjust is a field of the state in the place
-    of a constant; a name that the filter does not have lists those it has.
+    a page that explains how to call it, and `make check`: it replays recorded steps and compares
+    each state and each code with those of this program. With --float32 it runs the scenario in
+    single precision too, and reports what that costs against the simulated truth. With --board it
+    builds a program that stands for a part of the bench: the satellite's attitude determination, or
+    the navigation computer of INS/GNSS. A number named by --adjust is a field of the state in the
+    place of a constant; a name that the filter does not have lists those it has.
     """
     write(scenario, to, fast=not small, as_json=as_json, **options)
 
 
 @app.command(
-    short_help="Compare two results: what was asked, what was found.",
+    short_help="Compare two results: their requests and figures.",
     epilog=examples("robins compare results/before results/after"),
 )
 @click.argument("first", type=LOGS)

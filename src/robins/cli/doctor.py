@@ -1,4 +1,4 @@
-"""The command `doctor`: what a log holds and what is wrong with it, in colours."""
+"""The command `doctor`: contents of a log and findings on it, in colours."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _KINDS = {
 
 
 def warn(findings: Sequence[Any]) -> None:
-    """Tell what the doctor says of a log at once; errors end the command and are told there."""
+    """Report the findings on a log at once; errors end the command and are reported there."""
     for finding in findings:
         if finding.severity != "error":
             click.echo(f"robins: {finding}", err=True)
@@ -34,7 +34,7 @@ def judge(
 ) -> Status:
     """Print what there is and the findings; bad input if a run on this log would be wrong.
 
-    What the log tells of its unit is written to a file where one is named.
+    What the log shows of its unit is written to a file where one is named.
     """
     with only_json(as_json):
         from robins.workbench import examine

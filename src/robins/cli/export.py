@@ -12,7 +12,7 @@ from robins.cli.tell import say
 
 
 def write(scenario: str, to: Path, *, as_json: bool, **options: Any) -> None:
-    """Write the folder and say what is in it."""
+    """Write the folder and list its contents."""
     cache.enable()
     workbench = importlib.import_module("robins.workbench")
     made = workbench.export_filter(scenario, to, **options)

@@ -1,4 +1,4 @@
-"""What every command needs: exit status, errors of the user, which stream gets what."""
+"""Common parts of all commands: exit status, errors of the user, choice of streams."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ class Status(enum.IntEnum):
     DONE = 0
     FAILED = 1
     BAD_INPUT = 2
-    INTERRUPTED = 3  # the same command, run again, goes on or starts anew
+    INTERRUPTED = 3  # the same command, run again, continues or starts again
 
 
 @contextlib.contextmanager
 def only_json(wanted: bool) -> Iterator[None]:
-    """While a command works, turn what anything prints to standard error if JSON is wanted."""
+    """Redirect all prints of a command to standard error if JSON is wanted."""
     with contextlib.ExitStack() as stack:
         if wanted:
             stack.enter_context(contextlib.redirect_stdout(sys.stderr))

@@ -33,14 +33,14 @@ def _interrupt(_number: int, frame: FrameType | None) -> None:
     global _asked
     _asked = True
     if _is_deaf(frame):
-        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)  # ask again a little later
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)  # try again a little later
         return
     raise KeyboardInterrupt
 
 
 @contextlib.contextmanager
 def heeded() -> Iterator[None]:
-    """While this lasts, SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt where it will be heard.
+    """Context in which SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt where it is received.
 
     SIGTERM and SIGHUP too, so that a command that is killed, or whose terminal is closed, unwinds
     and leaves no half folder. `nohup` has SIGHUP ignored, and so it stays.
@@ -62,11 +62,11 @@ def heeded() -> Iterator[None]:
 
 
 def asked() -> bool:
-    """Whether an interrupt was asked for."""
+    """True if an interrupt was requested."""
     return _asked
 
 
 def obey() -> None:
-    """Raise KeyboardInterrupt if one was asked for and swallowed by somebody on its way."""
+    """Raise KeyboardInterrupt if one was requested and swallowed by other code on its way."""
     if _asked:
         raise KeyboardInterrupt

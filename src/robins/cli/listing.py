@@ -20,7 +20,7 @@ def listing(name: str | None, as_json: bool) -> None:
     if name is None and not as_json:
         first = next(scenario for _, titles in sections.values() for scenario in titles)
         click.echo("\n\n".join(_section(name, *told) for name, told in sections.items()))
-        click.echo("\nNext:   robins list SYSTEM   tells its filters and claims")
+        click.echo("\nNext:   robins list SYSTEM   lists its filters and claims")
         click.echo(f"        robins run {first}")
         return
     cache.enable()

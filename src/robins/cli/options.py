@@ -62,7 +62,7 @@ TRUST = option(
 
 
 def answers(command: Callable) -> Callable:
-    """Options of every command that tells something."""
+    """Options of every command that prints a result."""
     return JSON(DEBUG(command))
 
 
@@ -114,13 +114,13 @@ def choices(command: Callable) -> Callable:
 
 
 def folder_name(scenario: str) -> str:
-    """Of the result folder of a scenario."""
+    """Name of the result folder of a scenario."""
     if ".py:" in scenario:
         return Path(scenario).name.replace(".py:", "-")
     return Path(scenario).stem if scenario.endswith(".toml") else scenario.replace("/", "-")
 
 
 def log_name(log: Sequence[Path]) -> str:
-    """Of the result folder of a log, after its first file that is no configuration."""
+    """Name of the result folder of a log, after its first file that is no configuration."""
     first = next((path for path in log if path.suffix != ".toml"), log[0])
     return first.name.split(".")[0]

@@ -18,7 +18,7 @@ class Progress:
     """Call it with the share done (0 to 1) and what is being done.
 
     Used as a context manager, it shows a line at once, before anything heavy is imported, a bar
-    once `WAIT_S` have passed, even if nobody called it yet (a compilation takes its time), and
+    once `WAIT_S` have passed, even if it was not called yet (a compilation takes its time), and
     takes both away at the end.
     """
 
@@ -32,10 +32,10 @@ class Progress:
         self._timer.daemon = True
 
     def __call__(self, share: float, what: str) -> None:
-        """Note how far it is.
+        """Note the progress.
 
         Raises:
-            KeyboardInterrupt: somebody asked for it, and it got lost.
+            KeyboardInterrupt: it was requested, and got lost.
         """
         interrupts.obey()
         with self._lock:
@@ -55,7 +55,7 @@ class Progress:
         from rich.progress import Progress as Bar
 
         columns = (
-            SpinnerColumn("line"),  # a compilation tells nothing of its share, but it goes on
+            SpinnerColumn("line"),  # a compilation reports no share, but it goes on
             TextColumn("{task.description}", markup=False),
             BarColumn(),
             TaskProgressColumn(),

@@ -75,8 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line; the arguments of the process by default.
 
     Returns:
-        The exit status, see `Status`. Errors are told in a few lines on standard error, with the
-        traceback only if ``--debug`` is among the arguments.
+        The exit status, see `Status`. Errors are reported in a few lines on standard error, with
+        the traceback only if ``--debug`` is among the arguments.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     with contextlib.ExitStack() as stack:
@@ -134,11 +134,11 @@ def _leave(status: Status) -> NoReturn:
 
 
 def _told(error: Exception) -> Status:
-    """Say what went wrong in a few lines, and which status that is."""
+    """Report an error in a few lines, and return its exit status."""
     if isinstance(error, click.UsageError):
         _tell(error.format_message())
         command = error.ctx.command_path if error.ctx else "robins"
-        _tell(f"`{command} --help` tells what can be given.")
+        _tell(f"`{command} --help` lists what can be given.")
         return Status.BAD_INPUT
     if isinstance(error, click.ClickException):
         _tell(error.format_message())

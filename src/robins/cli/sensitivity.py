@@ -37,7 +37,7 @@ from robins.cli.tell import carry_out
 @TRUST
 @publishes
 def sensitivity(scenario: str, out: Path | None, **options: Any) -> None:
-    """Say which share of the variance of a filter's error comes from which parameter of SCENARIO.
+    """Attribute the variance of a filter's error to the parameters of SCENARIO.
 
     An error budget: the simulated world varies between the ends, independently in each parameter,
     and the filter goes on believing the scenario as written. For each block of the state there are

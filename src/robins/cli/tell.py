@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def carry_out(name: str, *given: Any, out: Path, as_json: bool, **settings: Any) -> Outcome:
-    """Have the workbench compute, print what it found, write that as a result.
+    """Compute by the workbench, print the outcome, and write it as a result.
 
     Args:
         name: of the function of `robins.workbench`.
@@ -56,7 +56,7 @@ def deliver(
         if not as_json:
             _answer(outcome)
             click.echo("\nWriting the report ...")
-    except OSError:  # nobody reads: what was computed is kept all the same
+    except OSError:  # no reader: what was computed is kept all the same
         write()
         raise
     with only_json(as_json), writing:

@@ -23,7 +23,7 @@ from robins.cli.tell import carry_out
 
 
 @click.command(
-    short_help="Find what a filter should be told, and judge it on data held out.",
+    short_help="Find parameters of a filter, and judge them on data held out.",
     epilog=examples(
         "robins tune ins-gnss/drive --filter ekf --vary believed.r_factor=4",
         "robins tune imu.csv gnss.pos unit.toml --filter ekf --vary imu.gyro_noise "
@@ -57,7 +57,7 @@ def tune(what: tuple[str, ...], out: Path | None, **options: Any) -> None:
     measurements best. Every third segment of a log, and as many runs as were used, are held out:
     the values found are kept only if they are better there, beyond chance.
 
-    It refuses where the data do not say what a parameter should be. The folder has tuned.toml.
+    It refuses where the data do not determine a parameter. The folder has tuned.toml.
     """
     simulated = len(what) == 1 and (what[0].endswith(".toml") or not Path(what[0]).is_file())
     name = folder_name(what[0]) if simulated else log_name([Path(one) for one in what])

@@ -64,7 +64,7 @@ class MagneticModel:
 
 
 class Elements(NamedTuple):
-    """A field as compasses and dip needles tell it."""
+    """A field in the elements of compasses and dip needles."""
 
     declination_rad: Array  # of its horizontal part, clockwise from true north
     inclination_rad: Array  # below the horizon

@@ -72,7 +72,7 @@ def positive(what: str, given: object, of_infinity: str) -> None:
 
     Raises:
         TypeError: it is not one real number.
-        ValueError: it is not positive; the message says what infinity would mean.
+        ValueError: it is not positive; the message states what infinity would mean.
     """
     number = np.asarray(given)
     if number.ndim or number.dtype.kind not in "iuf":

@@ -43,7 +43,7 @@ class FilterState(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """What a predict step leaves for a smoother and a log."""
+    """Record of a predict step for a smoother and a log."""
 
     transition: Transition | None  # None where there is not one, as in a mixture
     belief: Belief  # predicted
@@ -86,11 +86,11 @@ class Filter:
     def members(self, state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
         """Beliefs of the local filters of a joined filter, and how they go on from others.
 
-        The only question that a filter asks of the parts of another one.
+        The only access of a filter to the parts of another one.
 
         Returns:
             The beliefs, none by default, and ``follow(beliefs, belief) -> state``: the local
-            filters begin anew from beliefs, and the whole from their fusion.
+            filters start again from beliefs, and the whole from their fusion.
         """
         return (), lambda beliefs, belief: state
 
@@ -108,7 +108,7 @@ class Filter:
 
     @property
     def reports(self) -> bool:
-        """True if there can be something to report; a stream asks once."""
+        """True if there can be something to report; a stream checks once."""
         return type(self).report is not Filter.report
 
     def report(
@@ -152,7 +152,7 @@ class Filter:
 
 
 class Composite(Filter):
-    """A filter of filters; the reports of rules are asked of each by itself.
+    """A filter of filters; the reports of rules are taken from each by itself.
 
     Attributes:
         filters: the filters it is made of.
@@ -190,7 +190,7 @@ class Composite(Filter):
 
 @value
 class Around(Composite):
-    """A filter around another one, `inner`, whose state it has where it says nothing else."""
+    """A filter around another one, `inner`, whose state it has unless it defines its own."""
 
     inner: Filter
 
@@ -302,7 +302,7 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
 
 
 def _failure(inputs: Any, factor: Array) -> Array:
-    """Why a step failed: from finite inputs a factor that is not finite was not a covariance's."""
+    """Code of a failed step: a non-finite factor from finite inputs was not a covariance's."""
     indefinite = finite(inputs) & ~finite(factor)
     return jnp.where(indefinite, int(Code.INDEFINITE), int(Code.NOT_FINITE))
 
@@ -448,7 +448,7 @@ def kalman(
 
     A step that would leave a state, covariance or memory that is not finite is not taken, nor is
     one whose innovation is too large to be squared: the belief and the rules' memories stay, the
-    step's code says so, and its log-likelihood is -inf, so that no search is drawn there.
+    step's code reports it, and its log-likelihood is -inf, so that no search is drawn there.
 
     Args:
         linearise: `taylor` (default), `unscented` or `cubature`.

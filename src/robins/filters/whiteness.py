@@ -106,7 +106,7 @@ def _standard(e: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 
 
 def _repeats(readings: State, there: np.ndarray, e: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Most equal readings in a row of each component; zero where repetition is legitimate.
+    """Longest run of equal readings of each component; zero where repetition is legitimate.
 
     A constant reading is a pseudo-measurement such as zero velocity, and a sensor at rest repeats
     itself if its resolution is above a tenth of the innovation's sigma.

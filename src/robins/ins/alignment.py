@@ -1,10 +1,10 @@
 """Coarse alignment: attitude of a vehicle at rest, with the uncertainty that the sensors leave.
 
-At rest the accelerometers see the reaction to gravity, which tells roll and pitch (`level`), and
-the gyros see the rotation of the Earth, which tells the heading if they are good enough
+At rest the accelerometers measure the reaction to gravity, which gives roll and pitch (`level`),
+and the gyros measure the rotation of the Earth, which gives the heading if they are good enough
 (`gyrocompass`; Titterton & Weston 2004, chapter 10; Groves 2013, section 5.6). Where they are not,
 a vehicle that drives straight ahead has its heading in its velocity (`heading_from_velocity`).
-`align` chooses by itself from a record at rest; `is_static` says whether it is at rest.
+`align` chooses by itself from a record at rest; `is_static` tests a record for rest.
 
 Attitudes are q_nb, north-east-down from forward-right-down. Uncertainty is the covariance of phi in
 ``C_true = exp(phi x) C_estimate``, phi along north, east, down, as in `robins.rotation.Rotation`.
@@ -46,7 +46,7 @@ class Alignment(NamedTuple):
 
 
 class StaticCheck(NamedTuple):
-    """Whether a record was taken at rest, and what it says if so."""
+    """Result of a test for rest, with the mean values of the record."""
 
     static: bool
     reasons: tuple[str, ...]  # why not, one sentence each
@@ -70,7 +70,7 @@ def is_static(
 
     The thresholds suit MEMS at some hundred Hz on a vehicle with its engine running; they must lie
     above the noise of a sample and the biases of the sensor. A steady climb, drive or turn slower
-    than ``largest_omega`` cannot be told from rest by inertial sensors.
+    than ``largest_omega`` cannot be distinguished from rest by inertial sensors.
 
     Args:
         omega_ib_b: (n, 3) gyro rates [rad/s].
@@ -265,7 +265,7 @@ def heading_from_velocity(
 
     It is the direction of motion over ground, taken for that of the nose: the vehicle must move
     forwards, not backwards, without turning (so the lever arm of the antenna does not matter), and
-    its slip, or drift in wind or current, is what ``sideslip_sigma_rad`` says.
+    its slip, or drift in wind or current, has the sigma ``sideslip_sigma_rad``.
 
     Args:
         v_n: (3,) or (m, 3) velocities [m/s] of a straight piece, NaN where missing.
@@ -402,7 +402,7 @@ def _refuse_bad_sigmas(**sigmas: ArrayLike | float) -> None:
 
 
 def _tilt_of_force(f: np.ndarray, C_nb: np.ndarray) -> np.ndarray:
-    """What an error of each component of f_b makes of phi (..., 3, 3); phi_D is left at zero."""
+    """Sensitivity of phi to an error of each component of f_b (..., 3, 3); zero for phi_D."""
     g = np.linalg.norm(f, axis=-1)[..., None]
     return np.stack([C_nb[..., 1, :] / g, -C_nb[..., 0, :] / g, np.zeros_like(f)], axis=-2)
 

@@ -1,7 +1,7 @@
 """Overlapping Allan deviation of inertial sensor data, with bounds, and the noises in it.
 
 `deviation` estimates, `fit` reads the model off the curve (IEEE Std 952-1997, Annex C): angle or
-velocity random walk N, bias instability B, rate random walk K and, where asked for, quantisation Q
+velocity random walk N, bias instability B, rate random walk K and, if requested, quantisation Q
 and rate ramp R. Everything is NumPy and per axis; SI units go through, so for gyros in rad/s
 the coefficients come in rad, rad/sqrt(s), rad/s, rad/s/sqrt(s), rad/s^2.
 
@@ -11,7 +11,7 @@ noise, for times beyond it,
 
     N^2 / tau - C / tau^2,    C = 3 integral_0^inf t r(t) dt
 
-of the rate's autocovariance r. Where the terms asked for do not explain the curve, `fit` takes C
+of the rate's autocovariance r. Where the requested terms do not explain the curve, `fit` takes C
 with them, leaves out so many of the shortest times as it takes to explain the rest, and then goes
 on to twice that time.
 
@@ -88,10 +88,10 @@ class Coefficients(NamedTuple):
 
 
 class AllanFit(NamedTuple):
-    """Noise terms read off an Allan curve. Terms not asked for are zero with zero interval."""
+    """Noise terms read off an Allan curve. Terms not requested are zero with zero interval."""
 
     value: Coefficients
-    lower: Coefficients  # interval of the confidence asked for; 0 where a term is not resolved
+    lower: Coefficients  # interval of the given confidence; 0 where a term is not resolved
     upper: Coefficients
     chi2: np.ndarray  # (A,) weighted squared residual; far above dof: the terms do not explain it
     dof: np.ndarray  # (A,) degrees of freedom of it
@@ -176,8 +176,7 @@ def fit(allan: Allan, terms: str = "NBK", confidence: float = 0.95) -> AllanFit:
     Where the terms do not explain the whole curve (a residual of a probability below 1e-3), short
     times are taken to be coloured (module docstring): the term -C / tau^2 joins in, and the
     shortest times are left out one by one until the rest is explained, and two more; ``from_s``
-    says from where.
-    If nothing explains it, the fit is that of the whole curve.
+    is the first time left. If nothing explains it, the fit is that of the whole curve.
 
     Args:
         allan: from `deviation`.
@@ -185,7 +184,7 @@ def fit(allan: Allan, terms: str = "NBK", confidence: float = 0.95) -> AllanFit:
         confidence: of the intervals of the coefficients.
 
     Raises:
-        ValueError: unknown or repeated terms; a curve too short to tell the terms apart; a curve
+        ValueError: unknown or repeated terms; a curve too short to separate the terms; a curve
             that fits no noise at all.
         ArithmeticError: a curve so unlike the terms that the fit does not settle.
     """
@@ -234,9 +233,9 @@ class Interval(NamedTuple):
 
 
 def in_field_units(fitted: AllanFit, sensor: Literal["gyro", "accel"]) -> dict[str, Interval]:
-    """The terms of a fit as data sheets tell them.
+    """The terms of a fit as data sheets state them.
 
-    White noise is told twice, as random walk and as density: the density here is that of the
+    White noise is stated twice, as random walk and as density: the density here is that of the
     two-sided spectrum (IEEE Std 952), so 1 deg/sqrt(h) is 1/60 deg/s/sqrt(Hz); a data sheet that
     means the one-sided spectrum prints sqrt(2) more.
     """
@@ -314,7 +313,7 @@ def _explained(
                 further = tried(min(first + _FURTHER, parts[-1]))
                 if further is not None:
                     return further
-    # without a fit, for what it has to say
+    # without a fit, for its diagnostics
     return whole or (*_fit_axis(variance, expected, index), points - count, 0)
 
 
@@ -328,7 +327,7 @@ def _fit_axis(
         before = expected.mean @ p
         p, sigma, chi2 = _weighted_fit(variance, expected, index, p, coloured)
         _refuse_no_noise(p)
-        # Far below what the data can tell, and reached in ten to thirty passes.
+        # Far below the resolution of the data, and reached in ten to thirty passes.
         if np.all(np.abs(expected.mean @ p - before) <= 1e-6 * before):
             return p, sigma, chi2
     raise ArithmeticError(
@@ -352,7 +351,7 @@ def _weighted_fit(
     design = whitened[:, :-1] / size
     solution, residual = nnls(design, whitened[:, -1])
     squares, sigma = np.zeros(5), np.zeros(5)
-    # Q and C are one term with two signs: with both asked for, the one that is zero is left out
+    # Q and C are one term with two signs: with both requested, the one that is zero is left out
     free = np.ones(len(size), bool)
     if coloured and 0 in index:
         free[0 if solution[-1] > 0.0 else -1] = False
@@ -452,7 +451,7 @@ def _refuse_bad_values(x: np.ndarray) -> None:
 
 
 def _refuse_short_curve(allan: Allan, terms: str) -> None:
-    # Terms are told apart by the slope of the curve: a decade for each but the first.
+    # Terms are separated by the slope of the curve: a decade for each but the first.
     needed = 10 ** (len(terms) - 1)
     have = allan.clusters[-1] / allan.clusters[0]
     if have < needed or len(allan.clusters) < len(terms) + 2:

@@ -1,4 +1,4 @@
-"""What the noises of an inertial sensor do to its Allan variance: mean and covariance.
+"""Allan variance of the noises of an inertial sensor: mean and covariance.
 
 The overlapping estimate at cluster size m is the mean of z_i^2 / (2 tau^2) over the second
 differences ``z_i = x_i - 2 x_(i+m) + x_(i+2m)`` of the integrated output x. For each noise,
@@ -11,7 +11,7 @@ differences ``z_i = x_i - 2 x_(i+m) + x_(i+2m)`` of the integrated output x. For
     R rate ramp        (a drift)           R^2 tau^2 / 2        -
 
 where the variances and letters are those of IEEE Std 952 (annex on Allan variance) and s is a
-generalised autocovariance: what a difference of second or higher order of x makes of it is a true
+generalised autocovariance: a difference of second or higher order of x turns it into a true
 covariance. So the covariance of two estimates, at sizes m and m', is the sum over lags of
 
     2 R(l)^2,   R(l) = sum_pq w_p w_q s(l + q m' - p m),   w = (1, -2, 1),
@@ -115,6 +115,6 @@ def _cross_covariance(lags: np.ndarray, m: int, m_large: int) -> np.ndarray:
             s = np.stack([t == 0.0, -t / 2, t * t * log_t / (2 * np.pi), t**3 / 12])
             total += w_p * w_q * s
     # Without overlap of the two differences white and integrated white noise are independent; the
-    # rounding of |t|^3 would say otherwise.
+    # rounding of |t|^3 would couple them.
     total[[1, 3]] *= (lags > -2 * m_large) & (lags < 2 * m)
     return total

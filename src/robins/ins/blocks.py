@@ -138,7 +138,7 @@ def cut(
 
 
 def reach_of_rate(usual_s: float) -> float:
-    """How far about a time `rate_about` looks [s], of a sensor with this sampling interval."""
+    """Reach of `rate_about` around a time [s], for a sensor with this sampling interval."""
     return max(0.01, 1.5 * usual_s)
 
 
@@ -169,7 +169,7 @@ def rate_about(
 def gained_in_window(
     increments: Increments, time_s: np.ndarray, at_s: np.ndarray, window_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How much velocity was gained from the average instant of a window to its end.
+    """Velocity gained from the average instant of a window to its end.
 
     The mean over the window (t - T, t] of v(t) - v(s) is the integral of the specific force with a
     weight that grows from 0 at t - T to 1 at t, seen in the body axes at t.

@@ -39,7 +39,7 @@ def _turn(phi: Array, v: Array, once: Array, twice: Array) -> Array:
 class ExtendedPose:
     """Attitude, velocity and position; tangent order phi [rad], nu [m/s], rho [m].
 
-    ``error`` says on which side the error stands:
+    ``error`` is the side of the error:
 
     - "right" invariant: ``true = exp(xi) estimate``, xi seen in the frame the attitude maps *to*.
       Its attitude part is the package's own error, ``C_true = exp(phi x) C``.
@@ -56,7 +56,7 @@ class ExtendedPose:
 
     @classmethod
     def identity(cls, error: Side = "right") -> ExtendedPose:
-        """At the origin, at rest, unturned."""
+        """Pose at the origin, at rest, unturned."""
         return cls(Rotation.identity(), jnp.zeros(3), jnp.zeros(3), error)
 
     @classmethod

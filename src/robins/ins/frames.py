@@ -68,8 +68,8 @@ def to_ned_frd(table: Table) -> Table:
 def to_enu_rfu(table: Table) -> Table:
     """The same table in ENU/RFU.
 
-    Exact, and there and back gives the same bits. Only attitudes that mix the conventions (NED with
-    RFU, say) round: turning one side of a quaternion takes a square root of two.
+    Exact, and there and back gives the same bits. Only attitudes that mix the conventions (such as
+    NED with RFU) round: turning one side of a quaternion takes a square root of two.
     """
     return _to(table, "ENU", "RFU")
 

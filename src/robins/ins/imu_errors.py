@@ -9,8 +9,8 @@ with scale factor errors S, misalignments M, and for gyros a sensitivity G to th
 The bias is the sum of a constant that changes from one switching on to the next, a first-order
 Gauss-Markov process, a random walk and a ramp; the noise is white. This module describes, from SI
 numbers or data sheets (by grade: `grade`; from an Allan fit:
-`robins.ins.allan.triad_errors`), and says in closed form what to expect; `robins.sim.imu_sensor`
-draws.
+`robins.ins.allan.triad_errors`), and gives the expected errors in closed form;
+`robins.sim.imu_sensor` draws.
 
 Units are SI, per axis: [y] stands for rad/s of a gyro and m/s^2 of an accelerometer.
 
@@ -76,7 +76,7 @@ FLICKER_FLAT = float(np.sqrt(2.0 * np.log(2.0) / np.pi))
 class TriadErrors:
     """Errors of three gyros or three accelerometers; None: the sensor has no such error.
 
-    Sigmas are one sigma of what is drawn anew in each run. A number stands for all three axes, of a
+    Sigmas are one sigma of what is drawn in each run. A number stands for all three axes, of a
     matrix for all elements that can differ from zero (of a given ``g_sensitivity``: the diagonal).
     A model is a pytree: which errors there are is its structure, how large they are its leaves, so
     models of one structure can be stacked, mapped over and traced. Values that are known are

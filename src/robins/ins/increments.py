@@ -2,7 +2,7 @@
 
 An `Increments` row describes the motion of the body relative to inertial space between two times,
 in body axes at the earlier one: rotation vector, velocity increment and displacement, with coning,
-sculling and scrolling in them. What the samples do not tell is how rate and specific force ran
+sculling and scrolling in them. The samples do not show how rate and specific force ran
 inside an interval. One rule for each kind of sensor fills that in:
 
 *increment*: both ran linearly, with the slope that the previous sample shows. For equal intervals
@@ -20,11 +20,11 @@ The integrals are then taken by the Gauss rule of two points, with the rotation 
 closed form: exact in every product of the linear model up to the third order, of fourth order
 beyond (Iserles & Norsett 1999 for the rotation vector). All is NumPy over whole tables.
 
-`own_intervals` tells where samples are missing, and over which time the sample after a gap was
+`own_intervals` finds missing samples, and the time over which the sample after a gap was
 taken. An increment is the integral since the sample before it. Where that one was lost, most
 sensors have put out the integral of their own interval only, and the motion of the others is lost
-with them; some go on summing up and have the motion of the whole gap. Stamps cannot tell the two
-apart, but rate and specific force can: the one that fits those of the sample before is true.
+with them; some go on summing up and have the motion of the whole gap. Stamps cannot separate the
+two cases, but rate and specific force can: the one that fits those of the sample before is true.
 """
 
 from __future__ import annotations
@@ -227,7 +227,7 @@ def after_gap(dt: np.ndarray, usual_s: float | None = None) -> np.ndarray:
 def own_intervals(
     dt: np.ndarray, theta: np.ndarray, dv: np.ndarray, usual_s: float | None = None
 ) -> np.ndarray:
-    """How long each increment of a table lasted [s]: the interval before it, or less after a gap.
+    """Duration of each increment of a table [s]: the interval before it, or less after a gap.
 
     Args:
         dt: (N - 1,) s, between the samples.

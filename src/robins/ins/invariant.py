@@ -49,7 +49,7 @@ class InvariantState(NamedTuple):
 
     @classmethod
     def start(cls, pose: ExtendedPose) -> InvariantState:
-        """At a pose, with sensors believed perfect."""
+        """State at a pose, with sensors believed perfect."""
         return cls(pose, jnp.zeros(3), jnp.zeros(3))
 
 
@@ -153,7 +153,7 @@ def _read_velocity(x: InvariantState, aux: Data) -> Array:
 
 
 def landmark_sensor(sigma: Sigma, landmark: Vector, name: str = "landmark") -> Sensor:
-    """Where a known point of the navigation frame is seen from the body [m], body axes.
+    """Sensor of the position of a known point, relative to the body [m], body axes.
 
     A right-invariant observation: it goes with a pose of right error (Hartley et al. 2020).
     """

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 
 def one_kernel(f: Callable[..., Array]) -> Callable[..., Array]:
-    """Ask for one CPU kernel for `f`, a function of float arrays.
+    """Request one CPU kernel for `f`, a function of float arrays.
 
     `f` must consist of element-wise operations, reductions and slices of small arrays: matrix
     products, linear algebra, scatters and callbacks need what only a kernel of their own is given.

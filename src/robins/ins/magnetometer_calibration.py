@@ -5,20 +5,20 @@ sphere and what it does read, ``z = A b + h + noise``, on an ellipsoid. `calibra
 
     b = W (z - h),   W symmetric, |b| = F
 
-The size alone cannot tell a rotation of the sensor's axes, so that of A stays: W is the symmetric
+The size alone does not show a rotation of the sensor's axes, so that of A stays: W is the symmetric
 root ``(A A')^(-1/2)`` (Renaudin, Afzal & Lachapelle 2010, "Complete triaxis magnetometer
 calibration in the magnetic domain"). Unless F is given W has determinant one and F is estimated.
 
 The fit starts from the ellipsoid of least squares in its coefficients, which cannot become another
 quadric (Li & Griffiths 2004, "Least squares ellipsoid specific fitting"), and then minimises
 Huber's loss of the distance of each sample to the ellipsoid, to first order
-``(|W (z - h)| - F) / |W u|`` with u the direction of b, less what curvature makes of noise: with
+``(|W (z - h)| - F) / |W u|`` with u the direction of b, less the bias of noise by curvature: with
 normal noise, equal on the three axes, that is maximum likelihood, and single disturbed samples
 hardly count. Fields that are disturbed in the same way for long do: turn the sensor well away from
 iron.
 
-Where the directions do not tell an ellipsoid, a sphere is fitted, the hard iron alone, which needs
-fewer of them; a turn about one axis tells neither and is refused.
+Where the directions do not determine an ellipsoid, a sphere is fitted, the hard iron alone, which
+needs fewer of them; a turn about one axis determines neither and is refused.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from scipy.spatial import KDTree
 from robins.errors import RobinsError
 
 FEWEST = 50  # samples
-MOST = 20_000  # that are looked at, spread evenly over the log; neighbours tell hardly more
+MOST = 20_000  # that are used, spread evenly over the log; neighbours add hardly any information
 _ENDS = (0.2, 99.8)  # per cent between which the samples' extent is taken, against single spikes
 _SIDE, _SHARE = 0.15, 20  # cubes of that part of the extent count for so many samples at most
 _HUBER = 1.345  # of the noise; the estimates of normal noise keep 95 % of their efficiency
@@ -42,7 +42,7 @@ _OFF = 0.1  # of the field, RMS: a surface that samples are further from than th
 _SPHERE = np.vstack([np.eye(4, 9)[:3], [[0, 0, 0, 1, 1, 1, 0, 0, 0]]]).T  # (9, 4) free directions
 _FLAT = 0.08  # of the extent along the widest axis; less along the narrowest is a plane
 _REACH = np.deg2rad(30.0)  # of a sample, for the share of directions that are covered
-_PASSES, _SETTLED = 200, 1e-8  # of the extent; far below what any log can tell
+_PASSES, _SETTLED = 200, 1e-8  # of the extent; far below the resolution of any log
 _NO_ELLIPSOID = (
     "the samples lie on no ellipsoid: the field was not the same while the sensor was turned, or "
     "it was turned too little; turn it away from iron, so that each of its axes points up and down "
@@ -56,10 +56,10 @@ class CalibrationError(RobinsError, ValueError):
 
 
 class Calibration(NamedTuple):
-    """What `calibrate` found. Sigmas are of the noise and allow for its correlation in time.
+    """Result of `calibrate`. Sigmas are of the noise and allow for its correlation in time.
 
     Fields that differ from place to place, as they do indoors, come on top: there two logs differ
-    by more than the sigmas say.
+    by more than the sigmas.
     """
 
     offset_t: np.ndarray  # (3,) h, hard iron
@@ -73,7 +73,7 @@ class Calibration(NamedTuple):
     before_t: float  # RMS of the size of the samples about its mean, each direction alike
     after_t: float  # RMS of the size of the calibrated samples about F
     outliers: float  # share of samples further than 5 sigma from the ellipsoid
-    independent: float  # samples that would tell as much if their noise were independent
+    independent: float  # effective number of samples, if their noise were independent
     covered: float  # share of all directions within 30 deg of one of a sample
     gap: np.ndarray  # (3,) direction of the field, sensor axes, that is furthest from any sample
     gap_rad: float  # how far
@@ -94,11 +94,11 @@ def calibrate(
         field_t: (N, 3) samples [T] in sensor axes, in order of time; rows with NaN are left out.
         strength_t: size of the field at the place [T], e.g. of `robins.earth.magnetic`; it sets the
             scale of the result. None: the scale is kept on average, ``det W = 1``.
-        soft_iron: whether to look for it; None: if the directions tell it.
+        soft_iron: whether to fit it; None: if the directions determine it.
 
     Raises:
         CalibrationError: too few samples; they lie in a plane or a part of the ellipsoid so small
-            that it does not tell what is looked for; neither an ellipsoid nor, where soft iron is
+            that it does not determine the result; neither an ellipsoid nor, where soft iron is
             None, a sphere fits; a strength that is not positive.
     """
     z = np.asarray(field_t, float)

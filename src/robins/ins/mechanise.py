@@ -5,8 +5,8 @@ One step takes the increments of one interval and moves attitude, velocity and p
 taken at the middle of the interval, which a half step with the values at its start finds, so the
 error of a step is of third order in its length and that of a path of second.
 
-The frame is not defined at the poles; `refuse_polar` says so before a run starts. ENU/RFU users
-convert their tables, see `robins.ins.frames`.
+The frame is not defined at the poles; `refuse_polar` refuses them before a run starts. ENU/RFU
+users convert their tables, see `robins.ins.frames`.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def step(nav: Nav, inc: Increments) -> Nav:
 
 
 def step_each(nav: Nav, inc: Increments) -> Nav:
-    """As `step`, for N states and an increment each, in NumPy: there is nothing to compile."""
+    """Step of N states by an increment each, as `step`, in NumPy: there is nothing to compile."""
     p = nav.position
     columns = [*nav.q_nb.wxyz.T, *nav.v_n.T, p.lat, p.lon, p.alt]
     return unpacked(np.stack(_advanced(columns, rows(inc, np).T, np), -1))
@@ -63,7 +63,7 @@ def step_each(nav: Nav, inc: Increments) -> Nav:
 def mechanise(nav: Nav, increments: Increments) -> Nav:
     """Navigate from `nav` over N increments; the N states at the ends of the intervals.
 
-    Compiled for each N anew; `mechanise_chunked` is not.
+    Compiled again for each N; `mechanise_chunked` is not.
     """
     return _run(nav, increments)[1]
 
@@ -81,7 +81,7 @@ def _run(nav: Nav, increments: Increments) -> tuple[Nav, Nav]:
 
 
 def mechanise_chunked(nav: Nav, increments: Increments, chunk: int = 16384) -> Nav:
-    """As `mechanise`, on the host: NumPy arrays in and out, `chunk` increments at a time.
+    """Navigate as `mechanise`, on the host: NumPy arrays in and out, `chunk` increments at a time.
 
     The device holds one chunk whatever the length of the run, and one compilation serves all
     lengths, the last chunk being padded.
@@ -160,7 +160,7 @@ def unpacked(x: Float[Real, "*b 10"]) -> Nav:
 
 
 def rows(inc: Increments, library: ModuleType = jnp) -> Float[Real, "*b 11"]:
-    """What a step needs of an increment and nothing else depends on: dt, exp(theta/2), dv, dr."""
+    """Parts of a step that depend on the increment alone: dt, exp(theta/2), dv, dr."""
     inc = Increments(*(None if a is None else library.asarray(a, float) for a in inc))
     half = 0.5 * inc.theta
     sq = library.sum(half * half, -1, keepdims=True)

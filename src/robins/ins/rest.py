@@ -1,9 +1,9 @@
-"""Detects causally, sample by sample, when a unit stands still.
+"""Causal detection of rest, sample by sample.
 
 `standstill` looks at the scatter of the samples over a window, as suits a vehicle that stops;
 `still_samples` at their distance from running means, and for how long it has been small, as suits a
-unit in a hand. `robins.ins.alignment.is_static` judges a whole record instead. None of them tells a
-smooth motion at constant speed from rest.
+unit in a hand. `robins.ins.alignment.is_static` judges a whole record instead. None of them
+distinguishes a smooth motion at constant speed from rest.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from robins.ins.increments import Increments
 
 _MEMORY_S = 0.5  # time constant of the running means
-_FEWEST = 5  # samples in the memory, below which nothing can be told
+_FEWEST = 5  # samples in the memory, below which there is no decision
 
 
 def moving_statistics(
@@ -116,10 +116,11 @@ def unrest(
 def still_samples(
     increments: Increments, after_s: float, quiet_rate: float, quiet_force: float, most_rate: float
 ) -> np.ndarray:
-    """(N,) bool: whether the unit has lain still for a while, sample by sample.
+    """Detect, sample by sample, that the unit has lain still for a while: (N,) bool.
 
     Still means that rate and specific force stay near their running means, and the mean rate near
-    zero, without a break. Samples that are too rare for a mean over half a second tell nothing.
+    zero, without a break. Samples that are too rare for a mean over half a second never count as
+    still.
 
     Args:
         increments: dt (N,) s, theta (N, 3) rad, dv (N, 3) m/s.
@@ -146,7 +147,7 @@ def still_samples(
 
 
 def _running_mean(values: np.ndarray, step: float) -> np.ndarray:
-    """First-order low-pass, begun at the first sample."""
+    """First-order low-pass, started at the first sample."""
     # Imported here: it takes most of a second, and a simulation needs none of it.
     from scipy.signal import lfilter
 

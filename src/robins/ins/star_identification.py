@@ -4,21 +4,21 @@ The angle between two stars is the same in all axes, so it can be looked up. `in
 table of all pairs of a catalogue that fit into a field of view, sorted by angle, with the k-vector
 of Mortari & Neta (2000) to find a range of it without search. `identify` looks up the angles of a
 triangle of directions, keeps the triangles of stars that have all three and the same handedness,
-and asks the other directions: a fourth star where the triangle says it must be makes it a pyramid
-(Mortari, Samaan, Bruccoleri & Junkins 2004). Triangles are tried in their order, which puts a
-false star aside after one attempt where nested loops would try it again and again.
+and checks the other directions: a fourth star where the triangle predicts it makes it a pyramid
+(Mortari, Samaan, Bruccoleri & Junkins 2004). Triangles are tried in their order, which drops a
+false star after one attempt where nested loops would try it again and again.
 
 Nothing is guessed. With p the probability that some star lies by chance within the tolerance of a
 direction, m of n other directions agree by chance with probability P(Binomial(n, p) >= m); times
-the number of triangles asked so far that is `chance`, and the stars are named only where it is
+the number of triangles tried so far that is `chance`, and the stars are named only where it is
 below a limit. So four stars are enough where they are bright and few, and are not where they are
 faint and many. A direction that two stars could be, or a star that two directions could be, has no
 name. The work is NumPy's.
 
 A sensor that has found its attitude need not search the sky again: the last attitude, carried on by
-the gyros, says where each star of the catalogue must be. `track_stars` gives a direction the star
-within a tolerance of it, unless a second star or a second direction lays claim to the same place;
-nothing is guessed. It is pure JAX and of fixed size, for use inside a loop.
+the gyros, predicts the direction of each star of the catalogue. `track_stars` gives a direction the
+star within a tolerance of it, unless a second star or a second direction lays claim to the same
+place; nothing is guessed. It is pure JAX and of fixed size, for use inside a loop.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _CROWDED = 3.0
 
 _MOST_TRIANGLES = 400
 _LEAST_SIDES = (
-    0.03  # of a triangle, twice its area over its longest side [rad]: else it tells little
+    0.03  # of a triangle, twice its area over its longest side [rad]: else it is ill-defined
 )
 
 
@@ -73,7 +73,7 @@ class Identification(NamedTuple):
     q_ib: np.ndarray  # (4,) attitude they lead to, scalar first; NaN: none
     named: int  # directions with a name
     chance: float  # bound of the probability that they agree by chance; 1: nothing agreed
-    triangles: int  # asked before these stars, or in vain
+    triangles: int  # tried before these stars, or in vain
     refusal: str  # why there are no names; empty: there are
 
 
@@ -125,7 +125,7 @@ def index_pairs(stars: Stars, field_rad: float) -> PairIndex:
 def pairs_between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[Any, Any]:
     """Pairs of stars with an angle from low to high: places in the catalogue of both.
 
-    The k-vector says at once between which rows they are, to a few rows too many at either end.
+    The k-vector gives the range of their rows at once, with a few rows too many at either end.
     """
     start, step = index.line
     last = len(index.k_vector) - 1
@@ -298,7 +298,7 @@ def _alike(index: PairIndex, star, magnitude, tolerance):
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> Any:
-    """Between unit vectors, exact for small angles too."""
+    """Angle between unit vectors [rad], exact for small angles too."""
     return 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(a - b, axis=-1), 1.0))
 
 

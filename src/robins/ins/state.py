@@ -1,8 +1,8 @@
-"""The state of an aided INS: attitude, velocity, position and what its sensors do wrong.
+"""The state of an aided INS: attitude, velocity, position and sensor errors.
 
 A sensor reads ``raw = (1 + scale) true + bias``, component by component in body axes. `step` and
-`propagate` undo that and mechanise; `propagate_linear` also says how small errors go through a
-whole block of samples, so that a filter propagates its covariance once for the block.
+`propagate` undo that and mechanise; `propagate_linear` also gives the transition of small errors
+over a whole block of samples, so that a filter propagates its covariance once for the block.
 
 The state is a pytree on a manifold: `robins.manifold.retract` and `local` work on it, and its
 tangent vector is the error state of `robins.ins.errors`.

@@ -145,8 +145,8 @@ def triad(
     """TRIAD: an orthogonal frame on two directions, once in each axes; arguments as `quest`.
 
     The first direction is that of the largest weight, the earliest if there are several; the
-    second is that farthest from the line of the first. The others are not used, nor is what
-    the second says about more than the turn about the first. The loss is that of all.
+    second is that farthest from the line of the first. The others are not used, nor is the part
+    of the second beyond the turn about the first. The loss is that of all.
     """
     seen = _seen(vectors_b, vectors_i, weight, least_separation_rad)
     first = jnp.argmax(seen.weight, -1)
@@ -307,7 +307,7 @@ def _adjugate_trace(S: Float[Array, "*b 3 3"]) -> Float[Array, "*b"]:
 
 
 def _inverse(M: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
-    """Of a symmetric matrix, by its cofactors."""
+    """Inverse of a symmetric matrix, by its cofactors."""
     x, y, z = M[..., 0, :], M[..., 1, :], M[..., 2, :]
     cofactors = jnp.stack([jnp.cross(y, z), jnp.cross(z, x), jnp.cross(x, y)], -2)
     return cofactors / jnp.sum(x * jnp.cross(y, z), -1)[..., None, None]

@@ -85,11 +85,11 @@ def _with_diagonal(L: Array, diagonal: Array) -> Array:
 def independent_rows(
     rows: Float[Array, "m k"], size: Float[Array, "m"] | None = None
 ) -> Bool[Array, "m"]:
-    """Which rows are independent of those above them, to rounding; a row of zeros is not.
+    """Mask of the rows independent of those above them, to rounding; a row of zeros is not.
 
     A row that is not finite counts as independent, so that a fault is not taken for a repetition.
-    Gram-Schmidt, each row twice (Parlett 1998, sec. 6.9). QR without row exchange cannot tell: past
-    a lost pivot its later ones are arbitrary.
+    Gram-Schmidt, each row twice (Parlett 1998, sec. 6.9). QR without row exchange cannot decide:
+    past a lost pivot its later ones are arbitrary.
 
     Args:
         rows: (m, k), each with a scale of its own.
@@ -131,7 +131,7 @@ def independent_rows(
 
 
 def plainly_independent(rows: Float[Array, "m k"]) -> Bool[Array, ""]:
-    """Whether rows are lower triangular with a solid diagonal: independent at a glance."""
+    """True if rows are lower triangular with a solid diagonal, and so plainly independent."""
     m, k = rows.shape
     if k < m:
         return jnp.zeros((), bool)
@@ -142,7 +142,7 @@ def plainly_independent(rows: Float[Array, "m k"]) -> Bool[Array, ""]:
 
 
 def lost_in_rounding(rows: Float[Array, "m k"], size: Float[Array, "m"]) -> Bool[Array, "m k"]:
-    """Which entries are rounding against the size of what their row was summed from."""
+    """Mask of the entries that are rounding against the size of what their row was summed from."""
     return jnp.abs(rows) <= DEPENDENT * size[:, None]
 
 
@@ -268,7 +268,7 @@ def guard(
 
     A row that depends on those above it carries no information of its own. It is left out: its
     pivot is infinite, so that solving gives exactly zero there, which is the limit of a
-    pseudo-inverse; the second result says which rows are independent.
+    pseudo-inverse; the second result is the mask of independent rows.
 
     Args:
         factor: (n, k), its rows with scales of their own.

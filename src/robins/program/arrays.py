@@ -253,7 +253,7 @@ class Arrays:
 
     @property
     def refused(self) -> list[ProgramError | BuildError]:
-        """Reasons for which some of it stays with JAX, once it was called."""
+        """Reasons why parts stay with JAX, once it was called."""
         every = (step for _, _, step in self._steps if isinstance(step, Written))
         return [step.refused for step in every if step.refused is not None]
 

@@ -163,7 +163,7 @@ class _Writer:
         return read if kind in ("real", "whole") else f"{kind}_of_whole({read})"
 
     def _read(self, node: Node, bare: bool = False) -> str:
-        """A node as an argument; bare where a number needs no macro, beside an operator."""
+        """A node as an argument; bare where a number needs no macro, next to an operator."""
         graph = self.graph
         match graph.op[node]:
             case "constant":
@@ -320,7 +320,7 @@ def live_inputs(program: Program) -> list[Node]:
 
 
 def literal(value: object, kind: str, bare: bool = False, precision: Precision = DOUBLE) -> str:
-    """A number in C; bare beside an operator, else in the macro of its kind."""
+    """A number in C; bare next to an operator, else in the macro of its kind."""
     if kind == "real":
         text = precision.number(value)
         if not bare or text.lstrip("-") in ("INFINITY", "NAN"):  # which C has as floats

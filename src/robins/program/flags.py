@@ -10,11 +10,11 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-# Passes that look for what is computed twice: there is nothing left to find, and it takes half of
-# the time of the compiler. Compilers that do not know them say nothing.
+# Passes that look for repeated computations: there is nothing left to find, and they take half of
+# the time of the compiler. Compilers that do not know them ignore the flags.
 FASTER = ("-fno-gcse", "-fno-tree-pre")
-# Beside these for gcc, which others may refuse: no search for what is stored twice or side by side,
-# and a limit to how many writes it looks at behind a read. Half of the time that is left; the code
+# In addition for gcc, which others may refuse: no search for double or adjacent stores, and a limit
+# to how many writes it looks at behind a read. Half of the time that is left; the code
 # is as fast.
 FASTER_IN_GCC = (
     *("-fno-code-hoisting", "-fno-tree-slp-vectorize", "-fno-tree-dse", "-fno-dse"),

@@ -25,7 +25,7 @@ TOLERANCE = 1e-9  # of the size of a field; of a library of doubles
 
 MAKEFILE = """\
 # make check   compiles {name}.c and a test of it, and runs the test on recorded steps
-# make stack   says how much stack each function uses (gcc, clang)
+# make stack   lists the stack of each function (gcc, clang)
 CC ?= cc
 CFLAGS ?= -std=c99 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Wpedantic -Wdouble-promotion
 
@@ -135,12 +135,12 @@ class Recorded(NamedTuple):
             axis of calls.
         tolerances: of fields, in parts of their size, the largest number that each has; `TOLERANCE`
             of the others.
-        codes_off: how many calls may return another code, count or flag.
+        codes_off: number of calls that may return another code, count or flag.
         sizes: of fields, the least size by which a difference is judged, where the numbers of the
             field may be nothing but rounding.
         ends: of each entry point that is called once after the last step, its arguments after the
             state.
-        ruined: why the library is not to be used, however well it was compiled; its test says so
+        ruined: why the library is not to be used, however well it was compiled; its test prints it
             and fails.
     """
 

@@ -3,7 +3,7 @@
 That is the structure of equations (primitives, parameters, shapes and numbers, not names or where
 code stands); or, before anything is traced, the names of functions of robins and the numbers that
 they are given (`names.by_name`). A digest is of that and of robins' own code. Names in the cache
-also tell the versions of JAX, NumPy and SciPy, which trace and fold; those in a wheel serve all.
+also contain the versions of JAX, NumPy and SciPy, which trace and fold; those in a wheel serve all.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ def _code() -> str | None:
 
 def digest(parts: Iterable[Any]) -> str:
     """A digest of jaxprs, arrays, numbers and texts, nested in any way."""
-    draws = jax.config.values["jax_threefry_partitionable"]  # which a jaxpr does not say
+    draws = jax.config.values["jax_threefry_partitionable"]  # which a jaxpr does not contain
     texts: list[str | bytes] = [f"{_code()} {draws}"]
     _feed(texts, list(parts), {}, {})
     return _digest_of(texts)
@@ -233,7 +233,7 @@ def _feed(to: list[str | bytes], value: Any, names: dict[Any, int], jaxprs: dict
                 _feed(to, one, names, jaxprs)
         case _:
             # Functions among the parameters, of JAX's generators and rules of batching, make no
-            # node; they are told apart by name alone.
+            # node; they are distinguished by name alone.
             text = re.sub(r" at 0x[0-9a-f]+", "", repr(value))
             to.append(f"{type(value).__name__} {text};")
 

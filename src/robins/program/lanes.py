@@ -86,24 +86,24 @@ class Rounds:
         self._scan, self.lanes = engine(program)
 
     def hand_over(self, engine: RoundsEngine) -> None:
-        """Have another engine carry out the program; calls under way end as they began."""
+        """Change the engine of the program; calls under way end as they began."""
         self._scan, self.lanes = engine(self.program)
 
     def holds_for(self, begin: Sequence[Given]) -> bool:
-        """Whether runs begin with the zeros that the program takes for granted."""
+        """True if runs begin with the zeros that the program takes for granted."""
         zeros = self.program.zeros
         return all(bool(np.all(zero_in_all(begin[k])[mask])) for k, mask in zeros.items())
 
     def __call__(
         self, runs: int, given: Sequence[Given], named: Collection[int] = ()
     ) -> list[np.ndarray]:
-        """What is carried in the end, and the rows made, with a leading axis of runs.
+        """Final carry, and the rows made, with a leading axis of runs.
 
         A key is a whole number there, as `robins.program.kinds.numbers_of` makes it.
 
         Args:
-            runs: how many.
-            given: what is carried, what stays, rows.
+            runs: number of runs.
+            given: carry, constants, rows.
             named: numbers of the results that are kept of the first run only.
 
         Raises:
@@ -144,14 +144,14 @@ class Rounds:
 
 
 def zero_in_all(given: Given) -> np.ndarray:
-    """Which entries of an array are zero in all runs."""
+    """Mask of the entries of an array that are zero in all runs."""
     array, batched = given
     zero = positive_zeros(numbers_of(array))
     return np.asarray(np.all(zero, axis=0)) if batched else zero
 
 
 def _dtype(dtype: Any) -> np.dtype:
-    """Of an array of C: a key is one number."""
+    """Type of an array of C: a key is one number."""
     return np.dtype(np.uint64) if is_key(dtype) else np.dtype(dtype)
 
 

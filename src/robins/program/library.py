@@ -55,7 +55,7 @@ class Entry(NamedTuple):
 
     @property
     def symbol(self) -> str:
-        """Its name as a part of names in C."""
+        """Name of the entry as a part of names in C."""
         return symbol(self.name)
 
 
@@ -68,12 +68,12 @@ class Field(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many numbers it holds."""
+        """Count of its numbers."""
         return int(np.prod(self.leaf.shape))
 
     @property
     def is_real(self) -> bool:
-        """Whether it lies among the reals."""
+        """True if it lies among the reals."""
         return self.leaf.kind == "real"
 
     def first(self, struct: str) -> str:
@@ -125,7 +125,7 @@ class Library(NamedTuple):
         entries: the entry points; all have the same state.
         start: the state to begin with.
         about: lines of comment for the head of both files.
-        notes: what more to say of a field, by struct and name.
+        notes: additional comments on fields, by struct and name.
         precision: of its reals.
     """
 
@@ -133,7 +133,7 @@ class Library(NamedTuple):
     entries: Sequence[Entry]
     start: Any
     about: Sequence[str] = ()
-    notes: dict[tuple[str, str], str] = {}  # noqa: RUF012 a default that nobody changes
+    notes: dict[tuple[str, str], str] = {}  # noqa: RUF012 a default that is never changed
     precision: Precision = DOUBLE
 
     @property
@@ -155,7 +155,7 @@ class Library(NamedTuple):
         return f"{entry.symbol}_{name}"
 
     def result(self, entry: Entry) -> list[Field]:
-        """Fields of what an entry point tells."""
+        """Fields of the result of an entry point."""
         return fields_of(entry.program.results, 1)
 
     # ------------------------------------------------------------------------------ the header
@@ -286,7 +286,7 @@ def _text(lines: Sequence[str]) -> str:
 def _copied(
     fields: Sequence[Field], struct: str, reals: str, others: str, inwards: bool
 ) -> list[str]:
-    """Between a struct and the arrays of a program."""
+    """Lines of C that copy between a struct and the arrays of a program."""
     lines = []
     for f in fields:
         if f.is_real:

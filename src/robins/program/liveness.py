@@ -1,7 +1,6 @@
-"""Which values are last used where, and so how much memory a function takes.
-
-A stage is told by the variables of a jaxpr that it takes and makes. The equations of a jaxpr are
-stages too, so what JAX computes is counted by the same function.
+"""Last uses of values, and so the memory that a function takes.  A stage is described by the
+variables of a jaxpr that it takes and makes. The equations of a jaxpr are stages too, so what JAX
+computes is counted by the same function.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ KEY_BYTES = 8
 
 
 class Touched(NamedTuple):
-    """What a stage takes and makes, and the bytes that it needs for itself beside these."""
+    """Inputs and outputs of a stage, and the bytes that it needs for itself in addition."""
 
     takes: Sequence[Variable]
     makes: Sequence[Variable]
@@ -31,11 +30,11 @@ class Touched(NamedTuple):
 
 
 def last_uses(stages: Sequence[Touched], kept: Collection[Variable]) -> list[list[Variable]]:
-    """By stage, the variables that nothing needs once it is done.
+    """Variables that nothing needs once a stage is done, by stage.
 
     Args:
         stages: in an order of computation.
-        kept: what is needed in the end.
+        kept: variables needed in the end.
     """
     last: dict[Variable, int] = {}
     for k, one in enumerate(stages):
@@ -92,7 +91,7 @@ def bytes_of(v: Variable) -> int:
 
 
 def variables(some: Iterable[Variable]) -> list[Variable]:
-    """Those that are not literals."""
+    """Variables that are not literals."""
     return [v for v in some if not isinstance(v, jex.Literal)]
 
 

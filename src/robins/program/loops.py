@@ -1,8 +1,8 @@
 """Equations of a jaxpr that go along one axis, as rounds of one loop.
 
 A scan goes along its axis; so does an operation on arrays whose first axis is as long, if it does
-to each row the same by itself; and so do random numbers, as the generator can be told the number of
-an entry. What goes along the same axis is one loop: a row that the next equation needs is never
+to each row the same by itself; and so do random numbers, as the generator can be given the number
+of an entry. What goes along the same axis is one loop: a row that the next equation needs is never
 written to memory. What a round leaves for the next is carried.
 """
 
@@ -106,7 +106,7 @@ def _by_rows(e: Equation, name: str, p: Any, length: int) -> bool:
 
 
 def operations(e: Equation) -> int:
-    """About how many scalar operations of a scan an equation is worth to JAX."""
+    """Approximate cost of an equation to JAX, in scalar operations of a scan."""
     name = e.primitive.name
     if name == "scan":
         return e.params["length"] * size_of(e.params["jaxpr"].jaxpr)

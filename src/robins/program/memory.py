@@ -1,8 +1,8 @@
-"""A state that stays in the memory of C from call to call, and programs that step it.
+"""A state that stays in the memory of C between calls, and programs that step it.
 
 `Native` takes a function's arguments apart and puts its results together at every call. Here the
 state is never taken apart: every program has it at the head of its arguments and of its results,
-and these lie in one memory, so that a call copies only what is given besides and what is told.
+and these lie in one memory, so that a call copies only the other arguments and results.
 Programs are kept for the process, so that a filter made again is not traced again, and those with
 names in the user's cache (`robins.program.kept`).
 """
@@ -26,7 +26,7 @@ from robins.program.refusal import ProgramError
 from robins.program.trace import Leaf, Program, trace
 
 Function = Callable[..., Any]  # of a state and arguments
-# A program, the structure of its result beside the state, and what makes steps of it.
+# A program, the structure of its result apart from the state, and what makes steps of it.
 Made = tuple[Program, Any, Callable[[], Step]]
 LIVE_UNROLL = 300  # of 15 states as fast as written out, and compiled in two thirds of the time
 _MOST = 128  # programs remembered; the least recently used are forgotten
@@ -126,9 +126,9 @@ class _Call(NamedTuple):
     views: list[np.ndarray]  # where they go
     run: Any
     pointers: tuple[ctypes.c_void_p, ...]
-    begin: tuple[int, int]  # in the memories, of what it tells, and
+    begin: tuple[int, int]  # in the memories, of the result, and
     end: tuple[int, int]  # behind it
-    result: Reader  # of what it tells, counted from there
+    result: Reader  # of the result, counted from there
 
     def takes(self, leaves: list[Any], tree: Any) -> bool:
         """True if it was traced for arguments like these."""
@@ -160,11 +160,11 @@ class NativeState:
 
         Args:
             state: a pytree of arrays.
-            content: what the functions hold, by which those of equal names are told apart in this
-                process.
+            content: what the functions hold, by which those of equal names are distinguished in
+                this process.
             engine: what makes steps of programs: `interpreted_step`, or `compiled_step`.
             unroll: as in `trace`.
-            lasting: content and names tell functions apart in other processes too, if they have
+            lasting: content and names distinguish functions in other processes too, if they have
                 texts (`names.by_name`): then programs of the interpreter are kept in the user's
                 cache.
 

@@ -34,7 +34,7 @@ NO_COMPILER = (
 
 
 class Language(NamedTuple):
-    """How texts are compiled: one number by C, lanes by C++, which chooses between vectors."""
+    """Language of compiled texts: one number by C, lanes by C++, which chooses between vectors."""
 
     suffix: str
     variable: str  # of the environment, that names the compiler
@@ -47,7 +47,7 @@ CPP = Language(".cc", "CXX", ("c++", "g++", "clang++"), "c++")
 
 
 def compiler(language: Language = C) -> tuple[str, ...]:
-    """The command of a compiler: what CC or CXX says, else the system's, else that of `ziglang`.
+    """Command of a compiler: CC or CXX, else the system's, else that of `ziglang`.
 
     Raises:
         BuildError: there is none.
@@ -70,13 +70,13 @@ def _version(command: tuple[str, ...]) -> str:
 
 
 def is_gcc(command: tuple[str, ...]) -> bool:
-    """Whether a compiler is that of GNU, by whatever name it is called."""
+    """True if a compiler is that of GNU, by whatever name it is called."""
     return "Free Software Foundation" in _version(command)
 
 
 @lru_cache
 def _processor() -> str:
-    """What this processor can do, as far as the system tells: a cache may be shared by machines."""
+    """Features of this processor, as the system reports: a cache may be shared by machines."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text("utf-8").splitlines():
             if line.startswith(("flags", "Features")):
@@ -85,7 +85,7 @@ def _processor() -> str:
 
 
 def cache_folder() -> Path:
-    """Where what was compiled is kept: the user's cache, else a folder that this process makes."""
+    """Folder of compiled libraries: the user's cache, else one that this process makes."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base) / "robins" / "native"
     with contextlib.suppress(OSError):
@@ -104,7 +104,7 @@ def build(text: str, flags: tuple[str, ...] = FLAGS, language: Language = C) -> 
     Where the flags hold `FASTER`, gcc is given `FASTER_IN_GCC` too.
 
     Raises:
-        BuildError: there is no compiler, or it refuses the text; it says what was said.
+        BuildError: there is no compiler, or it refuses the text; contains its message.
     """
     command = compiler(language)
     if set(FASTER) <= set(flags) and is_gcc(command):

@@ -1,8 +1,8 @@
 """The graph of a program: scalars, each written once, folded where they are known.
 
 A node is a number, an index into the lists of a `Graph`. Its arguments are nodes before it, so the
-order of nodes is an order of computation. Two equal nodes are one node. Beside scalar operations
-there are
+order of nodes is an order of computation. Two equal nodes are one node. In addition to scalar
+operations there are
 
 - *blocks*: a routine on arrays, such as a QR; its arguments are gathered, its results are leaves;
 - *loops*: `Loop`; what depends on the leaves of a loop is computed inside it, all else before.

@@ -15,7 +15,7 @@ import numpy as np
 
 
 class Precision(NamedTuple):
-    """What reals are.
+    """Type of reals.
 
     Attributes:
         kind: their type in C.

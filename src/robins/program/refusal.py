@@ -1,4 +1,4 @@
-"""What this room raises when it cannot make a program, or cannot build one."""
+"""Errors of this room when it cannot make a program, or cannot build one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from robins.errors import RobinsError
 
 
 class ProgramError(RobinsError, ValueError):
-    """A function cannot be made a program: it names the operation and the line that asks for it."""
+    """A function cannot be made a program: it names the operation and the line that uses it."""
 
 
 class BuildError(RobinsError):

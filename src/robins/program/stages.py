@@ -2,7 +2,7 @@
 
 The jaxpr of the function is cut into *stages*: what goes along one axis is a loop
 (`robins.program.loops`), what lies between loops are arrays (`robins.program.arrays`). What depends
-on no run is computed once. What has no place in a program stays with JAX, which is said.
+on no run is computed once. What has no place in a program stays with JAX, which is reported.
 """
 
 from __future__ import annotations
@@ -360,7 +360,7 @@ class Staged:
 
     @property
     def refused(self) -> list[ProgramError | BuildError]:
-        """Reasons for which some of it stays with JAX, once it was called."""
+        """Reasons why parts stay with JAX, once it was called."""
         arrays = (one for one in self._stages if isinstance(one, Arrays))
         loops = [loop.refused for loop in self.loops if loop.refused]
         return [*self._known_refused, *(why for one in arrays for why in one.refused), *loops]

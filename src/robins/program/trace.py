@@ -1,4 +1,4 @@
-"""From a function of JAX to a program: its jaxpr, walked with arrays of nodes for values.
+"""Tracing of a function of JAX to a program: its jaxpr, walked with arrays of nodes for values.
 
 Each primitive has a rule, in `robins.program.primitives`: arrays of nodes in, arrays of nodes out.
 A rule that only moves data moves nodes, and so leaves no code.
@@ -312,7 +312,7 @@ def trace_steps(
 
 
 def positive_zeros(a: np.ndarray) -> np.ndarray:
-    """Which entries of an array are reals, and zero."""
+    """Mask of the entries of an array that are reals and +0."""
     if a.dtype != np.float64:
         return np.zeros(a.shape, bool)
     return np.asarray((a == 0.0) & ~np.signbit(a))

@@ -1,4 +1,4 @@
-"""Figures, tables and pages of results; knows what a result holds, not who made it.
+"""Figures, tables and pages of results; depends on the contents of a result, not on its origin.
 
 `add` gives a result folder that is being written its figures and its page. Which figures there are
 follows from the roles of the arrays in the solution: one row each in `robins.report.figures`.

@@ -1,4 +1,4 @@
-"""The covariance bound: as a line beside filters, and as tables and figures of its own."""
+"""The covariance bound: as a line among filters, and as tables and figures of its own."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def line(solution: xr.Dataset, block: str, role: str = "bound") -> Line:
 
 
 def beside(solution: xr.Dataset, block: str) -> Line | None:
-    """The bound to draw beside the filters; None if the solution has none."""
+    """The bound to draw with the filters; None if the solution has none."""
     return line(solution, block) if block in find(solution, "bound") else None
 
 
 def draw(axes: Axes, bound: Line, k: int, seconds: float, times: float = 1.0) -> np.ndarray:
-    """Draw a multiple of the bound of an axis beside filters; returns it."""
+    """Draw a multiple of the bound of an axis with the filters; returns it."""
     y = times * bound.values[:, k]
     axes.plot(*series.thin(bound.x / seconds, y), zorder=4, **_LOOK)
     return y
@@ -120,7 +120,7 @@ def _scale(axes: Axes, every: np.ndarray, without: np.ndarray, unaided: np.ndarr
 
 @style.styled
 def information(solution: xr.Dataset) -> Picture:
-    """What the measurements so far tell of each state at the start, by state and time."""
+    """Figure of the information of the measurements on each state at the start, over time."""
     array, rank = find(solution, "information")[""], find(solution, "gramian_rank")[""]
     names = series.coordinate(solution, "state")
     time = series.x_of(array, 1)
@@ -152,7 +152,7 @@ def information(solution: xr.Dataset) -> Picture:
 
 
 def epochs(solution: xr.Dataset, times_s: Sequence[float] = ()) -> list[int]:
-    """Numbers of the epochs at the times asked for; by default at the quarters.
+    """Numbers of the epochs at the given times; by default at the quarters.
 
     Raises:
         ValueError: a time is not among those of the solution.
@@ -178,12 +178,12 @@ def metrics(solution: xr.Dataset) -> dict[str, list[float]]:
 
 
 class Row(NamedTuple):
-    """What the sensors make of one component of the state, in the unit of figures."""
+    """Bounds of one component of the state, in the unit of figures."""
 
     state: str
     unit: str
     prior: float
-    sigma: list[float]  # at the times asked for
+    sigma: list[float]  # at the given times
     unaided: float  # with no sensor, at the last of them
     without: list[float]  # each sensor left out, at the last of them
     start: float  # share of the prior that is left of the start, process noise aside
@@ -195,7 +195,7 @@ class Row(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """Whether the sensors see it: "seen", "hardly seen", "not seen"; or "known" before."""
+        """Verdict on its observability: "seen", "hardly seen", "not seen"; or "known" before."""
         if self.unaided == 0.0:
             return "known"
         share = np.fmax(self.sigma[-1] / self.unaided, self.start)
@@ -227,7 +227,7 @@ _STYLES = {"seen": "green", "hardly seen": "yellow", "not seen": "red", "known":
 
 
 def table(solution: xr.Dataset, at: Sequence[int]) -> Group:
-    """The rows as something rich can print; `sentences` tell what is least observable."""
+    """The rows as something rich can print; `sentences` list what is least observable."""
     time = np.asarray(solution["time"], float)
     made = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     made.add_column("sigma at best", no_wrap=True)
@@ -257,7 +257,7 @@ def _short(value: float) -> str:
 
 
 def sentences(solution: xr.Dataset) -> list[str]:
-    """What is least observable, for readers."""
+    """Sentences on the least observable directions."""
     count, rank = solution.sizes["state"], int(find(solution, "gramian_rank")[""])
     told = [
         f"The observability Gramian has rank {rank} of {count}; the least observable directions, "

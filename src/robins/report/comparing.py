@@ -1,4 +1,4 @@
-"""Filters side by side by their metrics; designs by what a bound on the worst case costs."""
+"""Filters side by side by their metrics; designs by the cost of a bound on the worst case."""
 
 from __future__ import annotations
 
@@ -124,13 +124,13 @@ def trade_off(solution: xr.Dataset) -> Picture:
         keys.append(style.key(f"least of {hinf.attrs['least_of']}", **_LEAST))
     unit = hinf.attrs["units"]
     above.set(ylabel=_label("H2 norm", h2.attrs["units"]), title="over the true H∞ norm")
-    below.set(ylabel="above the best [%]", title="over the gamma that was asked for")
+    below.set(ylabel="above the best [%]", title="over the requested gamma")
     below.set(xlabel=_label("H∞ norm from the modelling error to the estimate", unit))
     style.legend(figure, keys)
     caption = (
         "True norms. Above, left is safer against the modelling error and down is less noise; a "
         "method that ends has no gain for what is further left. Below, what is lost to the best "
-        "method for that gamma: designs by LMI that are not retuned prove more than was asked."
+        "method for that gamma: designs by LMI that are not retuned prove more than was requested."
     )
     return Picture("trade_off", "What a bound on the worst case costs", caption, figure)
 

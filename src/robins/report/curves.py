@@ -62,7 +62,7 @@ def _used(solution: xr.Dataset) -> xr.DataArray | None:
 
 @style.styled
 def worst_case(solution: xr.Dataset) -> Picture | None:
-    """How near each H-infinity filter comes to not existing; None if there is none."""
+    """Distance of each H-infinity filter from not existing, over time; None if there is none."""
     ratio = _used(solution)
     if ratio is None:
         return None
@@ -96,7 +96,7 @@ def bound_names(solution: xr.Dataset) -> list[str]:
 
 
 def bound_note(solution: xr.Dataset) -> str:
-    """What must be said of them beside an envelope; empty where there is none."""
+    """Remark on H-infinity filters under an envelope; empty where there is none."""
     named = bound_names(solution)
     if not named:
         return ""
@@ -108,7 +108,7 @@ def bound_note(solution: xr.Dataset) -> str:
 
 _START = 0.2  # of the time axis
 _BEYOND = 4.0  # a stated sigma this many times any error does not set the scale
-_STEEP = 3.0  # a start this much higher than all that follows is cut off, and said so
+_STEEP = 3.0  # a start this much higher than all that follows is cut off, with a remark
 
 
 def _limit(axes: Axes, x: np.ndarray, lines: list[np.ndarray], centred: bool = True) -> bool:
@@ -251,7 +251,7 @@ def estimates(solution: xr.Dataset, block: str, role: str = "estimate") -> Pictu
 
 
 def values(solution: xr.Dataset, name: str) -> Picture:
-    """What a vehicle does beside what is estimated of it."""
+    """Figure of true values with their estimates."""
     return estimates(solution, name, "value")
 
 
@@ -337,7 +337,7 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
 
 @style.styled
 def height(solution: xr.Dataset) -> Picture | None:
-    """Height over time, with the fixes and the reference; None if no filter tells it."""
+    """Height over time, with the fixes and the reference; None if no filter estimates it."""
     filters = series.filters(solution)
     data = series.get(solution, "track", "alt_m")
     if data is None:

@@ -19,7 +19,7 @@ _LONGEST_SCENARIO = 40_000  # characters shown; the manifest has all of it
 
 
 class Origin(NamedTuple):
-    """Where a result came from."""
+    """Origin of a result."""
 
     command: str
     scenario_text: str

@@ -134,7 +134,7 @@ def svg(figure: Figure) -> bytes:
 
 
 def _points(figure: Figure) -> int:
-    """How many points a drawing has."""
+    """Number of points of a drawing."""
     count = 0
     for axes in figure.axes:
         for line in axes.lines:
@@ -156,7 +156,7 @@ def _png_source(content: bytes) -> str:
 
 
 class _Choice:
-    """The forms of one picture, each made only when it is asked for.
+    """The forms of one picture, each made only when it is needed.
 
     Attributes:
         source: its form.

@@ -35,7 +35,7 @@ class Figure(NamedTuple):
     when: Callable[[xr.Dataset, str], bool] | None = None  # not always, but if this holds
 
     def of(self, solution: xr.Dataset, only: Sequence[str] = ()) -> Iterator[tuple[str, ...]]:
-        """What follows the solution among the arguments of each drawing, or of those in `only`."""
+        """Arguments of each drawing after the solution, or of those in `only`."""
         found = find(solution, self.roles.split()[0])
         if not self.each:
             named = not only or getattr(self.draw, "__name__", "") in only
@@ -53,7 +53,7 @@ def _scatters(solution: xr.Dataset, block: str) -> bool:
 
 
 def _tells_more(solution: xr.Dataset, block: str) -> bool:
-    """Beside its error an estimate tells something new only where it should settle on a value."""
+    """True if an estimate shows more than its error: where it should settle on a value."""
     return block not in find(solution, "error") or "bias" in block or "scale" in block
 
 
@@ -92,7 +92,7 @@ FIGURES = (
 def drawings(
     solution: xr.Dataset | None, summary: Mapping[str, Any], only: Sequence[str] = ()
 ) -> list[Callable[[], Picture | None]]:
-    """What to draw, in the order of the page; the comparison of a summary comes last.
+    """Functions that draw, in the order of the page; the comparison of a summary comes last.
 
     In `only` are the names of some, which are those of their arrays, or else of their functions.
     """

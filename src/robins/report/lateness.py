@@ -1,4 +1,4 @@
-"""How late the steps of a bench began, where they had deadlines."""
+"""Lateness of the steps of a bench, where they had deadlines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How large the errors of a campaign's runs are, by percentiles."""
+"""Sizes of the errors of a campaign's runs, by percentiles."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from robins.report.numbers import words
 from robins.report.style import Picture
 from robins.results import find
 
-_COLUMNS = 3  # blocks beside each other
+_COLUMNS = 3  # blocks side by side
 _ORDERS = {"first": "first order: alone", "total": "total: with others"}
 _SLICES, _FEW = 10, 8  # of the means over a parameter: how many, and points in each at least
 _THICK = 0.36  # of a bar; two of them to a parameter

@@ -1,4 +1,4 @@
-"""What a solution holds, by the roles and dimensions that `robins.results` lists, over time."""
+"""Arrays of a solution over time, by the roles and dimensions that `robins.results` lists."""
 
 from __future__ import annotations
 

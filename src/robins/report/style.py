@@ -1,4 +1,4 @@
-"""How figures look: one style, colours that the colour-blind can tell apart, nothing global."""
+"""Style of figures: one style, colours that the colour-blind can distinguish, nothing global."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WIDTH = 7.2  # inches; at 9 points the text of a figure is as large as that of t
 # distinction onto paper without colours.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LINES = ("-", "--", "-.", (0, (1, 1)))
-TINTED = 4  # filters whose tints can be told apart
+TINTED = 4  # filters whose tints can be distinguished
 _ROWS = 2  # of a legend that every figure has room for
 _REMARK = 100  # characters of small words in a line
 TRUTH = "#222222"

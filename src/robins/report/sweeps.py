@@ -18,12 +18,12 @@ _DECADE = 8.0  # times the least error: from there on the colours are logarithmi
 
 
 def two_keys(solution: xr.Dataset, block: str) -> bool:
-    """Whether two parameters are varied."""
+    """True if two parameters are varied."""
     return solution.sizes["sweep_2"] > 1
 
 
 def one_key(solution: xr.Dataset, block: str) -> bool:
-    """Whether one parameter is varied."""
+    """True if one parameter is varied."""
     return not two_keys(solution, block)
 
 

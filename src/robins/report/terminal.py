@@ -18,7 +18,7 @@ _COLOURS = {"reproduced": "green", "partly": "yellow", "not": "red", "undecided"
 def table(summary: Mapping[str, Any], width: int = 100) -> Group:
     """Metrics by filter, claims with verdicts and refused samples, as something rich can print.
 
-    Filters that have no room beside each other in so many columns come in tables of their own.
+    Filters that do not fit side by side into so many columns come in tables of their own.
     """
     parts: list[Any] = []
     filters = summary["filters"]

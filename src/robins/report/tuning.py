@@ -1,4 +1,4 @@
-"""What tuning found: factors with their intervals, and the parts held out before and after."""
+"""Figures of tuning: factors with their intervals, and the parts held out before and after."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from robins.report.style import Picture
 
 @style.styled
 def tuning(solution: xr.Dataset) -> Picture:
-    """On the left the factor on each parameter, on the right the objective of each part."""
+    """Figure with the factor on each parameter (left) and the objective of each part (right)."""
     names = [str(name) for name in solution["parameter"].values]
     figure, grid = style.new(1, 2, max(2.6, 1.4 + 0.3 * len(names)))
     _factors(grid[0, 0], names, solution)

@@ -23,7 +23,7 @@ def quantile(probability: float, degrees: Any) -> np.ndarray:
 
 
 class Band(NamedTuple):
-    """Where a statistic of a consistent filter lies with the given probability."""
+    """Band in which a statistic of a consistent filter lies with the given probability."""
 
     low: np.ndarray  # (filter, time)
     high: np.ndarray
@@ -121,7 +121,7 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
     name = words(sensor)
     caption = (
         "Measured minus predicted. They should look like white noise "
-        "between the lines; runs to one side tell of an error the filter does not model."
+        "between the lines; runs to one side show an error the filter does not model."
     )
     if any(axes.get_yscale() == "symlog" for axes in stack):
         caption += " Far from zero the scale is logarithmic."
@@ -129,7 +129,7 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
 
 
 def _refused(solution: xr.Dataset, sensor: str, shape: tuple[int, int]) -> np.ndarray:
-    """Where a gate refused an update, (filter, update time)."""
+    """Mask of the updates that a gate refused, (filter, update time)."""
     found = series.get(solution, "refused", sensor)
     return np.zeros(shape, bool) if found is None else found.values[..., 0] > 0.0
 
@@ -190,7 +190,7 @@ def _statistic(
 ) -> str:
     """Draw a statistic of each filter over its band; return how much of it lies inside."""
     values, x = np.asarray(array, float), series.x_of(array, 1) / clock.seconds
-    if limits is not None:  # without a degree of freedom nothing was used, and zero says nothing
+    if limits is not None:  # without a degree of freedom nothing was used, and zero has no meaning
         values = np.where(np.isfinite(limits.high), values, np.nan)
     joined = _is_smooth(array)
     for i in range(len(filters)):

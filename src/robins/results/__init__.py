@@ -3,9 +3,9 @@
 ::
 
     results/walk/
-        manifest.json   where it came from: scenario text and hash, seed, versions, device; a
+        manifest.json   its origin: scenario text and hash, seed, versions, device; a
                         checksum of every file; written last, `complete`
-        summary.json    what scripts read: metrics by filter, claims, counts of refused samples
+        summary.json    for scripts: metrics by filter, claims, counts of refused samples
         solution.nc     time series with named dimensions, units and frames (netCDF-4)
         figures/*.png
         report.html     one self-contained page
@@ -28,11 +28,11 @@ Solution
 --------
 Every numeric array and coordinate has the attributes ``units`` and ``long_name``; an array with
 components along axes also has ``frame`` ("NED", "FRD", ...), and ``display_unit`` ("deg", "deg/h",
-"mg") where figures have another unit. An array tells by ``role`` what it is, and by ``of`` of what:
-the standard deviation of the attitude, the innovation of a sensor. `ROLES` is their table, printed
-on the page of the documents on the result folder. `array` builds an array, `variable` a coordinate,
-`find` reads the arrays of a role. Figures are drawn from whatever is there; dimensions are
-recognised by their place, so any time dimension serves whose coordinate is in seconds since the
+"mg") where figures have another unit. The attribute ``role`` gives the kind of an array, ``of`` its
+object: the standard deviation of the attitude, the innovation of a sensor. `ROLES` is their table,
+printed on the page of the documents on the result folder. `array` builds an array, `variable` a
+coordinate, `find` reads the arrays of a role. Figures are drawn from whatever is there; dimensions
+are recognised by their place, so any time dimension serves whose coordinate is in seconds since the
 start (``time``, ``gnss_time``, ...). Dimension coordinates ``filter`` and ``axis_...`` hold names.
 Bands of consistency figures follow from ``degrees_of_freedom`` and ``runs`` at ``probability``
 (0.95), or are given by ``band_low`` and ``band_high``.

@@ -46,7 +46,7 @@ def to_dataframe(
 
     The column of the array ``estimate_velocity``, component north, is called
     ``estimate_velocity_north_m_per_s``. Where there is an attitude as a quaternion (``q_nb_w`` ...)
-    and no angles beside it, roll, pitch and heading are added. The index is ``time_s``, time since
+    without its angles, roll, pitch and heading are added. The index is ``time_s``, time since
     the start. Where the stamps of the log have a date, ``utc`` is the first column; leap seconds
     are taken off the stamps, which count GPS time.
 

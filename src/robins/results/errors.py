@@ -1,4 +1,4 @@
-"""Why a result could not be written or read."""
+"""Errors of writing and reading results."""
 
 from __future__ import annotations
 

@@ -1,14 +1,13 @@
 """A folder that appears whole or not at all.
 
-A writer fills a *stage*, a hidden folder beside the target, and `commit` renames it into place. The
-result that was there is renamed aside first and deleted last, so at every instant one of the two is
-whole on the disk. POSIX has no portable call that exchanges two folders; what a crash between the
-two renames leaves behind is found by `locate` and mended by `sweep`, on the next read or write.
-
-A living writer holds advisory locks: on a small file beside the target, so that there is one writer
-of a result at a time, and on its folders. The kernel drops them with the process, however that
-ends, so a file or hidden folder whose lock is free belongs to nobody, and the next writer removes
-it. What the file says is for people, nothing trusts it.
+A writer fills a *stage*, a hidden folder next to the target, and `commit` renames it into place.
+The result that was there is renamed aside first and deleted last, so at every instant one of the
+two is whole on the disk. POSIX has no portable call that exchanges two folders; what a crash
+between the two renames leaves behind is found by `locate` and repaired by `sweep`, on the next read
+or write.  A living writer holds advisory locks: on a small file next to the target, so that there
+is one writer of a result at a time, and on its folders. The kernel drops them with the process,
+however that ends, so a file or hidden folder whose lock is free belongs to no writer, and the next
+writer removes it. The content of the file is for people, nothing trusts it.
 
 A file system may know no locks (some network ones). Then two writers do not see each other, and the
 result of the one that is done last stands, whole.
@@ -93,7 +92,7 @@ def _lock(folder: Path) -> ExitStack | None:
 
 
 def _claim(target: Path) -> ExitStack:
-    """Be the one writer of a target until the stack is closed.
+    """Claim a target as its only writer until the stack is closed.
 
     Raises:
         Busy: another one is.
@@ -133,7 +132,7 @@ def _unlink(path: Path) -> None:
 
 
 def locate(path: str | os.PathLike[str]) -> Path:
-    """Where a result is to be read: the path itself, or its folder set aside by a cut commit."""
+    """Path of a result to read: the path itself, or its folder set aside by a cut commit."""
     target = resolve(path)
     if os.path.lexists(target):
         return target
@@ -149,7 +148,7 @@ def sweep(target: Path) -> None:
             except OSError:
                 continue  # alive, or gone meanwhile
             if lock is None:
-                continue  # cannot be told from a living writer's: leave it
+                continue  # cannot be distinguished from a living writer's: leave it
             with lock, suppress(OSError):
                 if kind == "old" and not os.path.lexists(target):
                     os.rename(folder, target)
@@ -173,7 +172,7 @@ def stage(path: str | os.PathLike[str]) -> Stage:
     target = resolve(path)
     parents = tuple(_missing(target.parent))
     existing = parents[-1].parent if parents else target.parent
-    # Asked for, because the short name of the hidden folder would not show it before `commit`.
+    # Checked, because the short name of the hidden folder would not show it before `commit`.
     if len(os.fsencode(target.name)) > os.pathconf(existing, "PC_NAME_MAX"):
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(target))
     folder, locks = None, ExitStack()

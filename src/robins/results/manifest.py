@@ -1,4 +1,4 @@
-"""`manifest.json`: where a result came from, and the checksums that show it is whole."""
+"""`manifest.json`: the origin of a result, and the checksums that show it is whole."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a command found, before any of it is written."""
+"""Outcome of a command, before any of it is written."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ Progress = Callable[[float, str], None]  # share done in 0..1, what is being don
 
 
 def silent(share: float, what: str) -> None:
-    """Progress that nobody wants to hear of."""
+    """Ignore progress."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a command found: all that its result folder, its report and its last lines say.
+    """Outcome of a command: all contents of its result folder, its report and its last lines.
 
-    Who computes (a system, a campaign) fills in the first part; who was asked for it
+    The part that computes (a system, a campaign) fills in the first part; the one that was called
     (`robins.workbench`) adds the rest. In `last_lines`, ``{out}`` stands for the folder.
     """
 
@@ -32,7 +32,7 @@ class Outcome:
     notes: list[str] = field(default_factory=list)  # sentences for the reader
     warnings: list[str] = field(default_factory=list)  # why a reader should doubt the figures
 
-    # what was asked
+    # of the request
     scenario: str = ""  # its name
     seed: int = 0
     runs: int = 1
@@ -40,7 +40,7 @@ class Outcome:
     device: str = "cpu"
     machine: str = ""  # of a campaign: programs, interpreted ("vm") or compiled ("c"), or "jax"
 
-    # how it is told
+    # of the presentation
     title: str = ""
     figures: tuple[str, ...] = ()  # names of those that are drawn; else all
     tables: list[Any] = field(default_factory=list)  # else that of the metrics; texts, or for rich
@@ -50,7 +50,7 @@ class Outcome:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What `summary.json` says."""
+        """Contents of `summary.json`."""
         return {
             "scenario": self.scenario,
             "seed": self.seed,

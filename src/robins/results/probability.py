@@ -1,8 +1,8 @@
-"""A probability that was found by counting: with the interval in which it lies, and never without.
+"""A probability estimated by counting, always with its confidence interval.
 
 The interval is that of Clopper and Pearson (1934), "The use of confidence or fiducial limits
 illustrated in the case of the binomial": whatever the true probability, it is inside at least as
-often as the level says, also of few runs and of rare events. None of 50 runs that diverged means
+often as the level, also for few runs and of rare events. None of 50 runs that diverged means
 that up to 7 % may.
 """
 
@@ -35,7 +35,7 @@ class Probability(NamedTuple):
 
     @classmethod
     def among(cls, holds: np.ndarray, level: float = LEVEL) -> Probability:
-        """Of (runs,) answers, one of each run.
+        """Share of the runs (runs,) for which a condition holds.
 
         Raises:
             ValueError: there are none.

@@ -20,14 +20,14 @@ _KEPT = "computed"  # the attribute of an error that takes numbers along
 
 
 class NotWritten(RobinsError, RuntimeError):
-    """A result was computed and could not be written; the message tells where its numbers are."""
+    """A result that was computed and not written; the message names the folder of its numbers."""
 
     bad_input = False
 
 
 @contextmanager
 def keeping(tree: Any) -> Generator[None, None, None]:
-    """Let any error that leaves this block take along what was computed, for `rescued` to write.
+    """Attach computed arrays to any error that leaves this block, for `rescued` to write.
 
     Args:
         tree: of arrays; in blocks inside each other that of the inner one counts.
@@ -43,7 +43,7 @@ def keeping(tree: Any) -> Generator[None, None, None]:
 def rescued(path: str | os.PathLike[str]) -> Generator[None, None, None]:
     """Write what an error takes along (`keeping`) where no result folder can be made at `path`.
 
-    The arrays go into a new folder beside the result, or among the temporary files where nothing
+    The arrays go into a new folder next to the result, or among the temporary files where nothing
     can be written there.
 
     An interrupt stays one, with a note that names the folder.

@@ -1,8 +1,8 @@
 """The roles of a solution's arrays, in one table.
 
-A row tells how arrays are named, what their dimensions are and what must be known with them. The
+A row gives the names of arrays, their dimensions and their required attributes. The
 rest follows from it: `robins.results.array` builds one with its name and its attributes ``role``
-and ``of``, `find` reads by these attributes, `fault` says why a writer refuses one, `recognised`
+and ``of``, `find` reads by these attributes, `fault` states why a writer refuses one, `recognised`
 serves files written before there were roles, and the documents print the table.
 """
 
@@ -19,7 +19,7 @@ _MORE = "..."  # or other dimensions, of any number
 
 
 class Role(NamedTuple):
-    """What some arrays are, each *of* something: a block of the state, a sensor, a limit."""
+    """Role of some arrays, each *of* something: a block of the state, a sensor, a limit."""
 
     variable: str  # name of an array; in braces what it is of, as a word or as choices
     dims: str  # by place: as time any serves whose coordinate is in seconds since the start
@@ -30,7 +30,7 @@ class Role(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What the attribute ``role`` says."""
+        """Value of the attribute ``role``."""
         return self.named or self._parts[0].strip("_")
 
     @property
@@ -48,7 +48,7 @@ class Role(NamedTuple):
         return f"{head}{of}{tail}"
 
     def of(self, variable: str) -> str | None:
-        """What an array of this name is of; None if it has no such name."""
+        """Object of an array of this name; None if it has no such name."""
         head, of, tail = self._parts
         found = re.fullmatch(f"{head}({of if '|' in of else of and '.+'}){tail}", variable)
         return found[1] if found else None
@@ -239,7 +239,7 @@ def row(role: str, of: str) -> Role:
 
 
 def fault(name: str, array: xr.Variable | xr.DataArray) -> str:
-    """What is wrong with an array by the row of its role; empty if nothing is."""
+    """Fault of an array by the row of its role; empty if there is none."""
     if "role" not in array.attrs:
         return "the attribute 'role' is missing; build it with robins.results.array"
     try:

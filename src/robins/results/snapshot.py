@@ -27,7 +27,7 @@ _LARGEST = 1 << 30  # bytes of a file
 
 
 class Snapshot(NamedTuple):
-    """What a file says."""
+    """Contents of a file."""
 
     parameters: str  # TOML
     state: Any  # as it was given to `write`, tuples as tuples, arrays as NumPy's
@@ -83,10 +83,10 @@ def read(path: str | os.PathLike[str], kind: str) -> Snapshot:
     told, arrays = _unpacked(content, path)
     if told.get("version") != VERSION:
         what = f"it is of version {told.get('version')} of the format, this robins reads {VERSION}"
-        raise ResultError(path, what, "use the robins that wrote it, or begin anew")
+        raise ResultError(path, what, "use the robins that wrote it, or start again")
     body = {key: told.get(key) for key in ("kind", "parameters", "state")}
     if told.get("digest") != _digest(body, arrays):
-        raise ResultError(path, "it is damaged", "begin anew, or restore an older one")
+        raise ResultError(path, "it is damaged", "start again, or restore an older one")
     if told["kind"] != kind:
         fix = f"load it with {told['kind']}.load"
         raise ResultError(path, f"it holds a {told['kind']}, not a {kind}", fix)

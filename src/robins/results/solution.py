@@ -19,7 +19,7 @@ from robins.results.errors import ResultError
 def variable(
     dims: str | Sequence[str], values: Any, unit: str, long_name: str, frame: str = "", **attrs: Any
 ) -> xr.Variable:
-    """Numbers with what a reader must know about them: a coordinate, such as the time.
+    """Numbers with their unit, name and frame: a coordinate, such as the time.
 
     Args:
         dims: names of the axes of `values`.
@@ -56,10 +56,10 @@ def array(
         frame: as of `variable`.
         axes: names of the components along the last dimension.
         dims: names of the dimensions, between blanks; else those of the row.
-        attrs: as of `variable`; those that the row asks for must be among them.
+        attrs: as of `variable`; those that the row requires must be among them.
 
     Raises:
-        ValueError: there is no such role, or the array lacks what its row asks for.
+        ValueError: there is no such role, or the array lacks what its row requires.
     """
     row = roles.row(role, of)
     names = roles.dims(row, of) if dims is None else dims.split()
@@ -79,7 +79,7 @@ def check(solution: xr.Dataset) -> None:
     Raises:
         ValueError: a numeric array has no units or no name, components along axes have no frame,
             a unit for figures is not of its kind, an attribute is of a type that netCDF cannot
-            hold, or the array is not what its role says. The message names the array.
+            hold, or the array does not fit its role. The message names the array.
     """
     for name, array in solution.variables.items():
         if array.dtype.kind in "biuf":

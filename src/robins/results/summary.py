@@ -1,4 +1,4 @@
-"""What scripts read of a result: `summary.json`, checked and in strict JSON."""
+"""Summary of a result for scripts: `summary.json`, checked and in strict JSON."""
 
 from __future__ import annotations
 

@@ -145,7 +145,7 @@ class ResultWriter:
         return self.path
 
     def _files(self) -> dict[str, Any]:
-        """What the folder holds, by kind, as paths inside it."""
+        """Files of the folder, by kind, as paths inside it."""
         here = self._stage.path
         names = sorted(p.relative_to(here).as_posix() for p in here.rglob("*") if p.is_file())
         own = {"solution": SOLUTION, "report": REPORT}

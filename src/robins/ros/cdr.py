@@ -1,6 +1,6 @@
 """The bytes of a message of ROS 2, and back: its header and fields in CDR.
 
-CDR is that of DDSI-RTPS 2.3 (OMG), chapter 10: four bytes that say "little endian", then XCDR1:
+CDR is that of DDSI-RTPS 2.3 (OMG), chapter 10: four bytes that mean "little endian", then XCDR1:
 each number is aligned to its own size, counted from there; a text is its length with the closing
 zero, and the bytes.
 
@@ -33,7 +33,7 @@ _LAYOUTS: dict[type[Message], tuple[str, ...]] = {  # codes of `struct`, one a f
 
 
 class RosError(RobinsError, ValueError):
-    """What cannot be a message of ROS."""
+    """A value that cannot be a message of ROS."""
 
 
 class Stamped(NamedTuple):
@@ -53,7 +53,7 @@ def encode(message: Message, time_ns: int, frame_id: str = "") -> bytes:
         frame_id: of its header.
 
     Raises:
-        RosError: a field has another length or type, or the time is beyond what ROS can say (32 bit
+        RosError: a field has another length or type, or the time is beyond the range of ROS (32 bit
             of seconds).
     """
     values: list[object] = [_LITTLE, *divmod(time_ns, 1_000_000_000)]
@@ -90,7 +90,7 @@ def _packer(layout: tuple[str, ...], lengths: tuple[int, ...]) -> struct.Struct:
 
 
 def decode(kind: type[Message], data: bytes) -> Stamped:
-    """A message from its bytes; what follows its last field is not looked at.
+    """A message from its bytes; bytes after its last field are ignored.
 
     Raises:
         RosError: there are too few bytes, or they are not in XCDR1.

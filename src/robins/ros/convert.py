@@ -1,13 +1,13 @@
-"""From quantities in the frames of robins to messages of ROS, in the frames of ROS.
+"""Conversion of quantities in the frames of robins to messages of ROS, in the frames of ROS.
 
 ROS has bodies forward-left-up and the Earth east-north-up (REP-103, REP-105); robins has FRD and
-NED, or RFU and ENU. Whoever names the frames of what is given gets FLU and ENU:
+NED, or RFU and ENU. Quantities whose frames are named become FLU and ENU:
 
     v_FLU = (x, -y, -z) of FRD = (y, -x, z) of RFU        v_ENU = (y, x, -z) of NED
 
 Without a name (a body in space, an inertial frame) axes stay what they are. Numbers are only
 exchanged and turned in sign, so NaN stays NaN, each by itself; quaternions round. A quantity that
-is not given is marked as the message says: -1 in the covariance of an Imu, else NaN.
+is not given is marked as the message defines: -1 in the covariance of an Imu, else NaN.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from robins.ros.messages import (
 
 
 class _Axes(NamedTuple):
-    """How a frame becomes that of ROS: component k there is `sign[k]` times `order[k]` here."""
+    """Map of a frame to that of ROS: component k there is `sign[k]` times `order[k]` here."""
 
     order: tuple[int, int, int]
     sign: tuple[float, float, float]
@@ -178,7 +178,7 @@ def _vector(v: Any, axes: _Axes) -> Floats:
 
 
 def _covariance(spread: ArrayLike | None, axes: _Axes, vectors: int = 1) -> Floats:
-    """By rows; of one vector, or of two that lie in one matrix; zeros where it is not known."""
+    """Covariance by rows, of one vector or of two in one matrix; zeros where it is not known."""
     size = 3 * vectors
     if spread is None:
         return _NO_COVARIANCE if vectors == 1 else (0.0,) * size**2
@@ -190,7 +190,7 @@ def _covariance(spread: ArrayLike | None, axes: _Axes, vectors: int = 1) -> Floa
 
 
 def _quaternion(q_nb: Any, body: _Axes, nav: _Axes) -> Floats:
-    """In the order of ROS, x, y, z, w."""
+    """Quaternion in the order of ROS, x, y, z, w."""
     w, x, y, z = (float(one) for one in q_nb)
     if body is not _SAME or nav is not _SAME:
         a, b, c, d = body.q

@@ -41,7 +41,7 @@ class NavSatFix(NamedTuple):
     """sensor_msgs/msg/NavSatFix; the header's frame is that of the antenna."""
 
     status: int  # `FIX` or `NO_FIX`, or 1 and 2 with augmentation
-    service: int  # bits of the systems used; 0: not told
+    service: int  # bits of the systems used; 0: not reported
     latitude: float  # deg
     longitude: float  # deg
     altitude: float  # m above the WGS-84 ellipsoid

@@ -1,6 +1,6 @@
 r"""Scenarios: TOML text with units in strings, read into a checked parameter class.
 
-A system states its parameters as a class; a quantity says its kind, and the text its unit:
+A system states its parameters as a class; a quantity has its kind, and the text its unit:
 
     Axes = tuple[float, float, float]
 

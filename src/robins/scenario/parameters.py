@@ -1,8 +1,8 @@
-"""Parameter classes: what a system can be told, with kinds of quantities and their bounds.
+"""Parameter classes of systems, with kinds of quantities and their bounds.
 
 Each kind has a range, which keeps slips of a power of ten, and of a unit, out of a simulation; it
-is wider than what any vehicle does. A parameter that is narrower by nature says so where it is
-declared.
+is wider than what any vehicle does. A parameter that is narrower by nature has its bounds where it
+is declared.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class Quantity:
         return si
 
     def __get_pydantic_core_schema__(self, source: Any, handler: pydantic.GetCoreSchemaHandler):
-        """How pydantic checks a field of this kind."""
+        """Schema by which pydantic checks a field of this kind."""
         if get_origin(source) is not tuple:
             return core_schema.with_info_before_validator_function(
                 lambda value, info: self.read(value, unit_needed=info.mode == "json"),
@@ -177,6 +177,6 @@ class Span(Parameters):
         return self
 
     def holds(self, time_s: Any) -> np.ndarray:
-        """Which times lie in it; those of a grid are rounded."""
+        """Mask of the times in it; those of a grid are rounded."""
         time = np.asarray(time_s, float)
         return (time >= self.begin - 1e-9) & (time < self.end - 1e-9)

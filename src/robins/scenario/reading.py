@@ -1,6 +1,6 @@
 """Reads a scenario's text into parameters, with a message where that fails.
 
-pydantic's findings become one line a fault, with path, value and mend.
+pydantic's findings become one line a fault, with path, value and fix.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-# Where pydantic speaks of its own concepts, the word of TOML.
+# Words of TOML for the concepts of pydantic.
 _TABLE = "should be a table"
 _LIST = "should be a list"
 _WORDS = {
@@ -106,7 +106,7 @@ def _nearest(word: str, among: list[str]) -> str | None:
 def _unknown_key(
     cls: type[pydantic.BaseModel], path: list[int | str], loc: tuple[int | str, ...]
 ) -> tuple[str, str]:
-    """The dotted key that was probably meant (or nothing), and the line to say so."""
+    """The dotted key that was probably meant (or nothing), and the line of the message."""
     models = [cls]
     for step in loc[:-1]:
         inner = [m.model_fields[step].annotation for m in models if step in m.model_fields]
@@ -122,7 +122,7 @@ def _unknown_key(
 
 
 def _is_branch(model: type[pydantic.BaseModel], step: int | str) -> bool:
-    """Whether that is pydantic's name of a class among several: its own, or that of its tag."""
+    """True if that is pydantic's name of a class among several: its own, or that of its tag."""
     tags = [tag for info in model.model_fields.values() for tag in get_args(info.annotation)]
     return step == model.__name__ or step in tags
 
@@ -156,7 +156,7 @@ def load(cls: type[P], path: str | Path, settings: Iterable[str] = ()) -> P:
 
 
 def parse(cls: type[P], text: str, settings: Iterable[str] = (), *, source: str = "") -> P:
-    """Read scenario text, change what the settings say, and check it.
+    """Read scenario text, apply the settings, and check it.
 
     Args:
         cls: the parameter class wanted.

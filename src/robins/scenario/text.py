@@ -66,8 +66,8 @@ def override(mapping: Mapping[str, Any], settings: Iterable[str]) -> dict[str, A
     """A copy of the tables with ``path=value`` settings applied, the later ones winning.
 
     The value is read as TOML (``3``, ``true``, ``["1 m", "2 m"]``), else it is text as it stands
-    (``2 deg/h``). Items of a list are named by their number, from 0. Whether the path exists is for
-    `validate` to say, which knows all keys.
+    (``2 deg/h``). Items of a list are named by their number, from 0. `validate`, which knows all
+    keys, checks that the path exists.
 
     Raises:
         ScenarioError: not ``path=value``, or a path that leads through a plain value.

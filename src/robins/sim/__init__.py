@@ -1,4 +1,4 @@
-"""Simulation: motions over the Earth and what sensors make of them.
+"""Simulation: motions over the Earth and the outputs of sensors along them.
 
 - `trajectory`: smooth motions from waypoints, velocity or a sine; that of another point.
 - `commands`: smooth motions from manoeuvres (import the manoeuvres by their module).
@@ -6,15 +6,15 @@
 - `manoeuvres`: smooth motions of an aircraft that banks, a ship in the sea, a rough road.
 - `disturbance`: heavy tails, outliers, steps of noise and drift (import it by its name).
 - `ideal_imu`: an IMU without errors, and the inversion of the mechanisation.
-- `imu_sensor`, `gnss_sensor`: what a real IMU and a real receiver make of it.
-- `wind`: gusts and what they carry; Dryden and von Karman spectra.
+- `imu_sensor`, `gnss_sensor`: an IMU and a receiver with errors.
+- `wind`: gusts, and a vehicle carried by them; Dryden and von Karman spectra.
 - `air_data`, `sar`: sensors of an airship.
-- `ballistic`, `free_body`: a rocket after burnout, the way it flies and the way it turns.
+- `ballistic`, `free_body`: a rocket after burnout, its trajectory and its attitude.
 - `gyro`, `magnetometer`: its sensors.
-- `spacecraft`, `orbit`: a rigid body with wheels and magnetorquers, and what is about it.
-- `attitude_reference`, `attitude_control`: where it is to point, and the law that turns it there.
-- `rate_table`: what turns a gyro on the ground.
-- `star_sensor`, also `gyro`: sensors of a spacecraft that turns as it is told to.
+- `spacecraft`, `orbit`: a rigid body with wheels and magnetorquers, and its environment.
+- `attitude_reference`, `attitude_control`: target attitude, and the control law that tracks it.
+- `rate_table`: a table that turns a gyro on the ground.
+- `star_sensor`, also `gyro`: sensors of a spacecraft that turns as commanded.
 - `random`: streams of random numbers by seed, run and component; Gauss-Markov processes.
 """
 

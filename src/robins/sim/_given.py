@@ -1,4 +1,4 @@
-"""What a simulated sensor is given, checked as far as it is known before the run is compiled."""
+"""Checks of the inputs of a simulated sensor, as far as known before the run is compiled."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from robins.rotation import normalise
 
 
 def known(*values: Any) -> bool:
-    """Whether these are numbers by now, and not placeholders of `jit`, `vmap` or `grad`."""
+    """True if these are numbers by now, and not placeholders of `jit`, `vmap` or `grad`."""
     return not any(isinstance(x, Tracer) for x in jax.tree_util.tree_leaves(values))
 
 
@@ -98,7 +98,7 @@ def unit_quaternion(name: str, value: Any) -> jax.Array:
 
 
 def presence(present: Any) -> jax.Array:
-    """Whether there is a sample at each epoch, (E,) bool.
+    """Presence of a sample at each epoch, (E,) bool.
 
     Raises:
         ValueError: not a list, or an empty one.

@@ -32,7 +32,7 @@ _ENOUGH = 1e-6  # determinant of W W' of unit axes that span space
 
 
 class Controller(NamedTuple):
-    """What the controller knows and its gains; `controller` makes one of checked numbers."""
+    """Plant model and gains of the controller; `controller` makes one of checked numbers."""
 
     inertia_b: Any  # (3, 3) kg m2
     wn: Any  # rad/s, natural frequency of the attitude loop
@@ -100,7 +100,7 @@ def allocate_within(
     wheel_h: Float[Array, "w"],
     momentum_limit: Float[Array, "w"],
 ) -> Float[Array, "w"]:
-    """`allocate`, where a wheel that is full is not asked to take more: the others then do.
+    """`allocate`, where the other wheels take over from a wheel that is full.
 
     So long as they give torque about three axes; if not, the plain allocation stands, and what a
     full wheel cannot give is missing.

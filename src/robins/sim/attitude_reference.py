@@ -1,4 +1,4 @@
-"""Where a spacecraft is to point: attitudes with their exact rates and angular accelerations.
+"""Target attitudes of a spacecraft, with their exact rates and angular accelerations.
 
 A reference is a motion of reference axes d, to which the body axes b are to be brought: q_id, and
 omega_id and its derivative in the axes d. Turning about one axis after another keeps all three
@@ -122,11 +122,11 @@ PEAK_ACCELERATION = 10.0 / 3.0**0.5
 
 @jax.jit
 def handed_over(base: Reference, turn_rad: Any, rate_rad_s: Any, length_s: Any, time_s: Any):
-    """On top of a reference, the way to it from another: a turn about one axis, from rest to rest.
+    """Reference with the way to it from another: a turn about one axis, from rest to rest.
 
     The turn dies away by 1 - s, s the polynomial 10 x^3 - 15 x^4 + 6 x^5, x = t/length (an
     eigenaxis slew, Wie 2008, sec. 7.3, by the quintic of Craig 2005, "Introduction to Robotics",
-    sec. 7.3). What rate there is at the beginning goes on as a second turn, about the axis of that
+    sec. 7.3). The rate at the beginning goes on as a second turn, about the axis of that
     rate, by length (x - 6 x^3 + 8 x^4 - 3 x^5), whose rate begins with 1 and which ends with
     nothing. So attitude and rate go on without a jump, and from the end on the base is left.
 
@@ -155,7 +155,7 @@ def _fade_in(t: Array, length_s: float) -> tuple[Any, Any, Any]:
 
 
 def _from_rest_to_rest(t: Array, length_s: Any) -> tuple[Any, Any, Any]:
-    """From 0 to 1 within a length of time, and its first two derivatives, 0 at both ends."""
+    """Rise from 0 to 1 within a length of time, with two derivatives that are 0 at both ends."""
     x = jnp.clip(t / length_s, 0.0, 1.0)
     return (
         x**3 * (10.0 - 15.0 * x + 6.0 * x**2),
@@ -165,7 +165,7 @@ def _from_rest_to_rest(t: Array, length_s: Any) -> tuple[Any, Any, Any]:
 
 
 def _turned(base: Reference, angle: Array, rate: Array, acceleration: Array) -> Reference:
-    """On top of a reference, a turn about a fixed axis; all three (E, 3) along it."""
+    """Reference followed by a turn about a fixed axis; all three (E, 3) along it."""
     turn = from_rotvec(angle)
     back = conjugate(turn)
     omega = rotate(back, base.omega_b)

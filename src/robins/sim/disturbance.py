@@ -1,4 +1,4 @@
-"""What disturbs sensors beyond white noise: heavy tails, outliers, steps of noise and of drift.
+"""Disturbances of sensors beyond white noise: heavy tails, outliers, steps of noise and of drift.
 
 Pure JAX; keys come from `robins.sim.random.stream`. Noise is drawn with unit standard deviation, to
 be scaled, and a disturbance that is switched off leaves the numbers of the rest as they were.

@@ -29,7 +29,7 @@ _WN_TAU = 2.146  # (1 + x) exp(-x) = 1/e
 
 
 class Flexure(NamedTuple):
-    """How a structure moves, by axis."""
+    """Motion of a structure, by axis."""
 
     sigma_rad: Any  # (3,) stationary standard deviation; 0: stiff
     tau_s: Any  # (3,) correlation time

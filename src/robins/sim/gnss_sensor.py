@@ -1,7 +1,7 @@
 """A GNSS receiver: fixes of position and velocity of its antenna along a true motion.
 
-`fix_times` says at which instants the truth is wanted, `observe` makes the fixes from it, in pure
-JAX (map over ``key`` for a batch of runs), `as_table` makes a `GnssTable` of one run.
+`fix_times` gives the instants at which the truth is needed, `observe` makes the fixes from it, in
+pure JAX (map over ``key`` for a batch of runs), `as_table` makes a `GnssTable` of one run.
 
     times = fix_times(model, 0.0, 600.0)
     fixes = observe(model, key, times.valid_s, lat, lon, alt, v_n, q_nb, omega_ib_b)
@@ -64,8 +64,8 @@ class GnssErrorModel:
     sigma_v: Any = None  # (3,) m/s, white error of a velocity; None: the receiver gives none
     markov_sigma_m: Any = None  # (3,) m, slowly changing error of position (first-order Markov)
     markov_tau_s: Any = None  # (3,) s, its correlation time
-    stated_sigma_m: Any = None  # (3,) m, what the receiver says; None: the truth, both parts
-    stated_sigma_v: Any = None  # (3,) m/s, what it says of velocity; None: the truth
+    stated_sigma_m: Any = None  # (3,) m, reported by the receiver; None: the truth, both parts
+    stated_sigma_v: Any = None  # (3,) m/s, reported of velocity; None: the truth
     lever_b_m: Any = None  # (3,) m, from IMU to antenna in body axes; None: no lever arm
     rate_hz: float = 1.0
     time_offset_s: float = 0.0  # time stamp less the instant the fix is true for
@@ -121,7 +121,7 @@ class FixTimes(NamedTuple):
     """Times of the fixes of a run [s], each (m,)."""
 
     valid_s: np.ndarray  # the instants whose truth the fixes measure
-    stamp_s: np.ndarray  # what the receiver says
+    stamp_s: np.ndarray  # time stamps of the receiver
     arrival_s: np.ndarray  # when the fix is there to be used
 
 

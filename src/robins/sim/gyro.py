@@ -39,7 +39,7 @@ from robins.sim import _given
 from robins.sim.imu_sensor import corrupt, quantise
 from robins.sim.random import gauss_markov
 
-# Folded into the key, beside the streams 0 and 1 of `imu_sensor`; part of the file format.
+# Folded into the key, next to the streams 0 and 1 of `imu_sensor`; part of the file format.
 _WHITE = 2
 
 
@@ -94,7 +94,7 @@ def read_gyro(
     residue: Float[Array, "3"],
     quantum_rad: Any = 0.0,
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """What a triad reports of one sample, and what it has not yet reported.
+    """Reported angle of a triad over one sample, and the residue of quantisation.
 
     Args:
         theta_b: true angle [rad] over the sample, the integral of omega_ib_b.
@@ -125,7 +125,7 @@ class MemsGyro(NamedTuple):
 
 
 class MemsErrors(NamedTuple):
-    """What a triad was off by."""
+    """True errors of a triad."""
 
     bias_rad_s: Any  # (3,) constant
     markov_rad_s: Any  # (E, 3) slow drift in each interval

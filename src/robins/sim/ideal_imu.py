@@ -1,4 +1,4 @@
-"""What an IMU without errors would deliver, in two senses.
+"""Output of an IMU without errors, in two senses.
 
 `true_increments` integrates what the body of a smooth motion really feels, by quadrature. A
 mechanisation that works on them shows its discretisation error.

@@ -1,4 +1,4 @@
-"""An inertial measurement unit: what its gyros and accelerometers report of a true motion.
+"""An inertial measurement unit: reports of its gyros and accelerometers along a true motion.
 
 In go the ideal increments, the angle and the change of velocity of each sampling interval; out come
 those of a unit with the errors of an `ImuErrorModel`. Every process is discretised exactly, for the
@@ -96,7 +96,7 @@ class _TriadState(NamedTuple):
 
 
 class ImuState(NamedTuple):
-    """What a unit carries from sample to sample."""
+    """State of a unit from sample to sample."""
 
     number: Any  # () int, number of the next sample
     elapsed_s: Any  # () s since it was switched on
@@ -142,7 +142,7 @@ def sample(
 def corrupt(
     dt_s: ArrayLike, theta: ArrayLike, dv: ArrayLike, model: ImuErrorModel, key: Array
 ) -> tuple[Array, Array, ImuTruth]:
-    """What a unit reports of n ideal samples in a row, and its true errors.
+    """Reported increments of n ideal samples in a row, and the true errors of the unit.
 
     An error the model has not (None) costs nothing and changes nothing: with none at all the
     increments come back bit for bit. Memory grows with n; a long campaign takes `begin` and

@@ -1,6 +1,6 @@
 """A magnetometer: the field in its own axes, with iron about it, disturbances and noise.
 
-What `observe_field` makes of the Earth's field B at the attitude q_nb is
+The output of `observe_field` in the Earth's field B at the attitude q_nb is
 
     z = clip(round(M (C_sb (C_bn (T B + d_n) + d_b)) + h + v))
 
@@ -10,8 +10,8 @@ factors and oblique axes, h the hard iron and v white noise. `ins.magnetometer_c
 M and h from turning the sensor about.
 
 `observe_magnetic_attitude` is the "magnetic attitude" of papers that let a magnetometer report
-roll, pitch and heading. No such sensor exists: one vector tells two angles, and the third has to
-come from elsewhere, so that its error is not independent of whatever told it.
+roll, pitch and heading. No such sensor exists: one vector determines two angles, and the third has
+to come from elsewhere, so that its error is not independent of its source.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ def field_bursts(
 
 
 def bursts(time_s, every_s, length_s, first_s) -> tuple[Array, Array]:
-    """Whether each sample is in a burst, and the number of the last burst begun."""
+    """Membership of each sample in a burst (E,), and the number of the last burst started (E,)."""
     time = jnp.asarray(time_s, float)
     require(time.ndim == 1, "time_s must have shape (E,)", time.shape)
     _given.number("every_s", every_s, 0.0, above=True, endless=True)

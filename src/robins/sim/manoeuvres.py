@@ -41,7 +41,7 @@ class Wave(NamedTuple):
 
 
 class Sea(NamedTuple):
-    """What a ship does in waves: sums of sines."""
+    """Motion of a ship in waves: sums of sines."""
 
     roll: Sequence[Wave] = ()  # rad
     pitch: Sequence[Wave] = ()  # rad
@@ -72,10 +72,10 @@ def fly(
     It begins with level wings and takes up the bank of each leg within the leg's first `roll_s`,
     smoothly (two continuous derivatives). The heading turns at ``g tan(bank) / V``, the rate of a
     level coordinated turn. The attitude is banked so that no specific force is felt to the side:
-    by the command, but for the few arcminutes that pitch and Coriolis acceleration ask for.
+    by the command, but for the few arcminutes that pitch and Coriolis acceleration require.
 
     Args:
-        start: where.
+        start: position at the start.
         banks: the legs, in order.
         speed_mps: over the ground.
         heading_rad: at the start, clockwise from north.
@@ -188,7 +188,7 @@ def _slope(waves: Sequence[Wave], t: np.ndarray) -> np.ndarray:
 
 
 def _ease(u: np.ndarray) -> np.ndarray:
-    """From 0 to 1 over u in [0, 1] with two continuous derivatives."""
+    """Rise from 0 to 1 over u in [0, 1] with two continuous derivatives."""
     s = np.clip(u, 0.0, 1.0)
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 

@@ -34,7 +34,7 @@ UNITS_OF_A_KIND = 256  # stride between the streams of two sensors of one kind
 
 
 class Component(IntEnum):
-    """Who draws. A second or third sensor of a kind is named by `unit(component, index)`."""
+    """Component that draws; a second or third sensor of a kind is `unit(component, index)`."""
 
     INITIAL_STATE = 0  # true initial state and the errors of the initial estimate
     IMU = 1  # errors of an inertial measurement unit
@@ -96,7 +96,7 @@ def _bounded(name: str, value: Any, limit: int) -> int:
 def gauss_markov(
     key: Array, count: int, width: int, step_s: Any, tau_s: Any
 ) -> Float[Array, "{count} {width}"]:
-    """Independent processes of unit variance, begun in their steady state.
+    """Independent processes of unit variance, started in their steady state.
 
     The normal numbers drawn do not depend on step or correlation time.
 

@@ -6,7 +6,7 @@ its acceleration:
     w' = clip((c - w)/lag, -a, a),    |c| <= limit of rate.
 
 While the command stays the same, w has a closed form, a ramp of slope a while the lag alone would
-ask for more and then an exponential, and so has its integral: both are exact at any step. The
+require more and then an exponential, and so has its integral: both are exact at any step. The
 attitude turns by the integral and Magnus' term of the fourth order for a rate whose direction
 changes (Hairer, Lubich & Wanner 2006, "Geometric Numerical Integration", sec. IV.7).
 
@@ -30,7 +30,7 @@ _GAUSS = np.sqrt(3.0) / 6.0  # of a step, from its middle to the two points of G
 
 
 class RateTable(NamedTuple):
-    """What the table can do; `rate_table` makes one of checked numbers."""
+    """Limits of the table; `rate_table` makes one of checked numbers."""
 
     lag_s: Any  # (3,)
     rate_limit_rad_s: Any  # (3,)
@@ -38,7 +38,7 @@ class RateTable(NamedTuple):
 
 
 class TableState(NamedTuple):
-    """Where it is."""
+    """State of the table."""
 
     q_ib: Any  # (4,) what it carries to inertial, scalar first
     rate_b: Any  # (3,) rad/s
@@ -102,7 +102,7 @@ def _response(table: RateTable, goal: Array, rate: Array, t: Any) -> tuple[Array
     """Rate, and angle gone through, a time t > 0 after a command was given."""
     lag, most = table.lag_s, table.acceleration_limit_rad_s2
     way = goal - rate
-    # What the ramp has to go until the lag alone asks for no more than the limit.
+    # Length of the ramp, until the lag alone requires no more than the limit.
     excess = way - jnp.clip(way, -most * lag, most * lag)
     done = jnp.clip(excess, -most * t, most * t)
     ramp = jnp.minimum(t, jnp.abs(excess) / most)

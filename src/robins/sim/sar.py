@@ -1,7 +1,7 @@
 """A synthetic aperture radar that finds itself on a map: horizontal position and heading.
 
 Errors are normal, and a share of the samples, struck one by one, is in gross error in all three
-components. What that means is for the model to say: noise that is ``outlier_factor`` times as
+components. The model defines what that means: noise that is ``outlier_factor`` times as
 large (the contaminated normal distribution), or an ``outlier_offset`` of so many sigmas that comes
 on top, or both.
 
@@ -41,7 +41,7 @@ class SarErrorModel(NamedTuple):
 
 
 class SarFix(NamedTuple):
-    """What the radar says; NaN where it says nothing, and always for the height."""
+    """Fix of the radar; NaN where there is none, and always for the height."""
 
     position: Any  # Geodetic (E,), alt NaN
     heading_rad: Any  # (E,) clockwise from north, in [-pi, pi)

@@ -36,7 +36,7 @@ from robins.sim import _given
 
 
 class Spacecraft(NamedTuple):
-    """What a spacecraft is built of; `spacecraft` makes one of checked numbers."""
+    """Parameters of a spacecraft; `spacecraft` makes one of checked numbers."""
 
     inertia_b: Any  # (3, 3) kg m2, of all, wheels that do not spin included
     wheel_axes_b: Any  # (3, W) unit columns
@@ -48,7 +48,7 @@ class Spacecraft(NamedTuple):
 
 
 class CraftState(NamedTuple):
-    """How it moves."""
+    """State of motion: attitude, angular momentum of the craft, momenta of the wheels."""
 
     q_ib: Any  # (4,) body to inertial, scalar first
     momentum_i: Any  # (3,) N m s, total angular momentum in inertial axes
@@ -151,8 +151,8 @@ def rate_b(craft: Spacecraft, state: CraftState) -> Float[Array, "3"]:
 def gravity_gradient(J: u.Matrix, r: u.Three) -> u.Three:
     """Torque [N m] of gravity on a body of inertia J at r from the Earth's centre, body axes.
 
-    3 mu/r^5 (r x J r), far from the Earth and for a body small beside its distance (Wertz 1978, eq.
-    17-31). None at r = 0, which stands for no Earth.
+    3 mu/r^5 (r x J r), far from the Earth and for a body small against its distance (Wertz 1978,
+    eq. 17-31). None at r = 0, which stands for no Earth.
     """
     sq = u.dot(r, r)
     none = sq == 0.0
@@ -180,8 +180,8 @@ def advance(
     Args:
         craft: what it is built of.
         state: at the beginning.
-        wheel_torque: (W,) asked of the wheels, on the body, over the step [N m].
-        dipole_b: (3,) asked of the magnetorquers over the step [A m2].
+        wheel_torque: (W,) commanded of the wheels, on the body, over the step [N m].
+        dipole_b: (3,) commanded of the magnetorquers over the step [A m2].
         r_i_m: (3,) place from the Earth's centre, inertial axes; of the middle of the step, or
             near it. Zeros: no gravity gradient.
         field_i_t: (3,) magnetic field there, inertial axes.
@@ -194,7 +194,7 @@ def advance(
 
 
 class Turn(NamedTuple):
-    """What the dynamics of a step come to."""
+    """Result of the dynamics of a step."""
 
     gibbs_b: Any  # (3,) tangent of half the turn along its axis, body axes, as three scalars
     momentum_i: Any  # (3,) N m s, total angular momentum after it, inertial axes
@@ -265,7 +265,7 @@ def kinematics(q_ib: Float[Array, "4"], gibbs_b: Any) -> Float[Array, "4"]:
 
 
 def wheels_give(craft: Spacecraft, wheel_torque: Float[Array, "w"]) -> Float[Array, "w"]:
-    """What the wheels give of a torque [N m], while there is room left in them."""
+    """Torques that the wheels give of a command [N m], while there is room left in them."""
     most = craft.wheel_torque_limit
     return craft.wheel_works * jnp.clip(wheel_torque, -most, most)
 
@@ -273,7 +273,7 @@ def wheels_give(craft: Spacecraft, wheel_torque: Float[Array, "w"]) -> Float[Arr
 def wheels_after(
     craft: Spacecraft, wheel_h: Float[Array, "w"], wheel_torque: Float[Array, "w"], dt_s: Any
 ) -> Float[Array, "w"]:
-    """Momenta of the wheels [N m s] after a step in which a torque [N m] was asked of them."""
+    """Momenta of the wheels [N m s] after a step under a commanded torque [N m]."""
     # A wheel that was given more than its limit may lose it, but is not torn back to it.
     room = jnp.maximum(craft.wheel_momentum_limit, jnp.abs(wheel_h))
     return jnp.clip(wheel_h - dt_s * wheels_give(craft, wheel_torque), -room, room)

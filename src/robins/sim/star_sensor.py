@@ -126,7 +126,7 @@ class StarCamera:
 
 
 class StarImage(NamedTuple):
-    """What a camera reports of a moment, brightest first; M = most_stars + false_stars rows."""
+    """Report of a camera at a moment, brightest first; M = most_stars + false_stars rows."""
 
     vectors_b: Any  # (M, 3) unit vectors, body axes; NaN: none
     sigma_rad: Any  # (M,) of each of the two angles of a direction
@@ -199,10 +199,10 @@ def show(
 
 
 def turned(shown: Shown, camera: StarCamera, turn_rad: Float[Array, "3"]) -> Shown:
-    """What a camera has before it that is turned a little [rad], sensor axes, from what is shown.
+    """Stars before a camera that is turned a little [rad], sensor axes, from those shown.
 
-    It is what `show` says of the turned camera, to rounding, if the margin of what is shown exceeds
-    the turn.
+    They are the result of `show` for the turned camera, to rounding, if the margin of what is shown
+    exceeds the turn.
     """
     vectors_s = rotate(conjugate(from_rotvec(turn_rad)), shown.vectors_s)
     return _in_field(shown._replace(vectors_s=vectors_s), camera, camera.most_stars)
@@ -240,7 +240,7 @@ def photograph(
 
 
 def expose(key: Array, shown: Shown, camera: StarCamera) -> StarImage:
-    """The image of what is before a camera: each star with its error, some missed, false ones.
+    """Image of the stars before a camera: each with its error, some missed, false ones.
 
     Args:
         key: of the frame.
@@ -292,7 +292,7 @@ def measure_attitude(
     q_ib_prior: Any = None,
     tolerance_rad: Any = None,
 ) -> tuple[Float[Array, "4"], Float[Array, "3 3"], Int[Array, ""]]:
-    """A frame of a star sensor: photograph, know the stars again, QUEST. Pure JAX.
+    """A frame of a star sensor: photograph, identify the stars, QUEST. Pure JAX.
 
     Args:
         key: of the frame.

@@ -52,7 +52,7 @@ class Kinematics(NamedTuple):
     omega_nb_b: np.ndarray  # (N, 3) rad/s, body relative to NED
 
     def rates(self) -> tuple[np.ndarray, np.ndarray]:
-        """What an ideal IMU feels: omega_ib_b [rad/s] and specific force f_b [m/s^2]."""
+        """Input of an ideal IMU: omega_ib_b [rad/s] and specific force f_b [m/s^2]."""
         omega_ie = np.zeros_like(self.v_n)
         omega_ie[:, 0], omega_ie[:, 2] = OMEGA_E * np.cos(self.lat), -OMEGA_E * np.sin(self.lat)
         meridian, transverse = _radii(self.lat)
@@ -122,7 +122,7 @@ def from_waypoints(
     q_nb: Values | None = None,
     vehicle: Vehicle = "ground",
 ) -> Motion:
-    """Through given points at given times.
+    """Motion through given points at given times.
 
     Args:
         time_s: (K,) increasing, at least four; taken from the first one on.
@@ -131,7 +131,7 @@ def from_waypoints(
         alt_m: (K,) above the ellipsoid.
         q_nb: (K, 4) attitude at the points, NED/FRD. Without it the vehicle points where it goes;
             an aircraft banks so that its turns are coordinated.
-        vehicle: who moves, if `q_nb` is not given.
+        vehicle: kind of vehicle, if `q_nb` is not given.
 
     Raises:
         ValueError: too few points, time that does not increase, shapes that do not match, values
@@ -171,10 +171,9 @@ def from_waypoints(
 
 
 def from_velocity(time_s: np.ndarray, v_n: np.ndarray, start: Geodetic, q_nb: np.ndarray) -> Motion:
-    """From velocity (K, 3) NED [m/s] and attitude (K, 4) at dense, increasing times from zero [s].
-
-    Between the knots the path follows splines of sixth degree, whose rates are those of the
-    velocity at the knots.
+    """Motion of velocity (K, 3) NED [m/s] and attitude (K, 4) at dense times (K,) from zero [s].
+    The times increase. Between the knots the path follows splines of sixth degree, whose rates are
+    those of the velocity at the knots.
 
     Raises:
         ValueError: the start is too near a pole.

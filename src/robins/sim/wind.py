@@ -1,4 +1,4 @@
-"""Wind that comes in gusts, and a vehicle that it carries.
+"""Gusts and turbulence, and a vehicle carried by the wind.
 
 Horizontal vectors are north, east. `gusts` draws a wind that is held for some seconds at a time.
 `carry` moves a point mass, whose drag is linear in its velocity through the air, in such a wind
@@ -71,7 +71,7 @@ def gusts(
     speed_m_s: tuple[Any, Any] = (5.0, 10.0),
     direction_rad: tuple[Any, Any] = (0.5 * math.pi, 0.25 * math.pi),
 ) -> Float[Array, "{count} 2"]:
-    """Winds drawn anew at fixed times: ``count`` of them, each held for ``every_s``.
+    """Winds drawn at fixed times: ``count`` of them, each held for ``every_s``.
 
     The wind of step k blows from ``k every_s`` to ``(k + 1) every_s``, counted from time zero; it
     is zero where the middle of the step is not between begin and end. What is drawn for a step
@@ -293,7 +293,7 @@ def _check(count, step_s, airspeed_m_s, direction_rad):
 
 
 def _turned(pair, direction_rad):
-    """From along and to the right of a direction to north and east."""
+    """Components north and east of vectors given along and to the right of a direction."""
     cos, sin = jnp.cos(direction_rad), jnp.sin(direction_rad)
     along, right = pair[:, 0], pair[:, 1]
     return jnp.stack([cos * along - sin * right, sin * along + cos * right], 1)
@@ -318,7 +318,7 @@ def _across(key, count, step):
 
 
 def _correlation(x, across):
-    """Of von Karman turbulence at the distance x = r/(aL): transforms of the spectra.
+    """Correlation of von Karman turbulence at the distance x = r/(aL): transforms of the spectra.
 
     Along it is f(x), proportional to x^(1/3) K_1/3(x); across it is f + x f'/2, as for every
     isotropic field free of divergence (Batchelor 1953, section 3.4).

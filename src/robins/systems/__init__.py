@@ -3,8 +3,8 @@
 A system of your own needs no place in here: `robins.systems.finding` takes it from your file or
 package.
 
-Names are imported when they are asked for: who needs the model of one system alone, such as a
-process of the test bench, does not wait for all of them, and `robins.systems.catalogue` tells of
+Names are imported when they are used: a program that needs the model of one system alone, such as
+a process of the test bench, does not wait for all of them, and `robins.systems.catalogue` lists
 all without importing one.
 """
 

@@ -1,8 +1,8 @@
-"""What systems there are and the scenarios that come with them, told without importing one.
+"""Catalogue of systems and their scenarios, listed without importing one.
 
-Beside the systems of robins these are the systems of installed packages: an entry point of the
-group "robins.systems" names a `robins.systems.System` or `Study`, and the TOML files in the folder
-`scenarios` beside its module are its scenarios.
+In addition to the systems of robins these are the systems of installed packages: an entry point of
+the group "robins.systems" names a `robins.systems.System` or `Study`, and the TOML files in the
+folder `scenarios` next to its module are its scenarios.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def summaries() -> dict[str, str]:
 
 
 def is_file(name: str) -> bool:
-    """Whether a system is named by a file of Python, such as "my_system.py:study"."""
+    """True if a system is named by a file of Python, such as "my_system.py:study"."""
     return name.partition(":")[0].endswith(".py")
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class UnknownSystem(RobinsError, ValueError):
-    """There is no such system, or what is said to be one is none."""
+    """A name that is no system, or an object that is none."""
 
 
 def find_system(name: str, folder: Path = Path(), named_in: str | os.PathLike[str] = "") -> System:
@@ -35,7 +35,7 @@ def find_system(name: str, folder: Path = Path(), named_in: str | os.PathLike[st
         named_in: file that names it; empty where the user does.
 
     Raises:
-        UnknownSystem: there is none; the message says what there is.
+        UnknownSystem: there is none; the message lists the known ones.
         RobinsError: it is a file named in another file, and the user has not confirmed it.
     """
     if is_file(name):

@@ -1,4 +1,4 @@
-"""What a study says of its filters: claims with a number, their verdicts, consistency."""
+"""Evaluation of the filters of a study: claims with a number, their verdicts, consistency."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Metrics = Mapping[str, Mapping[str, Any]]  # by filter
 Band = Sequence[float | int | None]  # from, to
 Verdicts = list[dict[str, Any]]  # of claims, as `summary.json` has them
 Judge = Callable[..., Verdicts]  # (metrics, metrics of draws of the runs) -> verdicts
-MOST_MORE = 1e4  # times as many runs, beyond which nobody waits for a verdict
+MOST_MORE = 1e4  # times as many runs, beyond which a verdict is not worth waiting for
 RUNS = "runs"  # in the metrics of draws: of how many runs they are
 
 
@@ -26,8 +26,8 @@ class Claim(NamedTuple):
     """A claim and the figure that decides it."""
 
     text: str
-    needs: tuple[str, ...]  # filters that must have been run, and exist, for anything to be said
-    value: Callable[[Metrics], Any]  # None: nothing can be said
+    needs: tuple[str, ...]  # filters that must have been run, and exist, for a verdict
+    value: Callable[[Metrics], Any]  # None: there is no verdict
     band: Band | None  # in which it is reproduced
     partly: Band | None = None
     verdict: Callable[[Metrics], str] | None = None  # decides where no band of the value does
@@ -120,7 +120,7 @@ def judging(claims: Mapping[str, Claim], stated: Sequence[str] | None = None) ->
 
 
 def about(filters: Sequence[str], judge: Judge) -> Judge:
-    """Verdicts on these filters alone, whatever else was run beside them."""
+    """Verdicts on these filters alone, whatever else was run with them."""
 
     def judged(metrics: Metrics, drawn: Sequence[Metrics] = ()) -> Verdicts:
         chosen = [{k: m for k, m in one.items() if k in filters} for one in (metrics, *drawn)]
@@ -168,7 +168,7 @@ def interval_of(
         value_of: the value of metrics.
         value: that of all runs.
         drawn: metrics of draws of the runs, the same runs for all filters; the first are of all
-            runs, each once. Each filter says in `RUNS` how many.
+            runs, each once. Each filter has their number under `RUNS`.
 
     Returns:
         From, to; None: there are no draws, or the value does not follow from figures of each run.
@@ -235,7 +235,7 @@ def rms_by_component(statistics: Any) -> np.ndarray:
 def rms_by_axis(statistics: Any, all_axes: Sequence[str] = ()) -> dict[str, Any]:
     """RMS error of every axis of every block in its display unit, over runs and epochs that count.
 
-    Of the blocks in `all_axes` the RMS over all axes is told too.
+    Of the blocks in `all_axes` the RMS over all axes is reported too.
     """
     rms, out = rms_by_component(statistics), {}
     for block in statistics.blocks:
@@ -248,7 +248,7 @@ def rms_by_axis(statistics: Any, all_axes: Sequence[str] = ()) -> dict[str, Any]
 
 
 def standard_metrics(statistics: Any) -> dict[str, Any]:
-    """RMS error of every block, whether the filter errs as much as it says, runs that diverged."""
+    """RMS error of every block, consistency of the filter, and number of diverged runs."""
     rms, errors = rms_by_component(statistics), {}
     for block in statistics.blocks:
         size = float(np.linalg.norm(rms[block.where]))  # pooled over the axes
@@ -258,11 +258,11 @@ def standard_metrics(statistics: Any) -> dict[str, Any]:
 
 
 def consistency(statistics: Any) -> dict[str, Any]:
-    """Metrics, of campaign statistics, on whether a filter errs as much as it says.
+    """Metrics of campaign statistics on the consistency of errors and stated covariance.
 
     A NEES is the mean over runs and epochs, over its degrees of freedom, and named by what it is
     of: ``nees_all_states`` or that of a block. The ANEES, whose share inside the 95 % band is
-    told, is the mean over the runs at each epoch, of all states.
+    reported, is the mean over the runs at each epoch, of all states.
     """
     out: dict[str, Any] = {
         "error_over_sigma": statistics.overall_ratio().tolist(),

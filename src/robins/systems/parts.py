@@ -1,4 +1,4 @@
-"""Parameters that systems share, and what a scenario may ask for at most."""
+"""Parameters that systems share, and the limits of a scenario."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Names = Annotated[tuple[str, ...], pydantic.Field(min_length=1)]
 
 
 class Place(Parameters):
-    """Where a vehicle begins; a study adds its height."""
+    """Position of a vehicle at the start; a study adds its height."""
 
     latitude: Annotated[float, Quantity("angle", least="-89 deg", most="89 deg")]
     longitude: Annotated[float, Quantity("angle", least="-180 deg", most="180 deg")]
@@ -65,7 +65,7 @@ def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
 
 
 def outside(spans: Sequence[Span], time_s: np.ndarray) -> np.ndarray:
-    """Which times (N,) lie in none of some spans, (N,) bool."""
+    """Mask of the times (N,) in none of some spans, (N,) bool."""
     return ~np.any([np.zeros(len(time_s), bool), *(span.holds(time_s) for span in spans)], axis=0)
 
 
@@ -80,12 +80,12 @@ def as_array(numbers: Any) -> Any:
 
 
 def any_there(numbers: Sequence[Any]) -> bool:
-    """Whether one of some sizes is not zero, or may not be, for it is traced."""
+    """True if one of some sizes is not zero, or may not be, for it is traced."""
     return not _given.known(numbers) or any(numbers)
 
 
 Draw = Literal["normal", "plus-sigma", "random-sign"]
-"""How errors of a stated size are made: drawn with it as sigma, as stated, or with signs drawn."""
+"""Draw of errors of a stated size: with it as sigma, as stated, or with random signs."""
 
 
 def signed(key: Array, size: Any, draw: Draw) -> Array:
@@ -98,17 +98,17 @@ def signed(key: Array, size: Any, draw: Draw) -> Array:
 
 
 class Cutting(Parameters):
-    """How a recorded log is cut into steps of a filter."""
+    """Partition of a recorded log into steps of a filter."""
 
     longest_block: q.Duration = default("0.25 s")
-    # a gap of the inertial samples beyond this ends a piece, and the next is aligned anew
+    # a gap of the inertial samples beyond this ends a piece, and the next is aligned again
     longest_gap: q.Duration = default("0.5 s")
     # process noise factor across one that is bridged
     gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
 
 
 class Departure(Place):
-    """Where a vehicle begins, at what height, and its heading there."""
+    """Position, height and heading of a vehicle at the start."""
 
     height: Annotated[float, Quantity("length", least="-1 km", most="100 km")] = default("0 m")
     heading: q.Angle = default("0 deg")
@@ -128,7 +128,7 @@ class Leg(Parameters):
 
     @property
     def lasts_s(self) -> float:
-        """Duration as of `robins.sim.commands`; 0 for a leg that does not say it."""
+        """Duration as of `robins.sim.commands`; 0 for a leg that has none."""
         if self.seconds is not None or self.angle is None or self.rate is None:
             return self.seconds or 0.0
         hold = abs(self.angle) / self.rate
@@ -148,7 +148,7 @@ class Leg(Parameters):
         return make(*(getattr(self, name) for name in needed))
 
 
-# what each leg says, in the order its command takes it
+# parameters of each leg, in the order its command takes them
 _COMMANDS: dict[str, tuple[Callable[..., Command], tuple[str, ...]]] = {
     "stop": (stop, ("seconds",)),
     "straight": (straight, ("seconds",)),

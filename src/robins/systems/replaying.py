@@ -1,8 +1,9 @@
 """Recorded logs: pieces that can be run, their estimates by filters and smoothers, the outcome.
 
 A log is cut where a gap is too long to bridge, and every piece is prepared as a world, of which a
-`Contender` makes its case just as it does of a simulated one. What the filters say of the pieces is
-laid end to end. A system gives the preparation, its contenders, and what only it has to report.
+`Contender` makes its case just as it does of a simulated one. The estimates of the pieces are
+laid end to end. A system gives the preparation, its contenders, and the parts of the report that
+only it has.
 """
 
 from __future__ import annotations
@@ -89,11 +90,11 @@ class Reported(NamedTuple):
     # mean, leading axis E -> (E, k) estimates by block, and "q_nb" (E, 4), the attitude, scalar
     # first; or "euler" [rad] along the axes below, where no whole attitude is known
     estimates: Callable[[Any], Mapping[str, Any]]
-    causes: str  # the sentence on the likely causes, said where there is a warning
-    # sensors that nobody built, such as "the wheels do not slip": their noise is a guess on the
-    # cautious side, so that small innovations say nothing
+    causes: str  # the sentence on the likely causes, added where there is a warning
+    # sensors that do not exist as devices, such as "the wheels do not slip": their noise is a guess
+    # on the cautious side, so that small innovations mean nothing
     assumed: Collection[str] = ()
-    euler: StateBlock = EULER  # by which the attitude is told; its frame is that of q_nb
+    euler: StateBlock = EULER  # by which the attitude is reported; its frame is that of q_nb
 
 
 # -------------------------------------------------------------------------------- log to pieces
@@ -112,7 +113,7 @@ def prepared(
     raises a ValueError where they cannot be run.
 
     Raises:
-        ValueError: no piece can be run; the sentence says why.
+        ValueError: no piece can be run; the message gives the reason.
     """
     edges = [-1, *np.flatnonzero(dt_s > longest_gap_s).tolist(), len(dt_s)]
     found, problems = [], []
@@ -133,9 +134,10 @@ def prepared(
 def noise_scale(
     blocks: Blocks, dt_s: np.ndarray, across_gap: float, usual_s: float | None = None
 ) -> np.ndarray:
-    """(E,) of the process noise factor: 1, or `across_gap` in a block in which samples are missing.
+    """Process noise factor (E,): 1, or `across_gap` in a block in which samples are missing.
 
-    The blocks are cut from increments of lengths `dt_s` (N,), usually `usual_s`, or as these tell.
+    The blocks are cut from increments of lengths `dt_s` (N,), usually `usual_s`, by default
+    found from these.
     """
     gap = after_gap(dt_s, usual_s)
     missing = np.any(gap[blocks.parent] & (blocks.parent >= 0), axis=1)
@@ -193,10 +195,10 @@ def navigated(
 
 
 def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answer, Answer]:
-    """Estimates of a filter on a piece, and of its smoother if that is asked for."""
+    """Estimates of a filter on a piece, and of its smoother if that is requested."""
     filter_, case = contender.filter, contender.case(piece.world)
     with warnings.catch_warnings():
-        # what would be said here is among the warnings of the outcome
+        # these are among the warnings of the outcome
         warnings.simplefilter("ignore", StepWarning)
         found, why = _ran(contender, case, everything if smoothed else kept, piece.epoch_s)
         of_steps = on_each(kept, found.steps) if smoothed else found.steps
@@ -281,7 +283,7 @@ def outcome(
         epoch_s: (E,) on the clock of the log.
         answers: by filter.
         reported: of every filter.
-        metrics: figures of merit of an answer, beside the consistency of its innovations.
+        metrics: figures of merit of an answer, in addition to the consistency of its innovations.
         variables: what else is in the solution, as `robins.results` lists it.
         counts: of samples and pieces.
         notes: sentences for the reader.
@@ -344,9 +346,9 @@ def _sigma(answer: Answer, block: StateBlock) -> np.ndarray | None:
 
 
 def _innovations(answer: Answer) -> dict[str, Any]:
-    """Grand mean NIS with its band, and how many were refused, of each sensor that spoke.
+    """Grand mean NIS with its band, and number of refusals, of each sensor with measurements.
 
-    What a filter of bounds expects is no covariance, so it has no NIS.
+    The bound of an H-infinity filter is no covariance, so it has no NIS.
     """
     out: dict[str, Any] = {}
     for sensor, update in answer.updates.items():

@@ -1,9 +1,9 @@
-"""What live objects share: samples that are refused, answers that say how they stand, the file.
+"""Common parts of live objects: refusal of samples, status of answers, the saved file.
 
 A live object takes a sample and answers at once. A sample that is no sample (another shape, text)
 raises; one that is wrong as a sensor can be (no number, absurd, out of order) is refused, counted,
 and answered from what is known. Stamps that stay elsewhere are a clock that was set, or a long
-pause: the object then begins anew.
+pause: the object then starts again.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ def online(
 
 
 class Flag(IntFlag):
-    """How an answer stands; several may hold."""
+    """Status of an answer; several may hold."""
 
     STARTING = 1  # the first attitude is not known yet: no numbers
-    REFUSED = 2  # this sample was not used, `counts` says why
+    REFUSED = 2  # this sample was not used, `counts` has the reason
     REST = 4  # the unit lies still
     SATURATED = 8  # a sensor is at the end of its range in this sample
     DISTURBED = 16  # the last look at the magnetometer was refused
     DOUBTFUL = 32  # states or innovations contradict what was assumed
-    BEHIND = 64  # the filter waits for what this sample alone cannot say; the gyros carry on
+    BEHIND = 64  # the filter waits for later samples; the gyros carry on
     OUTLIER = 128  # the filter refused a measurement of its last step
 
 
 class Door:
-    """Which samples come in, by their stamps and sizes."""
+    """Gate of samples, by their stamps and sizes."""
 
     def __init__(self, longest_gap_s: float, patience: int):
         """Begin.
@@ -72,7 +72,8 @@ class Door:
         self._elsewhere_ns, self._row = 0, 0
 
     def ask(self, time_ns: int, values: np.ndarray) -> str:
-        """Why a sample is refused; "" for one that comes in, "anew" for one that begins anew.
+        """Reason why a sample is refused; "" for one that is taken, "anew" for one that starts
+        again.
 
         Args:
             time_ns: its stamp.
@@ -119,7 +120,7 @@ def numbers(name: str, values: Any, size: int) -> np.ndarray:
             raise TypeError
     except (TypeError, ValueError):
         what = f"must be {size} real numbers, got {values!r:.80}"
-        raise LiveError(what, name, "NaN says that a number is missing") from None
+        raise LiveError(what, name, "NaN means that a number is missing") from None
     return found.astype(float)
 
 
@@ -172,7 +173,7 @@ class Live:
         """Write all that is known into one file, whole or not at all.
 
         Raises:
-            ResultError: it cannot be written; the sentence says why.
+            ResultError: it cannot be written; the message gives the reason.
         """
         snapshot.write(path, type(self).__name__, *self._all_known())
 
@@ -192,7 +193,7 @@ class Live:
             raise ResultError(path, what, fix) from error
 
     def __reduce__(self) -> Any:
-        """To be pickled as it is saved: what was compiled is compiled again."""
+        """Pickle as it is saved: compiled code is compiled again."""
         return _made_again, (type(self), *self._all_known())
 
     def _all_known(self) -> tuple[str, dict[str, Any]]:

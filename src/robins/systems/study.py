@@ -40,7 +40,7 @@ class StateBlock(NamedTuple):
 
 
 class SensorAxes(NamedTuple):
-    """What the components of a sensor's innovation are."""
+    """Units and names of the components of a sensor's innovation."""
 
     units: str
     frame: str
@@ -115,7 +115,7 @@ class Limit(NamedTuple):
 
 
 class Output(NamedTuple):
-    """What a vehicle does beside what is estimated of it: where it points, what its wheels hold."""
+    """Output of a vehicle besides the estimated states: pointing error, momentum of its wheels."""
 
     name: str
     units: str  # SI
@@ -123,7 +123,7 @@ class Output(NamedTuple):
     frame: str
     axes: tuple[str, ...]
     text: str  # a sentence for the caption of its figure
-    is_error: bool = False  # it should be zero, so its RMS over the runs says something
+    is_error: bool = False  # it should be zero, so its RMS over the runs is meaningful
 
 
 class Norm(NamedTuple):
@@ -141,7 +141,7 @@ class Instrument(NamedTuple):
     # (parameters, course, key of a component, true motion) -> its reading, leading axis E, NaN
     # where there is none; None: it takes what another instrument has read
     measure: Any
-    # (parameters, course) -> `Sensor`: h(x) and R, as a filter believes; None: it is not aboard
+    # (parameters, course) -> `Sensor`: h(x) and R, as a filter believes; None: the vehicle lacks it
     believed: Callable[..., Any]
     # world -> the measurement, and what h(x) needs besides the state; None: the reading, nothing
     taken: Any = None
@@ -149,13 +149,13 @@ class Instrument(NamedTuple):
 
 @dataclass(frozen=True)
 class View:
-    """What is reported of every filter, and what figures and metrics need to know of it."""
+    """Report of every filter, with the data for figures and metrics."""
 
     epoch_s: np.ndarray  # (E,)
     blocks: Sequence[StateBlock]  # of the reported components
     sensors: Mapping[str, SensorAxes]
     metrics: Callable[[Any], dict[str, Any]] = standard_metrics  # campaign statistics -> metrics
-    # truth, fixes, outages: what figures show beside the filters
+    # truth, fixes, outages: what figures show in addition to the filters
     context: xr.Dataset = field(default_factory=xr.Dataset)
     # means of the first run by filter -> more variables of the solution, such as the track. A
     # mean is the state of its own filter.
@@ -177,7 +177,7 @@ class Problem(View):
     """A simulated scenario, ready to be run any number of times.
 
     Raises:
-        ValueError: names clash, or what one part names no other part has; it says so before a
+        ValueError: names clash, or what one part names no other part has; raised before a
             campaign is computed whose result could not be written.
     """
 
@@ -222,7 +222,7 @@ class Problem(View):
 
 
 class Scenario(Parameters):
-    """What every simulated scenario says; a study adds its own, and `study`, its name."""
+    """Parameters of every simulated scenario; a study adds its own, and `study`, its name."""
 
     system: str = ""
     study: str = ""
@@ -275,7 +275,7 @@ class Study(NamedTuple):
 
 
 class Alignment(NamedTuple):
-    """How a system takes a recorded master and slave in the place of its simulation."""
+    """Use of a recorded master and slave in the place of a simulation."""
 
     study: str  # whose scenarios serve as configurations
     parameters: type[Parameters]
@@ -288,16 +288,17 @@ class System(NamedTuple):
 
     name: str  # as in the catalogue, which knows its summary and its scenarios
     studies: Mapping[str, Study]
-    # the filter to use where nothing is known of what may go wrong; a run has it beside its own
+    # the filter to use where nothing is known of what may go wrong; a run has it in addition to its
+    # own
     default: str = ""
     replay_filters: tuple[str, ...] = ()
     replay_parameters: type[Parameters] | None = None
     replay_default: Path | None = None  # configuration of a log that comes without one
     # of a log that was examined and cleaned by `robins.logs`: (dataset, parameters, what the files
-    # do not say, names of filters, where there are none those of the parameters, progress)
+    # do not contain, names of filters, where there are none those of the parameters, progress)
     replay: Callable[..., Outcome] | None = None
-    # the same log before it is replayed, as its filters take it: (dataset, parameters) -> what
-    # `replaying.Recorded` says; a system without it cannot be tuned on logs
+    # the same log before it is replayed, as its filters take it: (dataset, parameters) ->
+    # `replaying.Recorded`; a system without it cannot be tuned on logs
     recorded: Callable[..., Any] | None = None
     reads: Literal["dataset", "ranges"] = "dataset"  # what its logs are: `Dataset` or `RangeLog`
     # roles of arrays that a replay finds, of which exports are made

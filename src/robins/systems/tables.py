@@ -1,4 +1,4 @@
-"""What replays and campaigns share: updates of sensors, and labelled time series."""
+"""Common tables of replays and campaigns: updates of sensors, and labelled time series."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ EULER = StateBlock("euler", slice(0, 3), "rad", "deg", "FRD to NED", ("roll", "p
 
 
 class Update(NamedTuple):
-    """What is kept of the updates of one sensor, of a `StepInfo`; leading axis E epochs."""
+    """Kept part of the `StepInfo` of one sensor's updates; leading axis E epochs."""
 
     innovation: Any  # (E, m)
     sigma: Any  # (E, m)
@@ -27,7 +27,7 @@ class Update(NamedTuple):
 
 
 def updates(step: Step, notes: Collection[str] = ()) -> dict[str, Update]:
-    """What is kept of a step, by sensor, and of what its rules noted that of these names."""
+    """Kept part of a step, by sensor, with the named notes of its rules."""
     return {
         k: Update(
             *(i.innovation, i.sigma, i.nis, i.dof, i.code),
@@ -63,7 +63,7 @@ def place_arrays(
 
 
 def track_arrays(places: Iterable[Any], name: str = "{}") -> dict[str, Any]:
-    """Where each filter thought something was: a `Geodetic` of each, leading axis E epochs."""
+    """Estimated positions of each filter: a `Geodetic` of each, leading axis E epochs."""
     rows = zip(*((place.lat, place.lon, place.alt) for place in places), strict=True)
     return place_arrays("track", map(np.stack, rows), name)
 
@@ -85,7 +85,7 @@ def attitude_array(q_nb: Any, frame: str, time: str = "time", words: str = "") -
 def innovation_tables(
     seen: Sequence[Mapping[str, Any]], axes: Mapping[str, SensorAxes], epoch_s: np.ndarray
 ) -> dict[str, Any]:
-    """Arrays and coordinates of a solution, at the epochs where each sensor spoke.
+    """Arrays and coordinates of a solution, at the epochs of each sensor's measurements.
 
     Args:
         seen: by filter and sensor, an `Update`. A filter that has no such sensor, as a smoother has
@@ -114,7 +114,7 @@ def innovation_tables(
 
 
 def _every(seen: Sequence[Mapping[str, Any]], sensor: str, what: str) -> np.ndarray:
-    """What is kept of a sensor by every filter, leading axis; NaN for one without the sensor."""
+    """Kept part of a sensor by every filter, leading axis; NaN for one without the sensor."""
     rows = [getattr(of[sensor], what) if sensor in of else None for of in seen]
     blank = np.full(np.shape(next(row for row in rows if row is not None)), np.nan)
     return np.stack([blank if row is None else np.asarray(row, dtype=float) for row in rows])

@@ -4,7 +4,7 @@ A file that the user names, on the command line or in a call, runs as a script o
 file that another file names (a scenario, a campaign, the header of a record) runs only if the user
 has confirmed it. Confirmations are kept in the user's configuration folder, by path, with a digest
 of the file and of the local modules that it can import. What runs is the text that was hashed: no
-compiled file beside it is read, and no folder is added to `sys.path`.
+compiled file next to it is read, and no folder is added to `sys.path`.
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ def elsewhere(name: str, root: Path) -> str:
 
 
 def load(path: Path) -> ModuleType:
-    """Import a file and, as it asks for them, the local modules that belong to its digest.
+    """Import a file and, as it imports them, the local modules that belong to its digest.
 
     Raises:
         RobinsError: the name of a module is that of another one.

@@ -1,4 +1,4 @@
-"""What every command does: one function a command, from what is asked to an `Outcome`.
+"""Functions behind the commands: one a command, from its arguments to an `Outcome`.
 
 ::
 
@@ -8,7 +8,7 @@
 The first line writes nothing; `publish` makes a result folder of any outcome, with its report.
 Where computing takes long, `publishing` refuses a folder that cannot be written before it begins.
 
-A function is imported when it is asked for: the doctor of logs does not wait for the systems, nor a
+A function is imported when it is used: the doctor of logs does not wait for the systems, nor a
 list of scenarios for JAX. A new command is a function in a module here, and its row below.
 """
 

@@ -61,7 +61,7 @@ def bench_up(
             None leaves one as it is.
 
     Raises:
-        InputError, robins.scenario.ScenarioError: what was asked for cannot be run.
+        InputError, robins.scenario.ScenarioError: the request cannot be run.
         robins.bench.ports.port.PortError: a port cannot be opened.
     """
     if paused and not live:
@@ -83,7 +83,7 @@ def bench_up(
 
 
 def flight_of(scenario: str, settings: Sequence[str], options: Mapping[str, Any]) -> Flight:
-    """The run that is asked for; options that were not given stay as the scenario has them.
+    """Flight of a request; options that were not given stay as the scenario has them.
 
     Raises:
         robins.scenario.ScenarioError: there is no such scenario, or an option does not fit.
@@ -129,7 +129,7 @@ class Compared(NamedTuple):
     """Comparison of what a part sent in the record and in its replay."""
 
     node: str
-    frames: int  # that it said the second time
+    frames: int  # that it sent the second time
     same: bool  # byte for byte
     differences: list[FieldDifference]
     whole: bool  # neither record was cut or damaged
@@ -171,11 +171,11 @@ def bench_replay(
     diff: str | Path | None = None,
     progress: Progress = silent,
 ) -> Compared:
-    """Let a part hear a record again and compare what it says; or compare it in two records.
+    """Run a part again on a record and compare its answers; or compare it in two records.
 
     Args:
         record: of a run, as the bench wrote it.
-        node: which part.
+        node: name of the part.
         filter_: another filter for it to run.
         diff: another record to compare with, in place of running the part.
         progress: called with the share done and what is being done.
@@ -262,11 +262,11 @@ def bench_node(
     seed: int | None = None,
     opened: Callable[[], None] = lambda: None,
 ) -> None:
-    """Be a part of a scenario at a port until the bench says stop, as its process would be.
+    """Run a part of a scenario at a port until the bench sends stop, as its process would.
 
     Args:
         name: of the part.
-        port: where the bench is, "/dev/ttyUSB0,460800".
+        port: to the bench, "/dev/ttyUSB0,460800".
         scenario: as for `bench_up`, with the same seed.
         filter_: of the attitude determination.
         seed: of all noise.

@@ -1,4 +1,4 @@
-"""Runs of a filter by its entry points: what a board is given, and what JAX makes of it."""
+"""Runs of a filter by its entry points: inputs of a board, and the results of JAX."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from robins.systems.study import Case, Problem
 
 
 class Told(NamedTuple):
-    """What a prediction tells on a board."""
+    """Result of a prediction on a board."""
 
     code: Array
 
 
 class Used(NamedTuple):
-    """What an update tells on a board."""
+    """Result of an update on a board."""
 
     code: Array
     nis: Array
@@ -54,16 +54,16 @@ class BoardRun(NamedTuple):
 
     @property
     def steps(self) -> int:
-        """How many steps it has."""
+        """Number of steps."""
         return len(jax.tree_util.tree_leaves(self.given)[0])
 
     def cut(self, steps: int) -> BoardRun:
-        """Its first steps."""
+        """The same run, cut to its first steps."""
         given = jax.tree_util.tree_map(lambda a: a[:steps], self.given)
         return self._replace(given=given)
 
     def row(self, k: int) -> dict[str, tuple[Any, ...]]:
-        """What is given in one step."""
+        """Inputs of one step."""
         return jax.tree_util.tree_map(lambda a: a[k], self.given)
 
 
@@ -93,7 +93,7 @@ def _given(case: Case, model: Model) -> dict[str, tuple[Any, ...]]:
 
 
 def entry_functions(filter_: Filter, model: Model, names: Mapping[str, Any]) -> dict[str, Any]:
-    """The entry points as functions of JAX, ``(state, *args) -> (state, what it tells)``."""
+    """The entry points as functions of JAX, ``(state, *args) -> (state, result)``."""
 
     def predict(state: Any, u: Any):
         state, prediction = filter_.predict(state, model.motion, u)
@@ -117,11 +117,11 @@ def _told(info: StepInfo) -> Used:
 
 
 def reset_function(filter_: Filter, start: Any) -> Any:
-    """The entry point `reset`, ``(state, belief) -> (state, what it tells)``.
+    """The entry point `reset`, ``(state, belief) -> (state, result)``.
 
     The filter is `reset` as it was at the start, so that nothing is left of what it learned since,
-    not even of a state that is no longer finite. Of the factor what stands above the diagonal is
-    not looked at. A belief that is not finite is not taken.
+    not even of a state that is no longer finite. The entries of the factor above the diagonal
+    are ignored. A belief that is not finite is not taken.
     """
 
     def begin_anew(state: Any, belief: Belief):
@@ -144,7 +144,7 @@ def ends(calls: Calls) -> tuple[State, Array]:
 
 
 def by_jax(functions: Mapping[str, Any], run: BoardRun, kept: Callable[[Calls], Kept]) -> Kept:
-    """What is kept of the calls of each step, with a leading axis of steps; NumPy."""
+    """Kept values of the calls of each step, with a leading axis of steps; NumPy."""
 
     def step(state: State, row: State):
         calls: Calls = {}

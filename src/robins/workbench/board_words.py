@@ -1,4 +1,4 @@
-"""What a header says of its fields: units, frames and axes, as far as the problem knows them."""
+"""Comments on the fields of a header: units, frames and axes, as far as the problem knows them."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ Axis = tuple[str, str, str]  # block, "[unit], frame", axis
 
 
 def tangent_axes(problem: Problem, reported: Any, n: int) -> list[Axis | None]:
-    """What each of n components of the error is, where it is reported by itself.
+    """Axes of those of n components of the error that are reported by themselves.
 
-    Where what is reported turns with the time, that is all epochs.
+    Where the reported axes turn with time, those are reported so at all epochs.
     """
     rows = np.eye(n) if reported is None else np.asarray(reported)
     if rows.ndim == 3:

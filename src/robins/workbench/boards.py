@@ -43,15 +43,15 @@ from robins.workbench.scenarios import check_filters, find_scenario, read_scenar
 from robins.workbench.single_precision import Cost, cost, differences, in_floats
 
 STEPS = 60  # of a run, recorded for the test
-RUNS = 3  # by which the cost of single precision is told
+RUNS = 3  # by which the cost of single precision is measured
 NIS = 1e-7  # tolerance: it squares what is left of readings far larger than their sigma
 MARGIN, LEAST = 4.0, 1e-6  # of its differences in the test: other compilers round otherwise
-RESET = "reset"  # the entry point that begins anew
+RESET = "reset"  # the entry point that starts again
 SMALL = 200  # scalar operations up to which a loop is written out where the code is to be small
 
 
 class Exported(NamedTuple):
-    """What was written."""
+    """Files written, and remarks on them."""
 
     folder: Path
     files: tuple[str, ...]
@@ -94,8 +94,8 @@ def export_filter(
             the folder holds something; or no part of a rig is made of such a filter.
         robins.program.ProgramError: the filter does what has no place in C yet; the message names
             the line of the model or the rule.
-        robins.program.BuildError: single precision is asked for, and there is no compiler here by
-            which to tell what it costs.
+        robins.program.BuildError: single precision is requested, and there is no compiler here by
+            which to measure its cost.
     """
     _float64.require()
     if to.exists() and (not to.is_dir() or any(to.iterdir())):
@@ -182,7 +182,7 @@ def _built(folder: Path, part: str) -> Path:
 
 
 class _Asked(NamedTuple):
-    """What is exported."""
+    """Request of an export."""
 
     problem: Problem  # by which the filter is tried
     filter: str
@@ -241,7 +241,7 @@ def _library(
     about = (
         f"Filter '{name}' of {label}, by robins {__version__}; program {identity[:16]}.",
         "SI units and radians. NaN is missing, for each component of a reading.",
-        *(["Single precision: README.md says what that costs."] if single else []),
+        *(["Single precision: README.md states the cost."] if single else []),
         *components(axes),
     )
     library = library._replace(about=about)
@@ -261,7 +261,7 @@ def _entry(name: str, program: Program) -> Entry:
     if name == "predict":
         return Entry(name, program, ("input",), "Moves on by one step.")
     if name == RESET:
-        return Entry(name, program, ("belief",), "Begins anew from a belief, all else as by init.")
+        return Entry(name, program, ("belief",), "Starts again from a belief, all else as by init.")
     return Entry(name, program, ("reading", "about"), f"Uses a reading of {name[7:]}.")
 
 
@@ -289,7 +289,7 @@ def _record(run: BoardRun, functions: Mapping[str, Any], anew: Any) -> Recorded:
 
 
 def _sizes(made: Calls) -> dict[Key, float]:
-    """Numbers beside which a billionth is no difference, by struct and field.
+    """Sizes against which a billionth is no difference, by struct and field.
 
     They are the largest sigma of what is in the units of a sigma, and the degrees of freedom of a
     NIS.
@@ -314,7 +314,7 @@ def _largest(numbers: np.ndarray) -> float:
 
 
 def _compared(library: Library, record: Recorded, singles: Calls) -> Recorded:
-    """With how far off floats may be: a margin beside what they are."""
+    """Record with the tolerances of floats: their differences times a margin."""
     parts: dict[Key, float] = {}
     off = 0
     for entry in library.entries:
@@ -337,7 +337,7 @@ def _compared(library: Library, record: Recorded, singles: Calls) -> Recorded:
 
 
 def _readme(library: Library, name: str, label: str, found: Cost | None) -> str:
-    """One page for who compiles it."""
+    """README of the exported folder."""
     n, calls = library.name, "\n".join(f"    {library.signature(e)};" for e in library.entries)
     codes = "\n".join(f"| {int(code)} | {sentence} |" for code, sentence in SENTENCES.items())
     return f"""# Filter `{name}` of `{label}` in C
@@ -346,9 +346,9 @@ By robins {__version__}. C99, no allocation, no global state, no recursion, no l
 one thread may use one state, several threads several states.
 
     make check     compiles the library and a test, replays recorded steps, compares all outputs
-    make stack     says how much stack each function uses
+    make stack     lists the stack of each function
 
-`{n}.h` names all fields; `{n}.c` needs nothing else. What the model was told (noise, axes,
+`{n}.h` names all fields; `{n}.c` needs nothing else. The numbers of the model (noise, axes,
 constants) is in the code: export again to change it.
 
     void {n}_init({n}_state *state);
@@ -364,8 +364,8 @@ is missing is NaN, so the header refuses `-ffast-math`. Each call returns a code
 Where a reading was used, `sigma` of the result is the standard deviation of each component of the
 innovation: a reading is suspicious where the innovation exceeds three of them.
 
-`{n}_init` begins where the recorded run does. `{n}_reset` begins anew from a mean and the factor of
-a covariance, in any state: whatever else the filter has learned is then as after `{n}_init`. A
+`{n}_init` begins where the recorded run does. `{n}_reset` starts again from a mean and the factor
+of a covariance, in any state: whatever else the filter has learned is then as after `{n}_init`. A
 belief that is not finite is not taken (code {int(Code.NOT_FINITE)}). Read the state, copy it, but
 change it by `{n}_init` and the calls only.
 {_costs(found)}"""

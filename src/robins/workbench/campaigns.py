@@ -58,19 +58,19 @@ def plan_campaign(
     settings: Sequence[str] = (),
     machine: str = "",
 ) -> Plan:
-    """Begin a campaign in a store, or widen the one that is there by more runs or filters.
+    """Start a campaign in a store, or extend the one that is there by more runs or filters.
 
     Args:
         where: a folder, or an address such as "s3://bucket/campaign".
         name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
-        runs: how many; by default what the scenario says.
+        runs: their number; by default that of the scenario.
         seed: of the random streams.
         filters: names; by default those of the scenario and the default of its system.
         settings: "path=value" texts that change the scenario.
         machine: "vm", "c" or "jax"; not given, the interpreter where it can be.
 
     Raises:
-        InputError, robins.scenario.ScenarioError: what was asked for cannot be run, or another
+        InputError, robins.scenario.ScenarioError: the request cannot be run, or another
             campaign is there.
         robins.errors.RobinsError: the machine is not there, or the store cannot be used.
     """
@@ -121,7 +121,7 @@ def plan_campaign(
 
 
 def _of_runs(text: str) -> str:
-    """Of a scenario what any run depends on, and its title: what is kept may change at any time."""
+    """Scenario text that any run depends on, and its title: what is kept may change at any time."""
     said = scenario.mapping_of(text)
     return scenario.text_of({k: v for k, v in said.items() if k not in KEPT})
 
@@ -207,7 +207,7 @@ def sweep_of(where: Where) -> tuple[list[str], list[str]] | None:
 
 
 class Status(NamedTuple):
-    """How far a campaign is; runs are counted by filter."""
+    """Progress of a campaign; runs are counted by filter."""
 
     scenario: str
     seed: int
@@ -224,7 +224,7 @@ class Status(NamedTuple):
 
 
 def campaign_status(where: Where) -> Status:
-    """Read and check all shards of a campaign, and say how far it is."""
+    """Read and check all shards of a campaign, and report its progress."""
     store, plan = opened(where)
     found, there = gather(store, plan), kept(store, by_stem(plan.shards))
     return Status(
@@ -252,7 +252,7 @@ def diverged_of(found: State, name: str) -> list[int]:
 
 
 def campaign_report(where: Where) -> Outcome:
-    """Outcome of all runs that are there; fewer than wanted are told.
+    """Outcome of all runs that are there; fewer than wanted are reported.
 
     Args:
         where: folder or address.
@@ -339,7 +339,7 @@ def _kept(store: Store, shard: Shard, run: int, problem: Problem) -> Statistics 
 
 
 class Verified(NamedTuple):
-    """What a campaign was found to be."""
+    """Result of the verification of a campaign."""
 
     shards: int
     damaged: list[str]

@@ -15,7 +15,7 @@ Where = str | os.PathLike[str]
 
 
 class Comparison(NamedTuple):
-    """What differs between two results; where one has nothing it has None.
+    """Differences between two results; where one has nothing it has None.
 
     Attributes:
         scenarios: their names.
@@ -44,7 +44,7 @@ class Comparison(NamedTuple):
 
 
 def compare(first: Where, second: Where) -> Comparison:
-    """Compare two results: what was asked, what was found.
+    """Compare two results: their requests and their figures.
 
     Raises:
         robins.results.ResultError: one of them is none, or damaged.
@@ -76,7 +76,7 @@ def _differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, tuple[An
 
 
 def _flat(mapping: Mapping[str, Any], under: str = "") -> dict[str, Any]:
-    """Of tables in tables one, with dotted names as `--set` takes them."""
+    """One table of nested tables, with dotted names as `--set` takes them."""
     found: dict[str, Any] = {}
     for key, value in mapping.items():
         if isinstance(value, Mapping):

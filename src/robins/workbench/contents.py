@@ -1,4 +1,4 @@
-"""The command `list`: what there is to run, told without importing a system."""
+"""The command `list`: what there is to run, listed without importing a system."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def overview() -> dict[str, tuple[str, dict[str, str]]]:
 
 
 def inventory(system: str | None = None) -> dict[str, Any]:
-    """What there is, or what a system has: scenarios, filters, claims, whether it replays logs.
+    """Inventory of robins or of a system: scenarios, filters, claims, replay of logs.
 
     Args:
         system: its name, or "file.py:study"; "bench", or a rig that is no system: the bench; all

@@ -9,12 +9,12 @@ from robins.errors import RobinsError
 
 
 class InputError(RobinsError, ValueError):
-    """Something a command was given cannot be used."""
+    """An input of a command that cannot be used."""
 
 
 @contextlib.contextmanager
 def refusing(what: object) -> Iterator[None]:
-    """Say of a ValueError what it is about.
+    """Add to a ValueError what it is about.
 
     Raises:
         InputError: in its place.

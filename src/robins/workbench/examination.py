@@ -23,7 +23,7 @@ SEVERITIES = ("error", "warning", "note")
 
 
 class Examined(NamedTuple):
-    """What the files of a log hold, and what the doctor says of it."""
+    """Contents of the files of a log, and the findings of the doctor."""
 
     files: list[str]
     tables: list[dict[str, Any]]  # "kind", "file", "samples", "span_s", "rate_hz"
@@ -50,14 +50,14 @@ class Examined(NamedTuple):
 def examine(
     paths: Sequence[str | os.PathLike[str]], columns: Sequence[str | os.PathLike[str]] = ()
 ) -> Examined:
-    """Have the files of a log examined; one that ends in .toml tells how the sensor is mounted.
+    """Examine the files of a log; one that ends in .toml gives the mounting of the sensor.
 
     Args:
         paths: the files.
         columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
 
     Raises:
-        InputError: there is no log beside the configuration, or more than one of these.
+        InputError: there is a configuration without a log, or more than one of these.
         robins.logs.LogError, robins.scenario.ScenarioError: a file cannot be read.
     """
     files, configuration = parted(paths)
@@ -77,10 +77,10 @@ def examine(
 def unit_file(
     paths: Sequence[str | os.PathLike[str]], columns: Sequence[str | os.PathLike[str]] = ()
 ) -> str:
-    """A configuration with what a log tells of its unit and its receiver, for `robins replay`.
+    """Configuration for `robins replay` with what a log shows of its unit and its receiver.
 
     Args:
-        paths: the files of the log, without a configuration: what is written is found anew.
+        paths: the files of the log, without a configuration, so that the values come from the log.
         columns: as of `examine`.
 
     Raises:
@@ -135,7 +135,7 @@ def parted(paths: Sequence[str | os.PathLike[str]]) -> tuple[list[Path], Path | 
 
 
 def mounting_of(configuration: Path | None) -> logs.Mounting | None:
-    """How the sensor sits in the vehicle, as a replay would read it from the same file.
+    """Mounting of the sensor in the vehicle, as a replay would read it from the same file.
 
     Raises:
         InputError: the file names no system that replays logs.

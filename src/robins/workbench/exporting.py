@@ -1,4 +1,4 @@
-"""What a filter found in the formats of other programs: CSV, TUM, KML, GPX."""
+"""Estimates of a filter in the formats of other programs: CSV, TUM, KML, GPX."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Track(NamedTuple):
         return float(self.lat_rad[row]), float(self.lon_rad[row]), float(self.alt_m[row])
 
     def pieces(self) -> Iterator[tuple[list[tuple[str, str, str]], list[str] | None]]:
-        """Of each piece latitude and longitude [deg] and height [m], as text, and dates."""
+        """Latitude and longitude [deg] and height [m] of each piece, as text, and dates."""
         edges = np.flatnonzero(np.diff(self.whole, prepend=False, append=False))
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
             rows = slice(begin, end)
@@ -157,7 +157,7 @@ def with_exports(outcome: Outcome, formats: Sequence[str], name: str) -> Outcome
 
 
 def _remarks(solution: xr.Dataset, formats: Sequence[str]) -> list[str]:
-    """Sentences on what the files do not say."""
+    """Sentences on what the files do not contain."""
     said, ways = [], tracks(solution)
     if "tum" in formats and not ways:
         said.append("The files .tum hold attitudes only: no place was found, x, y and z are zero.")
@@ -295,7 +295,7 @@ FORMATS = {
     "kml": Format("tracks for globes and maps", "track", _kml),
     "gpx": Format("tracks, GPX 1.1", "track", _gpx),
 }
-"""What a result can be exported in."""
+"""Formats in which a result can be exported."""
 
 
 def _clocks_of_estimates(solution: xr.Dataset) -> list[str]:

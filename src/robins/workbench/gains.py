@@ -1,4 +1,4 @@
-"""The command `design`: filters with constant gains, and what a bound on the worst case costs."""
+"""The command `design`: filters with constant gains, and the cost of a bound on the worst case."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MISSING = "robins[design]"  # in the sentence of a method whose packages are no
 
 
 def as_text(gammas: Sequence[float]) -> list[str]:
-    """Gammas with as few digits as tell them apart, four at least."""
+    """Gammas with as few digits as distinguish them, four at least."""
     for digits in range(4, 18):
         texts = [f"{gamma:.{digits}g}" for gamma in gammas]
         if len(set(texts)) == len(texts):
@@ -31,7 +31,7 @@ def as_text(gammas: Sequence[float]) -> list[str]:
 
 
 def cell(attempt: Attempt) -> Any:
-    """What a table says where a method has no design."""
+    """Entry of a table where a method has no design."""
     if np.isfinite(attempt.least):
         return f"cannot, least {attempt.least:.4g}"
     return "not certified"
@@ -76,7 +76,7 @@ def solution_of(problem: Problem, found: TradeOff) -> xr.Dataset:
 
 
 def gains_of(problem: Problem, found: TradeOff) -> dict[str, Any]:
-    """Every gain with full digits, and what could not be had."""
+    """Every gain with full digits, and the methods without one."""
     made = [("kalman", found.kalman)]
     made += [(o.method, o.design) for o in found.attempts if o.design is not None]
     refused = [o for o in found.attempts if o.design is None]
@@ -119,7 +119,7 @@ def table_of(found: TradeOff) -> str:
 
 
 def advice(problem: Problem, found: TradeOff) -> list[str]:
-    """What the numbers say, in sentences."""
+    """Conclusions from the numbers, in sentences."""
     own, gain = found.kalman, _unit(problem.unit_gain)
     least = found.least
     reach = f"the least Hinf of {_whose(found)} is {least.reached:.4g}{gain}"
@@ -155,7 +155,7 @@ def advice(problem: Problem, found: TradeOff) -> list[str]:
 
 
 def _whose(found: TradeOff) -> str:
-    """Whose least gamma it is."""
+    """Set of gains that the least gamma refers to."""
     return "any gain" if found.least.exact or found.least.reached == 0.0 else "the gains found"
 
 
@@ -184,7 +184,7 @@ def design(
     methods: Sequence[str] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Constant-gain filters for a problem, and what a bound on the worst case costs.
+    """Constant-gain filters for a problem, and the cost of a bound on the worst case.
 
     Args:
         given: the path of a problem, or the name of an example.

@@ -79,7 +79,7 @@ def samples(
 
 
 def advice(found: Calibration) -> list[str]:
-    """What to do next, in sentences."""
+    """Advice on the next step, in sentences."""
     notes = []
     if not found.soft_iron:
         notes.append(
@@ -169,7 +169,7 @@ def calibrate(
     """Hard and soft iron of a magnetometer from a log in which it is turned about all its axes.
 
     Args:
-        log: its files; one that ends in .toml tells how the sensor is mounted.
+        log: its files; one that ends in .toml gives the mounting of the sensor.
         field: its size at the place, "48.5 uT"; by default the mean scale of the sensor is kept.
         begin: use samples from "20 s" after the first one on.
         end: use samples up to "80 s" after the first one.
@@ -177,7 +177,7 @@ def calibrate(
         progress: called with the share done and what is being done.
 
     Raises:
-        InputError: the log cannot be calibrated with; the sentence says why.
+        InputError: the log cannot be calibrated with; the sentence gives the reason.
         robins.units.UnitError: a field or a time without its unit.
         robins.logs.LogError: a file cannot be read.
     """

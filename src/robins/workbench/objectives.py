@@ -1,8 +1,8 @@
-"""What tuning makes small: the errors of simulated runs, or how badly a log is predicted.
+"""Objectives of tuning: the errors of simulated runs, or the prediction of a log.
 
-Both are measured of independent parts, runs or segments, in the columns `DENSITY` (log density of
+Both are measured on independent parts, runs or segments, in the columns `DENSITY` (log density of
 all measurements), `COMPONENTS` (how many were measured), and of simulated runs by block the mean
-square of the error's length and of what the filter states of it.
+square of the error's length and the variance that the filter states for it.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Varied(NamedTuple):
 
 
 def varied(texts: Sequence[str], parameters: Any, text: str) -> list[Varied]:
-    """What ``key`` or ``key=value`` says.
+    """Read texts ``key`` or ``key=value``.
 
     Raises:
         InputError: none is named, or one twice.
@@ -71,7 +71,7 @@ def varied(texts: Sequence[str], parameters: Any, text: str) -> list[Varied]:
 
 
 class Asked(NamedTuple):
-    """What is to be tuned, on what data: the same for simulated runs and for a log."""
+    """Request of a tuning and its data: the same for simulated runs and for a log."""
 
     filter: str
     vary: list[Varied]
@@ -97,7 +97,7 @@ def total_of(by: str, names: Sequence[str]) -> Callable[[np.ndarray], float]:
 
 
 def worded(by: str) -> str:
-    """What is made small, in words."""
+    """Objective in words."""
     if by == INNOVATIONS:
         return "log density of a measured component"
     return "geometric mean of the RMS errors of all blocks" if by == ERROR else f"RMS error of {by}"
@@ -116,7 +116,7 @@ def on_runs(
     settings: Sequence[str],
     progress: Progress,
 ) -> Asked:
-    """What is asked of simulated runs; arguments as of `robins.workbench.tune`.
+    """Request for simulated runs; arguments as of `robins.workbench.tune`.
 
     Raises:
         InputError, robins.scenario.ScenarioError: it cannot be done.
@@ -141,7 +141,7 @@ def on_runs(
     lay_out = read.study.lay_out
     ends = [parsed(settings_at(tuned, x)) for x in np.outer((0.0, 1.0), np.ones(len(tuned)))]
     course = lay_out(ends[0])
-    # what a filter believes of the course, such as its process noise, is what it is told
+    # a filter's assumptions on the course, such as its process noise, are its inputs
     moves = depends(course, *map(lay_out, ends))
 
     def trial(x: np.ndarray) -> Trial:
@@ -186,7 +186,7 @@ def settings_at(tuned: Sequence[Varied], x: np.ndarray) -> list[str]:
 
 @value
 class OfRuns:
-    """What is measured of each run: see above."""
+    """Measures of each run: see above."""
 
     blocks: Blocks = kind()
     count_from: int = kind()
@@ -217,7 +217,7 @@ def on_log(
     settings: Sequence[str],
     findings: Findings,
 ) -> Asked:
-    """What is asked of a recorded log; arguments as of `robins.workbench.tune`.
+    """Request for a recorded log; arguments as of `robins.workbench.tune`.
 
     Raises:
         InputError, robins.scenario.ScenarioError: it cannot be done.

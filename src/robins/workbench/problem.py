@@ -22,7 +22,7 @@ _OTHERS = {"title", "form", "gamma", "units"}
 
 
 class Problem(NamedTuple):
-    """What is to be designed."""
+    """Design problem."""
 
     name: str  # of the file or example
     title: str
@@ -30,7 +30,7 @@ class Problem(NamedTuple):
     plant: Plant
     blocks: dict[str, Any]  # the matrices as they were given
     gammas: list[float] | None
-    unit_z: str  # of what is estimated; "1" if it was not said
+    unit_z: str  # of what is estimated; "1" if it was not given
     unit_n: str  # of the modelling error
     text: str  # of the file
 

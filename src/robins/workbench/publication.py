@@ -1,4 +1,4 @@
-"""From an outcome to a result folder with its report: for every command the same way."""
+"""Publication of an outcome as a result folder with its report, the same for every command."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def publishing(
     """Hold a result folder while something is computed for it.
 
     The folder is refused at once if it could not be written. Without an outcome, or with an error,
-    what was there stays as it was. What was computed and cannot be written is kept beside it.
+    what was there stays as it was. What was computed and cannot be written is kept next to it.
 
         with publishing("results/walk") as publish:
             result = publish(replay(["imu.csv", "gnss.pos"]))

@@ -25,7 +25,7 @@ Findings = Callable[[Sequence[Finding]], None]
 
 
 def unheard(findings: Sequence[Finding]) -> None:
-    """What the doctor says, where nobody wants to hear it."""
+    """Ignore the findings of the doctor."""
 
 
 def replay(
@@ -44,7 +44,7 @@ def replay(
 
     Args:
         paths: the log's files; one that ends in .toml is the configuration.
-        system: which system navigates it.
+        system: that navigates it.
         filters: names; by default those of the configuration.
         settings: "path=value" texts that change the configuration.
         columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
@@ -52,10 +52,10 @@ def replay(
             among those of the outcome.
         seed: recorded in the result; a replay draws nothing.
         progress: called with the share done and what is being done.
-        findings: called with what the doctor says.
+        findings: called with the findings of the doctor.
 
     Raises:
-        InputError: the log or what was asked of it cannot be used.
+        InputError: the log or the request cannot be used.
         robins.logs.LogError, robins.scenario.ScenarioError: a file cannot be used.
     """
     _float64.require()
@@ -85,7 +85,7 @@ class OpenLog(NamedTuple):
     parameters: Any  # as read, with the settings
 
     def read(self, findings: Findings = unheard) -> Any:
-        """What its files hold, examined and cleaned.
+        """Contents of its files, examined and cleaned.
 
         Raises:
             InputError: the doctor finds errors, or the files are of another kind.
@@ -176,7 +176,7 @@ def align(
 
 
 def _examine(dataset: Dataset, findings: Findings) -> None:
-    """Ask the doctor.
+    """Examine a dataset by the doctor.
 
     Raises:
         InputError: there are errors; the message has all of them.

@@ -1,4 +1,4 @@
-"""Scenarios and configurations: found by name, and what is recorded of them in a result."""
+"""Scenarios and configurations: found by name, and recorded in a result."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def find_scenario(
     """System, name and text of a scenario.
 
     Args:
-        name: "system/name" of a packaged one; a path that ends in .toml, which says its system in
+        name: "system/name" of a packaged one; a path that ends in .toml, which names its system by
             the key ``system``; or a system of the user's own, "file.py:study" or the name of an
             installed one, whose parameters then have their defaults.
         recorded: a recorded pair takes the place of the simulation.
@@ -99,7 +99,7 @@ class Simulated(NamedTuple):
     text: str  # TOML, as it stands
     study: Study
     parameters: Any  # with the settings
-    source: str  # how it was asked for
+    source: str  # how it was requested
 
     @property
     def own(self) -> tuple[str, ...]:
@@ -116,7 +116,7 @@ class Simulated(NamedTuple):
             return self.study.problem(self.parameters, filters, seed)
 
     def parsed(self, settings: Sequence[str]) -> Any:
-        """Its parameters with other settings.
+        """Parameters of the scenario with other settings.
 
         Raises:
             robins.scenario.ScenarioError: they do not fit.
@@ -157,6 +157,6 @@ def beside(one: Simulated) -> tuple[str, ...]:
 
 
 def asked(text: str, settings: Sequence[str]) -> dict[str, Any]:
-    """Fields of an outcome: the scenario as it was run, and what ran it."""
+    """Fields of an outcome: the scenario as it was run, and the machine that ran it."""
     effective = scenario.text_of(scenario.override(scenario.mapping_of(text), settings))
     return {"parameters": effective if settings else text, "device": jax.devices()[0].device_kind}

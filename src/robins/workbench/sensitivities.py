@@ -1,4 +1,4 @@
-"""The command `sensitivity`: which uncertain parameter the variance of the error comes from."""
+"""The command `sensitivity`: the variance of the error by uncertain parameter."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Uncertain(NamedTuple):
 
 
 def uncertain(text: str) -> Uncertain:
-    """What ``key=low to high`` says; the unit of the high end serves for both.
+    """Read ``key=low to high``; the unit of the high end serves for both.
 
     Raises:
         InputError: it is not of this form.
@@ -93,24 +93,24 @@ def sensitivity(
     settings: Sequence[str] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Tell which share of the variance of the error comes from which uncertain parameter.
+    """Attribute the variance of the error to the uncertain parameters.
 
     The world varies; the filter believes the scenario as written. The output is the RMS of the
-    length of the error of each block, over runs and epochs that count: it is what requirements are
-    stated of, in a unit, and unlike its logarithm it has a variance where it may become zero.
+    length of the error of each block, over runs and epochs that count: requirements are stated
+    for it, in a unit, and unlike its logarithm it has a variance where it may become zero.
 
     Args:
         name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
         vary: texts ``key=low to high``.
-        filter_name: which; by default the first of the scenario.
-        runs: how many at each point, the same ones at all.
+        filter_name: of the filter; by default the first of the scenario.
+        runs: number at each point, the same runs at all.
         samples: a power of two; there are ``samples * (parameters + 2)`` points.
         seed: of the random streams and of the points.
         settings: "path=value" texts that change the scenario.
         progress: called with the share done and what is being done.
 
     Raises:
-        InputError, robins.scenario.ScenarioError: what was asked for cannot be computed.
+        InputError, robins.scenario.ScenarioError: the request cannot be computed.
     """
     _float64.require()
     every = _checked(vary, samples)
@@ -133,7 +133,7 @@ def sensitivity(
                 "decides the motion or what else all runs share, so it cannot vary with the rest "
                 "of the world",
                 f"--vary {one.key}",
-                "`robins sweep` lays out the scenario anew for each of its values.",
+                "`robins sweep` lays out the scenario again for each of its values.",
             )
     budget = Budget(study, given, course, view, contender, seed, tuple(ranges))
     points = sobol_points(len(every), samples, seed)
@@ -193,7 +193,7 @@ def _checked(vary: Sequence[str], samples: int) -> list[Uncertain]:
 
 
 def _refused(budget: Budget, every: Sequence[Uncertain]) -> InputError:
-    """Why the worlds cannot be traced, when they could not be."""
+    """Error for worlds that cannot be traced, with the reason."""
     names = [every[k].key for k in untraceable(budget)] or [one.key for one in every]
     return InputError(
         "decides a shape or a branch of the simulation, or goes through NumPy there, so that it "
@@ -203,7 +203,7 @@ def _refused(budget: Budget, every: Sequence[Uncertain]) -> InputError:
     )
 
 
-# ------------------------------------------------------------------------------- what is told
+# -------------------------------------------------------------------------------- of the report
 
 
 def _law(one: Between) -> str:
@@ -227,7 +227,7 @@ def _spread(squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _metrics(
     every: Sequence[Uncertain], blocks: Sequence[StateBlock], found: Indices
 ) -> dict[str, dict[str, Any]]:
-    """By parameter."""
+    """Indices with their bounds, by parameter."""
     out: dict[str, dict[str, Any]] = {one.key: {} for one in every}
     for j, one in enumerate(every):
         for k, b in enumerate(blocks):
@@ -379,7 +379,7 @@ def _warnings(
 
 
 def _next(name: str, filter_: str, every: Sequence[Uncertain], found: Indices) -> list[str]:
-    """What to look at next: the parameter that counts most somewhere."""
+    """Suggestion for the next step: the parameter that counts most somewhere."""
     known = np.nan_to_num(found.total, nan=-np.inf)
     if not np.any(np.isfinite(known)):
         return []

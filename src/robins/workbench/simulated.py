@@ -1,4 +1,4 @@
-"""The commands `run` and `bound`: a scenario simulated, and what its sensors allow at best."""
+"""The commands `run` and `bound`: a scenario simulated, and the best that its sensors allow."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ def run(
 
     Args:
         name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
-        runs: how many; by default what the scenario says.
+        runs: their number; by default that of the scenario.
         seed: of the random streams.
-        filters: names; by default those of the scenario, on which its claims are judged, and beside
-            them the default of its system.
+        filters: names; by default those of the scenario, on which its claims are judged, and the
+            default of its system.
         settings: "path=value" texts that change the scenario.
         machine: "vm", "c" or "jax"; not given, the interpreter where it can be.
         progress: called with the share done and what is being done.
 
     Raises:
-        InputError, robins.scenario.ScenarioError: what was asked for cannot be run.
-        robins.errors.RobinsError: the machine asked for is not there.
+        InputError, robins.scenario.ScenarioError: the request cannot be run.
+        robins.errors.RobinsError: the machine is not available.
     """
     _float64.require()
     check_machine(machine)
@@ -94,7 +94,7 @@ def demo(
 
 
 def _not_kept(one: Simulated) -> list[str]:
-    """A sentence where a scenario asks for histories that only a campaign in a folder keeps."""
+    """A sentence where a scenario requests histories that only a campaign in a folder keeps."""
     if not (one.parameters.keep or one.parameters.keep_diverged):
         return []
     return ["keep and keep_diverged are for `robins campaign run`: here run 0 alone has histories"]
@@ -111,21 +111,21 @@ def bound(
     settings: Sequence[str] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Tell what the sensors of a scenario allow at best, with the model of one of its filters.
+    """Compute the best that the sensors of a scenario allow, with the model of one of its filters.
 
     Args:
         name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
-        filter_name: whose model; by default that of the scenario's first filter.
-        runs: over how many simulated trajectories to average.
+        filter_name: whose model is taken; by default the scenario's first filter.
+        runs: number of simulated trajectories to average over.
         seed: of the random streams.
         without: sensors to leave out altogether.
-        at: times to tell, such as "200 s"; by default the quarters.
+        at: times to report, such as "200 s"; by default the quarters.
         settings: "path=value" texts that change the scenario.
         progress: called with the share done and what is being done.
 
     Raises:
-        InputError, robins.scenario.ScenarioError, robins.units.UnitError: what was asked for cannot
-            be computed.
+        InputError, robins.scenario.ScenarioError, robins.units.UnitError: the request cannot be
+            computed.
     """
     _float64.require()
     one = read_scenario(name, (*settings, f"runs={runs}"))

@@ -1,7 +1,7 @@
-"""What single precision costs a filter: its own runs in floats, beside doubles and the truth.
+"""Cost of single precision for a filter: its runs in floats, against doubles and the truth.
 
-The library is compiled on this machine and given what the filter was given, rounded to floats. What
-comes out is compared with double precision number by number, and both with the simulated truth.
+The library is compiled on this machine and gets the inputs of the filter, rounded to floats. Its
+output is compared with double precision number by number, and both with the simulated truth.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class BlockCost(NamedTuple):
 
     @property
     def growth(self) -> float:
-        """By what single precision multiplies the RMS, or the NEES if that moves further."""
+        """Factor of single precision on the RMS, or on the NEES if that moves further."""
         with np.errstate(all="ignore"):
             factor = np.divide(self.rms_single, self.rms)
             ratio = np.divide(self.nees_single, self.nees)
@@ -64,15 +64,15 @@ class BlockCost(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """What single precision costs.
+    """Cost of single precision.
 
     Attributes:
-        runs: how many runs were compared.
+        runs: number of runs compared.
         steps: of each.
         fields: of each field of the state, the largest difference over the largest number.
         blocks: errors against the truth.
-        codes: how many codes were compared.
-        codes_off: how many of them differ.
+        codes: number of codes compared.
+        codes_off: number of those that differ.
         finite: whether the state is finite wherever that of double precision is.
     """
 
@@ -86,13 +86,13 @@ class Cost(NamedTuple):
 
     @property
     def bearable(self) -> bool:
-        """Whether the filter is still the one that was judged."""
+        """True if the filter is still the one that was judged."""
         grows = max((b.growth for b in self.blocks), default=1.0)
         return self.finite and grows <= MUCH and self.codes_off <= SEVERAL * self.codes
 
     @property
     def verdict(self) -> str:
-        """A sentence for who decides."""
+        """Sentence that sums up the cost."""
         if not self.finite:
             return "Single precision RUINS this filter: its state does not stay finite."
         worst = max(self.blocks, key=lambda b: b.growth)
@@ -110,7 +110,7 @@ class Cost(NamedTuple):
         return "Single precision costs nothing that shows in the errors."
 
     def as_data(self) -> dict[str, Any]:
-        """For scripts; what is not finite is None."""
+        """Figures for scripts; None where one is not finite."""
 
         def sound(x: float) -> float | None:
             return x if math.isfinite(x) else None
@@ -145,7 +145,7 @@ class Cost(NamedTuple):
 def in_floats(
     library: Library, runs: Sequence[BoardRun], kept: Callable[[Calls], Kept]
 ) -> list[Kept]:
-    """What is kept of all calls of the library, compiled here; leading axis of steps, doubles.
+    """Kept values of all calls of the library, compiled here; leading axis of steps, doubles.
 
     Raises:
         BuildError: there is no compiler.
@@ -238,7 +238,7 @@ def cost(
     doubles: Sequence[Made],
     singles: Sequence[Made],
 ) -> Cost:
-    """What single precision costs in some runs."""
+    """Cost of single precision in some runs."""
     fields: dict[str, float] = {}
     for (wide, _), (narrow, _) in zip(doubles, singles, strict=True):
         for name, part in differences(library.state, wide, narrow).items():

@@ -72,7 +72,7 @@ def still(path: Path, columns: Sequence[str | os.PathLike[str]] = ()) -> Still:
 
 
 def _moved(gyro: np.ndarray, time_ns: np.ndarray) -> bool:
-    """Whether the mean rate of any second is off by more than a resting sensor's could be."""
+    """True if the mean rate of any second is off by more than a resting sensor's could be."""
     second = (time_ns - time_ns[0]) // 1_000_000_000
     starts = np.flatnonzero(np.diff(second, prepend=-1))
     count = np.diff(np.append(starts, len(second)))[:, None]

@@ -61,7 +61,7 @@ class Varied(NamedTuple):
 
 
 def varied(text: str) -> Varied:
-    """What ``key=a,b,c`` says.
+    """Read ``key=a,b,c``.
 
     Raises:
         InputError: it is not of this form, or names a value twice.
@@ -126,7 +126,7 @@ def sweep(
         **options: runs, seed and filters, as for `plan_campaign`.
 
     Raises:
-        InputError, robins.scenario.ScenarioError: what was asked for cannot be run.
+        InputError, robins.scenario.ScenarioError: the request cannot be run.
         robins.errors.RobinsError: a worker failed, or the store cannot be used.
     """
     chosen = [varied(text) for text in vary]
@@ -152,7 +152,7 @@ def sweep(
 
 
 def status(where: Where) -> Status | dict[str, Status]:
-    """How far a campaign is, or by the settings of its points each of those of a sweep."""
+    """Progress of a campaign, or of those of a sweep by the settings of its points."""
     every = _asked(where)
     if every is None:
         return campaign_status(where)
@@ -160,7 +160,7 @@ def status(where: Where) -> Status | dict[str, Status]:
 
 
 def report(where: Where) -> Outcome:
-    """What the runs say that are there of a campaign, or of all campaigns of a sweep.
+    """Outcome of the runs that are there of a campaign, or of all campaigns of a sweep.
 
     Raises:
         InputError: there is no run of some filter.
@@ -170,7 +170,7 @@ def report(where: Where) -> Outcome:
 
 
 def _asked(where: Where) -> tuple[list[Varied], list[Point]] | None:
-    """What the sweep of a folder varies, and its points; None where there is one campaign."""
+    """Varied parameters of a folder's sweep, and its points; None where there is one campaign."""
     sweep = sweep_of(where)
     if sweep is None:
         return None
@@ -179,7 +179,7 @@ def _asked(where: Where) -> tuple[list[Varied], list[Point]] | None:
 
 
 class Rms(NamedTuple):
-    """Of a filter and a block at one point: RMS error over runs and epochs, with 95 % bounds."""
+    """RMS error of a filter and a block at one point, over runs and epochs, with 95 % bounds."""
 
     rms: float
     low: float
@@ -188,7 +188,7 @@ class Rms(NamedTuple):
 
     @classmethod
     def of(cls, found: Statistics, block: StateBlock) -> Rms:
-        """In SI; the length of the error over the components of the block."""
+        """RMS of the length of the error over the components of a block, in SI."""
         squares = np.sum(found.run_rms[:, block.where] ** 2, axis=1)
         stated = np.sum(found.sigma[found.counted, block.where] ** 2, axis=1)
         rms, low, high = (float(one) for one in rms_with_bounds(squares))

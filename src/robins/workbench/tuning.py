@@ -1,4 +1,4 @@
-"""The command `tune`: what a filter should be told, by simulated runs or by a recorded log."""
+"""The command `tune`: parameters of a filter, by simulated runs or by a recorded log."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from robins.workbench.publication import csv_of, part
 from robins.workbench.recorded import Findings, open_log, unheard
 from robins.workbench.scenarios import asked
 
-RUNS = 16  # of either half, where nothing is said
+RUNS = 16  # of either half, where none is given
 
 
 def tune(
@@ -51,13 +51,13 @@ def tune(
 ) -> Outcome:
     """Find values of parameters with which a filter is best, and judge them on other data.
 
-    The world stays as the scenario, or the log, says it; only what the filter believes is tuned. If
+    The world stays as in the scenario, or the log; only the filter's assumptions are tuned. If
     the values found are not better on the data held out, beyond chance, those written stay.
 
     Args:
         names: a scenario, "system/name", a TOML file or "file.py:study"; or the files of a log.
         vary: texts ``key``, or ``key=value`` to begin elsewhere, one a parameter.
-        filter_name: which filter; by default the first of the scenario or system.
+        filter_name: of the filter; by default the first of the scenario or system.
         runs: simulated runs to choose on; as many others to judge on.
         seed: of the random streams.
         by: "error", the geometric mean of the RMS errors of all blocks, or the name of one block;
@@ -67,11 +67,11 @@ def tune(
         settings: "path=value" texts that change scenario and filter before.
         columns: TOML files that declare formats of the log's files.
         progress: called with the share done and what is being done.
-        findings: called with what the doctor says of a log.
+        findings: called with the doctor's findings on a log.
 
     Raises:
-        InputError, robins.scenario.ScenarioError: what was asked for cannot be done.
-        TooLittle: the data do not say what a parameter should be.
+        InputError, robins.scenario.ScenarioError: the request cannot be fulfilled.
+        TooLittle: the data do not determine a parameter.
     """
     _float64.require()
     if _is_log(names):
@@ -88,7 +88,7 @@ def tune(
 
 
 def _is_log(names: Sequence[str | os.PathLike[str]]) -> bool:
-    """Whether these are files of a log, and no scenario."""
+    """True if these are files of a log, and no scenario."""
     if len(names) > 1:
         return True
     name = os.fspath(names[0])
@@ -147,7 +147,7 @@ def _outcome(of: Asked, found: Tuned, seed: int) -> Outcome:
 
 
 def _change(of: Asked, found: Tuned) -> str:
-    """What became of the objective on the data held out, in words."""
+    """Change of the objective on the data held out, in words."""
     if of.by == worded(INNOVATIONS):
         total = total_of(INNOVATIONS, ())
         was, now = (-total(m.mean(axis=0)) for m in (found.before, found.after))
@@ -161,7 +161,7 @@ def _change(of: Asked, found: Tuned) -> str:
 
 
 def _metrics(of: Asked, parts: np.ndarray) -> dict[str, Any]:
-    """Of the data held out: the log density, and by block RMS error and what is stated over it."""
+    """Figures of the data held out: log density, and by block RMS error and stated over it."""
     mean = np.mean(parts, axis=0)
     out: dict[str, Any] = {"log_density": float(mean[DENSITY] / mean[COMPONENTS])}
     n = len(of.blocks)

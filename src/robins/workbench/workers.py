@@ -71,12 +71,12 @@ class _Process:
 
     @property
     def status(self) -> int | None:
-        """Its exit status, negative if it was killed; None as long as it runs."""
+        """Exit status, negative if it was killed; None as long as it runs."""
         return self._process.poll()
 
     @property
     def said(self) -> str:
-        """What it told of its errors."""
+        """Text of its error output."""
         self._errors.seek(0)
         return self._errors.read().decode("utf-8", "replace").strip()
 
@@ -118,7 +118,7 @@ def fill(
     workers: int,
     progress: Progress = silent,
 ) -> None:
-    """Have workers compute what is missing or damaged of a campaign, or of those of a sweep.
+    """Compute by workers what is missing or damaged of a campaign, or of those of a sweep.
 
     A worker that is killed is replaced. All are ended if this is interrupted.
 

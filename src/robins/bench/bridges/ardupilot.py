@@ -1,4 +1,4 @@
-"""The physics that ArduPilot's SITL asks for: servo outputs come, the motion goes back as JSON.
+"""Physics server of ArduPilot's SITL: receives servo outputs, returns the motion as JSON.
 
 Over UDP; ArduPilot sends to port 9002, we answer to where that came from. Its packets, little
 endian, of 16 channels or, with its parameter SERVO_32_ENABLE, of 32:
@@ -7,12 +7,12 @@ endian, of 16 channels or, with its parameter SERVO_32_ENABLE, of 32:
 
 ArduPilot waits for an answer to each packet, so the two are in lock-step. If none comes for some
 seconds it sends the packet again with the same count, and we answer the same again: nothing is
-computed twice. A count that jumps tells of packets that were lost. A smaller count, or another
-port, tells of an ArduPilot that was restarted: the physics then has to restart too.
+computed twice. A count that jumps means lost packets. A smaller count, or another
+port, means that ArduPilot was restarted: the physics then has to restart too.
 
-UDP has no connection, so whoever reaches the port can send. The first sender of a packet is the
-ArduPilot; `admits` is the rule by which another address takes its place. Datagrams of all others
-are counted as `strangers`, and nobody answers them.
+UDP has no connection, so any host that reaches the port can send. The first sender of a packet is
+the ArduPilot; `admits` is the rule by which another address takes its place. Datagrams of all
+others are counted as `strangers` and get no answer.
 
 (ArduPilot, libraries/SITL/examples/JSON/readme.md.) ArduPilot looks for the names of fields as
 text: no blank may follow a colon, "velocity" has to come before "velocity_wind", and each answer
@@ -215,7 +215,7 @@ class ArduPilotPhysics:
         return sender[0] == self._peer[0] and known and silent
 
     def receive(self, timeout_s: float) -> Servos | None:
-        """The next packet that asks for a step; None: none came in that time.
+        """Next packet that requests a step; None: none came in that time.
 
         A packet that was answered and comes again is answered again and not handed out.
 
@@ -236,15 +236,15 @@ class ArduPilotPhysics:
 
         Raises:
             BridgeError: a number is NaN or infinite, or there are too few or too many.
-            BridgeClosed: nobody asked, or this end was closed.
+            BridgeClosed: no request is waiting, or this end was closed.
         """
         if self._peer is None:
             raise BridgeClosed(
                 "no packet of ArduPilot came yet", f"port {self.port}", "call receive() first"
             )
         answer = encode(state)
-        # If we were slow, ArduPilot asked again meanwhile. It takes the answers one for one, so
-        # each beyond the first would leave it a step behind.
+        # If we were slow, ArduPilot has repeated its request meanwhile. It takes the answers one
+        # for one, so each beyond the first would leave it a step behind.
         while len(self._waiting) < _WAITING and (arrived := self._take(0.0)) is not None:
             self._waiting.append(arrived)
         asked = self._waiting
@@ -261,7 +261,7 @@ class ArduPilotPhysics:
             return False
 
     def _sort(self, datagram: bytes, sender: Address) -> Servos | None:
-        """A packet that asks for a step; None: it was no packet, or it was answered again."""
+        """Packet that requests a step; None: it was no packet, or it was answered again."""
         try:
             servos = decode(datagram)
         except BridgeError:

@@ -1,4 +1,4 @@
-"""What goes wrong at a bridge to another program."""
+"""Errors of a bridge to another program."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from robins.errors import RobinsError
 
 
 class BridgeError(RobinsError, ValueError):
-    """Something that a protocol cannot carry, or bytes that are none of its messages."""
+    """A value that a protocol cannot carry, or bytes that are none of its messages."""
 
 
 class BridgeClosed(RobinsError, ConnectionError):
-    """There is nobody at the other end, or no longer."""
+    """No program is connected at the other end, or no longer."""
 
     bad_input = False
 

@@ -34,7 +34,7 @@ FREEWHEEL_S = 0.004  # that a step waits for an answer while PX4 starts
 
 @dataclass
 class Px4Counts:
-    """What came from PX4 since we listen."""
+    """Counts of the messages received from PX4 since listening began."""
 
     actuators: int = 0
     heartbeats: int = 0
@@ -90,12 +90,12 @@ class Px4Simulator:
 
     @property
     def connected(self) -> bool:
-        """Whether there is a connection; that PX4 has gone shows at the next send or receive."""
+        """True if connected; a lost PX4 is noticed at the next send or receive."""
         return self._line is not None
 
     @property
     def freewheeling(self) -> bool:
-        """Whether PX4 has not answered a sample yet."""
+        """True until PX4 answers a sample."""
         return not self._answers
 
     def close(self) -> None:
@@ -152,7 +152,7 @@ class Px4Simulator:
         self._put(message(sample))
 
     def actuators(self, timeout_s: float) -> Actuators | None:
-        """The next that PX4 asks of the actuators; None: nothing came in that time.
+        """Next actuator commands of PX4; None: nothing came in that time.
 
         Raises:
             BridgeClosed: PX4 is not connected, or has gone.

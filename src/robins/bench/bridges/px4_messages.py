@@ -1,4 +1,4 @@
-"""What goes between a simulator and PX4: four messages of MAVLink's common set.
+"""Messages between a simulator and PX4: four of MAVLink's common set.
 
     HIL_SENSOR (107), from us             `Sensors`: IMU, magnetic field, pressure
     HIL_GPS (113), from us                `GnssFix`: position and velocity of a receiver
@@ -81,7 +81,7 @@ class GnssFix:
 
 @dataclass(frozen=True, kw_only=True)
 class Truth:
-    """The true motion. PX4 logs it beside its estimate and does not use it.
+    """The true motion. PX4 logs it with its estimate and does not use it.
 
     Attributes:
         time_us: of the simulation.
@@ -109,7 +109,7 @@ Px4Sample = Sensors | GnssFix | Truth
 
 
 class Actuators(NamedTuple):
-    """What PX4 asks of motors and servos."""
+    """Commands of PX4 to motors and servos."""
 
     time_us: int  # in lock-step: that of the sample which it answers
     controls: tuple[float, ...]  # 16: motors in [0, 1], servos in [-1, 1]; 0 while disarmed
@@ -118,12 +118,12 @@ class Actuators(NamedTuple):
 
     @property
     def armed(self) -> bool:
-        """Whether the motors may turn (MAV_MODE_FLAG_SAFETY_ARMED)."""
+        """True if the motors may turn (MAV_MODE_FLAG_SAFETY_ARMED)."""
         return bool(self.mode & 128)
 
     @property
     def lockstep(self) -> bool:
-        """Whether PX4's clock is that of our samples."""
+        """True if PX4 takes its clock from our samples."""
         return bool(self.flags & 1)
 
 

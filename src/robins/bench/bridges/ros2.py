@@ -2,7 +2,7 @@
 
 ROS 2 is reached by one of two programs on its side, each with its convention for keys:
 
-- "ros2dds": zenoh-bridge-ros2dds, beside ROS 2 over DDS. The key is the topic without its first
+- "ros2dds": zenoh-bridge-ros2dds, next to ROS 2 over DDS. The key is the topic without its first
   slash, "imu/data"; the payload is CDR.
 - "rmw_zenoh": ROS 2 with rmw_zenoh_cpp. The key is "<domain>/<topic>/<type>/<hash>", such as
   "0/imu/data/sensor_msgs::msg::dds_::Imu_/RIHS01_7d9a..."; the payload is CDR. Each sample has an
@@ -14,8 +14,8 @@ liveliness token is declared, so tools that list topics do not show ours.
 Messages are those of `robins.ros`, in the frames of ROS; its functions `imu`, `nav_sat_fix` and
 `odometry` make them of what robins has. Only the hash of a type needs rosbags.
 
-A session finds nobody by itself: it connects to the endpoints that are given and listens at those
-that are given, such as "tcp/127.0.0.1:7447".
+A session discovers no peers by itself: it connects to the endpoints that are given and listens at
+those that are given, such as "tcp/127.0.0.1:7447".
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def topic_key(
 
 
 def attachment(sequence: int, time_ns: int, gid: bytes) -> bytes:
-    """What rmw_zenoh attaches to a sample; gid: 16 bytes that name the publisher."""
+    """Attachment of rmw_zenoh to a sample; gid: 16 bytes that name the publisher."""
     return _ATTACHMENT.pack(sequence, time_ns, len(gid), gid)
 
 
@@ -100,7 +100,7 @@ class Ros2Topics:
 
     Attributes:
         bad: samples taken that were no message of their topic.
-        dropped: samples that nobody took in time.
+        dropped: samples that were not taken in time.
     """
 
     def __init__(
@@ -166,7 +166,7 @@ class Ros2Topics:
         self._session.close()
 
     def publish(self, topic: str, message: Message, time_ns: int, frame_id: str = "") -> None:
-        """Send a message, with the time and frame of its header; who does not listen yet misses it.
+        """Send a message, with the time and frame of its header; later subscribers miss it.
 
         Raises:
             BridgeError: the topic has no full name, or had another type before.
@@ -183,7 +183,7 @@ class Ros2Topics:
         self._publishers[key].put(data, attachment=attached)
 
     def heard(self, topic: str) -> bool:
-        """Whether somebody subscribes to a topic on which we have published."""
+        """True if a topic, on which we have published, has a subscriber."""
         kind = self._kinds.get(topic)
         publisher = None if kind is None else self._publishers.get(self._key(topic, kind))
         return publisher is not None and publisher.matching_status.matching

@@ -1,8 +1,9 @@
 """The broker of the bench: it holds the far ends of all lines and passes messages on.
 
-- `broker`: who says what to whom, step by step. `link`: one far end; what is wrong with its frames.
-- `faults`: what may go wrong on purpose, as parameters; `injector` does it.
-- `revive`: a part that was started anew is told all again. `errors`: what ends a run.
+- `broker`: passes messages between parts, step by step. `link`: one far end, and the checks of its
+  frames.
+- `faults`: faults that can be injected, as parameters; `injector` applies them.
+- `revive`: sends a restarted part all its input again. `errors`: conditions that end a run.
 """
 
 from robins.bench.broker.broker import Broker, Wiring

@@ -1,8 +1,8 @@
-"""Passes messages between the parts, step by step, over the links whose far ends it holds.
+"""Broker of messages between the parts, step by step, over the links whose far ends it holds.
 
 In each step it ticks a part as soon as all parts whose data of this step it needs are done, and the
-step is over when all are. Nothing here depends on how long anything took: that is the matter of the
-clock, which only says when a step begins and how long a part is waited for.
+step is over when all are. Nothing here depends on how long anything took: only the clock decides
+when a step begins and how long a part is waited for.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ Sends = Mapping[str, tuple[str, ...]]  # messages that a part sends
 Takes = Mapping[str, Mapping[str, int]]  # messages that it takes, and how many steps older
 _REMEMBERED = 64  # steps, whose messages are known if they come again
 _REPORT_S = 10.0  # between two reports of the parts that are waited for
-_GLANCE_S = 0.05  # how often the world beside the wire is looked at while nothing comes
+_GLANCE_S = 0.05  # period of polling everything but the wire while nothing comes
 _CLOCK_NS = time.monotonic_ns
 
 
 class Wiring(NamedTuple):
-    """Who says what to whom, in which messages."""
+    """Senders and receivers of each message."""
 
     wire: Wire
     sends: Sends
     takes: Takes
-    console: tuple[str, ...] = ()  # messages that the bench itself says
+    console: tuple[str, ...] = ()  # messages that the bench itself sends
 
     def sources(self, part: str) -> frozenset[str]:
         """Parts that must be done before this one may compute."""
@@ -60,7 +60,7 @@ class Ticked(NamedTuple):
 
 
 class Broker:
-    """The middle of the star.
+    """Hub of the star of links.
 
     Attributes:
         links: by part.
@@ -87,16 +87,16 @@ class Broker:
 
         Args:
             links: by part.
-            wiring: who says what to whom.
+            wiring: senders and receivers of each message.
             step_ns: length of a step.
             injector: the faults that the links have.
-            observe: told of each message that passes: name, time [ns], payload.
+            observe: called with each message that passes: name, time [ns], payload.
             glance: called now and then while nothing comes, and once a step.
-            done: told of an answer: part, step, when ticked, when answered [ns of the wall clock],
-                time it computed [ns].
+            done: called with each answer: part, step, when ticked, when answered [ns of the wall
+                clock], time it computed [ns].
             meanwhile: called when there is nothing to do but to wait for a part: what need not be
                 done before the part computes is done while it does.
-            keep: the histories of the parts that can be started anew.
+            keep: the histories of the parts that can be restarted.
             idle_s: for how long the process of a part has done nothing [s]; one that computes is
                 waited for however long it takes. Infinite: it has none.
             waiting: given the parts whose hello is waited for, and for how long they have been [s];
@@ -131,14 +131,14 @@ class Broker:
     # ------------------------------------------------------------------------------- beginning
 
     def gather(self, run: int, patience_s: float) -> None:
-        """Wait until every part has said hello, and let the run begin.
+        """Wait until every part has sent its hello, and start the run.
 
         Args:
             run: its number.
             patience_s: for a part without a process, or whose process does nothing.
 
         Raises:
-            BenchError: a part says nothing, or speaks another version of the wire.
+            BenchError: a part sends nothing, or uses another version of the wire.
         """
         self._run = run
         for link in self.links.values():
@@ -172,7 +172,7 @@ class Broker:
             known = wire.parts[number] if number < len(wire.parts) else f"part {number}"
             raise BenchError(f"at the port of '{name}' there is {known}: exchange the ports")
         if link.greeted and self._step >= 0 and frame.header.sequence == 0:
-            link.restart(self._run)  # it has been started anew
+            link.restart(self._run)  # the part has been restarted
         link.greeted = True
         self._put(link, "begin", BARE.encode("begin", {"step": self.step_ns}), 0)
         link.flush(_CLOCK_NS())
@@ -253,12 +253,12 @@ class Broker:
         self._advance()
 
     def say(self, message: str, payload: bytes) -> None:
-        """Pass on, between two steps, what the operator says; its time is the end of the last one.
+        """Pass on an operator message between two steps; its time is the end of the last one.
 
         It goes out with the ticks of the next step, to parts that take it with a lag of one.
 
         Raises:
-            SayError: it is not for the bench to say, or has a number beyond its limits.
+            SayError: the bench does not send this message, or a number is beyond its limits.
         """
         if message not in self.wiring.console:
             raise SayError(f"message: the bench does not say '{message}'")
@@ -270,7 +270,7 @@ class Broker:
                 self._put(self.links[taker], message, payload, self.time_ns)
 
     def revive(self, name: str, patience_s: float, glance: Callable[[], None]) -> None:
-        """Bring a part that was started anew to where the old one was; the run waits.
+        """Bring a restarted part to the state of the old one; the run waits.
 
         Args:
             name: of the part.
@@ -293,7 +293,7 @@ class Broker:
         """Go on without a part, whose process has ended, until `switch_on`."""
         link = self.links[name]
         with contextlib.suppress(OSError):
-            link.read(_CLOCK_NS(), self.time_ns)  # what it said last is of no use
+            link.read(_CLOCK_NS(), self.time_ns)  # its last output is of no use
         link.restart(self._run)
         link.greeted = False
         self.off.add(name)
@@ -304,7 +304,7 @@ class Broker:
         """Take in a part that was started again; the run waits for its hello.
 
         Raises:
-            BenchError: it says none.
+            BenchError: no hello comes.
             LinkLost: the far end of a port is gone.
         """
         self._await([name], patience_s)
@@ -411,7 +411,7 @@ class Broker:
     # ------------------------------------------------------------------------------------- the end
 
     def stop(self) -> None:
-        """Tell every part that the run is over."""
+        """Send every part the end of the run."""
         for link in self.links.values():
             try:
                 self._put(link, "stop", b"", self.time_ns)

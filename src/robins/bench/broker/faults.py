@@ -13,9 +13,9 @@ from robins.scenario import Parameters, Quantity, default
 
 Direction = Literal["from", "to"]
 Stage = Literal["sensed", "repeated", "said", "blind"]
-"""When the content of a frame is changed, in this order: what a sensor measures, what it says again
-and again in its place, what it says of it, and that it says nothing of it. What a blind sensor had
-lost it does not repeat."""
+"""Stage at which a fault changes the content of a frame, in this order: the measurement itself, its
+repetition in later frames, the values that are sent, and values that are missing. A blind sensor
+does not repeat its lost values."""
 
 _PLACE = ("link", "direction", "message", "share")
 _LINE: dict[str, tuple[str, ...]] = {
@@ -35,13 +35,13 @@ PROCESS = ("killed", "power")
 
 
 class Said(NamedTuple):
-    """A fault of a sensor or an actuator: its frames are sound, what they say is not.
+    """A fault of a sensor or an actuator: its frames are sound, their content is not.
 
     Attributes:
         link: of the part that has it.
-        message: that says it.
-        stage: see `Stage`; who repeats says again what it said last.
-        act: (values of the message, the fault, time of the run [ns]) -> values as they are said.
+        message: that carries it.
+        stage: see `Stage`; a sender that repeats sends its last values again.
+        act: (values of the message, the fault, time of the run [ns]) -> values as they are sent.
         takes: its parameters, besides place and share.
         needs: one of them that must be given; "": none.
     """
@@ -55,7 +55,7 @@ class Said(NamedTuple):
 
 
 class Table(NamedTuple):
-    """What the faults of a rig may be.
+    """Faults that a rig can have.
 
     Attributes:
         wire: its messages.
@@ -75,12 +75,12 @@ class Table(NamedTuple):
         return _LINE | {kind: (*_PLACE, *one.takes) for kind, one in self.said.items()}
 
     def carried(self, link: str, direction: Direction) -> tuple[str, ...]:
-        """What goes over the link of a part."""
+        """Names of the messages on the link of a part, in one direction."""
         return (self.sends if direction == "from" else self.takes)[link]
 
 
 class LinkFault(Parameters):
-    """Something goes wrong on a link from `begin` (included) to `end` (not; left out: for good).
+    """A fault on a link from `begin` (included) to `end` (excluded; left out: for good).
 
     Times are those of the clock of the run: a step has that of its end.
 
@@ -90,7 +90,7 @@ class LinkFault(Parameters):
     - "reorder": a frame comes after the next one of the same message, as what is late.
     - "delay": a frame comes ``delay`` later.
     - "killed": the part of the link is killed, at `begin`.
-    - "power": the part of the link is off, and begins anew at `end`, with nothing in mind.
+    - "power": the part of the link is off, and starts again at `end` without any memory.
     - and those of the sensors and actuators of a rig.
 
     ``link`` is that of a part, left out: of each; ``direction`` is "from" the part or "to" it;
@@ -113,7 +113,7 @@ class LinkFault(Parameters):
     @pydantic.model_validator(mode="before")
     @classmethod
     def _at_its_speaker(cls, given: Any) -> Any:
-        """Where the fault of a sensor or an actuator is, if it is left out."""
+        """Add link and message to a fault of a sensor or an actuator that leaves them out."""
         if isinstance(given, Mapping) and (said := cls.table.said.get(given.get("kind", ""))):
             return {"link": said.link, "message": said.message, **given}
         return given
@@ -138,16 +138,16 @@ class LinkFault(Parameters):
 
     @property
     def begin_ns(self) -> int:
-        """First time of the run at which it is there."""
+        """First time of the run at which it is active [ns]."""
         return round(self.begin * 1e9)
 
     @property
     def end_ns(self) -> float | int:
-        """First time at which it is there no more; infinite: never."""
+        """First time at which it is no longer active [ns]; infinite: never."""
         return math.inf if self.end is None else round(self.end * 1e9)
 
     def holds(self, now_ns: int) -> bool:
-        """Whether it is there at that time of the run."""
+        """True if the fault is active at that time of the run."""
         return self.begin_ns <= now_ns < self.end_ns
 
 
@@ -165,7 +165,11 @@ def faults_of(table: Table, **more: Any) -> type[LinkFault]:
 
 
 def _check_place(fault: LinkFault) -> None:
-    """That what the fault is to meet goes over that link."""
+    """Check that the message of a fault goes over its link.
+
+    Raises:
+        ValueError: no such link or message, or the link does not carry it.
+    """
     table = fault.table
     if fault.link is not None and fault.link not in table.sends:
         raise ValueError(f"link: there is no part '{fault.link}', only {', '.join(table.sends)}")

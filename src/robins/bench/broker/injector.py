@@ -1,8 +1,8 @@
-"""Injects faults into the links, at the bench.
+"""Injection of faults into the links, at the bench.
 
 A fault of the line acts on bytes: bit errors (the check is then wrong), loss, duplication,
-disorder, delay, silence. A fault of a sensor or an actuator acts on what is said: the payload
-changes, and the frame is as sound as any. Those come first, as on the way of a frame.
+disorder, delay, silence. A fault of a sensor or an actuator acts on the content: the payload
+changes, and the frame is as sound as any. Those are applied first, as on the way of a frame.
 
 Random numbers are addressed, not drawn in a row (Salmon et al., "Parallel random numbers: as easy
 as 1, 2, 3", SC 2011: NumPy's Philox): by the seed, the number of the fault, link, direction, and
@@ -29,7 +29,7 @@ _BLOCK = 256  # chances drawn at once
 
 
 class Piece(NamedTuple):
-    """What goes on: bytes that the line damaged, as they are, or a frame that gets a new header."""
+    """Output of the injector: bytes as the line damaged them, or a frame that gets a new header."""
 
     raw: bytes | None
     frame: Frame | None
@@ -43,7 +43,7 @@ class _Held(NamedTuple):
 
 
 class _Fault(NamedTuple):
-    """A fault as frames meet it."""
+    """A fault with its number, its times and the type of its message."""
 
     number: int
     begin_ns: int
@@ -62,7 +62,7 @@ class _Fault(NamedTuple):
 
 
 class Injector:
-    """Does what the faults say to the frames that pass.
+    """Apply faults to the frames that pass.
 
     Attributes:
         counts: frames hit so far, by kind and link; parts for "killed" and "power".
@@ -96,28 +96,28 @@ class Injector:
             self.add(fault)
 
     def add(self, fault: LinkFault) -> None:
-        """One more fault, after those there are; if its time has begun it acts from now on."""
+        """Add a fault after the present ones; if its time has come it acts from now on."""
         kind = None if fault.message is None else self._wire.numbers[fault.message]
         # a number is never used again, even when faults are cleared: each has its own noise
         self._faults.append(_Fault(self._added, fault.begin_ns, fault.end_ns, kind, fault))
         self._added += 1
 
     def clear(self) -> None:
-        """No fault any more; frames that are held back are due now."""
+        """Remove all faults; frames that are held back are due now."""
         self._faults.clear()
         for held in self._held.values():
             held[:] = [one._replace(due_ns=-math.inf, fault=None) for one in held]
 
     def remove(self, fault: LinkFault) -> None:
-        """That fault no more; frames that it holds back come in their time."""
+        """Remove a fault; frames that it holds back come in their time."""
         self._faults = [one for one in self._faults if one.is_ is not fault]
 
     def active(self, now_ns: int) -> list[LinkFault]:
-        """The faults that are there at that time of the run."""
+        """Faults that are active at that time of the run."""
         return [fault.is_ for fault in self._faults if fault.is_.holds(now_ns)]
 
     def killed(self, now_ns: int) -> list[str]:
-        """Links whose part is to be killed by now; each fault says so once."""
+        """Links whose part is to be killed by now; each fault is listed once."""
         found = []
         for fault in self._faults:
             link, due = fault.is_.link, fault.begin_ns <= now_ns
@@ -134,7 +134,7 @@ class Injector:
     def pass_on(
         self, link: str, direction: Direction, frame: Frame, raw: bytes, now_ns: int
     ) -> list[Piece]:
-        """What becomes of a frame: one piece, or two; none if it is lost or held back.
+        """Pieces that become of a frame: one or two; none if it is lost or held back.
 
         Args:
             link: part whose link it is.
@@ -192,15 +192,15 @@ class Injector:
         key = [self._seed, one.number * 2 * len(parts) + place]
         return np.random.Generator(np.random.Philox(key=key, counter=[0, count, use, 0]))
 
-    # ---------------------------------------------------------------- what is said
+    # ------------------------------------------------------------------- payloads
 
     def _say(
         self, where: tuple[str, str], kind: int, payload: bytes, met: list[_Fault], now_ns: int
     ) -> bytes:
-        """What a sensor or an actuator says, under the faults that it has; see `Stage`."""
+        """Payload of a sensor or an actuator under its faults; see `Stage`."""
         name = self._wire.names.get(kind)
         if name is None or len(payload) != self._wire.size_of(name):
-            return payload  # no such message; who takes it will refuse it
+            return payload  # no such message; its receiver will refuse it
         says = self._table.said
         hits = [
             one.is_ for one in met if one.is_.kind in says and self._hit(where, one) is not None
@@ -224,7 +224,7 @@ class Injector:
         return changed(changed(payload, at("said")), blind)
 
     def _lacks(self, name: str, payload: bytes) -> bool:
-        """Whether a number is missing of what a message says."""
+        """True if a number of a message is missing."""
         values = self._wire.decode(name, payload)
         fields = self._wire.message(name).fields
         return any(f.missing and np.isnan(values[f.name]).any() for f in fields)
@@ -240,7 +240,7 @@ class Injector:
         raw: bytes,
         now_ns: int,
     ) -> list[Piece]:
-        """What a fault of the line leaves of the pieces of a frame."""
+        """Pieces of a frame after a fault of the line."""
         fault, held = one.is_, self._held.setdefault(where, [])
         waits = any(h.fault == one.number and h.type == kind for h in held)
         if fault.kind == "reorder" and waits:
@@ -270,7 +270,7 @@ class Injector:
 
 
 def _inverted(raw: bytes, bits: int, noise: np.random.Generator) -> bytes:
-    """With so many bits the other way, no two the same."""
+    """Copy of a frame with so many bits inverted, no bit twice."""
     out = bytearray(raw)
     for k in noise.choice(8 * len(raw), min(bits, 8 * len(raw)), replace=False):
         out[k // 8] ^= 1 << int(k % 8)

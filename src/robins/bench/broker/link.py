@@ -1,9 +1,9 @@
-"""The bench's end of a link: frames out of bytes, bytes out of frames, and what is wrong with them.
+"""The bench's end of a link: frames to bytes and back, with counts of all that is wrong.
 
 What leaves gets its header here, then what goes wrong on purpose happens to it, then the line
-takes its time. What arrives goes the same way back. So a fault of the line is seen by whoever
-counts frames at the other end, exactly as a real one. Who watches sees what a part said as it said
-it, and what a part heard as it heard it: then its record can be heard again.
+takes its time. What arrives goes the same way back. So a receiver that counts frames at the other
+end sees a fault of the line exactly as a real one. A watcher sees the bytes as the part sent them
+and as the part received them: so its record can be replayed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from robins.errors import RobinsError
 
 
 class BenchError(RobinsError, RuntimeError):
-    """A run on the bench that cannot go on; says which part, when and why."""
+    """A run on the bench that cannot go on; names the part, the time and the cause."""
 
     bad_input = False
 
@@ -40,15 +40,15 @@ Direction = Literal["to", "from"]
 _MOST = 65536  # bytes read at once
 
 Watcher = Callable[[str, Direction, bytes, int], None]
-"""Who is told of all that goes over a link, as it was on the line: link, direction, the bytes of a
+"""Observer of all that goes over a link, as it was on the line: link, direction, the bytes of a
 whole frame or bytes that are none, time [ns]."""
 Refuser = Callable[[str, str, Unsound], None]
-"""Who is told of a frame that is refused: link, message, why."""
+"""Receiver of the refused frames: link, message, reason."""
 
 
 @dataclass
 class Health:
-    """What a link has carried so far, towards the bench; `Link.count` alone writes it."""
+    """Counts of frames from a link to the bench; `Link.count` alone writes it."""
 
     frames: int = 0  # data frames, sound and new
     wrong: int = 0  # runs of bytes that are no frame
@@ -70,7 +70,7 @@ class Link:
     Attributes:
         name: of the part.
         health: see `Health`.
-        greeted: whether the part has said hello, in this run.
+        greeted: whether the part has sent its hello, in this run.
     """
 
     def __init__(
@@ -90,10 +90,10 @@ class Link:
             fd: non-blocking file descriptor, of a pseudo-terminal or a real port.
             wire: its messages.
             injector: what goes wrong on purpose.
-            watch: told of everything on the line.
+            watch: called with everything on the line.
             baud: of the virtual line; None: bytes get through at once, or the line is real.
-            refuse: told of each frame that cannot be what its message says; it is counted and goes
-                no further.
+            refuse: called with each frame that contradicts the table of its message; it is counted
+                and goes no further.
         """
         self.name, self.fd = name, fd
         self._wire, self._refuse = wire, refuse
@@ -106,7 +106,7 @@ class Link:
         self.restart(0)
 
     def restart(self, run: int) -> None:
-        """Both directions begin anew, for a run or for a part that has been started anew."""
+        """Restart both directions, for a new run or for a restarted part."""
         self._run, self._sent = run, 0
         self._sequence = Sequence()
         self._receiver, self._spoilt = Receiver(), Receiver()
@@ -127,7 +127,7 @@ class Link:
         Returns:
             The bytes that go out.
         """
-        if name == "begin":  # said to each hello, always as number 0
+        if name == "begin":  # sent to each hello, always as number 0
             number, self._sent = 0, max(self._sent, 1)
         else:
             number, self._sent = self._sent, (self._sent + 1) % 2**32
@@ -178,16 +178,16 @@ class Link:
 
     @property
     def pending(self) -> bool:
-        """Whether bytes wait for the port."""
+        """True if bytes wait for the port."""
         return bool(self._out or self._ready)
 
     @property
     def is_slow(self) -> bool:
-        """Whether it has a virtual line, which takes its time."""
+        """True if it has a virtual line, which takes its time."""
         return self._lines is not None
 
     def next_ns(self) -> int | None:
-        """When the line will have carried another byte, on the clock that `flush` is given."""
+        """Time at which the line has carried another byte [ns], on the clock of `flush`."""
         if self._lines is None:
             return None
         times = [t for line in self._lines if (t := line.next_ns) is not None]
@@ -253,7 +253,7 @@ class Link:
             found.append((name, frame))
 
     def _bars(self, name: str, frame: Frame, now_ns: int) -> bool:
-        """Refuse a frame that cannot be what its message says."""
+        """Refuse a frame that contradicts the table of its message."""
         if (why := self._wire.unsound(name, frame.payload)) is None:
             return False
         if name != "hello":  # whose number is not of this run
@@ -263,7 +263,7 @@ class Link:
         return True
 
     def _counts(self, frame: Frame, now_ns: int) -> bool:
-        """Count the number of a frame; whether it is new and in its order."""
+        """Count the number of a frame; true if it is new and in its order."""
         here = now_ns if frame.header.time_ns == now_ns else None
         most = self._sequence.REMEMBERED + self._most_lost
         self._most_lost = 0

@@ -28,15 +28,15 @@ class Told(NamedTuple):
 
 
 class History:
-    """What went out to a part since it put its memory aside last.
+    """Frames sent to a part since it last saved its memory.
 
     Attributes:
-        told: so far.
-        since: the step after which the memory was put aside; -1: never.
+        told: those frames.
+        since: the step after which the memory was saved; -1: never.
     """
 
     def __init__(self, is_there: Callable[[int], bool]):
-        """Begin with a run.
+        """Start with a run.
 
         Args:
             is_there: whether the memory of a step has been written.
@@ -50,12 +50,12 @@ class History:
         self.told.append(Told(step, raw))
 
     def forget(self) -> None:
-        """Begin anew: the part has lost its memory, and was told nothing."""
+        """Start again: the part has lost its memory and has received nothing."""
         self.told.clear()
         self.since = -1
 
     def answered(self, step: int) -> None:
-        """Forget what is in the memory of a step that the part was done with."""
+        """Drop frames up to a step whose memory the part has saved."""
         if is_due(step) and step > self.since and self._is_there(step):
             first = next(k for k, one in enumerate(self.told) if one.step == step)
             del self.told[: first + 1]
@@ -71,11 +71,11 @@ def catch_up(
     glance: Callable[[], None],
     idle_s: Callable[[], float] = lambda: math.inf,
 ) -> None:
-    """Wait for the hello of a part that was started anew, and bring it to where the old one was.
+    """Wait for the hello of a restarted part, and bring it to the state of the old one.
 
     Args:
         link: its link; nothing else reads or writes it meanwhile.
-        told: all that was sent to the old one since the memory of this one, in order.
+        told: all frames sent to the old one since the memory of this one, in order.
         begin: the frame that begins the run.
         answered: the last step whose tick the old one answered; ticks beyond are sent, but their
             answers are left to the broker. -1: none.
@@ -136,7 +136,7 @@ class _Talk:
             if min(time.monotonic() - began, self._idle_s()) > self._patience_s:
                 what = name if step is None else f"answer to the tick of step {step}"
                 raise BenchError(
-                    f"'{self._link.name}' was started anew, but there is no {what} from it in "
+                    f"'{self._link.name}' was restarted, but there is no {what} from it in "
                     f"{self._patience_s:g} s"
                 )
             self._glance()

@@ -1,7 +1,8 @@
-"""What the operator says to the parts through the bench: messages that no part sends.
+"""Messages from the operator to the parts, through the bench: those that no part sends.
 
-A scenario says them at times of the run, the page and scripts when they like. Each goes out at the
-boundary of two steps, with the time at which the step before it ended; parts hear it in the next.
+A scenario sends them at set times of the run, the page and scripts at any time. Each goes out at
+the boundary of two steps, with the time at which the step before it ended; parts receive it in the
+next step.
 """
 
 from __future__ import annotations
@@ -22,16 +23,16 @@ _KINDS = {known[0]: kind for kind, known in reversed(units.KINDS.items())}  # by
 
 
 class SayError(RobinsError, ValueError):
-    """What cannot be said through the bench; names the message, field and limit."""
+    """An operator message that the bench cannot send; names the message, field and limit."""
 
 
 class Desk(NamedTuple):
-    """What the operator of a rig may say.
+    """Operator messages of a rig.
 
     Attributes:
         wire: its messages.
-        console: names of those that the bench says.
-        refuses: (message, values) -> why it cannot be, though each number is within its limits.
+        console: names of those that the bench sends.
+        refuses: (message, values) -> why it is refused, though each number is within its limits.
     """
 
     wire: Wire = BARE
@@ -39,16 +40,16 @@ class Desk(NamedTuple):
     refuses: Callable[[str, Mapping[str, Any]], str] = lambda message, values: ""
 
     def payload(self, message: str, values: Mapping[str, Any]) -> bytes:
-        """What goes out.
+        """Encode an operator message.
 
         Args:
-            message: which.
+            message: its name.
             values: by field, in the units of the wire. One that is left out is NaN where the
                 message has that for missing, else 0.
 
         Raises:
-            SayError: it is not for the bench to say, has no such field, or a value is beyond its
-                limits.
+            SayError: the bench does not send this message, it has no such field, or a value is
+                beyond its limits.
         """
         if message not in self.console:
             known = f"{hint(message, self.console)} It says {', '.join(self.console) or 'nothing'}"
@@ -71,10 +72,10 @@ def _blank(f: Field) -> Any:
 
 
 class Saying(Parameters):
-    """Something that the operator says, `at` a time of the run: at the first boundary of steps from
-    then on, and not before the end of the first step.
+    """Operator message `at` a time of the run: at the first boundary of steps from then on, and not
+    before the end of the first step.
 
-    ``message`` is one that the bench says; then follow its fields. One that is left out is missing
+    ``message`` is one that the bench sends; then follow its fields. One that is left out is missing
     where the message allows that, else 0. Of two in one step the later one stands.
     """
 
@@ -90,17 +91,17 @@ class Saying(Parameters):
 
     @property
     def payload(self) -> bytes:
-        """What goes out."""
+        """Encoded message."""
         given = self.model_fields_set - set(Saying.model_fields)
         return self.desk.payload(self.message, {name: getattr(self, name) for name in given})
 
     def step(self, step_ns: int) -> int:
-        """The first step whose parts hear it, from 1."""
+        """First step whose parts receive it, from 1."""
         return max(1, -(-round(self.at * 1e9) // step_ns))
 
 
 def sayings_of(desk: Desk) -> type[Saying]:
-    """What the operator of a rig may say, as parameters: a field for each of its messages.
+    """Operator messages of a rig as parameters: every field of its messages.
 
     Raises:
         SayError: two messages have a field of one name that is not the same.
@@ -119,7 +120,7 @@ def sayings_of(desk: Desk) -> type[Saying]:
 
 
 def _type(f: Field) -> Any:
-    """As a scenario gives a field: with a unit where the wire's is one of the SI."""
+    """Type of a field in a scenario: with a unit where the wire's is one of the SI."""
     one: Any = float if f.kind == "f64" else int
     if f.unit in _KINDS and f.unit != "1":
         of = one if f.length == 1 else tuple[(one,) * f.length]

@@ -1,10 +1,10 @@
 """The live page: a running bench in a browser, from a process of its own.
 
-- `Live`: what the bench holds; starts the server, feeds it, takes its commands, never waits for it.
-- `signals`: what is drawn.
-- `feed`: what goes between the bench and the server.
+- `Live`: the handle of the bench; starts the server, feeds it, takes its commands, never waits.
+- `signals`: signals and plots of the page.
+- `feed`: data between the bench and the server.
 - `hub`, `commands`, `guard`, `server`: the server; they need the extra "live".
-- `static`: the page; no build step, uPlot with its licence beside it.
+- `static`: the page; no build step, uPlot with its licence.
 """
 
 from robins.bench.live.feed import Signal

@@ -13,7 +13,7 @@ LONGEST_S = 3600.0  # of a fault; without a length it lasts until it is cleared
 
 
 class CommandError(RobinsError, ValueError):
-    """What the page sent is no command; the text is for the page."""
+    """Text of a page that is no command; the message is for the page."""
 
 
 def read(
@@ -22,15 +22,15 @@ def read(
     alarms: Sequence[Mapping[str, Any]] = (),
     says: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """The command that a page sent.
+    """Command sent by a page.
 
     Args:
         text: JSON: `{"do": ...}`, with "label" and "duration_s" (or neither) for "inject", with
             "label" (or not) for "clear", with "label" for "say", with "alarms", their numbers, for
             "acknowledge".
-        faults: that the page was offered, each with its label.
+        faults: offered to the page, each with its label.
         alarms: that wait to be acknowledged, the oldest first: "id", "time_s", "text".
-        says: labels of what the operator can say to the parts.
+        says: labels of the operator messages.
 
     Returns:
         The command as `Live.commands` gives it.
@@ -76,7 +76,7 @@ def read(
 
 
 def _acknowledged(ids: Any, alarms: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Which of these alarms wait, and a label by which a record tells them."""
+    """Numbers of those alarms that wait, and a label that names them in a record."""
     if not isinstance(ids, list) or not all(type(one) is int for one in ids):
         raise CommandError(f"alarms are acknowledged by a list of their numbers: {_short(ids)}")
     found = [one for one in alarms if one["id"] in ids]  # another page may have been quicker

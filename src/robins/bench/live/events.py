@@ -1,4 +1,4 @@
-"""The events of a run, of which a bounded number is kept, and who has acknowledged its alarms.
+"""The events of a run, of which a bounded number is kept, and the acknowledgement of alarms.
 
 An event is a mapping: `id`, `level`, `time_s`, `text`; `count` and `until_s` if it came more than
 once in a row; `acknowledged` of an alarm.
@@ -31,19 +31,19 @@ class Events:
         return again
 
     def keep(self, event: dict[str, Any]) -> None:
-        """Keep an event in the place of what was known of it."""
+        """Keep an event in the place of its former state."""
         if self.kept and self.kept[-1]["id"] == event["id"]:
             self.kept[-1] = event
         else:
             self.kept = latest([*self.kept, event], lambda one: one["level"], EVENTS)
 
     def waiting(self) -> list[dict[str, Any]]:
-        """Alarms that nobody has acknowledged."""
+        """Alarms that are not acknowledged."""
         alarms = (one for one in self.kept if one["level"] == "alarm")
         return [one for one in alarms if "acknowledged" not in one]
 
     def acknowledge(self, ids: Collection[int]) -> None:
-        """Note that somebody has."""
+        """Note the acknowledgement of alarms."""
         for one in self.waiting():
             if one["id"] in ids:
                 one["acknowledged"] = True

@@ -33,7 +33,7 @@ class Signal(NamedTuple):
 
     An attitude is four signals that follow one another, w, x, y, z of the quaternion from body to
     reference, scalar first, with the same `of`. A plot of attitudes is drawn in three dimensions:
-    the first is solid, others are ghosts beside it.
+    the first is solid, others are shown transparent.
     """
 
     name: str
@@ -57,7 +57,7 @@ def check(signals: Sequence[Signal]) -> None:
     units: dict[str, str] = {}
     for s in signals:
         if s.name in by_name:
-            raise ValueError(f"two signals are named '{s.name}'; names tell them apart")
+            raise ValueError(f"two signals are named '{s.name}'; names distinguish them")
         if s.role not in get_args(Role):
             roles = ", ".join(get_args(Role))
             raise ValueError(f"signal '{s.name}': role '{s.role}' is none of {roles}")
@@ -108,7 +108,7 @@ EVENTS = 200  # lines of the same
 
 
 class Kind(IntEnum):
-    """What a body is."""
+    """Type of the body of a frame."""
 
     HELLO = 0
     SAMPLE = 1
@@ -157,7 +157,7 @@ def _plain(value: Any) -> Any:
 
 
 def latest(events: Sequence[Any], kind: Callable[[Any], Hashable], most: int) -> list[Any]:
-    """As many of the latest events as there is room for, in their order.
+    """Latest events, as many as there is room for, in their order.
 
     Each kind has the same room, and what one does not need is for the others; so a thousand
     warnings leave the alarm that came before them.
@@ -165,7 +165,7 @@ def latest(events: Sequence[Any], kind: Callable[[Any], Hashable], most: int) ->
     Args:
         events: the oldest first.
         kind: of an event.
-        most: how many there is room for.
+        most: number that there is room for.
     """
     if len(events) <= most:
         return list(events)

@@ -2,7 +2,7 @@
 
 A browser on the machine of the bench also runs pages of other sites, which may open a websocket to
 any address. Two headers, which a page cannot forge, identify them: `Origin`, the site of the page,
-must be this server, and `Host`, the address that it asked for, must be an address or a name of this
+must be this server, and `Host`, the address that it requested, must be an address or name of this
 machine, since a foreign name can be made to point here (DNS rebinding).
 """
 
@@ -20,7 +20,7 @@ _HOST = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(?::\d{1,5})?")
 
 
 def known_host(host: str) -> bool:
-    """Whether a Host header is a bare address, localhost or the name of this machine."""
+    """True if a Host header is a bare address, localhost or the name of this machine."""
     found = _HOST.fullmatch(host)
     if found is None:
         return False
@@ -35,7 +35,7 @@ def known_host(host: str) -> bool:
 
 
 def same_origin(origin: str | None, host: str) -> bool:
-    """Whether an Origin header, which programs other than browsers leave out, is that of Host."""
+    """True if an Origin header names the Host, or there is none, as from other than browsers."""
     if origin is None:
         return True
     try:
@@ -46,7 +46,7 @@ def same_origin(origin: str | None, host: str) -> bool:
 
 
 class Guard:
-    """Answers pages of other sites with 403, and tells browsers to load nothing from elsewhere."""
+    """Middleware: answers other sites with 403, lets browsers load nothing from elsewhere."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

@@ -42,7 +42,7 @@ class Live:
         url: of the page.
         run: number of the run.
         dropped: samples that the server was too slow, or not there, to take.
-        restarts: times that the server was started anew.
+        restarts: times that the server was restarted.
     """
 
     def __init__(
@@ -58,19 +58,19 @@ class Live:
         """Start the server and wait until it listens.
 
         Args:
-            signals: what each sample has, in this order.
+            signals: of each sample, in this order.
             title: of the page.
             run: number of the run; a page clears its plots when it changes.
-            host: where to listen; who reaches it can stop the bench, so another than this machine
-                gives a warning.
+            host: address to listen at; any program that reaches it can stop the bench, so another
+                than this machine gives a warning.
             port: to listen at; 0: any that is free.
             faults: that the page offers to inject: each `{"label": str, "fault": {...}}`.
-            says: labels of what the page offers to say to the parts.
+            says: labels of the operator messages that the page offers.
 
         Raises:
             ValueError: signals that cannot be drawn, or faults without a label of their own.
             ImportError: the extra "live" is not installed.
-            OSError: the host or port cannot be had.
+            OSError: the host or port is not available.
             RuntimeError: the server does not start.
         """
         check(signals)
@@ -102,7 +102,7 @@ class Live:
             self.close()
             raise
 
-    # ------------------------------------------------------------------------- what the bench says
+    # ---------------------------------------------------------------------- from bench to page
 
     def push(self, time_s: float, values: Sequence[float] | np.ndarray) -> None:
         """Show a sample.
@@ -128,7 +128,7 @@ class Live:
         self._pump()
 
     def status(self, status: Mapping[str, Any]) -> None:
-        """Show how the bench is; the latest counts. The keys are those of docs/live.md.
+        """Show the state of the bench; the latest counts. The keys are those of docs/live.md.
 
         Raises:
             TypeError: something in it is no number, text, list or mapping.
@@ -137,9 +137,9 @@ class Live:
         self._pump()
 
     def event(self, level: Level, time_s: float, text: str) -> None:
-        """Add a line to the events, or to the count of the last if it says the same.
+        """Add a line to the events, or to the count of the last if the text is the same.
 
-        An "alarm" goes to the alarm line too, until somebody acknowledges it.
+        An "alarm" goes to the alarm line too, until it is acknowledged.
 
         Args:
             level: how much it matters.
@@ -167,16 +167,16 @@ class Live:
         self._hello = self._make_hello()
         self._pump()
 
-    # ------------------------------------------------------------------------- what the page says
+    # ---------------------------------------------------------------------- from page to bench
 
     def commands(self) -> list[dict[str, Any]]:
-        """What was pressed since the last call, oldest first.
+        """Commands of the page since the last call, oldest first.
 
         Each has "do": "start", "pause", "stop", "inject", "clear", "say" or "acknowledge". "inject"
         has the "label" and the "fault" as they were given, and "duration_s", a number, or None for
         "until cleared"; "clear" has the "label" of one fault, or None for all; "say" has the
-        "label" of what was offered; "acknowledge" has "alarms", the numbers of events, and a
-        "label" that says in words which.
+        "label" of an offered message; "acknowledge" has "alarms", the numbers of events, and a
+        "label" that describes them.
         """
         self._receive()
         taken = list(self._commands)
@@ -187,7 +187,7 @@ class Live:
 
     @property
     def alive(self) -> bool:
-        """Whether the server runs."""
+        """True if the server runs."""
         return self._pipe is not None and self._process is not None and self._process.poll() is None
 
     def poll(self) -> None:
@@ -235,7 +235,7 @@ class Live:
         ours, theirs = socket.socketpair()
         ours.setblocking(False)
         self._pipe, self._unread, self._listens = ours, b"", False
-        # A server that comes anew shows what the one before it did.
+        # A restarted server shows what the one before it did.
         self._hello: bytes | None = self._make_hello()
         self._before = self._history.pack(self.run)
         lines = (feed.to_json(event).encode() for event in self._events.kept)
@@ -282,7 +282,7 @@ class Live:
             self._receive()
 
     def _next(self) -> bytes:
-        """What goes next, in the order in which a page needs it; empty: nothing waits."""
+        """Next bytes, in the order in which a page needs them; empty: nothing waits."""
         if self._hello is not None:
             kind, body, self._hello = Kind.HELLO, self._hello, None
         elif self._before:

@@ -26,7 +26,7 @@ HISTORY_HEAD = struct.Struct("<6I")
 
 
 class History:
-    """What samples were; see above.
+    """Least and greatest values of the samples of a run, in buckets; see above.
 
     Attributes:
         samples: how many.
@@ -48,7 +48,7 @@ class History:
             self._take_in()
 
     def pack(self, run: int) -> bytes:
-        """As it is sent; empty: there is none."""
+        """Bytes of the history as sent; empty where there is none."""
         self._take_in()
         n, signals = -(-self.samples // self.per), self._least.shape[1]
         if not n:
@@ -59,7 +59,7 @@ class History:
 
     @classmethod
     def unpack(cls, packed: bytes) -> History:
-        """What was packed."""
+        """Restore a packed history."""
         _, _, n, signals, per, samples = HISTORY_HEAD.unpack_from(packed)
         made = cls(signals)
         made.per, made.samples = per, samples

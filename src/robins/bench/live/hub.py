@@ -1,7 +1,7 @@
 """The server's data on the bench, and the pages that show them.
 
 Each page has queues of its own, with a bound: one that is slow loses its oldest samples, which are
-counted, and slows nobody.
+counted, and slows no other.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ QUEUE = 2 * RECENT  # samples that wait for a page
 
 
 class Client:
-    """What waits for one page.
+    """Queues of one page.
 
     Attributes:
         dropped: samples that it was too slow for.
@@ -35,7 +35,7 @@ class Client:
         self._some = asyncio.Event()
 
     def greet(self, hello: str, history: bytes, recent: deque[bytes]) -> None:
-        """All from the beginning: what waits is of no more interest."""
+        """Start with a full greeting; drop all that waits."""
         self._lines.clear()
         self._latest.clear()
         self._history = history
@@ -44,12 +44,12 @@ class Client:
         self._some.set()
 
     def line(self, text: str) -> None:
-        """Something to tell, in order."""
+        """Add a line to be sent in order."""
         self._lines.append(text)
         self._some.set()
 
     def latest(self, key: str, text: str) -> None:
-        """Something that replaces what was said of it before."""
+        """Set the latest text of a key, in place of the one before."""
         self._latest[key] = text
         self._some.set()
 
@@ -83,12 +83,12 @@ class Client:
 
 
 class Hub:
-    """Takes what the bench says, keeps what a page that comes later needs, and passes it on.
+    """Receive the data of the bench, keep what a page that comes later needs, and pass it on.
 
     Attributes:
         clients: pages.
         faults: that a page may inject.
-        says: labels of what a page may say to the parts.
+        says: labels of the operator messages that a page may send.
         events: of the run.
     """
 
@@ -105,7 +105,7 @@ class Hub:
         self._dropped = 0  # on the way from the bench
 
     def take(self, kind: int, body: bytes) -> None:
-        """Something the bench said."""
+        """Take a frame from the bench."""
         if kind == Kind.SAMPLE:
             return self._take_sample(body)
         if kind == Kind.HISTORY:
@@ -123,22 +123,22 @@ class Hub:
         return None
 
     def join(self, client: Client) -> None:
-        """A page that came."""
+        """Add a page."""
         client.greet(*self._greeting())
         self.clients.add(client)
         self.beat()
 
     def leave(self, client: Client) -> None:
-        """A page that went."""
+        """Remove a page."""
         self.clients.discard(client)
 
     def acknowledge(self, alarms: list[int]) -> None:
-        """Tell each page that somebody has acknowledged alarms."""
+        """Send each page the alarms that were acknowledged."""
         self.events.acknowledge(alarms)
         self._tell({"kind": "acknowledged", "alarms": alarms})
 
     def beat(self) -> None:
-        """Tell each page that the server lives, and what was dropped."""
+        """Send each page a sign of life, and the counts of dropped samples."""
         for client in self.clients:
             beat = {
                 "kind": "beat",
@@ -149,7 +149,7 @@ class Hub:
             client.latest("beat", to_json(beat))
 
     def end(self) -> None:
-        """Tell each page that the bench is gone."""
+        """Notify each page that the bench is gone."""
         self._tell({"kind": "ended"})
 
     def _take_hello(self, said: dict[str, Any]) -> None:

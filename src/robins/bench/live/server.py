@@ -32,7 +32,7 @@ STATIC = Path(__file__).parent / "static"
 BEAT_S = 0.5
 LONGEST_COMMAND = 4096  # bytes
 MOST_UNREAD = 1 << 16  # bytes of commands that the bench has not taken
-LAST_WORDS_S = 0.2  # for pages to hear that the bench is gone
+LAST_WORDS_S = 0.2  # for pages to receive that the bench is gone
 
 Pass = Callable[[dict[str, Any]], bool]
 
@@ -138,7 +138,7 @@ async def serve(at: socket.socket, pipe: socket.socket | None) -> None:
 
 
 async def _feed(reader: asyncio.StreamReader, hub: Hub) -> None:
-    """Take in what the bench says until it is gone."""
+    """Take in the data of the bench until it is gone."""
     with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
         while True:
             length, kind = HEAD.unpack(await reader.readexactly(HEAD.size))

@@ -15,9 +15,9 @@ _WORK_S = 0.5  # of processor time; a process that waits at a port uses less in 
 
 
 def idleness() -> Callable[[int | None], float]:
-    """Make a function that gives, by its number, for how long a process has done next to nothing.
+    """Make a function that gives, by its number, how long a process has been idle.
 
-    That time [s] begins when the function is first asked of the process. It is infinite where there
+    That time [s] begins at the first call for the process. It is infinite where there
     is no process, or where the system does not show its processor time in ``/proc``.
     """
     worked: dict[int, tuple[float, float]] = {}  # processor time, and when so much was used

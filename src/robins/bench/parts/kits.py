@@ -1,10 +1,10 @@
-"""A kit on its way to processes: its arrays lie in a file that all of them map, read only.
+"""Transfer of a kit to processes: its arrays lie in a file that all of them map, read only.
 
-So what a long run is driven by is in memory once, however many parts look at it, and only as far
-as they have come. Anything that pickles can be sent (PEP 574: arrays travel beside the pickle).
+So the inputs of a long run are in memory once, however many parts read them, and only as far as
+they have come. Anything that pickles can be sent (PEP 574: arrays travel outside the pickle).
 
 The file lies in a folder for temporary files that its bench holds a lock on. The kernel drops the
-lock with the process, however that ends, and the next bench removes what dead ones have left.
+lock with the process, however that ends, and the next bench removes the files of dead ones.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""A part of the vehicle as a process of its own, which knows nothing but its port.
+"""A part of the vehicle as a process of its own, connected by its port alone.
 
 python -m robins.bench.parts.node satellite gyro /dev/pts/5,460800 kit
 
-With a folder it puts its memory aside there, and with a step too it goes on from that of the step.
+With a folder it saves its memory there, and with a step too it goes on from the memory of that
+step.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from robins.bench.ports.port import address, open_port
 from robins.bench.rigs import rig_of
 from robins.errors import RobinsError
 
-REALTIME = "ROBINS_BENCH_REALTIME"  # set by the bench: ask for SCHED_FIFO
+REALTIME = "ROBINS_BENCH_REALTIME"  # set by the bench: request SCHED_FIFO
 _PRIORITY = 50
 RARELY = 100_000  # allocations between two collections of garbage
 
 
 def be_realtime() -> str:
-    """Ask for a real-time scheduler; says why it was refused, or nothing."""
+    """Request a real-time scheduler; returns the reason of a refusal, or an empty string."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
     except (AttributeError, OSError) as error:
@@ -62,17 +63,17 @@ def few_collections() -> Iterator[None]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Be a part until the bench says stop, or is gone."""
+    """Run a part until the bench sends stop, or is gone."""
     try:
         return _be(arguments)
-    except RobinsError as error:  # the bench tells people its last line
+    except RobinsError as error:  # the bench shows its last line to the user
         print(error, file=sys.stderr)
         return 2
 
 
 def _be(arguments: Sequence[str]) -> int:
     rig_name, name, port, kit_path, *more = arguments
-    # An interrupt of the terminal is for the bench, which then tells its parts.
+    # An interrupt of the terminal is for the bench, which then stops its parts.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     rig = rig_of(rig_name)
     kit = take(Path(kit_path))

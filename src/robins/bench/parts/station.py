@@ -1,10 +1,10 @@
-"""One end of a link, where a part of the vehicle sits: takes bytes, computes at a tick, answers.
+"""The end of a link at a part of the vehicle: takes bytes, computes at a tick, answers.
 
 A part is a function from what has reached it to what it sends; what the wire does to frames, and
 the order in which they come, is settled here. Firmware does the same, see `bench/wire/firmware`.
 
-Every so many steps a part puts its memory aside for the one that is started in its place. That one
-goes on from the latest memory that is older than what it is told again, so a death costs
+Every so many steps a part saves its memory for the process that may be started in its place. That
+one goes on from the latest memory that is older than the input sent again, so a death costs
 the time of some hundred steps, however long the run has been. A memory is a file in the folder of
 the bench's processes; the part writes it before it answers the tick of that step.
 """
@@ -31,12 +31,12 @@ EVERY = 256  # steps
 
 
 def is_due(step: int) -> bool:
-    """Whether a part puts its memory aside after a step."""
+    """True if a part saves its memory after a step."""
     return (step + 1) % EVERY == 0
 
 
 def path_of(folder: Path, part: str, step: int) -> Path:
-    """Where the memory of a part after a step is."""
+    """Path of the memory of a part after a step."""
     return folder / f"{part}.{step}.memory"
 
 
@@ -62,11 +62,11 @@ Sent = Iterable[tuple[str, Mapping[str, Any]]]  # messages with their values
 
 
 class Part(NamedTuple):
-    """What a part does.
+    """Behaviour of a part.
 
     Attributes:
         name: one of the parts of its rig.
-        takes: messages it takes, with how many steps they are older than the tick: 0 or 1.
+        takes: messages it takes, with their age in steps at the tick: 0 or 1.
         begin: () -> state before the first step.
         act: (state, step, inputs) -> (state, sent), at a tick.
         example: inputs as they will be, so that all can be compiled before the first tick; one
@@ -86,9 +86,9 @@ class Station:
     """The protocol of a part, without a port: bytes in, bytes out.
 
     Attributes:
-        counts: frames that were not used, by why: "strange" (of another run or an unknown message),
+        counts: frames that were not used, by reason: "strange" (another run or an unknown message),
             "repeated", "late" (of a step that is over), "size".
-        over: whether the bench has said that the run is over.
+        over: whether the bench has ended the run.
         begun: whether the bench has answered.
     """
 
@@ -99,13 +99,13 @@ class Station:
         memory: bytes | None = None,
         put_aside: Callable[[int, bytes], None] | None = None,
     ):
-        """Be a part.
+        """Set up the station of a part.
 
         Args:
-            part: which.
+            part: the part.
             wire: the messages of its rig.
-            memory: of the one in whose place it is started; None: it begins anew.
-            put_aside: takes the step and the memory now and then; None: nobody wants it.
+            memory: of the process that it replaces; None: it starts without one.
+            put_aside: takes the step and the memory now and then; None: memories are not saved.
         """
         self.part, self._wire, self._put_aside = part, wire, put_aside
         self.counts: Counter[str] = Counter()
@@ -119,8 +119,8 @@ class Station:
         self.begun = False
 
     def hello(self) -> bytes:
-        """What it says until the bench answers; numbered, so that a part that was started anew is
-        told from one whose hello was on its way when the bench answered.
+        """Hello frame, sent until the bench answers; numbered, so that a restarted part can be
+        distinguished from one whose hello was on its way when the bench answered.
         """
         wire = self._wire
         said = {"part": wire.parts.index(self.part.name), "schema": wire.number}
@@ -238,14 +238,14 @@ def ready(part: Part, steps: Iterable[int]) -> Part:
 
 
 def serve(port: Any, station: Station) -> Counter[str]:
-    """Be a part at a port until the bench says stop.
+    """Run a part at a port until the bench sends stop.
 
     Args:
         port: an open `serial.Serial`.
         station: of the part.
 
     Returns:
-        What was not used, see `Station.counts`.
+        Counts of the frames that were not used, see `Station.counts`.
 
     Raises:
         OSError: the far end of the port is gone.
@@ -256,7 +256,7 @@ def serve(port: Any, station: Station) -> Counter[str]:
         if not station.begun and time.monotonic() - said >= HELLO_EACH_S:
             port.write(station.hello())
             said = time.monotonic()
-        # What is there, in one call: `port.read` asks the system thrice for it.
+        # All that is there, in one call: `port.read` needs three calls of the system for it.
         if select.select([fd], [], [], None if station.begun else HELLO_EACH_S)[0]:
             data = os.read(fd, _MOST)
             if not data:

@@ -29,7 +29,7 @@ class Cable(NamedTuple):
 
 @contextlib.contextmanager
 def cable() -> Iterator[Cable]:
-    """A cable for as long as the context lasts; what nobody reads waits at its end."""
+    """A cable for as long as the context lasts; unread bytes wait at its end."""
     with contextlib.ExitStack() as stack:
         one, other = (stack.enter_context(open_pair()) for _ in range(2))
         wake, woken = os.pipe()
@@ -63,7 +63,7 @@ def _carry(one: Pair, other: Pair, wake: int) -> None:
 
 
 def main() -> None:
-    """Be a cable until interrupted."""
+    """Run a cable until interrupted."""
     with cable() as ends, contextlib.suppress(KeyboardInterrupt):
         print(f"bench: {ends.bench}\nboard: {ends.board}\nCtrl-C ends it.", flush=True)
         threading.Event().wait()

@@ -18,7 +18,7 @@ class Line:
     """One direction of a serial line.
 
     It holds at most ``most`` bytes; what is sent beyond is dropped, the newest first, as by a
-    transmitter whose buffer is full. A frame that was cut so is told by its check.
+    transmitter whose buffer is full. The check of a frame that was cut so fails.
 
     Attributes:
         dropped: bytes so far that found no room.
@@ -78,7 +78,7 @@ class Line:
 
     @property
     def next_ns(self) -> int | None:
-        """When the next byte is through; None: the line is empty."""
+        """Time at which the next byte is through [ns]; None: the line is empty."""
         if not self._bursts:
             return None
         return -(-(self._bursts[0][0] + self._byte) // self._baud)

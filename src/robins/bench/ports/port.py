@@ -1,10 +1,10 @@
-"""Serial ports: what people write for one, a real one opened, a pseudo-terminal in its place.
+"""Serial ports: their notation, opening a real one, a pseudo-terminal in its place.
 
 A link of the bench has two ends. Without hardware both are those of a pseudo-terminal: the bench
 holds the master, the part opens the path of the slave like any serial port. With hardware the part
 is a board, and the bench opens the device itself.
 
-`list_ports` lists those of this machine, and says whether we may use them.
+`list_ports` lists those of this machine, and whether we may use them.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ BAUD = 460800
 
 
 class PortError(RobinsError, ValueError):
-    """A port that cannot be had; says which, why, and what to do."""
+    """A port that cannot be opened; names the port, the cause and the fix."""
 
 
 class Address(NamedTuple):
-    """Where a port is and how fast it is."""
+    """Path and speed of a port."""
 
     path: str
-    baud: int = BAUD  # pseudo-terminals take any and heed none
+    baud: int = BAUD  # pseudo-terminals take any and ignore it
 
 
 def address(text: str) -> Address:
@@ -75,7 +75,7 @@ def parted(texts: Mapping[str, str]) -> tuple[dict[str, Address], dict[str, Path
 
 
 def obstacle(path: str) -> str:
-    """Why we may not open a path as a serial port, with what to do about it; empty if we may."""
+    """Reason why a path cannot be opened as a serial port, with the fix; empty if it can."""
     try:
         kind = os.stat(path).st_mode
     except OSError:
@@ -86,7 +86,7 @@ def obstacle(path: str) -> str:
     if not os.access(path, os.R_OK | os.W_OK):
         return (
             f"no permission to read and write it; it belongs to the group '{_group(path)}': "
-            f"add yourself (sudo usermod -aG {_group(path)} $USER) and log in anew"
+            f"add yourself (sudo usermod -aG {_group(path)} $USER) and log in again"
         )
     return ""
 
@@ -124,8 +124,8 @@ def open_port(at: Address, timeout_s: float | None = 0.0) -> serial.Serial:
                 fix=f"end it first (fuser -v {at.path} names it)",
             ) from None
         raise PortError(str(error), f"port '{at.path}' at {at.baud} baud") from None
-    # USB adapters gather bytes for up to 16 ms unless asked not to; ports that gather nothing
-    # refuse to be asked.
+    # USB adapters gather bytes for up to 16 ms unless set otherwise; ports that gather nothing
+    # refuse the setting.
     with contextlib.suppress(AttributeError, OSError, ValueError):
         port.set_low_latency_mode(True)
     return port
@@ -147,7 +147,7 @@ class Pair:
     path: str
 
     def close(self) -> None:
-        """Close both ends; a part that has its end open is told by an error. May be repeated."""
+        """Close both ends; a part that has its end open gets an error. May be repeated."""
         for end in (self.master, self.slave):
             if end >= 0:
                 os.close(end)
@@ -210,7 +210,7 @@ def _letters(path: str) -> str:
 
 
 def _number(path: str) -> int:
-    """So that ttyUSB10 comes after ttyUSB9."""
+    """Number at the end of a path, so that ttyUSB10 sorts after ttyUSB9."""
     digits = path[len(_letters(path)) :]
     return int(digits) if digits else -1
 
@@ -241,7 +241,7 @@ def table(ports: Sequence[PortInfo]) -> str:
     lines += [f"{p.path}: {p.why}" for p in ports if not p.usable]
     usable = [p for p in ports if p.usable]
     if usable:
-        # a port that tells what it is has been plugged in; a built-in one may have no socket
+        # a port with a description has been plugged in; a built-in one may have no socket
         likely = next((p for p in usable if p.description), usable[0])
         given = f"robins bench up satellite/s1 --node {EXAMPLE}={likely.path},{BAUD}"
         lines += ["", "To put a board in the place of a part:", f"  {given} --clock realtime"]

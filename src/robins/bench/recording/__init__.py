@@ -1,8 +1,8 @@
 """Records of the lines: written, read, replayed to a part, compared.
 
 - `layout`: how entries lie in an MCAP file. `writer`, `reader`: to the disk and back.
-- `topics`: messages for other tools beside the frames, a row a topic.
-- `replay`: a part hears a record again. `differences`: two runs, field by field.
+- `topics`: messages for other tools along with the frames, a row a topic.
+- `replay`: a part runs again on a record. `differences`: two runs, field by field.
 """
 
 from robins.bench.recording.differences import FieldDifference

@@ -22,9 +22,9 @@ _BATCH = 1024  # pairs that are looked at together, since each call of NumPy cos
 class FieldDifference:
     """One number of one message, over all frames in which it differs.
 
-    What cannot be told by fields has an empty `field`: frames that only one of the two has, and
-    frames of a message that this version does not know or knows by another length. Then `a` and
-    `b` count the frames, and the other measures are 0.
+    Differences that fields cannot express have an empty `field`: frames that only one of the two
+    has, and frames of a message that this version does not know or knows by another length. Then
+    `a` and `b` count the frames, and the other measures are 0.
     """
 
     message: str
@@ -41,7 +41,7 @@ class FieldDifference:
 
 
 class Differences:
-    """Where the frames of two runs differ, taken as they come.
+    """Differences between the frames of two runs, taken as they come.
 
     Frames belong together if message and time are the same; of several such, as of a tick that was
     repeated, the first to the first. Numbers are compared bit by bit, so -0.0 is not 0.0, but NaN
@@ -54,18 +54,18 @@ class Differences:
     """
 
     def __init__(self, wire: Wire, step_ns: int = 0):
-        """Begin.
+        """Set up a comparison.
 
         Args:
             wire: the messages of both.
-            step_ns: length of a step, to tell steps; 0: not known.
+            step_ns: length of a step, to number steps; 0: not known.
         """
         self._wire, self._step_ns = wire, step_ns
         self.frames, self.until_ns = [0, 0], [0, 0]
         # of the one whose partner has not come, by message and time
         self._waiting: dict[tuple[int, int], tuple[int, deque[bytes]]] = {}
         self._pairs: dict[int, list[_Pair]] = {}  # that differ, by message
-        self._odd: dict[int, list[int]] = {}  # times of pairs that no field tells apart
+        self._odd: dict[int, list[int]] = {}  # times of pairs that differ in no field
         self._found: dict[tuple[str, str, int], FieldDifference] = {}
 
     def take(self, which: int, frame: Frame) -> None:
@@ -109,7 +109,7 @@ class Differences:
         return sorted(found, key=lambda d: (d.first_time_s, self._place(d)))
 
     def _place(self, d: FieldDifference) -> tuple[int, int, int]:
-        """Where a number stands in the table of messages; what is of no field comes last."""
+        """Place of a number in the table of messages; one without a field comes last."""
         of = next((m for m in self._wire.data if m.name == d.message), None)
         if of is None:
             return 1 << 16, 0, 0
@@ -149,7 +149,7 @@ class Differences:
 def differences(
     wire: Wire, a: Iterable[Frame], b: Iterable[Frame], step_ns: int = 0
 ) -> list[FieldDifference]:
-    """Where the frames of two runs differ; see `Differences`."""
+    """Fields in which the frames of two runs differ; see `Differences`."""
     of = Differences(wire, step_ns)
     for pair in zip_longest(a, b):
         of.take_both(*pair)
@@ -225,7 +225,7 @@ def table(
 
 
 def name_of(d: FieldDifference) -> str:
-    """Such as ``estimate.q_ib[2]``."""
+    """Name of a number, such as ``estimate.q_ib[2]``."""
     index = "" if d.component < 0 else f"[{d.component}]"
     return f"{d.message}.{d.field}{index}" if d.field else d.message
 

@@ -41,7 +41,7 @@ _EVENT = {
 
 
 class RecordingError(RobinsError, ValueError):
-    """A record that cannot be begun or read; says what, where and the mend."""
+    """A record that cannot be created or read; names the cause, the place and the fix."""
 
 
 class Entry(NamedTuple):
@@ -54,7 +54,7 @@ class Entry(NamedTuple):
 
 
 class Event(NamedTuple):
-    """Something that happened."""
+    """Event of a run."""
 
     received_ns: int
     kind: str
@@ -63,7 +63,7 @@ class Event(NamedTuple):
 
 
 def schemas(wire: Wire) -> tuple[Schema, Schema]:
-    """Of frames and of events."""
+    """MCAP schemas of frames and of events."""
     table, event = wire.markdown().encode(), json.dumps(_EVENT, sort_keys=True).encode()
     return (
         Schema(FRAMES_SCHEMA, table, "text/markdown", f"{ENCODING}{VERSION}"),

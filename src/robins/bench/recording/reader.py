@@ -21,7 +21,7 @@ from robins.bench.wire.frames import VERSION
 from robins.errors import RobinsError
 from robins.foreign import decoding
 
-LONGEST = 1 << 24  # bytes of a record; a length beyond it is damage, and no memory is asked for it
+LONGEST = 1 << 24  # bytes of a record; a length beyond it is damage: no memory is allocated
 _ABOUT = {"wire", "header", "check"}
 _Place = tuple[str, Literal["to", "from"]]
 _EVENTS: _Place = ("", "from")  # no link has this name
@@ -29,7 +29,7 @@ _DIRECTIONS: dict[str, Literal["to", "from"]] = {"to": "to", "from": "from"}
 
 
 class Record(NamedTuple):
-    """What was written down."""
+    """Contents of a record."""
 
     header: dict[str, Any]
     entries: Sequence[layout.Entry] | Entries  # in the order in which they were written
@@ -39,7 +39,7 @@ class Record(NamedTuple):
 
 
 class Entries:
-    """Those of a file up to its first damage, read anew each time that they are gone through."""
+    """Entries of a file up to its first damage, read again at each iteration."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -53,13 +53,13 @@ class Entries:
 
 
 class _Damage(RobinsError):
-    """Why the reading of a record ends before its end."""
+    """Reason why the reading of a record stops before its end."""
 
 
 def read_record(path: str | Path) -> Record:
-    """Read a record, or what is there of it.
+    """Read a record, or as much of it as there is.
 
-    A file that was cut, or of which a part is damaged, gives what comes before, and says so.
+    A file that was cut or is partly damaged gives what comes before, with the reason.
 
     Raises:
         RecordingError: there is no such file, it is no record of the bench, it is of another
@@ -88,7 +88,7 @@ def _read(path: Path, entries: Callable[[_Reader], Sequence[layout.Entry] | Entr
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[_Reader]:
-    """What goes through a file.
+    """Open a file as a reader of its records.
 
     Raises:
         RecordingError: it cannot be read.
@@ -157,7 +157,7 @@ class _Reader:
         self.why = ""  # it did not come to the end
 
     def take(self, size: int) -> bytes:
-        """So many bytes, or as many as there are."""
+        """Read so many bytes, or as many as there are."""
         data = self._file.read(size)
         self._at += len(data)
         self._check = zlib.crc32(data, self._check)
@@ -182,7 +182,7 @@ class _Reader:
         return opcode, body
 
     def records(self) -> Iterator[None]:
-        """Take all records, one by one, up to the first damage; `why` tells of that."""
+        """Take all records, one by one, up to the first damage, which `why` describes."""
         try:
             while self.step():
                 yield

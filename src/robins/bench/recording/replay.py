@@ -1,9 +1,9 @@
-"""Runs a part of a recorded run again alone, on its recorded input, and compares its answers.
+"""Replay of one part of a recorded run on its recorded input, with a comparison of its answers.
 
 The part gets every byte that it got, in that order, wrong ones included, and as in lock-step the
 next tick waits until it is done with the one before. So a part whose output depends on its input
-alone says the same bits again, however the run was paced; one that has been changed does not, and
-`robins.bench.recording.differences` tells where.
+alone sends the same bits again, however the run was paced; one that has been changed does not, and
+`robins.bench.recording.differences` finds the differences.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ _HELLO, _TICK, _DONE, _STOP, _BEGIN = (
 _DONE_SIZE = BARE.size_of("done")
 
 Start = Callable[[str], AbstractContextManager[Any]]
-"""From the path of a port to a context within which the part runs there. What the context gives may
-have ``poll()``, as `subprocess.Popen` has, which tells a part that has died from a slow one."""
+"""Function from the path of a port to a context within which the part runs there. The value of the
+context may have ``poll()``, as `subprocess.Popen` has, to distinguish a dead part from a slow
+one."""
 
 
 class ReplayError(RobinsError, RuntimeError):
@@ -45,32 +46,32 @@ class ReplayError(RobinsError, RuntimeError):
 
 
 class Replayed(NamedTuple):
-    """What a part said when it heard a record again."""
+    """Answers of a part to a record, compared with those in the record."""
 
     part: str
-    compared: Differences  # frames with data, as it said them then and as it says them now
+    compared: Differences  # frames with data, as the part sent them then and now
     first_difference: str | None  # of any byte, but how long computing took; in words
     steps: int  # that were replayed
     step_ns: int
-    starts: int  # of the part; more than one where it was started anew in the record
+    starts: int  # of the part; more than one where it was restarted in the record
 
     @property
     def same(self) -> bool:
-        """Every byte of every frame; but how long computing took."""
+        """True if every byte of every frame is equal, apart from computing times."""
         return self.first_difference is None
 
 
 class _Row(NamedTuple):
-    """Something that was on the line of a part."""
+    """Bytes on the line of a part."""
 
-    life: int  # which start of the part, from 0
+    life: int  # number of the part's start, from 0
     begin: Frame  # of it
     to: bool  # the part, or from it
     data: bytes
     found: list[Frame]  # that end in it
 
     def ticks(self) -> list[Frame]:
-        """Those of this run."""
+        """Ticks of this run."""
         run = self.begin.header.run
         return [f for f in self.found if f.header.type == _TICK and f.header.run == run]
 
@@ -84,10 +85,10 @@ def replay(
     progress: Callable[[int, int], None] | None = None,
     says: Callable[[Frame], None] = lambda frame: None,
 ) -> Replayed:
-    """Let a part hear a record again, and compare what it says.
+    """Run a part again on a record, and compare its answers.
 
-    Where the part was started anew in the record, it is started anew here. Of the record and of
-    what the part says, only what cannot be compared yet is kept.
+    Where the part was restarted in the record, it is restarted here. Of the record and of
+    the answers, only what cannot be compared yet is kept.
 
     Args:
         entries: of a run, in the order in which they were written; gone through more than once.
@@ -96,12 +97,12 @@ def replay(
         part: whose link it is.
         start: runs the part at a port.
         patience_s: for the part's hello, and for each step.
-        progress: told the steps done, and all there are.
-        says: told each frame with data that the part says now.
+        progress: called with the steps done, and their total.
+        says: called with each frame with data that the part sends now.
 
     Raises:
         ReplayError: the record has nothing of the part, or the part has another schema, died, did
-            not answer in time, or started anew by itself; says in which step.
+            not answer in time, or restarted by itself; names the step.
     """
     total = sum(len(row.ticks()) for row in _rows(entries, part) if row.to)
     first: str | None = None
@@ -129,7 +130,7 @@ def replay(
 
 
 def recorded(entries: Iterable[Entry], part: str) -> Iterator[Frame]:
-    """What a part said in a record, data only, each frame once, in its order.
+    """Frames with data that a part sent in a record, each once, in order.
 
     Raises:
         ReplayError: the record has nothing of the part; at its end.
@@ -189,7 +190,7 @@ def _rows(entries: Iterable[Entry], part: str) -> Iterator[_Row]:
 
 
 class _Replay:
-    """One life of a part, lived again."""
+    """Replay of one life of a part."""
 
     def __init__(
         self, wire: Wire, part: str, pair: Pair, process: Any, patience_s: float, life: _Life
@@ -202,7 +203,7 @@ class _Replay:
         self._where = "before its hello"
 
     def run(self, rows: Iterable[_Row], count: Callable[[], None]) -> None:
-        """Say to the part what was said to it; tells the life what it said then and says now."""
+        """Send the part its recorded input; the life gets its answers then and now."""
         self._greet()
         latest, last = -1, self._life.begin.header
         for row in rows:
@@ -214,7 +215,7 @@ class _Replay:
             for tick in row.ticks():
                 step = int(BARE.decode("tick", tick.payload)["step"])
                 self._life.ticked(step)
-                if step >= latest:  # a part has forgotten what it said to older ones
+                if step >= latest:  # a part has forgotten its answers to older ones
                     self._where = f"in step {step}"
                     for frame in self._until_done(step, latest):
                         self._life.says(frame)
@@ -240,7 +241,7 @@ class _Replay:
             )
 
     def _until_done(self, step: int, latest: int) -> list[Frame]:
-        """What the part says in a step; `latest` is the one that it was done with last."""
+        """Frames that the part sends in a step; `latest` is the last step that it completed."""
         said: list[Frame] = []
         while True:
             frame = self._next()
@@ -307,10 +308,10 @@ class _Replay:
 
 
 class _Life:
-    """What a part said then and what it says now, from one begin to the next.
+    """Comparison of a part's answers then and now, from one begin to the next.
 
     Attributes:
-        begin: with which it began.
+        begin: the frame with which it began.
         step_ns: length of a step.
     """
 
@@ -334,15 +335,15 @@ class _Life:
         return self.begin.header.run
 
     def ticked(self, step: int) -> None:
-        """A tick was said to it."""
+        """Note a tick that was sent to it."""
         self._tick = step
 
     def said(self, row: _Row) -> None:
-        """What it said then."""
+        """Take a recorded answer."""
         for frame in row.found:
             head = frame.header
-            # the bench may have heard a frame twice: a fault doubled it, or the part died after it
-            # and the one that took its place said it again
+            # the bench may have received a frame twice: a fault doubled it, or the part died after
+            # it and its replacement sent it again
             if _is_said(frame, self.begin) and head.sequence > self._newest:
                 self._newest = head.sequence
                 self._compared.take(0, frame)
@@ -353,7 +354,7 @@ class _Life:
                 self._answered = max(self._answered, step)
 
     def says(self, frame: Frame) -> None:
-        """What it says now."""
+        """Take a present answer."""
         self._says(frame)
         self._compared.take(1, frame)
         self._now[frame.header.sequence] = frame

@@ -1,12 +1,12 @@
 """Messages of the wire as topics that other tools decode: a table, a row a topic.
 
-A row says which message becomes which type of ROS 2, or JSON, by which function, in which frame:
+A row names a message, its type of ROS 2 or JSON, the function that converts it, and its frame:
 
     Topic("sample", "/imu", "sensor_msgs/msg/Imu", lambda v: imu(v["omega_b"], body="FRD"), "imu")
     Topic("mode", "/mode", JSON, as_json)
 
 A `Recorder` with rows writes, next to each sound frame that a part sends, what the rows make of it.
-The header has the time of the frame, so the start of the run is zero, or where the row says so a
+The header has the time of the frame, so the start of the run is zero, or where the row names it a
 stamp of the message: GPS time becomes UTC, as in ROS, and a count from elsewhere stays. Messages of
 ROS are along the axes that `robins.ros.convert` names; JSON has the fields and units of the wire.
 The functions of that module are here too, for the rows.
@@ -38,12 +38,12 @@ from robins.ros import odometry as odometry
 
 JSON = "json"
 Values = Mapping[str, Any]
-"""Of a message, by field."""
+"""Values of a message, by field."""
 _FAILS = (LookupError, TypeError, ValueError, ArithmeticError)
 
 
 class Topic(NamedTuple):
-    """Which message of the wire becomes which message of a topic."""
+    """Conversion of a message of the wire to a message of a topic."""
 
     message: str  # of the wire
     topic: str  # begins with a slash
@@ -113,7 +113,7 @@ class Topics:
 
         Raises:
             RecordingError: a row names a message, a type, or a topic that cannot be, or its
-                function does not make what it says.
+                function does not make the type of the row.
         """
         self.failed, self._wire = 0, wire
         self._by_number: dict[int, list[tuple[Topic, Schema]]] = {}
@@ -134,7 +134,7 @@ class Topics:
             self._by_number.setdefault(number, []).append((row, _schema(row, wire.message(number))))
 
     def of(self, entry: Entry) -> list[Made]:
-        """What the rows make of something that was on a line; nothing if it is no sound frame."""
+        """Messages that the rows make of an entry; none if it is no sound frame."""
         if not self._by_number or entry.direction != "from" or len(entry.data) < 2:
             return []
         try:
@@ -148,7 +148,7 @@ class Topics:
         for row, schema in rows:
             try:
                 data = _bytes_of(row, row.make(values), _stamp(row, values, head.time_ns))
-            except _FAILS:  # what others would see is not worth the run, and the frame is kept
+            except _FAILS:  # a topic for other tools is not worth the run, and the frame is kept
                 self.failed += 1
                 continue
             encoding = MessageEncoding.JSON if row.type == JSON else MessageEncoding.CDR
@@ -169,7 +169,7 @@ def _stamp(row: Topic, values: Values, time_ns: int) -> int:
 
 
 def _try(wire: Wire, row: Topic) -> None:
-    """That the function of a row makes what it says.
+    """Check that the function of a row makes the type of the row.
 
     Raises:
         RecordingError: it does not.
@@ -197,7 +197,7 @@ def _bytes_of(row: Topic, made: Any, time_ns: int) -> bytes:
 
 
 def _schema(row: Topic, of: Message) -> Schema:
-    """What the messages of a topic are made of."""
+    """MCAP schema of the messages of a topic."""
     if row.type != JSON:
         text = definition(TYPES[row.type])
         return Schema(0, text.encode(), SchemaEncoding.ROS2, row.type)
@@ -207,7 +207,7 @@ def _schema(row: Topic, of: Message) -> Schema:
         "frame_id": {"type": "string"},
     }
     for f in of.fields:
-        # Foxglove takes one type a field, so null is said in words
+        # Foxglove takes one type a field, so null is described in words
         one = {"type": "number" if f.kind == "f64" else "integer"}
         many = {"type": "array", "items": one, "minItems": f.length, "maxItems": f.length}
         unit = "" if f.unit == "1" else f" [{f.unit}]"

@@ -1,4 +1,4 @@
-"""Writes the record of a run: raw frames with their times of arrival, in an MCAP file.
+"""Writer of the record of a run: raw frames with their times of arrival, in an MCAP file.
 
 Messages go to the disk in chunks of 512 messages, of 64 KiB or of a quarter of a second, whichever
 comes first, each in one write. So a file that was cut anywhere lacks what came in the last quarter
@@ -52,13 +52,13 @@ class Recorder:
         topics: Iterable[Topic] = (),
         overwrite: bool = False,
     ) -> None:
-        """Begin a record.
+        """Start a record.
 
         Args:
             path: of the file.
             wire: the messages that go over the lines.
             header: of the run, such as its scenario, seeds and versions; becomes JSON.
-            topics: what other tools get of the frames that parts send, beside the frames.
+            topics: rows that convert the frames that parts send for other tools.
             overwrite: whether a file that is there is replaced.
 
         Raises:
@@ -100,7 +100,7 @@ class Recorder:
         self.close()
 
     def write(self, entry: layout.Entry, time_ns: int | None = None) -> None:
-        """Take what went over a link.
+        """Take an entry: a frame or bytes that went over a link.
 
         Args:
             entry: with the time it came.
@@ -108,7 +108,7 @@ class Recorder:
                 and bytes that are no frame have the time they came.
 
         Raises:
-            OSError: the disk is full, or gone; said once, what comes after is counted as lost.
+            OSError: the disk is full, or gone; raised once, later entries are counted as lost.
         """
         received_ns, link, direction, data = entry
         channel = self._links.get((link, direction))
@@ -124,7 +124,7 @@ class Recorder:
             self._add(channel, received_ns, made.time_ns, made.data)
 
     def event(self, event: layout.Event) -> None:
-        """Take what happened.
+        """Take an event.
 
         Raises:
             RecordingError: JSON cannot hold its fields.
@@ -178,7 +178,7 @@ class Recorder:
         self._first = self._last = self._taken = self._size = 0
 
     def _channel(self, topic: str, encoding: str, schema: Schema) -> int:
-        """The number of a topic, which is told in the chunk in which it first is."""
+        """Number of a topic, which is declared in the chunk in which it first occurs."""
         channel = self._topics.get(topic)
         if channel is None:
             key = schema.name, schema.encoding
@@ -246,7 +246,7 @@ class _Disk:
 
 
 def _time_ns(data: bytes, otherwise: int) -> int:
-    """Of the header of a frame."""
+    """Time in the header of a frame [ns]; ``otherwise`` of bytes that are no frame."""
     if len(data) < 2 or data[0] or data[-1]:
         return otherwise
     try:

@@ -19,11 +19,11 @@ from robins.systems.catalogue import is_file
 __all__ = ["RIGS", "UnknownRig", "rig_of"]
 
 RIGS: tuple[str, ...] = ("satellite", "ins-gnss", "airship", "laboratory", "multirotor")
-"""Those that come with robins: each a module here, which calls it RIG."""
+"""Rigs that come with robins: each a module here, which calls it RIG."""
 
 
 class UnknownRig(RobinsError, ValueError):
-    """There is no such rig, or what is said to be one is none."""
+    """A name that is no rig, or an object that is none."""
 
 
 def rig_of(name: str, folder: Path = Path(), named_in: str | os.PathLike[str] = "") -> Rig:
@@ -35,7 +35,7 @@ def rig_of(name: str, folder: Path = Path(), named_in: str | os.PathLike[str] = 
         named_in: file that names it; empty where the user does.
 
     Raises:
-        UnknownRig: there is none; the message says what there is.
+        UnknownRig: there is none; the message lists the known ones.
         RobinsError: it is a file named in another file, and the user has not confirmed it.
     """
     if name in RIGS:

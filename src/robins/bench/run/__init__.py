@@ -1,10 +1,11 @@
 """A run on the bench.
 
-- `setup`: what is asked for.
-- `session`: doing it. `crew`: its processes. `clocks`: when a step begins. `accounting`: how late.
-- `telemetry`, `outcome`: what came of it, in a `room` on disk if it is long; `numbers`: where a
-  rig says nothing of that.
-- `watching`: who looks on.
+- `setup`: its parameters.
+- `session`: its execution. `crew`: its processes. `clocks`: the start of each step. `accounting`:
+  lateness and latencies.
+- `telemetry`, `outcome`: its results, in a `room` on disk if it is long; `numbers`: defaults where
+  a rig defines none.
+- `watching`: the page and the status file.
 """
 
 from robins.bench.run.accounting import Latencies

@@ -15,7 +15,8 @@ _BITS = 8  # kept of a number
 RECENT = 100  # cycles, for who watches
 EDGES_US = (1, 2, 5, 10, 20, 50, 100, 200, 500, *(k * 10**d for d in (3, 4, 5) for k in (1, 2, 5)))
 EDGES_US += (1_000_000,)
-"""Of the histogram of lateness; numbers below the first and from the last on are counted too."""
+"""Edges of the histogram of lateness; numbers below the first and from the last on are counted too.
+"""
 _KINDS = ("lateness", "compute", "round_trip")
 
 
@@ -32,7 +33,7 @@ class Histogram:
         self._cells: dict[int, int] = {}
 
     def add(self, ns: int) -> None:
-        """One more."""
+        """Add a number [ns]."""
         ns = max(ns, 0)
         shift = max(ns.bit_length() - _BITS, 0)
         cell = (shift << _BITS) + (ns >> shift)
@@ -84,9 +85,9 @@ class Latencies:
     """Accounts of the times of a run.
 
     *Lateness* is how much after its deadline a tick was sent or a cycle began: of waking up, in
-    real time; a clock in lock-step has no deadlines, and none of it. *Compute* is what a part says
-    that it computed, for a cycle the sum of its parts. *Round trip* is from a tick to its done, for
-    a cycle from its beginning to its end.
+    real time; a clock in lock-step has no deadlines, and none of it. *Compute* is the computing
+    time that a part reports, for a cycle the sum of its parts. *Round trip* is from a tick to its
+    done, for a cycle from its beginning to its end.
     """
 
     def __init__(self) -> None:
@@ -100,7 +101,7 @@ class Latencies:
         self._late = [0] * (len(EDGES_US) + 1)
 
     def tick(self, part: str, step: int, deadline_ns: int | None, sent_ns: int) -> None:
-        """A part was told to compute a step; when it is told again, the first time counts."""
+        """Note the tick of a part for a step; of a repeated tick the first time counts."""
         if self._asked.get(part, (None, 0))[0] == step:
             return
         self._asked[part] = step, sent_ns
@@ -108,7 +109,7 @@ class Latencies:
             self._of(part).add("lateness", sent_ns - deadline_ns)
 
     def done(self, part: str, step: int, received_ns: int, compute_ns: int) -> None:
-        """A part has done a step; what was not asked, or is said again, does not count."""
+        """Note the end of a step of a part; an unrequested or repeated answer does not count."""
         asked, sent_ns = self._asked.get(part, (None, 0))
         if asked != step or self._answered.get(part) == step:
             return
@@ -142,7 +143,7 @@ class Latencies:
         self._latest_missed.append(missed)
 
     def summary(self) -> dict[str, Any]:
-        """Of the run, as JSON holds it: microseconds, None where there is no number.
+        """Summary of the run for JSON: microseconds, None where there is no number.
 
         ``histogram`` is that of the lateness of cycles: ``counts`` has one number more than
         ``edges_us``, that of those below the first edge comes first; an edge belongs to what is
@@ -157,7 +158,7 @@ class Latencies:
         }
 
     def recent(self) -> dict[str, Any]:
-        """Of the last hundred cycles, as `summary` without the histogram."""
+        """Summary of the last hundred cycles, as `summary` without the histogram."""
         return {
             "cycles": len(self._latest_missed),
             "missed": sum(self._latest_missed),
@@ -188,7 +189,7 @@ class Latencies:
 
 
 def _quantiles(histogram: Histogram) -> dict[str, float | int | None]:
-    """In microseconds."""
+    """Quantiles of a histogram in microseconds, None where it is empty."""
     p50, p99 = (_us(histogram.quantile(share)) for share in (0.5, 0.99))
     most = _us(histogram.most) if histogram.count else None
     return {"p50": p50, "p99": p99, "max": most, "count": histogram.count}

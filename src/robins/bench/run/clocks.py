@@ -1,7 +1,7 @@
-"""When a step begins: as soon as it can, or at its time.
+"""Clocks that start each step: as soon as possible, or at its time.
 
-Soft real time: an ordinary kernel wakes us late now and then, and Python collects garbage. It is
-counted, not promised.
+Soft real time: an ordinary kernel wakes us late now and then, and Python collects garbage. Lateness
+is counted, not excluded.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class LockStep:
         return None
 
     def over(self, step: int) -> bool:
-        """Whether the step has missed its deadline: there is none."""
+        """False: in lock-step there is no deadline to miss."""
         return False
 
     def behind(self, step: int) -> str:
@@ -62,7 +62,7 @@ class RealTime:
         self._began_ns: int | None = None
 
     def deadline_ns(self, step: int) -> int:
-        """When a step is to begin."""
+        """Time at which a step is to begin [ns of the wall clock]."""
         assert self._began_ns is not None
         return self._began_ns + round((step + self.skipped) * 1e9 / self._rate_hz)
 
@@ -103,7 +103,7 @@ class RealTime:
         return f"the run is {late_s:.1f} s behind its clock: {self._rate_hz:g} Hz is too fast"
 
     def over(self, step: int) -> bool:
-        """Whether the step that is just done has missed the deadline of the next one.
+        """True if the step that is just done has missed the deadline of the next one.
 
         Raises:
             BenchError: it has, and the policy is to abort.

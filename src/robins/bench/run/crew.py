@@ -1,4 +1,4 @@
-"""The processes of the parts: started anew (never forked), watched, killed, and none left over."""
+"""The processes of the parts: spawned (never forked), watched, killed, and none left over."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from robins.bench.parts.station import path_of
 from robins.bench.rig import Rig
 
 _ERROR = re.compile(r"[\w.]*(Error|Exception|Interrupt)\b")
-_GRACE_S = 2.0  # between being told and being killed
+_GRACE_S = 2.0  # between the signal to stop and being killed
 
 
 class Death(NamedTuple):
@@ -50,13 +50,13 @@ class Crew:
         restarts: bool = False,
         programs: Mapping[str, Path] = MappingProxyType({}),
     ):
-        """Lay out what they are given.
+        """Prepare their input.
 
         Args:
             rig: whose parts they are.
             kit: for all of them.
-            realtime: whether they ask for a real-time scheduler.
-            restarts: whether they put their memory aside, to be started anew from it.
+            realtime: whether they request a real-time scheduler.
+            restarts: whether they save their memory, to be restarted from it.
             programs: in the place of a part of the rig, by part; each is given the path of a port.
         """
         self._rig, self._kit, self._programs = rig, kit, programs
@@ -78,12 +78,12 @@ class Crew:
         self._held.close()
 
     def start(self, part: str, port: str, since: int = -1) -> None:
-        """Start a part on its port; it says hello when it is ready.
+        """Start a part on its port; it sends its hello when it is ready.
 
         Args:
-            part: which.
+            part: its name.
             port: by its path.
-            since: the step whose memory it goes on from; -1: it begins anew.
+            since: the step whose memory it goes on from; -1: it starts without one.
         """
         assert self._folder is not None
         words = (self._folder / f"{part}.txt").open("wb")
@@ -118,12 +118,12 @@ class Crew:
         return self._idle_s(self.process(part))
 
     def remembers(self, part: str, step: int) -> bool:
-        """Whether a part has put its memory aside after a step."""
+        """True if a part has saved its memory after a step."""
         assert self._folder is not None
         return path_of(self._folder, part, step).exists()
 
     def deaths(self, among: str | None = None) -> list[Death]:
-        """Processes that have ended since this was asked last; of one part, or of all."""
+        """Processes that have ended since the last call; of one part, or of all."""
         asked = {k: p for k, p in self._running.items() if among in (None, k)}
         dead = [(part, code) for part, p in asked.items() if (code := p.poll()) is not None]
         for part, _ in dead:
@@ -136,7 +136,7 @@ class Crew:
             self._running[part].kill()
 
     def end(self) -> None:
-        """End all: those that were told to stop do so by themselves, the others are killed."""
+        """End all: those that received a stop end by themselves, the others are killed."""
         until = time.monotonic() + _GRACE_S
         while any(p.poll() is None for p in self._running.values()):
             if time.monotonic() > until:

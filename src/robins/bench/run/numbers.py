@@ -71,7 +71,7 @@ def faults_of(rig: Rig) -> tuple[Offer, ...]:
 
 
 def latest(values: np.ndarray, since: int, step: int) -> np.ndarray:
-    """The last row from one step to another of which something was heard; else NaN."""
+    """Last received row between two steps; else NaN."""
     some = values[since : step + 1]
     heard = np.flatnonzero(np.isfinite(some.reshape(len(some), -1)).any(axis=1))
     return np.asarray(some[heard[-1]] if len(heard) else np.full(values.shape[1:], np.nan))

@@ -1,4 +1,4 @@
-"""What is ordered while a run goes: faults, by label, and messages of the operator."""
+"""Commands during a run: faults, by label, and messages of the operator."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from robins.bench.run.setup import Flight
 
 
 class Due(NamedTuple):
-    """A message that the operator says now."""
+    """An operator message that is due."""
 
     message: str
     payload: bytes
@@ -23,11 +23,11 @@ class Orders:
     """Faults and messages of a run.
 
     Attributes:
-        said: what went out.
+        said: messages sent.
     """
 
     def __init__(self, flight: Flight, injector: Injector, step_ns: int):
-        """Take the faults of a run, and what its scenario says."""
+        """Take the faults of a run, and the operator messages of its scenario."""
         self.said: list[Spoken] = []
         self._rig, self._injector, self._step_ns = flight.rig, injector, step_ns
         self._labels: list[tuple[str, LinkFault]] = []
@@ -40,14 +40,14 @@ class Orders:
     def inject(
         self, label: str, fault: Mapping[str, Any], begin_s: float, length_s: float | None
     ) -> None:
-        """One more fault."""
+        """Add a fault."""
         end = {} if length_s is None else {"end": begin_s + length_s}
         made = self._rig.fault.model_validate({**fault, "begin": begin_s, **end})
         self._injector.add(made)
         self._labels.append((label, made))
 
     def clear(self, label: str | None) -> None:
-        """The faults of that label no more, or none at all."""
+        """Remove the faults of a label, or all."""
         for one, fault in self._labels:
             if label in (None, one):
                 self._injector.remove(fault)
@@ -56,7 +56,7 @@ class Orders:
         self._labels = [x for x in self._labels if label is not None and x[0] != label]
 
     def active(self, now_ns: int) -> list[tuple[str, LinkFault]]:
-        """Faults that are there at a time of the run, with what they are called."""
+        """Faults that are active at a time of the run, with their labels."""
         names = {id(fault): label for label, fault in self._labels}
         active = self._injector.active(now_ns)
         return [(names.get(id(f), f"{f.kind} at {f.link or 'all links'}"), f) for f in active]
@@ -64,15 +64,15 @@ class Orders:
     # ---------------------------------------------------------------------------------- messages
 
     def say(self, message: str, values: Mapping[str, Any]) -> None:
-        """Have something said before the next step; before the first one, it waits for its end.
+        """Queue a message for the next step; before the first one, it waits for its end.
 
         Raises:
-            SayError: it cannot be said.
+            SayError: it cannot be sent.
         """
         self._ordered.append(Due(message, self._rig.desk.payload(message, values), False))
 
     def due(self, step: int) -> list[Due]:
-        """What goes out before a step, in its order: of the same message the last one stands."""
+        """Messages sent before a step, in order: of the same message the last one stands."""
         if step == 0:
             return []
         planned = [one for at, one in self._planned if at <= step]
@@ -85,7 +85,7 @@ class Orders:
 
 
 def in_words(message: str, values: Mapping[str, Any]) -> str:
-    """What was said, for people."""
+    """Text of an operator message for the user."""
     told = ((name, [float(x) for x in _flat(value)]) for name, value in values.items())
     return f"'{message}': " + "; ".join(
         f"{name} {' '.join(f'{x:.6g}' for x in some)}" for name, some in told

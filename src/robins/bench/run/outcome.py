@@ -23,7 +23,7 @@ from robins.results.summary import dumps, plain
 
 RECORD, ACCOUNT = "record.mcap", "bench.json"
 
-_EVENTS = 200  # told; all are in the record
+_EVENTS = 200  # listed; all are in the record
 
 
 def judged(flight: Flight, ran: Ran) -> Judged:
@@ -60,9 +60,9 @@ def figures(
     """Figures for scripts.
 
     Args:
-        flight: what was asked for.
-        ran: what came of it.
-        said: of it by the rig.
+        flight: the setup of the run.
+        ran: its results.
+        said: its evaluation by the rig.
         inside: the same run inside one program; None where there is none to compare with.
     """
     health = ran.health.values()
@@ -112,9 +112,9 @@ def outcome(flight: Flight, ran: Ran, record: Path | None) -> Outcome:
     """Contents of the result folder of a run.
 
     Args:
-        flight: what was asked for.
-        ran: what came of it.
-        record: what went over the lines, to be moved into the folder.
+        flight: the setup of the run.
+        ran: its results.
+        record: the traffic of the lines, to be moved into the folder.
     """
     failures = [ran.failure]
     if not (ran.steps or ran.failure):
@@ -171,7 +171,7 @@ def text(told: dict[str, Any], said: Judged, ran: Ran) -> str:
 
 
 def refusals(ran: Ran) -> list[str]:
-    """Whose frames were refused."""
+    """Sentences on refused frames, by link."""
     return [
         f"'{name}': {h.refused} frames were refused, which cannot be what they say"
         for name, h in ran.health.items()

@@ -34,7 +34,7 @@ from robins.bench.wire.records import Unsound
 
 HELLO_S = 120.0  # for the hello of a part that does not compute
 REVIVED_S = 60.0
-_ANEW = '; on_death = "restart" would start it anew'
+_ANEW = '; on_death = "restart" would restart it'
 _LONG_S = 9.0  # of waiting for a hello, before it is an event
 _TELL_S = 0.2  # between two words on how far it is
 _MOST_DEATHS, _MINUTE_S = 3, 60.0  # of one part, by itself, until the run fails
@@ -46,7 +46,7 @@ class Watch(Protocol):
     """Observer of a run, such as the live page; its calls must return at once."""
 
     def event(self, kind: str, time_s: float, text: str) -> None:
-        """Something happened."""
+        """Take an event."""
 
     def step(self, session: Session, step: int) -> None:
         """A step is over."""
@@ -73,12 +73,12 @@ class Ran(NamedTuple):
     events: list[Event]
     deaths: int
     failure: str  # empty: the run came to its end
-    stopped: bool  # by whoever looked on
+    stopped: bool  # by an observer
     said: tuple[Spoken, ...] = ()  # by the operator
 
 
 class _DiedAgainError(Exception):
-    """A part that was started anew has died before it was where the old one was."""
+    """A restarted part has died before it reached the state of the old one."""
 
     def __init__(self, death: Death):
         super().__init__(str(death))
@@ -86,18 +86,18 @@ class _DiedAgainError(Exception):
 
 
 class Session:
-    """A run; `run` does it.
+    """A run; `run` executes it.
 
     Attributes:
-        flight: what was asked for.
+        flight: its setup.
         latencies: so far.
         telemetry: so far.
         injector: its faults; more may be added while it runs.
-        kit: what its parts are made from.
+        kit: input of its parts.
         crew: the processes.
-        clock: when a step begins.
+        clock: decides when a step begins.
         done: steps so far.
-        step_ms: how long the last step took.
+        step_ms: duration of the last step.
         pace: steps a second, of late.
         deaths: of processes, so far.
     """
@@ -116,9 +116,9 @@ class Session:
         Args:
             flight: the run.
             record: where to write the record; None: none.
-            watch: who looks on.
-            progress: told of the share that is done, and what is going on.
-            paused: whether it waits for a "start" of whoever looks on.
+            watch: the observer.
+            progress: called with the share that is done, and the present activity.
+            paused: whether it waits for a "start" of the observer.
             kit: of the same run, if it has been made before.
 
         Raises:
@@ -149,9 +149,9 @@ class Session:
         self.run_number = int.from_bytes(os.urandom(4), "little") or 1
         self.done = 0
         self.step_ms = self.pace = 0.0
-        self._histories: dict[str, History] = {}  # of parts that are started anew if they die
+        self._histories: dict[str, History] = {}  # of parts that are restarted if they die
         self._died: dict[str, list[float]] = {}  # when, of late, by part; not of those killed
-        self._barred: set[tuple[str, str]] = set()  # links and messages that were told of
+        self._barred: set[tuple[str, str]] = set()  # links and messages that were reported
         self._paused, self._stop = paused, False
         self._speaks: dict[str, str] = {}  # by part: the port that its process opens
         self._passed: deque[tuple[Entry, int]] = deque()  # not written yet
@@ -162,7 +162,7 @@ class Session:
     # --------------------------------------------------------------------------------- going
 
     def run(self) -> Ran:
-        """Do it; a run that fails is told in `Ran.failure`, with all that there was until then.
+        """Execute the run; a failure is in `Ran.failure`, with all results until then.
 
         Raises:
             KeyboardInterrupt: after all processes have ended and the record is whole.
@@ -186,7 +186,7 @@ class Session:
             finally:
                 seconds = time.monotonic() - began
                 self.broker.stop()
-                with contextlib.suppress(BenchError):  # whose failure has been told, or is next
+                with contextlib.suppress(BenchError):  # whose failure has been reported, or is next
                     self._catch_up()
                 if self._watch is not None:
                     self._watch.over(self, bool(failure))
@@ -241,7 +241,7 @@ class Session:
         return self.steps
 
     def _obey(self, step: int) -> None:
-        """Do what whoever looks on wants; wait while it is paused."""
+        """Execute the commands of the observer; wait while it is paused."""
         time_ns = (step + 1) * self.kit.step_ns
         switch(self, time_ns, self._speaks, self._bury)
         if self._watch is not None:
@@ -274,10 +274,10 @@ class Session:
         self.event("command", f"{what} {label or ''}".strip())
 
     def say(self, message: str, **values: Any) -> None:
-        """Say something to the parts before the next step; a field left out is missing or 0.
+        """Send the parts a message before the next step; a field left out is missing or 0.
 
         Raises:
-            SayError: it is not for the bench to say, has no such field, or one beyond its limits.
+            SayError: the bench does not send it, it has no such field, or one beyond its limits.
         """
         self._orders.say(message, values)
 
@@ -289,7 +289,7 @@ class Session:
             self.event("said", in_words(one.message, values), one.planned)
 
     def active_faults(self) -> list[tuple[str, LinkFault]]:
-        """Faults that are there now, with what they are called."""
+        """Faults that are active now, with their labels."""
         return self._orders.active(self.broker.time_ns)
 
     def state_of(self, part: str) -> str:
@@ -370,7 +370,7 @@ class Session:
 
     @property
     def broker(self) -> Broker:
-        """The middle, once the links are open."""
+        """Broker, once the links are open."""
         assert self._broker is not None
         return self._broker
 
@@ -385,7 +385,7 @@ class Session:
         return self._paused
 
     def event(self, kind: str, text: str, shown: bool = True) -> None:
-        """Write down that something happened."""
+        """Record an event."""
         self._catch_up()  # what passed before it stands before it
         one = Event(self._wall_ns(), kind, text, {"time_s": round(self.time_s, 9)})
         self.events.append(one)
@@ -402,7 +402,7 @@ class Session:
             self._passed.append((Entry(self._wall_ns(), link, direction, data), time_ns))
 
     def _refused(self, link: str, message: str, why: Unsound) -> None:
-        """Tell of a frame that cannot be; of those like it that follow, their count tells.
+        """Report a frame that contradicts its table; those like it that follow are only counted.
 
         Raises:
             BenchError: it is the truth, without which nothing is to be judged.
@@ -445,7 +445,7 @@ class Session:
             self._bury()
 
     def _bury(self, until: str | None = None) -> None:
-        """Look for processes that have ended, and do what the setup says.
+        """Handle processes that have ended, by the policy of the setup.
 
         Raises:
             BenchError: one has, and the run is to fail.
@@ -480,10 +480,10 @@ class Session:
                 death, by_itself = again.death, True
                 continue
             told = "all" if since < 0 else f"all since step {since}"
-            return self.event("restarted", f"'{part}' was started anew and told {told} again")
+            return self.event("restarted", f"'{part}' was restarted and sent {told} again")
 
     def _still_lives(self, part: str) -> None:
-        """Look whether a part that was started anew has died at once; others wait for their turn.
+        """Check that a restarted part has not died at once; others wait for their turn.
 
         Raises:
             _DiedAgainError: it has.

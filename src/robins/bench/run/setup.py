@@ -50,13 +50,13 @@ class Setup(Parameters):
     - ``patience``, in real time: periods for which a step waits for a part before it goes on
       without it.
     - ``on_death``: what becomes of a run whose process dies: it "fail"s, or the process is
-      "restart"ed and told again what it has forgotten, for which the run waits; in real time it
-      misses deadlines. ``restarts``: how often, of all processes together; one more fails the run,
-      and so does the third death of a part within a minute that no fault has killed.
+      "restart"ed and sent again the input that it has lost, for which the run waits; in real time
+      it misses deadlines. ``restarts``: how often, of all processes together; one more fails the
+      run, and so does the third death of a part within a minute that no fault has killed.
     - ``baud``: of a virtual line that each link without a real port has; left out: no delay.
     - ``ports``: parts that are boards, with their ports, ``gyro = "/dev/ttyUSB0,460800"``, or
       programs, which are given the path of a port: ``adm = "adm-c/adm_board"``.
-    - ``faults``: what goes wrong. ``says``: what the operator says to the parts.
+    - ``faults``: injected faults. ``says``: messages of the operator to the parts.
     """
 
     rig: ClassVar[Rig]
@@ -74,7 +74,7 @@ class Setup(Parameters):
     patience: Annotated[float, pydantic.Field(gt=0.0, le=1e6)] = 1.0
     on_death: Literal["fail", "restart"] = "fail"
     restarts: Annotated[int, pydantic.Field(ge=1, le=100_000)] = 10
-    fifo: bool = False  # ask for the scheduler SCHED_FIFO
+    fifo: bool = False  # request the scheduler SCHED_FIFO
     baud: Annotated[int, pydantic.Field(ge=300, le=100_000_000)] | None = None
     ports: dict[str, str] = pydantic.Field(default_factory=dict)
     faults: tuple[LinkFault, ...] = ()
@@ -124,7 +124,7 @@ class Flight(NamedTuple):
 
     @property
     def timing(self) -> Timing:
-        """Its steps, if it is flown to the end."""
+        """Steps of a complete run."""
         return self.rig.timing(self.given)
 
 
@@ -135,7 +135,7 @@ def calling(rig: Rig, name: str, otherwise: str = "") -> Iterator[None]:
     Args:
         rig: whose it is.
         name: field of the rig.
-        otherwise: what to do beside correcting it.
+        otherwise: advice in addition to correcting it.
 
     Raises:
         BenchError: it failed; names the line.
@@ -223,7 +223,7 @@ def _text(name: str) -> tuple[str, Rig]:
 
 
 def _flies(rig: Rig, setup: Setup) -> Parameters:
-    """The parameters of what flies."""
+    """Parameters of the vehicle and its flight."""
     packaged, flies = rig.flies(), setup.flies
     if flies in packaged:
         text = packaged[flies].read_text("utf-8")
@@ -261,7 +261,7 @@ def changed(flight: Flight, options: Mapping[str, Any]) -> Flight:
 
 
 def counted_from(flight: Flight, steps: int) -> int:
-    """First step of which figures of merit count: as the scenario says, else the second half."""
+    """First step that counts in figures of merit: that of the scenario, else of the second half."""
     first = flight.timing.counted_from
     return first if first < steps else steps // 2
 

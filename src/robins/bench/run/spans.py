@@ -1,6 +1,6 @@
-"""When faults were on, for the live page.
+"""Times at which faults were active, for the live page.
 
-It hears of the bench each half second, and some faults are shorter.
+It gets the state of the bench each half second, and some faults are shorter.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class FaultSpans:
 
     @property
     def told(self) -> list[dict[str, Any]]:
-        """As the page takes them; one that is still on has no end."""
+        """Spans for the page; one that is still active has no end."""
         return [
             {"label": label, "begin_s": begin, "end_s": end}
             for (label, begin), end in self._ends.items()

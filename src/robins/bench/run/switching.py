@@ -1,7 +1,7 @@
 """Faults of processes: parts that are killed, and parts whose power is switched off and on.
 
-A part that was killed is brought to where it was, if the run is to restart what dies. One that had
-no power has lost its state: it begins anew as before the first step, in the middle of the run.
+A part that was killed is brought back to its state, if the run restarts what dies. One that had
+no power has lost its state: it starts again as before the first step, in the middle of the run.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from robins.bench.run.session import Session
 
-HELLO_S = 60.0  # for a part that is switched on to say hello
+HELLO_S = 60.0  # for the hello of a part that is switched on
 
 
 def switch(
     session: Session, time_ns: int, speaks: Mapping[str, str], bury: Callable[[str], None]
 ) -> None:
-    """Do what the faults of processes say, before a step.
+    """Apply the faults of processes, before a step.
 
     A part is started again as soon as it is off, and waits, so that it is ready when it is switched
     on: what it takes to start is not part of the fault. Boards are left alone.
@@ -31,7 +31,7 @@ def switch(
         bury: waits until a part has died, and does what the run is to do then.
 
     Raises:
-        BenchError: a part that was switched on says no hello.
+        BenchError: a part that was switched on sends no hello.
     """
     for part in session.injector.killed(time_ns):
         session.event("killed", f"'{part}' is killed, as a fault")

@@ -1,4 +1,4 @@
-"""What a run on the bench did: the messages that passed, as arrays."""
+"""Telemetry of a run on the bench: the messages that passed, as arrays."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Flown(Mapping[str, np.ndarray]):
     """Fields of messages over a run, by ``message.field``; E steps.
 
     A field of one number has the shape (E,), others (E, length). NaN stands where nothing was
-    heard, 0 for whole numbers.
+    received, 0 for whole numbers.
 
     Attributes:
         time_s: (E,) at the end of each step.
@@ -40,7 +40,7 @@ class Flown(Mapping[str, np.ndarray]):
         return iter(self.arrays)
 
     def __len__(self) -> int:
-        """How many fields."""
+        """Number of fields."""
         return len(self.arrays)
 
     def until(self, steps: int) -> Flown:
@@ -103,7 +103,7 @@ def know_truth(rig: Rig, flown: Flown, counted: slice, time_s: float) -> None:
     known = first[counted]
     if len(known) and not np.any(np.all(np.isfinite(known.reshape(len(known), -1)), axis=-1)):
         speaker = next(part for part, sent in rig.sends.items() if truth in sent)
-        raise BenchError(f"no true {truth} was heard from '{speaker}' up to {time_s:.1f} s")
+        raise BenchError(f"no true {truth} was received from '{speaker}' up to {time_s:.1f} s")
 
 
 def difference(flown: Flown, inside: Mapping[str, np.ndarray]) -> float:

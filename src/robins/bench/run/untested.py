@@ -1,4 +1,4 @@
-"""Warnings of a run that is shorter or slower than what it was to test."""
+"""Warnings of a run that is too short or too slow for its test."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from robins.scenario import Parameters, Span
 
 
 def doubts(flight: Flight, ran: Ran) -> list[str]:
-    """Sentences on what was planned and did not happen, and on a clock that was not kept.
+    """Sentences on planned events that did not happen, and on a clock that was not kept.
 
     Of a run that failed the reason is known, so only the latter.
     """
@@ -44,7 +44,7 @@ def _after(what: str, begin_s: float, end_s: float) -> str:
 
 
 def _spans(given: Parameters, where: str = "") -> Iterator[tuple[str, Span]]:
-    """Times at which something goes wrong in a scenario: its lists of spans, with their names."""
+    """Times of the disturbances of a scenario: its lists of spans, with their names."""
     for name in type(given).model_fields:
         value = getattr(given, name)
         if isinstance(value, Parameters):

@@ -28,7 +28,7 @@ WARNINGS = ("missed", "refused", "command", "power", "waiting")
 
 @runtime_checkable
 class Page(Protocol):
-    """What a live page can do; see `robins.bench.live.Live`."""
+    """Interface of a live page; see `robins.bench.live.Live`."""
 
     url: str
 
@@ -36,13 +36,13 @@ class Page(Protocol):
         """Show a sample."""
 
     def status(self, status: Mapping[str, Any]) -> None:
-        """Show how the bench is."""
+        """Show the state of the bench."""
 
     def event(self, level: Any, time_s: float, text: str) -> None:
-        """Show that something happened."""
+        """Show an event."""
 
     def commands(self) -> list[dict[str, Any]]:
-        """What was pressed."""
+        """Commands of the user."""
         ...
 
     def poll(self) -> None:
@@ -50,7 +50,7 @@ class Page(Protocol):
 
 
 class Looking:
-    """Tells the page and the status file; as `robins.bench.run.session.Watch` wants it."""
+    """Observer of a run for the page and the status file; a `robins.bench.run.session.Watch`."""
 
     def __init__(self, page: Page | None, status: Status):
         """Take the page, if there is one."""
@@ -72,13 +72,13 @@ class Looking:
             self._page.poll()
 
     def event(self, kind: str, time_s: float, text: str) -> None:
-        """Something happened."""
+        """Take an event."""
         if self._page is not None and (kind != "command" or (text := self._shown(text))):
             level = "alarm" if kind in ALARMS else "warning" if kind in WARNINGS else "info"
             self._page.event(level, time_s, text)
 
     def _shown(self, text: str) -> str:
-        """What is shown of a command, so that many do not hide all else; the record has each.
+        """Text shown of a command, so that many do not hide all else; the record has each.
 
         One that comes again and again is shown, since the page counts it in one line.
         """
@@ -94,7 +94,7 @@ class Looking:
         return "" if flooded else "commands come too fast to show each; the record has them all"
 
     def commands(self, session: Session) -> list[dict[str, Any]]:
-        """What was pressed on the page."""
+        """Commands from the page."""
         if self._page is None:
             return []
         self._page.poll()
@@ -133,7 +133,7 @@ class Looking:
 
 
 def state(session: Session, done: int) -> dict[str, Any]:
-    """How the bench is, for the page."""
+    """State of the bench for the page."""
     recent = session.latencies.recent()
     late = recent["cycle"]["lateness_us"]
     now_ns, links, health = session.broker.time_ns, session.broker.links, _health(session)
@@ -191,7 +191,7 @@ def starting(flight: Flight) -> dict[str, Any]:
 
 
 def report(session: Session, done: int, url: str) -> dict[str, Any]:
-    """How the bench is, for the status file."""
+    """State of the bench for the status file."""
     return starting(session.flight) | {
         "state": "paused" if session.paused else "running",
         "time_s": session.time_s,
@@ -218,7 +218,7 @@ def page_for(rig: Rig, given: Any, title: str, run: int, host: str, port: int) -
     """A live page for a run.
 
     Raises:
-        ImportError, OSError, RuntimeError: as `Live` says.
+        ImportError, OSError, RuntimeError: as of `Live`.
     """
     shown, signals = rig.shown, [*rig.shown.signals(given), STEP]
     page = Live(signals, title, run, host, port, shown.offered, tuple(shown.says))

@@ -1,4 +1,4 @@
-"""What a message is made of: fields of numbers with their units and limits.
+"""Messages and their fields: numbers with units and limits.
 
 All numbers are little endian; lengths of vectors are fixed, so that firmware needs no heap.
 """
@@ -31,7 +31,7 @@ class Field(NamedTuple):
 
 
 class Message(NamedTuple):
-    """What one part of the bench tells another."""
+    """A message from one part of the bench to another."""
 
     number: int
     name: str

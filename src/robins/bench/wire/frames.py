@@ -35,12 +35,12 @@ class FrameError(RobinsError, ValueError):
 
 
 class Header(NamedTuple):
-    """What a frame says of itself."""
+    """Header of a frame."""
 
     type: int  # number of the message, see `robins.bench.wire.schema`
-    run: int  # of this run: a frame of an earlier one, left in a buffer, is told by it
+    run: int  # of this run: it marks a frame of an earlier one, left in a buffer
     sequence: int  # of the link and direction, from 0, modulo 2^32
-    time_ns: int  # of what the payload tells, since the start of the run
+    time_ns: int  # of the payload's content, since the start of the run
     version: int = VERSION
 
 

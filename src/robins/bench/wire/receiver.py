@@ -12,7 +12,7 @@ LONGEST = LEAST + MOST_PAYLOAD + (LEAST + MOST_PAYLOAD) // 254 + 1
 
 @dataclass
 class Counts:
-    """What a receiver has seen."""
+    """Counts of frames at a receiver."""
 
     frames: int = 0  # good ones
     cobs: int = 0  # not stuffed rightly
@@ -101,13 +101,13 @@ class Sequence:
         self._of_now: set[int] = set()
 
     def take(self, number: int, now_ns: int | None = None, most: int = 2**31) -> bool:
-        """Count a frame; whether it is new and in its order, and so may be used.
+        """Count a frame; true if it is new and in its order, and so may be used.
 
         Args:
             number: of the frame.
             now_ns: the time of the run, of a frame that is of this time. None: it may be an old
                 one. A frame of now whose number is old, but did not come now, is no repeated one:
-                its sender counts anew.
+                its sender has restarted its count.
             most: frames that can have been lost before it; a number further ahead is a jump.
         """
         if self._next is None:
@@ -136,7 +136,7 @@ class Sequence:
         return False
 
     def _came(self, number: int, now_ns: int) -> bool:
-        """Whether a number has come at this time already; so many are remembered, no more."""
+        """True if a number has come at this time already; so many are remembered, no more."""
         if now_ns != self._now_ns:
             self._now_ns, self._of_now = now_ns, set()
         if number in self._of_now:

@@ -1,4 +1,4 @@
-"""Payloads: values of a message to bytes and back, and whether they can be, as its table says."""
+"""Payloads: values of a message to bytes and back, checked by the limits of its table."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class RecordError(RobinsError, ValueError):
 
 
 class Unsound(NamedTuple):
-    """Why a payload cannot be what its message says."""
+    """Reason why a payload contradicts the table of its message."""
 
     text: str
     sized: bool  # it has the length of its message, so one of its numbers is to blame
 
 
 class _Number(NamedTuple):
-    """What a number of a payload may be."""
+    """Limits of a number of a payload."""
 
     name: str
     least: float
@@ -87,10 +87,10 @@ class Record:
         return out
 
     def unsound(self, payload: bytes) -> Unsound | None:
-        """The one gate of every frame: its length, and least and most of each number; None: sound.
+        """Check of every frame: its length, and least and most of each number; None: sound.
 
-        An infinity is beyond every limit; NaN passes only where the table says that it stands for a
-        number that there is not.
+        An infinity is beyond every limit; NaN passes only where the table has it for a missing
+        number.
         """
         if len(payload) != self.size:
             why = f"it has {len(payload)} bytes, '{self.message.name}' has {self.size}"

@@ -1,4 +1,4 @@
-"""All that is said on the lines of a rig, in one table: encoded, checked, documented, put into C.
+"""All messages on the lines of a rig, in one table: encoded, checked, documented, put into C.
 
 The messages of the protocol are those of every rig; a rig adds its parts and its data. Numbers are
 part of the protocol. Add at the end, never renumber, never reuse; a change of the fields of a
@@ -21,7 +21,7 @@ from robins.errors import RobinsError
 FIRST_DATA = 16
 """Messages of a lower number are of the protocol, the others carry data."""
 BENCH = "bench"
-"""Who is at the middle; its number as a part is 0."""
+"""Name of the hub; its number as a part is 0."""
 
 PROTOCOL: tuple[Message, ...] = (
     message(
@@ -131,7 +131,7 @@ class Wire:
         return self._record(name).decode(payload)
 
     def unsound(self, name: str, payload: bytes) -> Unsound | None:
-        """Why a payload cannot be what its message says; None: it is sound.
+        """Reason why a payload contradicts the table of its message; None: it is sound.
 
         Raises:
             KeyError: there is no such message.

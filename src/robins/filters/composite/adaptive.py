@@ -1,4 +1,4 @@
-"""One filter for a model of which nobody knows when it is wrong: a bank over the process noise.
+"""Adaptive filter for a model that may be wrong at unknown times: a bank over the process noise.
 
 An innovation that is too large is a bad record or a motion that was not foreseen. A robust weight
 alone takes it for the first, and once the motion is wrong it refuses the truth; a fading factor
@@ -8,7 +8,7 @@ scale of the process noise,
 
     Q_s = s^2 Q,     s of the scales
 
-so a motion that is wrong for long makes a mode of more noise likely, and a bad record, which is
+so a wrong motion model that lasts makes a mode of more noise likely, and a bad record, which is
 gone at the next step, does not. There is no gate, and where no mode has given weight to a sensor
 for long, its next record is believed by all.
 
@@ -17,7 +17,7 @@ bias that may wander explains what was something else, and what the quiet mode h
 lost when the modes are mixed.
 
 Where several instruments drive the motion, one goes wrong at a time. So a mode scales one part of
-the noise, and the part that is sound still tells the error of the other: a gyro that drifts must
+the noise, and the part that is sound still shows the error of the other: a gyro that drifts must
 not make an accelerometer doubtful by which the tilt is known.
 
 Neither more noise nor less weight answers a sensor whose records are off and stay off, or that

@@ -98,18 +98,18 @@ def _one(tree: T, second: Array) -> T:
 def alternative(
     inner: Filter, spread: Given, judging: Sequence[str], nats: float, wrong: str
 ) -> Filter:
-    """A filter of which a second run, from a wider start, takes over once it is the likelier.
+    """A filter and a second run of it from a wider start, which takes over once it is likelier.
 
     Both take every step. The evidence is the logarithm of the likelihood ratio of their
     innovations, summed from where it was least (Page's test, Biometrika 41, 1954). Before, the
     answer is bit for bit that of the first, afterwards that of the second. Updates note
     ``alternative.evidence`` and, as ``imm.wrong`` (1,), whether what is called `wrong` is. To
     smooth a run, run `inner` from the start that counts at its end. A `reset` has both go on from
-    one belief, so that nothing speaks for the second any more.
+    one belief, so that there is no evidence for the second any more.
 
     Args:
         inner: what both run.
-        spread: (n,) standard deviations that the second start has beside those given.
+        spread: (n,) standard deviations of the second start, in addition to those given.
         judging: names of the sensors whose innovations are compared.
         nats: evidence at which the second takes over, above 0.
         wrong: name of what the first start is wrong about (`Filter.suspects`).

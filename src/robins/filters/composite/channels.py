@@ -47,7 +47,7 @@ class Channel:
 
     @property
     def name(self) -> str:
-        """Its sensors, for messages."""
+        """Names of its sensors, for messages."""
         return "+".join(self.sensors)
 
 
@@ -68,7 +68,11 @@ def channel(sensors: str | Sequence[str], filter: Filter | None = None) -> Chann
 
 
 def owners(channels: Sequence[Channel]) -> dict[str, int]:
-    """Which channel has which sensor."""
+    """Number of the channel of each sensor.
+
+    Raises:
+        ValueError: there are no channels, or a sensor belongs to two.
+    """
     require(channels, "no channels: at least one local filter is wanted")
     owner: dict[str, int] = {}
     for i, one in enumerate(channels):
@@ -100,7 +104,7 @@ def local_dims(channels: Sequence[Channel], dims: Mapping[str, int]) -> list[dic
 
 
 class Joined(NamedTuple):
-    """What a filter of channels carries besides the fused belief."""
+    """Memory of a filter of channels besides the fused belief."""
 
     members: tuple[FilterState, ...]  # by channel; a master last, where there is one
     shares: Array  # (members, 1 or n) of the information
@@ -316,7 +320,7 @@ def followed_by(
 
 
 class Mastered(NamedTuple):
-    """What a joined filter with sensors at its master carries besides the belief given out."""
+    """Memory of a joined filter with sensors at its master, besides the belief given out."""
 
     joined: FilterState  # its belief is the one given out
     master: FilterState
@@ -405,8 +409,8 @@ def at_master(filter: Filter, sensors: str | Sequence[str], master: Filter | Non
         federated                   fusion-reset, zero-reset: shared out like all that was fused
                                     no-reset, rescale: output only
 
-    The sensors must come last in the model: a local measurement after them is fused anew from the
-    locals, which know nothing of them.
+    The sensors must come last in the model: a local measurement after them is fused again from the
+    locals, which do not contain them.
 
     Args:
         filter: `distributed`, `intersecting` or `federated`, of the other sensors.

@@ -45,7 +45,7 @@ class _Past(NamedTuple):
     u: Data
     y: dict[str, Data]  # by sensor, NaN where nothing is known yet
     aux: dict[str, Data]
-    asked: Array  # (., sensors) bool, the filter has been asked to update with the sensor
+    asked: Array  # (., sensors) bool, an update with the sensor has been requested
     known: Array  # (., sensors) bool, a measurement has been used
     log_likelihood: Array  # (., sensors)
 
@@ -67,7 +67,7 @@ class _Place(NamedTuple):
     at: Array  # the row of its step
     now: Array  # the row of the present step
     steps: Array  # from there to here
-    there: Array  # bool, it tells something
+    there: Array  # bool, it is informative
     too_old: Array  # bool
     used: Array  # bool, it is entered
     at_once: Array  # bool, the filter takes it as it stands
@@ -111,7 +111,7 @@ class Delayed(Around):
         return tuple(self.model.dims)
 
     def begin(self, inner: FilterState, known: Model) -> FilterState:
-        """With an empty buffer; the present step has no prediction to repeat."""
+        """Start with an empty buffer; the present step has no prediction to repeat."""
         size, extra = self.size, _numbers(self.aux)
         asked = jnp.zeros((size, len(self.names)), bool)
         past = _Past(
@@ -186,7 +186,11 @@ class Delayed(Around):
         return _outer(inner, Delay(inner.memory, past, held.now, held.reach, known)), told
 
     def recognised(self, model: Model, sensor: Sensor, aux: Data) -> tuple[int, Model]:
-        """Which sensor it is, and the model with its numbers."""
+        """Index of a sensor, and the model with its numbers.
+
+        Raises:
+            ValueError: the sensor is new, or its shapes or those of ``aux`` differ.
+        """
         names = self.names
         if sensor.name not in names:
             raise ValueError(f"sensor '{sensor.name}' is new; delayed() was told of {list(names)}")
@@ -240,7 +244,7 @@ class Delayed(Around):
             after, seen = self.inner.update(inner, each, row.y[each.name], row.aux[each.name])
             inner = select(row.asked[k], after, inner)
             gained = gained.at[j, k].set(jnp.where(row.asked[k], seen.log_likelihood, 0.0))
-            told = jnp.isneginf(row.log_likelihood[k])  # when it was first asked
+            told = jnp.isneginf(row.log_likelihood[k])  # at its first request
             failed = _first_failure(failed, row.asked[k] & ~told, seen.code)
             if k == place.which:
                 own = select(i == 0, seen, own)
@@ -254,7 +258,7 @@ def delayed(
 
     Give a late measurement as `Late`; a plain one is of age 0. However they come in, the belief and
     the sum of the log-likelihoods are those of a run in which each came in its own step, sensors in
-    the model's order. A rule that counts the updates it is asked for sees one of each sensor in a
+    the model's order. A rule that counts its updates sees one of each sensor in a
     step, as in `run`.
 
     A measurement older than the buffer, or than the start, has the code ``TOO_OLD``. ``REFUSED``
@@ -294,7 +298,7 @@ def delayed(
 def _entered(
     past: _Past, place: _Place, name: str, value: Data, aux: Data, info: StepInfo
 ) -> _Past:
-    """Enter a measurement in its own step; and in this one, where its sensor is asked for too."""
+    """Enter a measurement in its own step, and in this one where its sensor is due too."""
     now, at, which, used = place.now, place.at, place.which, place.used
 
     def entered(rows: Array, v: Array, here: Array | bool) -> Array:
@@ -361,18 +365,18 @@ def _with(
 
 
 def _unread(sensor: Sensor, state: FilterState, aux: Data) -> Data:
-    """A measurement of a sensor that tells nothing."""
+    """A measurement of a sensor without information."""
     like = jax.eval_shape(sensor.read, state.belief.mean, aux)
     return jax.tree_util.tree_map(lambda leaf: jnp.full(leaf.shape, jnp.nan), like)
 
 
 def _first_failure(code: Array, asked: Array, found: Array) -> Array:
-    """The code, or the first failure that is found in what was asked of the filter."""
+    """The code, or the first failure that is found among the requested updates."""
     return jnp.where(asked & ~is_failure(code) & is_failure(found), found, code)
 
 
 def _change(earlier: Array, later: Array, own: StepInfo, taken: Array) -> Array:
-    """What a late measurement adds to the log-likelihood of all; -inf where a step failed."""
+    """Change of the total log-likelihood by a late measurement; -inf where a step failed."""
     # Steps that failed before have made the whole minus infinity already.
     change = jnp.where(jnp.isfinite(earlier), later - earlier, own.log_likelihood)
     return jnp.where(taken, change, -jnp.inf)

@@ -4,7 +4,7 @@ The airship paper fuses two full filters as if they were independent (its eq. 51
 
     P_g = (P_1^-1 + P_2^-1)^-1        x_g = P_g (P_1^-1 x_1 + P_2^-1 x_2)
 
-and feeds x_g back to the navigation state. It does not say what becomes of the local filters then;
+and feeds x_g back to the navigation state. It does not define how the local filters continue;
 the three readings are ``feedback``:
 
     own    each goes on from its own mean and covariance: error states shifted by -x_g
@@ -17,7 +17,7 @@ covariance intersection is safe whatever the correlation.
 
 States that only one local has (the errors of a wind that only its sensors see) cannot be fused:
 with ``common`` the first so many tangent components are, from the marginals of all locals, and the
-rest follows from what the first local makes of it.
+rest follows from the estimate of the first local.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def distributed(
 
     The belief of its state is the fused one. Locals have their prior and process noise in common,
     which (51) takes for independent: expect too small a covariance, and see `federated` for the
-    filter that is right. What an update says of itself is what the sensor's local filter says.
+    filter that is right. The report of an update is that of the sensor's local filter.
 
     A local covariance that is singular (a hard constraint, a measurement without noise) has no
     inverse. The step is not taken, with `Code.NOT_FINITE`, and a run raises a ValueError with what
@@ -135,7 +135,7 @@ def distributed(
         common: how many tangent components, from the first on, are fused by (51); all by default.
             The others belong to the first channel, and follow from its conditional distribution
             given the common ones (`common_information_sum`). Locals are of one state, so the other
-            channels carry those components as well, but nothing of what they make of them is used.
+            channels carry those components as well, but their estimates of them are not used.
 
     Raises:
         ValueError: a sensor in two channels, an unknown feedback, no common component; at `init`, a

@@ -1,7 +1,7 @@
-"""The federated filter: local filters beside each other, and their information shared and fused.
+"""The federated filter: parallel local filters whose information is shared and fused.
 
 Each local filter has sensors of its own, and a share of what is known and of the process noise, so
-that what they know is the whole when it is added up (Carlson 1990):
+that their information adds up to the whole (Carlson 1990):
 
     fuse     Y_g = sum_i Y_i + Y_m,  x_g = Y_g^-1 (sum_i Y_i x_i + Y_m x_m)
     share    x_i = x_g,  P_i = P_g / b_i,  Q_i = Q / b_i,  sum_i b_i + b_m = 1
@@ -165,11 +165,11 @@ _TRACE = 1e-8
 class Federated(JoinedFilter):
     """The filter of `federated`.
 
-    The belief of its state is the fused one, after a prediction and after each sensor. What an
-    update says of itself (innovation, gain, NIS, log-likelihood) is what the sensor's local filter
-    says, which knows less than the whole: the log-likelihoods of a run do not sum to that of the
-    data. Notes: ``federated.share``, the mean share of that local filter, and
-    ``federated.silent``, steps since it used a measurement.
+    The belief of its state is the fused one, after a prediction and after each sensor. The report
+    of an update (innovation, gain, NIS, log-likelihood) is that of the sensor's local filter, which
+    has less information than the whole: the log-likelihoods of a run do not sum to that of the
+    data. Notes: ``federated.share``, the mean share of that local filter, and ``federated.silent``,
+    steps since it used a measurement.
 
     Rules of a local filter work on its share. With sharing after the prediction a local filter with
     rules predicts for itself, through the map that makes its share of the common prediction; one
@@ -231,7 +231,7 @@ class Federated(JoinedFilter):
         a = self.chosen_shares(state)
         if self.timeout is None:
             return a
-        # The master's share is its own; where all are silent there is nobody to hand over to.
+        # The master's share is its own; where all are silent there is no filter to hand over to.
         heard = (state.memory.silent.astype(float) < self.timeout)[:, None]
         mine = a[: self.count]
         left = floored(jnp.where(heard, mine, 0.0)) * jnp.sum(mine, axis=0, keepdims=True)

@@ -84,7 +84,7 @@ def _looked_at(beliefs: Sequence[Belief], doing: str) -> list[Belief]:
 
 
 def is_singular(belief: Belief) -> Array:
-    """Whether a combination of states is known exactly, to rounding."""
+    """True if a combination of states is known exactly, to rounding."""
     pivots = jnp.diagonal(linalg.lost_in_rounding(belief.factor, belief.sigma))
     return jnp.any(pivots)
 

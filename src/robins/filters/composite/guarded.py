@@ -66,7 +66,7 @@ SLACK = 0.1
 # sixth of what is gained, at beta = 1/2.
 _CHANCE = 0.5
 
-# Six deviations of the reference, squared, say all there is to say; more would not be forgotten.
+# Six deviations of the reference, squared, are conclusive; more would not be forgotten.
 _SURE = 36.0
 
 
@@ -97,7 +97,7 @@ class Watch(NamedTuple):
 class Guarded(Composite):
     """The filter of `guarded`.
 
-    What an update says of itself is what the filter with the greater weight says; a sensor of the
+    The report of an update is that of the filter with the greater weight; a sensor of the
     assumption that has the smaller one is refused. Notes: those of the filter, those of the
     reference as ``reference.`` and their name, ``guarded.weight``, ``guarded.evidence`` (the
     greatest, as a share of the limit) and ``guarded.trips``.
@@ -153,7 +153,7 @@ class Guarded(Composite):
         return self.filter.reset(watch.filter, watch.reference.belief)
 
     def judged(self, watch: Watch, failed: Array, renewed: Array | float) -> Watch:
-        """What is learnt of a step, and whether the filter goes on from its reference."""
+        """Watch after a step, in which the filter may go on from its reference."""
         square, gained = _difference(watch.filter.belief, watch.reference.belief)
         renewed = jnp.broadcast_to(jnp.asarray(renewed), square.shape)
         M = _members(self.groups, len(square))
@@ -252,7 +252,7 @@ def guarded(
     """A filter under an assumption, weighed against one without by the error learnt of it.
 
     The belief lies between those of ``filter`` and of ``reference``, which never sees the sensors
-    of the assumption, by the weight w of the worst group (module docstring); where nothing speaks
+    of the assumption, by the weight w of the worst group (module docstring); without evidence
     against the assumption it is that of ``filter``. What was learnt is forgotten to 1/e in
     ``patience`` looks. The filter goes on from the reference's belief when the evidence of a group
     of states exceeds its limit, when a component is further off than ``leap`` deviations of the
@@ -350,7 +350,7 @@ def _members(groups: Groups | None, n: int) -> np.ndarray:
 
 
 def _not_believed(info: StepInfo) -> StepInfo:
-    """What is said of a measurement that did not touch the belief given out."""
+    """Report of a measurement that did not change the belief given out."""
     missing = info.code == int(Code.MISSING)
     return info._replace(
         factor=jnp.eye(len(info.used)),

@@ -114,7 +114,7 @@ class Family:
     Attributes:
         make: makes a filter, or what `mode` makes of one, of one row of the numbers. What depends
             on a number is computed with it, not decided by it: the numbers are stand-ins then. A
-            function that is made anew at each call compiles anew: give a `Partial` of a module's.
+            function that is made at each call compiles again: give a `Partial` of a module's.
         numbers: pytree of arrays, one row a mode.
     """
 
@@ -141,7 +141,9 @@ class Family:
         return self.of(_at(jax.tree_util.tree_map(np.asarray, self.numbers), i))
 
     def every(self, of: Of, states: Data, *rows: Data) -> Every:
-        """As `Several.every`; one mode is traced, for all, and states have a leading axis."""
+        """Step of all modes, as `Several.every`; one mode is traced, for all, and states have a
+        leading axis.
+        """
         numbers = jax.tree_util.tree_map(jnp.asarray, self.numbers)
         after, found, notes = each_row(
             lambda row, *part: of(self.of(row), *part), numbers, states, *rows
@@ -319,7 +321,7 @@ def imm(
     The `StepInfo` is that of the mixture: innovation and factor are its moments before the update,
     the gain is the mean of the modes' gains, and ``imm.probability`` (modes,) is noted. What rules
     of mode i note is found under ``imm.i.`` and its name. A mode that is rare and wide makes these
-    moments those of no Gaussian, and the NIS says nothing: then ask for the ``likeliest``.
+    moments those of no Gaussian, and the NIS meaningless: then set ``likeliest``.
 
     Likelihoods only compare where all modes use the same components. Where a rule of one mode
     refuses what another uses, the measurement leaves the probabilities as they are. A mode whose

@@ -38,7 +38,7 @@ def root(weight: Array) -> Array:
 
 
 def mean_of(states: State, weight: Array, about: State) -> State:
-    """Weighted mean of states (leading axis), by Gauss-Newton steps begun at ``about``.
+    """Weighted mean of states (leading axis), by Gauss-Newton steps from ``about``.
 
     States of weight zero do not count, even if they are not finite.
     """

@@ -2,23 +2,24 @@
 
     y = h(x) [+] sigma * b + v,      v ~ N(0, R),  sigma the standard deviations of R
 
-b is a state beside x, counted in the noise of its sensor, so that the same numbers serve every
-sensor. Modes of a bank (`robins.filters.composite.imm`) suppose that
+b is a state in addition to x, counted in the noise of its sensor, so that the same numbers serve
+every sensor. Modes of a bank (`robins.filters.composite.imm`) assume that
 
     no sensor is off        b is not read
-    an offset begins        b is read, b ~ N(0, BEGINS^2 I): drawn anew
+    an offset begins        b is read, b ~ N(0, BEGINS^2 I): drawn again
     it lasts                b is read, and wanders by N(0, WANDERS^2 I) in a step
 
 and change by
 
     none is off  -- BEGIN -->  begins  -- at once -->  lasts  -- END -->  none is off
 
-The last two are apart because a mode that is unlikely is mixed anew from the likely ones in every
-step: a single one would begin with an unknown offset again and again, and pay for it each time.
+The last two are apart because a mode that is unlikely is mixed again from the likely ones in every
+step: a single one would start with an unknown offset again and again, at a cost each time.
 
-A weight (`robins.filters.rules.huber`) says that a record is bad, and forgets it at once. Where
+A weight (`robins.filters.rules.huber`) marks a record as bad, and forgets it at once. Where
 records stay away, because a sensor is disturbed for a while or because the model between two
-sensors is wrong, the offset is learnt, and what the records say of changes of x is not lost.
+sensors is wrong, the offset is learnt, and the information of the records on changes of x is not
+lost.
 """
 
 from __future__ import annotations
@@ -145,7 +146,7 @@ class ReadOff:
 
 
 def _wide_sensor(sensor: Sensor, names: Sequence[str], of: Supposed) -> Sensor:
-    """Of the wide state; a `linear` of its own is not used."""
+    """Sensor of the augmented state; a `linear` of its own is not used."""
     read: Any = Partial(_read, sensor)
     if sensor.name in names:
         at = names.index(sensor.name)

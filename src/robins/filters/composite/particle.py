@@ -236,7 +236,8 @@ def particle(
 
 
 def reseed(state: FilterState, key: Any) -> FilterState:
-    """The same state of a particle filter with other draws to come; `reset` it to draw it anew.
+    """The same state of a particle filter with other draws to come; `reset` it to draw the
+    particles again.
 
     Args:
         state: of a `particle` filter.
@@ -261,7 +262,7 @@ def _split(key: Array, count: int) -> tuple[Array, ...]:
 
 
 def _systematic(key: Array, weight: Array) -> Array:
-    """Which particles to take over, each about count * weight times (Kitagawa 1996, sec. 3)."""
+    """Indices of resampled particles, each about count * weight times (Kitagawa 1996, sec. 3)."""
     count = weight.shape[0]
     upto = jnp.cumsum(weight)
     at = (jnp.arange(count, dtype=float) + jax.random.uniform(key)) / count * upto[-1]
@@ -295,7 +296,7 @@ def _told(
     Args:
         state: before it.
         log_prior: (count,) weights then, of those that can be updated.
-        infos: what it tells of each particle.
+        infos: reports of each particle.
         cross: (count, n, m) covariance of state and measurement in each.
         cloud: after it.
         used: (m,) components.

@@ -65,7 +65,7 @@ def consider(states: Given) -> Rule:
         K_c = (I - M) K,   P+ = (I - K_c H) P (I - K_c H)' + K_c R K_c'
                               = P_best + (M K) S_y (M K)',         M = diag(1 on p, else 0)
 
-    S_y the covariance of the innovation: the information on p is added as columns beside the
+    S_y the covariance of the innovation: the information on p is added as columns next to the
     factor. So P_pp stays as predicted and nothing is subtracted. For states that are weakly
     observed and wrongly modelled (a scale factor, a lever arm): their uncertainty counts, but they
     do not absorb model errors.

@@ -2,7 +2,7 @@
 
 A plant has two inputs: white noise w and a modelling error n. A design minimises the H2 norm from w
 to the error of the estimate while the H-infinity norm from n to it stays below gamma. NumPy only,
-but for the designs by LMI, which ask for their solver when called; every answer carries its true
+but for the designs by LMI, which import their solver when called; every answer carries its true
 norms.
 """
 

@@ -1,9 +1,9 @@
 """Scaling of a plant to numbers of order one, and the way back.
 
 Interior-point solvers stop at absolute tolerances, so a plant in radians, or with an angle in
-arcseconds beside a bias a thousand times smaller, gets a wrong answer in silence. The states are
-balanced as Osborne does (*On pre-conditioning of matrices*, J. ACM 7, 1960): rows and columns of a
-state get equal norms. The result does not depend on the units of the plant.
+arcseconds along with a bias a thousand times smaller, gets a wrong answer in silence. The states
+are balanced as Osborne does (*On pre-conditioning of matrices*, J. ACM 7, 1960): rows and columns
+of a state get equal norms. The result does not depend on the units of the plant.
 """
 
 from __future__ import annotations

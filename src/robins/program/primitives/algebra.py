@@ -1,6 +1,6 @@
 """Products and factorisations of small matrices, written out in scalars.
 
-Written out, they use every structural zero of a matrix. Above the size that `trace` is told, they
+Written out, they use every structural zero of a matrix. Above the size that `trace` is given, they
 are calls of a routine of `routines.h` instead. Eigenvalues and LU always are: they choose by
 numbers.
 """
@@ -79,7 +79,7 @@ def _cholesky(walk: Walk, equation: Any, P: Nodes) -> list[Nodes]:
 
 
 def _cholesky_of(walk: Walk, P: Nodes) -> tuple[Nodes]:
-    """Lower factor by rows; all NaN where a pivot is not positive, as LAPACK's caller says it."""
+    """Lower factor by rows; all NaN where a pivot is not positive, as JAX returns it."""
     n, apply = len(P), walk.graph.apply
     if walk.stays_whole(n**3 // 3):
         return tuple(call(walk, "cholesky", [n], [P], [(n, n)]))

@@ -64,7 +64,7 @@ def _logistic(walk: Walk, equation: Any, a: Nodes) -> Nodes:
 
 @rule("integer_pow")
 def _integer_pow(walk: Walk, equation: Any, a: Nodes) -> Nodes:
-    """By squaring, in the order in which JAX multiplies."""
+    """Whole power by squaring, in the order in which JAX multiplies."""
     y = equation.params["y"]
     one = walk.each(lambda n: walk.graph.constant(1, walk.graph.kind[n]), a)
     power, factor, left = None, a, abs(y)
@@ -103,7 +103,7 @@ def _select_n(walk: Walk, equation: Any, which: Nodes, *cases: Nodes) -> Nodes:
 
 @rule("convert_element_type")
 def _convert(walk: Walk, equation: Any, a: Nodes) -> Nodes:
-    """What is no whole number is cut, at the ends of its new type too; whole numbers wrap round."""
+    """Convert: reals are cut, at the ends of the new type too; whole numbers wrap round."""
     graph, given = walk.graph, equation.invars[0].aval.dtype
     dtype = np.dtype(equation.params["new_dtype"])
     kind = kind_of(dtype)

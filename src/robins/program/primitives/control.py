@@ -56,7 +56,7 @@ def _platform(walk: Walk, equation: Equation) -> Nodes:
 
 @rule("cond")
 def _cond(walk: Walk, equation: Equation, index: Nodes, *args: Nodes) -> list[Nodes]:
-    """Its branch where the index is known; else all of them, and a choice of their results."""
+    """Conditional: the branch of a known index; else all, and a choice of their results."""
     branches, graph = equation.params["branches"], walk.graph
     last = len(branches) - 1
     which: Node = index.item()
@@ -211,7 +211,7 @@ FREE = {
 
 
 def size_of(jaxpr: Any) -> int:
-    """About how many scalar operations a jaxpr is, before anything is folded."""
+    """Approximate number of scalar operations of a jaxpr, before anything is folded."""
     total = 0
     for equation in jaxpr.eqns:
         name, p = equation.primitive.name, equation.params

@@ -45,7 +45,7 @@ def window(walk: Walk, a: Nodes, start: list[Node], sizes: SIZES) -> Nodes:
 
 
 def _inside(walk: Walk, start: list[Node], shape: SIZES, sizes: SIZES) -> Node:
-    """Whether a window lies inside an array."""
+    """Flag of a window that lies inside an array."""
     graph = walk.graph
     found = graph.constant(True, "flag")
     for index, n, size in zip(start, shape, sizes, strict=True):
@@ -92,14 +92,14 @@ def _dynamic_update(walk: Walk, equation: Any, a: Nodes, new: Nodes, *start: Nod
 
 
 def _drops(equation: Any) -> bool:
-    """Whether what lies outside is left out, not moved inside."""
+    """True if a window outside is left out, not moved inside."""
     return getattr(equation.params["mode"], "name", "") == "FILL_OR_DROP"
 
 
 def _starts(
     walk: Walk, indices: Nodes, batch: tuple[int, ...], rank: int, axes: Any, along: Any, by: Any
 ) -> list[Node]:
-    """Where the window of one index vector begins, in all axes of the array."""
+    """Start of the window of one index vector, in all axes of the array."""
     start = [walk.graph.constant(0, "whole")] * rank
     for k, axis in enumerate(axes):
         start[axis] = walk.graph.convert(indices[(*batch, k)].item(), "whole")
@@ -191,7 +191,8 @@ def _gather(walk: Walk, equation: Any, a: Nodes, indices: Nodes) -> Nodes:
             inside = _inside(walk, start, a.shape, sizes)
             one = walk.select(np.full(kept, inside), one, np.full(kept, outside))
         found[batch] = one
-    # The axes of a window go where the primitive says, those of the indices to the other places.
+    # The axes of a window go where the primitive puts them, those of the indices to the other
+    # places.
     offsets = [int(k) for k in d.offset_dims]
     others = [k for k in range(found.ndim) if k not in offsets]
     return np.moveaxis(found, range(found.ndim), [*others, *offsets])

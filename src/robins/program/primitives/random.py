@@ -44,12 +44,12 @@ def words(walk: Walk, both: Node) -> tuple[Node, Node]:
 
 
 def numbered(walk: Walk, keys: Nodes, shape: tuple[int, ...], row: Node | None = None) -> Nodes:
-    """What a generator makes of each key and the numbers from 0, in the order of a shape.
+    """Numbers of a generator for each key and the counts from 0, in the order of a shape.
 
     Where a row is given, of this shape, the numbers go on from those of the rows before it.
 
     Raises:
-        ProgramError: JAX is told to number in another way.
+        ProgramError: JAX is set to number in another way.
     """
     if not jax.config.values["jax_threefry_partitionable"]:
         raise ProgramError(

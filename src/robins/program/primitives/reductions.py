@@ -23,7 +23,7 @@ REDUCED = {
 
 
 def _empty(walk: Walk, kind: str, number: Any) -> Node:
-    """What a reduction of nothing is."""
+    """Value of a reduction of nothing."""
     if kind == "whole" and not np.isfinite(number):
         number = np.iinfo(np.int64).min if number < 0 else np.iinfo(np.int64).max
     return walk.graph.constant(number, kind)
@@ -117,7 +117,7 @@ def _sort(walk: Walk, equation: Any, *arrays: Nodes) -> list[Nodes]:
     rows = [[np.asarray(row) for row in np.moveaxis(a, axis, 0)] for a in arrays]
 
     def less(p: int, q: int) -> Nodes:
-        """Whether row p comes before row q."""
+        """Flag of row p coming before row q."""
         found: Nodes | None = None
         for row in reversed(rows[:keys]):
             real = graph.kind[int(row[p].ravel()[0])] == "real"

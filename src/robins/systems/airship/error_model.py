@@ -18,9 +18,10 @@ that of `robins.earth`, which above the ellipsoid has a small north component.
 Eq. (40) in print has two slips: the last cross product has the true rates in the place of their
 errors, which all but cancels the term before it, and the rates of dlat and dlon are exchanged.
 
-As a filter (`Fed`) the SINS navigates beside the estimate of its errors; once a step the estimate
-is taken off the SINS, and the errors begin anew at zero. It is the total-state form of `model`
-written differently, so it serves as its check; the paper's local filters are not built on it.
+As a filter (`Fed`) the SINS navigates along with the estimate of its errors; once a step the
+estimate is taken off the SINS, and the errors start again at zero. It is the total-state form of
+`model` written differently, so it serves as its check; the paper's local filters are not built on
+it.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ LON, LAT, ALT = 6, 7, 8
 
 
 class Sins(NamedTuple):
-    """What the SINS says, at an instant or on average over a period; ENU/RFU."""
+    """Output of the SINS, at an instant or on average over a period; ENU/RFU."""
 
     C_cb: Any  # (3, 3) body to computed navigation frame
     v_n: Any  # (3,) m/s
@@ -128,7 +129,7 @@ def error_rate(
 
     Args:
         x: error state, computed minus true.
-        sins: what the SINS says.
+        sins: output of the SINS.
         errors: of its sensors; zero in a filter, which has them as process noise.
     """
     phi, dv = x[PHI], x[VELOCITY]
@@ -163,7 +164,7 @@ def step(
 
 
 def sins_at(nav: Nav, f_b: Float[Array, "3"]) -> Sins:
-    """What a SINS says whose state is `nav` and whose accelerometers read f_b (FRD) [m/s^2]."""
+    """Output of a SINS whose state is `nav` and whose accelerometers read f_b (FRD) [m/s^2]."""
     f_c = swap(nav.q_nb.apply(f_b))
     return Sins(
         _swap_dcm(nav.q_nb.as_dcm()), swap(nav.v_n), nav.position.lat, nav.position.alt, f_c
@@ -254,7 +255,7 @@ def _step(fed: Fed, block: Increments) -> Fed:
 
 
 def _noise(noise: InsNoise, metres_per_radian: Array, fed: Fed, block: Increments) -> Array:
-    """As of the total state; longitude and latitude in radians."""
+    """Process noise as of the total state; longitude and latitude in radians."""
     per_metre = jnp.concatenate([jnp.ones(6), 1.0 / metres_per_radian[::-1], jnp.ones(1)])
     return per_metre[:, None] * walk(noise, block.dt)
 
@@ -296,7 +297,7 @@ ERRORS = States(
 
 
 class Surroundings(NamedTuple):
-    """What position and velocity decide; ENU."""
+    """Quantities that depend on position and velocity; ENU."""
 
     omega_in: Array  # rad/s, w_ie + w_en
     coriolis: Array  # rad/s, 2 w_ie + w_en

@@ -1,4 +1,4 @@
-"""The airship's instruments: how each is drawn, what of it a filter takes, h(x) and R it believes.
+"""The airship's instruments: simulation of each, measurements for a filter, its h(x) and R.
 
 By the errors of `model`, true minus estimated, at heading psi (clockwise from north) and pitch
 theta, with v_air = C_b^n v_air_b:
@@ -74,7 +74,7 @@ def read_sar(datum: Datum, x: Any, aux: Any) -> tuple[Array, Angle, Array]:
 
 
 def _measure_sar(given: Airship, course: Course, key: Keys, world: World):
-    """As `read_sar`, (E, 2), (E,), (E, 1)."""
+    """Measurements as `read_sar`: (E, 2) position, (E,) heading, (E, 1) height."""
     s, b, (q, _, position) = given.sar, given.barometer, world.truth
     errors = SarErrorModel(s.position, s.heading, s.outlier_share, s.outlier_factor)
     seen, heard = (jnp.asarray(present(course.epoch_s, of)) for of in (s, b))
@@ -101,7 +101,7 @@ RADAR = Instrument(
 
 
 class Early(NamedTuple):
-    """What sights before the end of an epoch need besides the state."""
+    """Inputs of sights before the end of an epoch, besides the state."""
 
     turned_b: ArrayLike  # (S - 1, 3) rad, raw turn of the body from each to the end
     age_s: ArrayLike  # (S - 1,)
@@ -173,7 +173,7 @@ EARLY_STARS = Instrument(STAR_EARLY, _EULER, None, _believed_early, _taken_early
 
 
 def read_wind(x: Any, v_air_b: ArrayLike) -> Array:
-    """(2,) m/s north east, what should be thought to be the wind: (22)."""
+    """Assumed wind (2,) [m/s], north and east: (22)."""
     q_nb, v_n, _ = navigation(x)
     thought = (v_n - q_nb.apply(jnp.asarray(v_air_b)))[:2]
     return thought + x.wind_error if isinstance(x, WithWind) else thought
@@ -187,7 +187,7 @@ def _measure_air(given: Airship, course: Course, key: Keys, world: World) -> Arr
 
 
 def _wind(world: World, wind: Array, air_b: Array) -> tuple[Array, Array]:
-    """What is taken for the wind, NaN where no air data come, and for the velocity in the air."""
+    """Wind, NaN where no air data come, and velocity in the air, as filters take them."""
     there = jnp.isfinite(world.readings[WIND][:, :1])
     return jnp.where(there, wind, jnp.nan), jnp.where(there, air_b, 0.0)
 
@@ -277,7 +277,7 @@ def printed_attitude_rows(
 def printed_constraint(
     heading_rad: ArrayLike, air_speed_error: ArrayLike
 ) -> tuple[Float[Array, "2 9"], Float[Array, "2"]]:
-    """D and d of (49), (50) to the letter, but for the error of the wind in d, which nobody knows.
+    """D and d of (49), (50) to the letter, but for the error of the wind in d, which is unknown.
 
     dv_E and dv_N are components already, and yet are multiplied by sine and cosine of the heading;
     d has these two the other way round. D loses a row wherever the heading is cardinal. The air

@@ -178,7 +178,7 @@ class States(NamedTuple):
 
 
 def believed_noise(given: Airship) -> InsNoise:
-    """Of filters of nine states, whose noise of velocity stands for the biases."""
+    """Noise for filters of nine states, whose noise of velocity stands for the biases."""
     return InsNoise(jnp.asarray(given.believed.gyro_noise), jnp.asarray(given.believed.accel_noise))
 
 

@@ -17,13 +17,13 @@ from robins.systems.study import Scenario
 
 
 class Position(Place):
-    """Where the flight begins."""
+    """Position at the start of the flight."""
 
     height: Annotated[float, Quantity("length", least="0 m", most="100 km")]
 
 
 class Hull(Parameters):
-    """How the airship moves: a velocity through the air, and how fast it is carried along."""
+    """Motion of the airship: velocity through the air, and time constant of the drift."""
 
     air_speed: q.SpeedSize = default("10 m/s")
     course: q.Angle = default("90 deg")
@@ -35,7 +35,7 @@ class Hull(Parameters):
 
 
 class Gusts(Parameters):
-    """Gusts drawn anew every so often, each held until the next."""
+    """Gusts drawn at fixed intervals, each held until the next."""
 
     speed: Annotated[tuple[float, float], Quantity("speed", least="0 m/s")]
     spread: q.AngleSize = default("45 deg")
@@ -62,7 +62,7 @@ class Wind(Parameters):
 
     @property
     def gusty(self) -> bool:
-        """Whether anything comes on top."""
+        """True if gusts or turbulence come on top."""
         return self.gusts is not None or self.turbulence is not None
 
     @pydantic.model_validator(mode="after")
@@ -89,7 +89,7 @@ class Imu(Parameters):
 
 
 class Readings(Parameters):
-    """What every instrument but the inertial unit has: how often it reads, when it is lost."""
+    """Parameters of every instrument but the inertial unit: rate and outages."""
 
     rate: q.Frequency = default("1 Hz")
     lost: tuple[Span, ...] = ()
@@ -126,7 +126,7 @@ class AirData(Readings):
 
 
 class Start(Parameters):
-    """What is not known at the start, in north, east, down; one standard deviation."""
+    """Uncertainty at the start, in north, east, down; one standard deviation."""
 
     attitude: q.AngleSizes
     velocity: q.SpeedSizes = default("0.1 m/s")
@@ -147,7 +147,7 @@ class BelievedNoise(Parameters):
 
 
 COMPARED = ("ekf", "aekf", "ukf", "raukf", "cukf-wind-states", "cukf-robust", "product")
-"""Those that a scenario compares unless it says otherwise."""
+"""Filters that a scenario compares by default."""
 
 
 class Airship(Scenario):

@@ -1,4 +1,4 @@
-"""The airship's study: its filters and the instruments they take, what is reported, the claims.
+"""The airship's study: filters and the instruments they take, report, claims.
 
 The paper's filters have two local ones, for radar with barometer and for stars, fused by its (51);
 the locals go on from their own means and covariances (`distributed`). What it does not state is
@@ -47,12 +47,12 @@ POINTS = filters.unscented(alpha=1.0, beta=2.0, kappa=0.0)
 
 
 def ukf(*of: Rule) -> Filter:
-    """By sigma points."""
+    """Kalman filter by sigma points."""
     return kalman(POINTS, of)
 
 
 def ekf(*of: Rule) -> Filter:
-    """By derivatives."""
+    """Kalman filter by derivatives."""
     return kalman(taylor(), of)
 
 
@@ -79,7 +79,7 @@ def _two(local: Callable[[], Filter], wind: Sequence[str] = (), **how: Any) -> F
 
 
 def _gated(constrained: Filter, assumption: tuple[str, ...]) -> Filter:
-    """The constraint as long as the filter without it does not speak against it.
+    """The constraint as long as the filter without it does not contradict it.
 
     Level velocity and position are judged. The ratio is higher than its default because the filter
     without, fused by (51), is overconfident (NEES of velocity 1.95 a state).
@@ -94,7 +94,7 @@ def _product() -> Filter:
 
 
 def _adaptive() -> Filter:
-    """As "product", but for a motion of which nobody knows when it is wrong."""
+    """The filter "product" for a motion model that may be wrong at unknown times."""
     return filters.adaptive(parts=DRIVEN)
 
 
@@ -153,7 +153,7 @@ CANDIDATES: dict[str, Candidate] = {
 
 
 def as_case(states: States, of: Taken, sigma: Array, world: World) -> Case:
-    """What a filter with these sensors takes of a run, errors at the start of sigma (n,); pure."""
+    """Case of a filter with these sensors, errors at the start of sigma (n,); pure."""
     estimate, zero = retract(world.start, -world.initial_error), jnp.zeros(3)
     count = world.wind.shape[0]
     gyro, accel = (jnp.tile(b, (count, 1)) for b in (world.gyro_bias, world.accel_bias))
@@ -186,13 +186,13 @@ BLOCKS = (
     StateBlock("velocity", slice(3, 6), "m/s", "m/s", "ENU", ENU),
     StateBlock("position", slice(6, 9), "m", "m", "ENU", ENU),
 )
-"""What every filter of the study reports, errors being true minus estimated."""
+"""Blocks reported by every filter of the study, errors being true minus estimated."""
 
 _AROUND_LOSS_S = (-1.0, 100.0, 200.0, 299.0, 350.0, 500.0)  # of which figures are stated
 
 
 def view(given: Airship, course: Course) -> View:
-    """What is reported of every filter."""
+    """Report of every filter."""
     # an epoch that ends a span belongs to it: 200 s to 800 s are the epochs 200.0 to 800.0
     first, last = (
         int(np.searchsorted(course.epoch_s, t))
@@ -200,7 +200,7 @@ def view(given: Airship, course: Course) -> View:
     )
     at_s = [lost.begin + t for lost in given.sar.lost[:1] for t in _AROUND_LOSS_S]
     span, time = given.wind.span, course.epoch_s
-    # an epoch tells of the second before it
+    # an epoch covers the second before it
     blown = (time > span.begin + 1e-9) & (time <= span.end + 1e-9) & given.wind.gusty
     return View(
         epoch_s=course.epoch_s,

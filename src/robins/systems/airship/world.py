@@ -3,10 +3,10 @@
 A mass without much inertia of its own: it is carried by the wind, towards which its velocity
 settles with a time constant, dv/dt = (v_air + w - v) / T, and holds a course through the air, so in
 a gust it drifts sideways. The motion gives the increments that an ideal inertial unit would report;
-the truth is what the mechanisation makes of these, so that an error-free unit navigates to it
+the truth is their mechanisation, so that an error-free unit navigates to it
 exactly.
 
-The paper says nothing of the dynamics (time constant, sway); they are assumptions of the
+The paper does not state the dynamics (time constant, sway); they are assumptions of the
 specification, and parameters here.
 """
 
@@ -47,7 +47,7 @@ AIR, WIND_ERROR = 0, 1  # of the air data
 
 
 class Datum(NamedTuple):
-    """Where horizontal positions are counted from, and the metres in a radian there."""
+    """Origin of horizontal positions, and the metres in a radian there."""
 
     lat: Array
     lon: Array
@@ -55,7 +55,7 @@ class Datum(NamedTuple):
 
 
 class Course(NamedTuple):
-    """What all runs share."""
+    """Data that all runs share."""
 
     epoch_s: np.ndarray  # (E,)
     sight_s: np.ndarray  # (E S,) of the stars, S in an epoch, the last at its end
@@ -130,7 +130,7 @@ def _towards(direction: float) -> np.ndarray:
 
 
 def present(time_s: np.ndarray, instrument: Readings) -> np.ndarray:
-    """Whether an instrument reads at times: at its own rate, and not where it is lost."""
+    """Mask of the times at which an instrument reads: at its own rate, and not where it is lost."""
     every = round(1.0 / (time_s[0] * instrument.rate))  # the first step is as long as all
     return (np.arange(1, len(time_s) + 1) % every == 0) & outside(instrument.lost, time_s)
 

@@ -30,10 +30,10 @@ KINDS = {
     "switchable": Kind(),
     "delays": Kind(delays=True),
 }
-"""What each filter takes the pseudoranges for; "delays" is the default of a replay."""
+"""Model of the pseudoranges of each filter; "delays" is the default of a replay."""
 
 SMOOTHERS = {f"{name}+rts": name for name, kind in KINDS.items() if kind.memory}
-"""Of recorded logs, by name: the filter whose run each smooths."""
+"""Smoothers of recorded logs, by name: the filter whose run each smooths."""
 
 NAMES = (*KINDS, *SMOOTHERS)
 

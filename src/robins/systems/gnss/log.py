@@ -33,7 +33,7 @@ from robins.systems.tables import block_array, place_arrays, track_arrays
 LEAST = 4  # satellites of the first fix
 HEADING = StateBlock("heading", slice(0, 1), "rad", "deg", "NED", ("heading",))
 LETTERS = {1: "G", 2: "S", 4: "R", 8: "E", 16: "J", 32: "C"}
-"""Of the satellite systems of libRSF, as in RINEX."""
+"""Letters of the satellite systems of libRSF, as in RINEX."""
 
 CAUSES = (
     "Likely causes: signals delayed by more than the filter believes, a jump of the receiver's "
@@ -160,10 +160,10 @@ def _travel(odometry: OdometryTable, time_ns: np.ndarray) -> tuple[Travel, np.nd
 
 
 def recorded(log: RangeLog, parameters: Replay) -> Recorded:
-    """The log as its filters take it, as `System.recorded` says.
+    """The log as its filters take it, see `System.recorded`.
 
     Raises:
-        ValueError: the log cannot be navigated; the sentence says why.
+        ValueError: the log cannot be navigated; the message gives the reason.
     """
     return _recorded(arrange(log, parameters), parameters)
 
@@ -179,16 +179,16 @@ def replay(
     filters: tuple[str, ...] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Navigate a log with the filters named and say how good they are.
+    """Navigate a log with the named filters, and report their quality.
 
     Args:
         log: pseudoranges, odometry, and true places where they are known.
-        parameters: what the file does not say.
+        parameters: what the file does not contain.
         filters: names such as "delays", "huber+rts"; by default those of the parameters.
         progress: called with the share done and what is being done.
 
     Raises:
-        ValueError: the log cannot be navigated; the sentence says why.
+        ValueError: the log cannot be navigated; the message gives the reason.
     """
     given = arrange(log, parameters)
     pieces, make = _recorded(given, parameters)

@@ -77,14 +77,14 @@ class Travel(NamedTuple):
 
 
 class Sky(NamedTuple):
-    """What the pseudoranges of an epoch need besides the state."""
+    """Inputs of the pseudoranges of an epoch, besides the state."""
 
     satellite_e: Any  # (N, 3) m, any place where a satellite is not measured
     sigma: Any  # (N,) m
 
 
 class Place(NamedTuple):
-    """Where the frame of the state is fixed."""
+    """Origin of the frame of the state."""
 
     origin_e: Array  # (3,) m
     C_en: Array  # (3, 3)
@@ -111,14 +111,14 @@ class Place(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """Which of the models a filter believes in."""
+    """Model that a filter believes in."""
 
     delays: bool = False  # a state for the delay of each satellite
     memory: bool = True  # without it every epoch stands alone: least squares
 
 
 def sagnac_m(satellite_e: Any, receiver_e: Any) -> Any:
-    """What the turn of the Earth adds to a range [m], (...) of positions (..., 3)."""
+    """Contribution of the Earth's rotation to a range [m], (...) of positions (..., 3)."""
     x, y = satellite_e[..., 0], satellite_e[..., 1]
     return OMEGA_E / LIGHT * (x * receiver_e[..., 1] - y * receiver_e[..., 0])
 
@@ -232,7 +232,7 @@ def gnss_model(believed: Believed, kind: Kind, place: Place, member: np.ndarray)
 def start_belief(
     believed: Believed, kind: Kind, fix: Any, place: Place, systems: int, u: Travel
 ) -> Belief:
-    """About the first fix; nothing is known of the heading.
+    """Belief about the first fix; nothing is known of the heading.
 
     Args:
         believed: of clock, wheels and delays.
@@ -292,7 +292,7 @@ def first_fix(y: Any, sky: Sky, member: Any, system_bias_m: float) -> Array:
 
 
 def sensor_axes(satellites: tuple[str, ...]) -> dict[str, SensorAxes]:
-    """What the components of the innovations are."""
+    """Units and names of the components of the innovations."""
     return {
         RANGES: SensorAxes("m", "line of sight", satellites),
         LENGTH: SensorAxes("1", "vehicle", ("scale",)),

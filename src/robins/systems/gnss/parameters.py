@@ -71,7 +71,7 @@ class Weights(Parameters):
 
 
 class Believed(Parameters):
-    """What every filter believes."""
+    """Assumptions of every filter."""
 
     clock: Clock = pydantic.Field(default_factory=Clock)
     wheels: Wheels = pydantic.Field(default_factory=Wheels)
@@ -80,7 +80,7 @@ class Believed(Parameters):
 
 
 class Replay(Believed):
-    """A recorded log: what its file does not say."""
+    """Parameters of a recorded log that its file does not contain."""
 
     system: Literal["gnss"] = "gnss"
     title: str = "Tight GNSS replay"
@@ -97,7 +97,7 @@ class Satellites(Parameters):
 
 
 class Streets(Parameters):
-    """Walls on both sides, in blocks whose height and distance are drawn anew."""
+    """Walls on both sides, in blocks whose height and distance are drawn for each block."""
 
     block: q.Length = default("40 m")
     gap: Annotated[float, pydantic.Field(ge=0.0, le=1.0)] = 0.25  # share of blocks without a wall

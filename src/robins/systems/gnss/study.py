@@ -1,4 +1,4 @@
-"""The study "city": what is reported of the filters and what is claimed of them."""
+"""The study "city": report of the filters, and claims."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def contender(city: City, course: Course, name: str) -> Contender:
 
 
 def view(city: City, course: Course) -> View:
-    """What is reported: the position, the true path, the track of each filter in the first run."""
+    """Report: the position, the true path, the track of each filter in the first run."""
     place = course.place
     p = place.geodetic(course.position)
     return View(
@@ -80,5 +80,5 @@ CLAIMS = {
     ),
 }
 
-# smoothers are named so that a campaign asked for one is told where it belongs
+# smoothers are named so that a campaign that requests one gets an error with their place
 CITY = Study(City, filters.NAMES, world.simulate, contender, view, world.lay_out, CLAIMS)

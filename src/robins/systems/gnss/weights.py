@@ -3,7 +3,7 @@ r"""Weights by satellite: a vector of pseudoranges, of which each component has 
 The rules `huber` and `student_t` of `robins.filters.rules` weigh a measurement as a whole. Here one
 reflected signal must not cost the others their weight. A component's residual is taken *after* the
 update, where the clock, which all satellites share, is known, and the update is repeated
-(iteratively reweighted least squares, begun at the Kalman filter)::
+(iteratively reweighted least squares, started at the Kalman filter)::
 
     e_i = (y - h(x+))_i / sqrt(R_ii),   w_i = w(e_i),   R_ij becomes R_ij / sqrt(w_i w_j)
 

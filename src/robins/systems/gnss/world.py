@@ -44,7 +44,7 @@ _MULTIPATH_S = 10.0  # correlation time of the multipath of a signal in direct s
 
 
 class Course(NamedTuple):
-    """What all runs share; E epochs, N satellites."""
+    """Data that all runs share; E epochs, N satellites."""
 
     epoch_s: np.ndarray  # (E,)
     place: Place
@@ -119,7 +119,7 @@ def _constellation(city: City, place: Place) -> tuple[np.ndarray, np.ndarray, np
 
 
 class Signals(NamedTuple):
-    """How the signals arrive in a run, (E, N)."""
+    """Arrival of the signals in a run, (E, N)."""
 
     delay: Any  # m, NaN where a signal is lost
     cn0_dbhz: Any

@@ -1,13 +1,13 @@
 """The filter "marg" for a board: its step takes increments, and a simulated hand tries it.
 
-A log has no scenario, so what `robins export` records and judges is simulated here: a unit that
-lies still for two seconds and is then turned and swung by a hand, read with the errors that the
-parameters of the unit allow, in a field that a magnet disturbs twice. From its samples to the first
-belief all goes the way of a log (`prepare`).
+A log has no scenario, so the run that `robins export` records and judges is simulated here: a unit
+that lies still for two seconds and is then turned and swung by a hand, read with the errors that
+the parameters of the unit allow, in a field that a magnet disturbs twice. From its samples to the
+first belief all goes the way of a log (`prepare`).
 
 On the board a step takes the increments of a block as they come, and the code integrates them by
 `model.of_block`, as a replay does beforehand. It is the filter of one prior: on a board the gains
-of the gyros are known, or asked of a log (`filters.filter_of`).
+of the gyros are known, or found in a log (`filters.filter_of`).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ FIELD_N = np.array([18e-6, 0.0, 44e-6])  # T, north is where it points
 SHAKE = 0.1  # of what is believed of the field, noise of a reading
 
 PLACE = StateBlock("place", slice(6, 9), "m", "m", "NED", NED)  # from the middle of its places
-_LEARNED = {"ratio": "learned variances, 1 as told", "samples": "that they were learned from"}
+_LEARNED = {"ratio": "learned variances, 1 as given", "samples": "that they were learned from"}
 _GATE = {"refused": "readings refused in a row", "ratio": "of the last one, 1 at the gate"}
 
 FIELDS = {
@@ -70,7 +70,7 @@ FIELDS = {
         for of, text in _LEARNED.items()
     },
 }
-"""What the fields of the exported library are, beside those that the model declares."""
+"""Comments on the fields of the exported library, in addition to those of the model."""
 
 
 class Given(NamedTuple):

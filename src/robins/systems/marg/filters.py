@@ -1,4 +1,4 @@
-"""The filter of a nine-axis unit: what it learns, refuses and asks as hypotheses."""
+"""The filter of a nine-axis unit: learnt noise, gates and hypotheses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from robins.systems.marg.parameters import Replay
 
 # of what is learned of travel: forgetting, and least and most of its variances
 _MEMORY, _TRAVEL_VARIANCE = 0.98, (0.3, 10.0)
-# the same of the field: within that of a room, or as a unit that nobody calibrated reads it
+# the same of the field: within that of a room, or as an uncalibrated unit reads it
 _FIELD_MEMORY, _FIELD_VARIANCE = 0.95, (1.0, 16.0)
 _TAILS = 4.0  # degrees of freedom of Student's t
 _NATS = 40.0  # for a bare chip; errors of travel last for some looks, so they count several times
@@ -116,7 +116,7 @@ def marg_filter(
 
 
 def one_prior(parameters: Replay) -> Filter:
-    """The filter, with its rules, for gyros as `parameters.gyro.gain` says."""
+    """The filter, with its rules, for gyros of the gain `parameters.gyro.gain`."""
     m, sees = parameters.magnetometer, parameters.use_magnetometer
     return marg_filter(
         gate=m.gate if sees == "undisturbed" else None,

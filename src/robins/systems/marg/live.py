@@ -122,11 +122,11 @@ class LiveMarg(Live):
         declination_rad: float = 0.0,
         machine: str | None = None,
     ):
-        """Begin; programs are made before the first sample.
+        """Start; programs are made before the first sample.
 
         Args:
             parameters: as of a replay.
-            rate_hz: of the samples, as the data sheet says; lost ones are told by it.
+            rate_hz: of the samples, by the data sheet; lost ones are detected by it.
             declination_rad: of the Earth's field here, clockwise from true north.
             machine: the machine that steps the filter, as for `OnlineFilter`; default: `usual()`.
                 Programs of "vm" are kept in the user's cache, "c" is compiled for minutes once.
@@ -166,7 +166,7 @@ class LiveMarg(Live):
         self._path.counts = self.counts
 
     def _compile(self) -> None:
-        """Have all compiled by blocks that are thrown away."""
+        """Compile all programs by blocks that are thrown away."""
         count = 2 + math.ceil(self.parameters.start.still / self._usual_s) + 2 * self._path.n
         gravity = self.parameters.accelerometer.gravity
         rows = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -gravity, 2e-5, 2e-5, 2e-5], (count, 1))

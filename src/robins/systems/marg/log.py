@@ -62,7 +62,7 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
     """Take a log through the path of its samples, as one chunk.
 
     Raises:
-        ValueError: the log cannot be used; the sentence says why.
+        ValueError: the log cannot be used; the message gives the reason.
     """
     table = to_ned_frd(dataset.imu)
     finite = np.all(np.isfinite(table.gyro), axis=1) & np.all(np.isfinite(table.accel), axis=1)

@@ -10,14 +10,14 @@ With q body to NED, C = C(q), f the specific force, w the rate that is read::
 A step is a block of samples, integrated beforehand (`Block`); F = exp of the linear form of these
 stands in `advance_linear`, Q in `_factor`. What is peculiar to it:
 
-- the accelerometer is integrated, not looked at: it carries the velocity, and gravity shows in that
-  a velocity and a place which do not run away leave no room for a tilt error. A swing of the hand
-  then pulls the attitude no more than its mean does;
+- the accelerometer is integrated, not used as a measurement: it carries the velocity, and gravity
+  shows in that a velocity and a place which do not run away leave no room for a tilt error. A swing
+  of the hand then pulls the attitude no more than its mean does;
 - scale factors and misalignments of the gyros are nine states. They are what a good MEMS gyro
-  drifts by when it is turned about, and tilt, which the accelerometer sees well, tells of them;
+  drifts by when it is turned about, and tilt, which the accelerometer sees well, shows them;
 - the magnetometer gives a heading and no tilt. North is where the field pointed at the start. How
   the field of other places is turned against that is a state, `declination`, which does not change
-  while the unit lies still: reading the same place again tells nothing new.
+  while the unit lies still: reading the same place again adds no information.
 
 Samples become blocks by `integrate`; `causal_attitudes` and `smoothed_attitudes` go back, from
 states at the ends of blocks to an attitude at every sample.
@@ -287,15 +287,15 @@ def model_of(parameters: Replay) -> Model:
     """Gyro and accelerometer carry the state; travel, rest and the magnetometer hold it.
 
     The Jacobian of the magnetometer has no columns of tilt: a disturbed field cannot tilt the
-    attitude, at the price of the little it could tell of tilt.
+    attitude, at the price of its little information on tilt.
 
     Returns:
         A model with sensors, in order: "travel" ((6,) zeros while the unit moves, else NaN), "rest"
         ((6,) zeros at rest, else NaN; aux (4,) mean rate read and its spread) and, where the field
         is used, "magnetometer" ((`Angle(0)`, (2,) zeros); aux (3,) field in body axes [T]) and
         "revisit" (`Angle(0)` where a site is read; aux (4 + SITES,) field [T], sigma of its azimuth
-        [rad] and 1 for the site). The measurement is zero and the reading what the state makes of
-        aux: the innovation is minus the reading.
+        [rad] and 1 for the site). The measurement is zero and the reading the prediction of aux by
+        the state: the innovation is minus the reading.
     """
     gyro, accelerometer = parameters.gyro, parameters.accelerometer
     magnetometer, travel, rest = parameters.magnetometer, parameters.travel, parameters.rest

@@ -1,8 +1,8 @@
-"""What a replay says against itself: states and innovations that its own assumptions forbid.
+"""Self-contradictions of a replay: states and innovations that its own assumptions forbid.
 
 A filter whose model is wrong goes on with a small sigma. Its states show it: a declination that the
 field of no room has, gains that no gyro is sold with, and a velocity or place that is again and
-again beyond what was stated, which is a tilt that does not fit.
+again beyond the stated sigma, which means a wrong tilt.
 """
 
 from __future__ import annotations
@@ -140,12 +140,12 @@ def sentences(name: str, doubt: Doubt, mean: MargState, dt_s: np.ndarray) -> lis
         (
             doubt.gain,
             f"a gain of the gyros is {largest:.1f} %, beyond three of its standard deviations "
-            "(gyro.gain): the gyros are worse than was said, or the gains take up another error, "
+            "(gyro.gain): the gyros are worse than stated, or the gains take up another error, "
             "and the heading with them",
         ),
         (
             doubt.tilt,
-            "velocity and place do not stay as small as was said (travel.velocity, travel.place), "
+            "velocity and place do not stay as small as stated (travel.velocity, travel.place), "
             "or the tilt is wrong: its stated sigma is too small",
         ),
         (

@@ -31,7 +31,7 @@ class Gyro(Parameters):
     bias_walk_moving: q.RateWalkSize = default("0.01 deg/s/sqrt(s)")
     # scale factors, misalignment and cross-coupling: each of nine numbers has this spread
     gain: Annotated[float, Quantity("scale factor", least="0 ppm")] = default("3000 ppm")
-    # the same of a chip that nobody calibrated, taken once the motion is likelier with it
+    # the same of an uncalibrated chip, taken once the motion is likelier with it
     bare_gain: Annotated[float, Quantity("scale factor", least="0 ppm")] = default("3 %")
     # what nine numbers do not explain, as a share of the angle turned
     turn_error: Annotated[float, pydantic.Field(ge=0.0, le=1e6)] = 0.001
@@ -65,7 +65,7 @@ class Magnetometer(Parameters):
     noise: q.FieldStrength = default("2.5 uT")
     declination: q.Spread = default("2.5 deg")
     declination_time: q.Duration = default("60 s")
-    # azimuth of the field where the unit lies again, beside what a wrong tilt adds
+    # azimuth of the field where the unit lies again, without the part of a wrong tilt
     site: q.Spread = default("0.3 deg")
     # random walk of strength and dip of the field that counts as undisturbed: spread after 1 s
     field_walk: Annotated[float, Quantity("magnetic field", least="0 uT")] = default("0.01 uT")
@@ -90,7 +90,7 @@ class Travel(Parameters):
 
 
 class Rest(Parameters):
-    """When the unit lies still, and what that says."""
+    """Detection of rest, and the measurements that it gives."""
 
     detect: bool = True
     after: q.Duration = default("1.5 s")
@@ -122,10 +122,11 @@ class Start(Parameters):
 
 
 class Stated(Parameters):
-    """What no state carries and the stated standard deviations of attitude must hold.
+    """Errors that no state carries and the stated standard deviations of attitude must hold.
 
-    Axes of a housing, gyros that do not respond at once, and stamps that are late cannot be told
-    from attitude. They do not average out, so they are added to what is stated, not to a noise.
+    Axes of a housing, gyros that do not respond at once, and stamps that are late cannot be
+    separated from attitude. They do not average out, so they are added to the stated sigma, not to
+    a noise.
     """
 
     tilt: q.Spread = default("0.3 deg")
@@ -134,7 +135,7 @@ class Stated(Parameters):
 
 
 class Update(Parameters):
-    """How the filter steps."""
+    """Steps of the filter."""
 
     # a sample is the mean over the interval it ends, or the value at an instant
     samples: Literal["means", "instants"] = "means"
@@ -146,7 +147,7 @@ class Update(Parameters):
 
 
 class Replay(Parameters):
-    """A recorded nine-axis log: what cannot be read from the files themselves."""
+    """Parameters of a recorded nine-axis log that its files do not contain."""
 
     system: Literal["marg"] = "marg"
     title: str = "Orientation from gyro, accelerometer and magnetometer"

@@ -1,4 +1,4 @@
-"""From samples to steps of the filter, chunk by chunk: the path of a replay and of a live object.
+"""Path from samples to steps of the filter, chunk by chunk, of a replay and of a live object.
 
 Samples are integrated over blocks; what is known at the end of each block becomes its measurements.
 Any chunks of the same samples give the same bits: a replay is one chunk, a live object is chunks of
@@ -76,7 +76,7 @@ class SamplePath:
         self._parameters, self._usual_s = parameters, usual_s
         self._kind: Literal["rate", "increment"] = kind
         self.n = max(1, round(parameters.update.block / usual_s))
-        # a peak that ends in a block may have begun in those before
+        # a peak that ends in a block may have started in those before
         self._most_context = math.ceil(LONGEST_S / usual_s) + 2 * FLANK
         self._by_sample = levels is None and kind == "rate"
         self.range = Range(levels)
@@ -311,7 +311,7 @@ def not_sampled(
     known = np.isfinite(doubt)
     unknown = full & ~known
     lost = gap + dt * (accel_full[1:] | accel_full[:-1])
-    # what a gyro at its end did not say, about its own axis; what all samples of a gap did not
+    # turn that a gyro at its end did not report, about its own axis; that of all samples in a gap
     turn = p.gap_rate * (gap[:, None] + dt[:, None] * (unknown[1:] | unknown[:-1]))
     turn = turn + dt[:, None] * np.where(known, doubt, 0.0)[1:]
     return turn, lost, int(np.sum(gap > 0.0))
@@ -324,7 +324,7 @@ def inputs(
     lost_s: np.ndarray,
     parameters: Replay,
 ) -> tuple[model.Block, np.ndarray]:
-    """What the motion takes of K blocks, and which of them fall freely (K,) bool.
+    """Inputs of the motion for K blocks, and mask of those in free fall (K,) bool.
 
     Args:
         integrals: of the blocks.
@@ -346,15 +346,15 @@ def inputs(
 
 
 class Pace:
-    """When travel and field were seen last, so that they are seen once in an interval."""
+    """Times of the last use of travel and field, so that they are used once in an interval."""
 
     def __init__(self) -> None:
-        """Nothing was seen."""
+        """Start without any use."""
         self.clock_s = 0.0  # end of the last block
         self.due_s = {model.TRAVEL: -np.inf, model.MAGNETOMETER: -np.inf}
 
     def take(self, name: str, clock_s: np.ndarray, able: np.ndarray, every_s: float) -> np.ndarray:
-        """(K,) bool: which blocks to take so that about `every_s` lies between two."""
+        """Mask (K,) of the blocks to take so that about `every_s` lies between two."""
         out = np.zeros(len(clock_s), dtype=bool)
         for k in np.flatnonzero(able):
             if clock_s[k] >= self.due_s[name]:

@@ -1,4 +1,4 @@
-"""The replay of a nine-axis log: how far it is from the truth, if that is known.
+"""The replay of a nine-axis log, and its errors where the truth is known.
 
 Errors of an orientation are those that BROAD defines (Laidig, Caruso, Cereatti & Seel 2021).
 """
@@ -72,7 +72,7 @@ def truth_at(attitude: AttitudeTable, time_ns: np.ndarray) -> tuple[np.ndarray, 
     """True q_nb (N, 4) NED at given times and whether they count; NaN where none is near.
 
     The nearest true attitude within half its own interval is taken, none is interpolated. A phase
-    counts where the author of the log said so, everywhere if nothing was said.
+    counts where the author of the log marked it, everywhere if nothing is marked.
     """
     table = to_ned_frd(attitude)
     times = table.time_ns
@@ -104,17 +104,17 @@ def contender(parameters: Replay, name: str) -> Contender:
     """The filter with the model it believes in.
 
     Raises:
-        ValueError: another is asked for.
+        ValueError: another is requested.
     """
     require_known("filter", name, (CAUSAL,), "this system, which smooths replays only")
     return Contender(filter_of(parameters), model.model_of(parameters))
 
 
 def recorded(dataset: Dataset, parameters: Replay) -> Recorded:
-    """The log as its filter takes it, as `System.recorded` says.
+    """The log as its filter takes it, see `System.recorded`.
 
     Raises:
-        ValueError: the log cannot be used; the sentence says why.
+        ValueError: the log cannot be used; the message gives the reason.
     """
     return Recorded([prepare(dataset, parameters)], partial(contender, parameters))
 
@@ -125,10 +125,10 @@ def replay(
     filters: tuple[str, ...] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Find the orientation over a log, as `System.replay` says, with and without a true attitude.
+    """Find the orientation over a log, with and without a true attitude; see `System.replay`.
 
     Raises:
-        ValueError: the log cannot be used; the sentence says why.
+        ValueError: the log cannot be used; the message gives the reason.
     """
     progress(0.0, "integrating blocks")
     log = prepare(dataset, parameters)
@@ -188,7 +188,7 @@ def _answers(
     log: Prepared, parameters: Replay, wanted: Sequence[str], progress: Progress
 ) -> tuple[dict[str, Answer], dict[str, Mapping[str, Update]]]:
     """Estimates of filters and smoother by name, and the updates that each can be doubted by."""
-    # the causal run is asked too: it finds out what gyros these are
+    # the causal run is needed too: it finds out what gyros these are
     causal = dict.fromkeys([*wanted, CAUSAL])
     causal.pop(SMOOTHED, None)
     make = partial(contender, parameters)
@@ -312,8 +312,8 @@ REPORTED = Reported(
     blocks=_BLOCKS,
     sensors=model.SENSORS,
     estimates=_estimates,
-    causes="Likely causes: a magnetometer without calibration (`robins calibrate`) or beside iron, "
-    "axes or units of a sensor that differ from what the log says, or noise of the gyro told too "
+    causes="Likely causes: a magnetometer without calibration (`robins calibrate`) or near iron, "
+    "axes or units of a sensor that differ from those stated, or noise of the gyro stated too "
     "small.",
     assumed=tuple(model.SENSORS),
     euler=EULER._replace(frame="body to NED"),
@@ -394,7 +394,7 @@ def _attitudes(log: Prepared, q_nb: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def _sentences(log: Prepared, answers: Mapping[str, Answer]) -> list[str]:
-    """What a reader of the report should know."""
+    """Remarks for the reader of the report."""
     c = log.counts
     out = [
         log.look.sentence,

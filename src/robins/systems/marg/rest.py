@@ -1,7 +1,7 @@
-"""When a unit lies still, by blocks of samples: from spread and constancy, not from the mean rate.
+"""Detection of rest by blocks of samples: from spread and constancy, not from the mean rate.
 
-A gyro of a cheap unit reads some degrees a second at rest, and a slow turn reads the same. What
-tells them apart: at rest the rate is constant, the specific force keeps its direction in the unit,
+A gyro of a cheap unit reads some degrees a second at rest, and a slow turn reads the same. The
+difference: at rest the rate is constant, the specific force keeps its direction in the unit,
 and so does the magnetic field. So the mean rate counts from a bias that rest has shown before, and
 a rest that shows a new one must last longer, unless the log begins with it.
 """
@@ -12,11 +12,11 @@ import numpy as np
 
 from robins.systems.marg.parameters import Rest
 
-_SHORT = 3  # blocks, below which nothing can be told
+_SHORT = 3  # blocks, below which there is no decision
 
 
 class Watch:
-    """Tells block by block whether the unit lies still.
+    """Detector of rest, block by block.
 
     A quiet spell is one in which rate and specific force stay near their means over the last
     `rest.after`, and the field near the one the spell began with. It is rest once it has lasted
@@ -48,13 +48,14 @@ class Watch:
 
     @property
     def settled(self) -> bool:
-        """Whether it is known how the log begins: at rest, which lasts `rest.after`, or not."""
+        """True if it is known how the log begins: at rest, which lasts `rest.after`, or not."""
         return not (self._able and self._unbroken) or self.first is not None
 
     def look(
         self, dt_s: float, rate: np.ndarray, force: np.ndarray, field: np.ndarray
     ) -> tuple[bool, float]:
-        """Whether the unit lies still in the next block, and the spread of its mean rate [rad/s].
+        """Decide whether the unit lies still in the next block, with the spread of its rate
+        [rad/s].
 
         Args:
             dt_s: s, length of the block.
@@ -66,7 +67,7 @@ class Watch:
         self._clock_s += dt_s
         if not self._able:
             return False, rest.rate
-        # one block is too little to tell from; a pair that differs breaks the spell
+        # one block is too little for a decision; a pair that differs breaks the spell
         self._rate = np.concatenate([self._rate, rate[None]])[-self._width :]
         self._force = np.concatenate([self._force, force[None]])[-self._width :]
         mean_rate, mean_force = self._rate.mean(axis=0), self._force.mean(axis=0)

@@ -1,4 +1,4 @@
-"""Gyros at the end of their range: found where nobody told the range, and bridged.
+"""Gyros at the end of their range: found where the range is not given, and bridged.
 
 A signal that is cut off jumps to a level, stays, and leaves it by a jump. A smooth peak that fills
 two samples within 0.5 % of its height has its next sample within 4.5 % of it (of a sine: half an
@@ -26,7 +26,7 @@ _PLATEAU_S = (0.08, 0.4)  # s, that a level without jumps may last; a machine tu
 _KEPT_PAIRS = 100  # of samples at the level, more than a peak has
 LONGEST_S = 0.2  # s, of a peak that is bridged
 FLANK = 3  # samples on either side, by which it is
-_FROZEN_SAMPLES = 5  # of a block, below which repeated numbers say nothing
+_FROZEN_SAMPLES = 5  # of a block, below which repeated numbers mean nothing
 _TURNS = np.radians(10.0)  # rad/s, more than a bias
 _OF_CHANGE = 0.02  # weight of a block in the usual difference of two samples
 _SHAKEN = 0.5  # m/s^2, range of the specific force in a block of a unit that moves
@@ -61,7 +61,7 @@ def levels(rate: np.ndarray, step_s: float = 0.0) -> np.ndarray:
 
 
 def _has_plateau(x: np.ndarray, top: float, step_s: float) -> bool:
-    """Whether a stay at the top of (N,) is that of a range and of no smooth peak."""
+    """True if a stay at the top of (N,) is that of a range and of no smooth peak."""
     high = np.concatenate([[False], x > (1.0 - _LEVEL) * top, [False]])
     for begin, end in np.flatnonzero(np.diff(high)).reshape(-1, 2):
         long = end - 1 - begin

@@ -2,7 +2,7 @@
 
 While a unit lies still its field does not change, so a rest is read once. Two rests with one
 strength and dip of the field are taken for one site, where the field points the same way: the
-azimuth that the later rest reads tells how the heading has drifted since the earlier one. Fields of
+azimuth that the later rest reads gives the drift of the heading since the earlier one. Fields of
 rooms differ by microtesla and degrees from place to place; another site that looks alike is rare,
 and the filter's noise of heavy tails answers it.
 """

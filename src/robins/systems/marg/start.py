@@ -1,4 +1,4 @@
-"""Where the filter of a unit begins: level, north by the field, the bias by rest."""
+"""Start of the filter of a unit: level, north by the field, the bias by rest."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SCALE = 0.1  # share of gravity that it may be off by
 
 
 class FirstLook(NamedTuple):
-    """Where the filter begins."""
+    """Start of the filter."""
 
     q_nb: np.ndarray  # (4,)
     field_t: np.ndarray  # (2,) T along the horizontal and down; zeros where no field was seen

@@ -41,7 +41,7 @@ class AngleState(NamedTuple):
 
 
 class Coefficients(NamedTuple):
-    """Of the motion: e1 (no unit), e2, e3 [1/s], k of the kinematic rows, the step T [s]."""
+    """Coefficients of the motion: e1 (no unit), e2, e3 [1/s], kinematic k, the step T [s]."""
 
     e1: Any
     e2: Any

@@ -19,7 +19,7 @@ def _pooled_deg(rms: np.ndarray) -> float:
 
 
 def _common_metrics(course: Course, statistics: Any) -> dict[str, Any]:
-    """Of both studies: components 0 to 2 are the attitude's.
+    """Metrics of both studies: components 0 to 2 are the attitude's.
 
     ``attitude_rms_deg`` is the RMS error of an axis, pooled over the three, ``quiet_rms_deg`` the
     same long after disturbances, ``burst_peak_deg`` the mean over axes, disturbances and runs of
@@ -43,7 +43,7 @@ def _each(axes: tuple[str, ...], unit: str, rms: np.ndarray) -> dict[str, Any]:
 
 
 def angle_metrics(course: Course, statistics: Any) -> dict[str, Any]:
-    """Of "magnetic-attitude": axes are roll, pitch, yaw, then the rates.
+    """Metrics of "magnetic-attitude": axes are roll, pitch, yaw, then the rates.
 
     ``settled_s`` is when the RMS error over runs and angles falls below 0.5 deg for the first time.
     """
@@ -56,7 +56,7 @@ def angle_metrics(course: Course, statistics: Any) -> dict[str, Any]:
 
 
 def field_metrics(course: Course, statistics: Any) -> dict[str, Any]:
-    """Of "field-vector": axes are those of the body, then about the field and across it.
+    """Metrics of "field-vector": axes are those of the body, then about the field and across it.
 
     ``total_rms_deg`` is of the angle of the error, ``across_field_rms_deg`` of its part across.
     """

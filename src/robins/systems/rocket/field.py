@@ -18,8 +18,8 @@ After Crassidis & Markley (2003), with rotation vectors in place of their modifi
 parameters: the two differ in the third order of a sigma point's length.
 
 One vector leaves the turn about itself open; only because B_n turns along the flight, and because
-the gyro carries the attitude, does it become known in the end. How well, K vectors with an angle
-noise sigma tell by their information about a constant turn of the attitude, H'R^-1 H of (B4):
+the gyro carries the attitude, does it become known in the end. How well is given by the
+information of K vectors with an angle noise sigma on a constant turn, H'R^-1 H of (B4):
 
     Y = 1/sigma^2 sum_k (I - b_k b_k') ,    b_k = B_k / |B_k|                   (B6)
 

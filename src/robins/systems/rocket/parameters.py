@@ -18,7 +18,7 @@ from robins.systems.study import Scenario
 
 
 class Launch(Parameters):
-    """Where free flight begins, when, and how fast, relative to inertial space."""
+    """Place, time and velocity at the start of free flight, relative to inertial space."""
 
     latitude: Annotated[float, Quantity("angle", least="-90 deg", most="90 deg")]
     longitude: Annotated[float, Quantity("angle", least="-180 deg", most="180 deg")]
@@ -88,7 +88,7 @@ class Magnetometer(Parameters):
 
 
 class Start(Parameters):
-    """How the estimate begins: its error, and what it believes of it, one sigma."""
+    """Start of the estimate: its error, and its believed sigma."""
 
     attitude_error: q.Angles = default("0 deg")
     attitude: q.Spread = default("2 deg")
@@ -96,7 +96,7 @@ class Start(Parameters):
 
 
 class Flight(Scenario):
-    """What the two studies share."""
+    """Parameters that the two studies share."""
 
     system: str = "rocket"
     claims: tuple[str, ...] | None = ()  # the paper's hold only where a scenario states them
@@ -128,7 +128,7 @@ class Flight(Scenario):
 
 
 class Believed(Parameters):
-    """What the filters believe of the motion: the paper's equation is wrong by some per cent."""
+    """Motion as the filters believe it: the paper's equation is wrong by some per cent."""
 
     error: Annotated[float, Quantity("ratio")] = default("0 %")  # of the coefficients
     wrong: Literal["rates", "all"] = "all"  # only e1, e2, e3, or the kinematic rows too

@@ -1,4 +1,4 @@
-"""The two studies of the rocket: the filters that are compared, what each believes and is given.
+"""The two studies of the rocket: filters, their assumptions and their inputs.
 
 The paper's filter is "federated-vector-stukf": two local unscented filters, for gyro and
 magnetometer, each with strong tracking in its simplified (lumped) form; shares by the observability
@@ -70,12 +70,12 @@ def fading(fade: Literal["lumped", "multiple", "projected"] = "lumped", beta: fl
 
 
 def patient() -> Rule:
-    """A gate that gives in when it has refused for too long, and says so."""
+    """A gate that gives in when it has refused for too long, and reports it."""
     return gate(PROBABILITY, PATIENCE, "inflate")
 
 
 def discriminator_of(sensor: str, given: MagneticAttitude) -> Rule:
-    """Outliers told from model errors; faded are the states that the sensor reads."""
+    """Rule that separates outliers from model errors; it fades the states that the sensor reads."""
     rates = sensor == GYRO and given.gyro_reads == "rate"
     seen = RATES_SEEN if rates else ANGLES_SEEN
     rule = discriminator(PATIENCE, PROBABILITY, 0.98, "multiple", threshold=PUBLISHED, weights=seen)
@@ -200,7 +200,7 @@ def angle_model(given: MagneticAttitude, course: Course, chosen: AngleFilter) ->
 
 
 def coefficients(given: MagneticAttitude) -> angles.Coefficients:
-    """Of the motion as the filters believe it: the paper's equation is wrong by some per cent."""
+    """Coefficients of the believed motion: the paper's equation is wrong by some per cent."""
     wrong = 1.0 + given.believed.error
     kinematic = wrong if given.believed.wrong == "all" else 1.0
     e1, e2, e3 = (wrong * e for e in body_of(given))
@@ -208,7 +208,7 @@ def coefficients(given: MagneticAttitude) -> angles.Coefficients:
 
 
 def angle_case(of: Taken, sigma: Array, world: World) -> Case:
-    """What a filter of "magnetic-attitude" takes of a run; pure."""
+    """Case of a filter of "magnetic-attitude" in a run; pure."""
     return Case(
         start=Belief(angle_state(world.start_q_nb, world.start_omega_b), jnp.diag(sigma)),
         u=field.bridged(world.theta_b).theta_b,
@@ -235,7 +235,7 @@ class FieldFilter(NamedTuple):
     filter: Filter = ukf()
     sensors: tuple[str, ...] = (FIELD,)  # or SNAPSHOT, the field taken at its word
     scaled: bool = False  # scale factors of the gyro are states
-    # outliers told from model errors, and what is done to outliers, in place of `filter`
+    # outliers separated from model errors, and what is done to outliers, in place of `filter`
     discriminates: Literal["huber", "gate"] | None = None
 
 
@@ -274,7 +274,7 @@ def field_sigma(given: FieldVector, chosen: FieldFilter) -> Array:
 
 
 def field_case(scaled: bool, of: Taken, numbers: tuple[Array, Array], world: World) -> Case:
-    """What a filter of "field-vector" takes of a run, scale factors being states or not; pure.
+    """Case of a filter of "field-vector" in a run, scale factors being states or not; pure.
 
     Its numbers are the initial sigma (n,) and the field (E, 3) [T] in n.
     """
@@ -306,7 +306,7 @@ def field_contender(given: FieldVector, course: Course, name: str) -> Contender:
 
 
 def _view(given: Flight, course: Course, **own: Any) -> View:
-    """What the two studies share: the path and the field for figures, and what is unobserved."""
+    """Common report of both studies: path and field for figures, and the unobserved direction."""
     height = array("context", course.alt_m, "height", unit="m", display_unit="km")
     block = StateBlock("field_n", slice(0, 3), "T", "uT", "launch NED", NED)
     about = {"long_name": "geomagnetic field", "dims": "time axis_field_n"}
@@ -327,7 +327,7 @@ def _view(given: Flight, course: Course, **own: Any) -> View:
 
 
 def angle_view(given: MagneticAttitude, course: Course) -> View:
-    """What "magnetic-attitude" reports."""
+    """Report of "magnetic-attitude"."""
     return _view(
         given,
         course,
@@ -340,7 +340,7 @@ def angle_view(given: MagneticAttitude, course: Course) -> View:
 
 
 def field_view(given: FieldVector, course: Course) -> View:
-    """What "field-vector" reports."""
+    """Report of "field-vector"."""
     across = ("about", "level", "upright")
     return _view(
         given,

@@ -45,7 +45,7 @@ _VECTOR, _ANGLES, _DISTURBED, _INTEGRATED = range(4)
 
 
 class Course(NamedTuple):
-    """What is the same in all runs; E steps."""
+    """Data that all runs share; E steps."""
 
     time_s: np.ndarray  # (E,) at the end of each step
     field_n: np.ndarray  # (E, 3) T, launch north-east-down, which is inertial
@@ -106,7 +106,7 @@ def lay_out(given: Flight) -> Course:
 
 
 def _disturbed(given: Flight, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """When disturbances begin, and (E,) the time since the end of the last; infinite before one."""
+    """Start times of disturbances, and (E,) time since the end of the last; infinite before one."""
     burst, since = given.magnetometer.disturbance, np.full(len(time_s), np.inf)
     if burst is None:
         return np.zeros(0), since
@@ -118,7 +118,7 @@ def _disturbed(given: Flight, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def faults(given: Flight, time_s: np.ndarray, name: str) -> dict[str, np.ndarray]:
-    """When the magnetometer, of this name, is disturbed; whether filters believe a wrong motion."""
+    """Masks (E,) of the disturbed magnetometer, by its name, and of a wrongly believed motion."""
     burst = given.magnetometer.disturbance
     disturbed = np.zeros(len(time_s), bool)
     if burst is not None:
@@ -166,7 +166,7 @@ def _felt(course: Course, rows: Array) -> Array:
 
 
 def instruments(given: Flight) -> tuple[Instrument, ...]:
-    """Those whose readings are measurements; in "field-vector" the gyro drives the motion."""
+    """Instruments whose readings are measurements; in "field-vector" the gyro drives the motion."""
     if isinstance(given, MagneticAttitude):
         return (RATE_GYRO if given.gyro_reads == "rate" else INTEGRATED_GYRO, MAGNETIC_ATTITUDE)
     taken = taken_field(given.magnetometer.full_scale)

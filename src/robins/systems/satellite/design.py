@@ -23,7 +23,7 @@ from robins.systems.satellite.model import ARCSEC, walk_covariance
 
 
 class GainSpec(NamedTuple):
-    """How the gain of an axis is found."""
+    """Design method of the gain of an axis."""
 
     method: Literal["raw", "h2", "lmi", "riccati"]
     share: float = 1.0  # gamma over the H-infinity norm that the Kalman filter of the axis has
@@ -31,7 +31,7 @@ class GainSpec(NamedTuple):
 
 
 class SensorNoise(NamedTuple):
-    """What is believed of gyro and star sensor, SI; hashable, for gains are kept."""
+    """Believed noise of gyro and star sensor, SI; hashable, for gains are kept."""
 
     random_walk: float
     rate_walk: float
@@ -40,7 +40,7 @@ class SensorNoise(NamedTuple):
 
 
 def axis_plant(b: SensorNoise, star_rad: float, enters: str) -> Plant:
-    """Of one axis, in current form, arcsec and s."""
+    """Plant of one axis, in current form, arcsec and s."""
     T = b.period_s
     Q = walk_covariance(b.random_walk / ARCSEC, b.rate_walk / ARCSEC, T)
     Bn = {"rate": [[T], [0.0]], "bias": [[-0.5 * T**2], [T]]}[enters]
@@ -97,7 +97,7 @@ def inflation(b: SensorNoise, spec: GainSpec) -> np.ndarray:
 
 
 def facts(b: SensorNoise, spec: GainSpec) -> Mapping[str, Any]:
-    """What the certified norms say of a filter, for its metrics.
+    """Figures of a filter from its certified norms, for its metrics.
 
     ``predicted_rms_arcsec``: the H2 norms of the three axes as one, the error at star frames if the
     noise is as believed. ``worst_case_share``: the H-infinity norm over that of the Kalman filter,

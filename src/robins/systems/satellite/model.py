@@ -1,4 +1,4 @@
-"""The filters of the satellite: their states, and what they believe of gyro and star sensor.
+"""The filters of the satellite: their states, and their models of gyro and star sensor.
 
 The attitude q_ib maps body to inertial, its error is seen in the body: q = q^ exp(dtheta). Over a
 sample of length T the gyro reports theta, and of attitude and bias b
@@ -51,7 +51,7 @@ class QuaternionState(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """What is believed of the gyro, for a sample of length T."""
+    """Believed noise of the gyro, for a sample of length T."""
 
     step_s: Array  # ()
     factor: Array  # (6, 6) of Q, attitude and bias
@@ -166,7 +166,7 @@ def model(noise: Noise, star_rad: Any, additive: bool = False, of_frame: bool = 
 
 
 def start(q_ib: Array, attitude_rad: Any, bias_rad_s: Any, additive: bool = False) -> Belief:
-    """What filters believe at first: no bias, and these sigmas."""
+    """Initial belief of filters: no bias, and these sigmas."""
     sizes = jnp.repeat(jnp.stack([jnp.asarray(attitude_rad), jnp.asarray(bias_rad_s)]), 3)
     if not additive:
         return Belief(AttitudeState(BodyRotation(q_ib), jnp.zeros(3)), jnp.diag(sizes))

@@ -40,7 +40,7 @@ UNIT = 1e-3  # that the length of a quaternion may be off by
 
 
 class StarSays(NamedTuple):
-    """What the star sensor makes of the truth at the end of a step, besides noise."""
+    """Effect of the star sensor on the truth at the end of a step, besides noise."""
 
     seen: Array  # () bool, whether there is a frame
     stuck: Array  # () bool, whether it is the last one again
@@ -49,7 +49,7 @@ class StarSays(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What acts in a step, from outside; with leading axis E in a course."""
+    """External inputs of a step; with leading axis E in a course."""
 
     ref_q_ib: Array  # (4,) wanted attitude at its beginning
     ref_omega_b: Array  # (3,) its rate
@@ -72,14 +72,14 @@ class Lens(NamedTuple):
 
 
 class Command(NamedTuple):
-    """What control asks of the actuators."""
+    """Command of control to the actuators."""
 
     wheel_torque: Array  # (W,) N m
     dipole_b: Array  # (3,) A m^2
 
 
 class Actuation(NamedTuple):
-    """What the actuators give."""
+    """Output of the actuators."""
 
     wheel_torque: Array  # (W,) N m
     dipole_b: Array  # (3,) A m^2
@@ -100,7 +100,7 @@ class Given(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What drives a step from outside."""
+    """External inputs of a step, with the noise of a run."""
 
     course: Step
     gyro_angle: Array  # (3,) rad
@@ -109,10 +109,10 @@ class Row(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """What the star sensor reports."""
+    """Report of the star sensor."""
 
     q_ib: Array  # (4,); NaN without a frame
-    factor: Array | None  # (3, 3) of its covariance [rad], body axes, where it says one
+    factor: Array | None  # (3, 3) of its covariance [rad], body axes, where it reports one
     stars: Array | None  # () used, where it is a camera
     seen_q_ib: Array  # (4,) for the next time
 
@@ -147,7 +147,7 @@ def acm(given: Given, q_ib: Array, bias: Array, theta: Array, wheel_h: Array, ro
 
 
 def actuators(given: Given, wheel_h: Array, command: Command, row: Step) -> Actuation:
-    """What wheels and magnetorquers can give of a command."""
+    """Part of a command that wheels and magnetorquers can give."""
     craft = given.craft._replace(wheel_works=row.wheel_works)
     limit = craft.dipole_limit_a_m2
     return Actuation(
@@ -172,7 +172,7 @@ def plant(given: Given, state: CraftState, given_by: Actuation, row: Step) -> Cr
 
 
 def gyro(given: Given, before: Array, after: Array, residue: Array, row: Row):
-    """What the gyro reports of a turn (3,), and what is left for the next sample."""
+    """Reported angle of the gyro over a turn (3,), and the residue for the next sample."""
     turned = to_rotvec(multiply(conjugate(before), after))
     return read_gyro(turned, row.gyro_angle, given.gyro_matrix, residue, given.quantum_rad)
 
@@ -183,7 +183,7 @@ def expected(given: Given, q_ib: Array, bias: Array, theta: Array) -> Array:
 
 
 def star(given: Given, q_ib: Array, expected_q_ib: Array, before: Array, row: Row) -> Frame:
-    """What the star sensor reports at the end of a step."""
+    """Frame of the star sensor at the end of a step."""
     if given.lens is None:
         return told(row, before, read_star(q_ib, row.star_error))
     looks = partial(_looks, given.lens, given.star_key)
@@ -196,7 +196,7 @@ def star(given: Given, q_ib: Array, expected_q_ib: Array, before: Array, row: Ro
 def told(
     row: Row, before: Array, q_ib: Array, factor: Array | None = None, stars: Array | None = None
 ) -> Frame:
-    """What the star sensor says of an attitude that it has measured."""
+    """Frame of the star sensor from an attitude that it has measured."""
     says = row.course.star
     now = multiply(q_ib, from_rotvec(says.turn))
     now = jnp.where(says.seen & ~says.stuck, now, before)
@@ -218,7 +218,7 @@ def solved(q_ib: Array, covariance: Array, stars: Array) -> tuple[Array, Array, 
 
 
 def shut(*_: Any) -> tuple[Array, Array, Array]:
-    """What a camera finds that does not look."""
+    """Result of a camera with its shutter closed."""
     return jnp.full(4, jnp.nan), jnp.eye(3), jnp.asarray(0)
 
 
@@ -240,7 +240,7 @@ def begin(given: Given, craft: CraftState) -> Vehicle:
 
 
 class StateForm(NamedTuple):
-    """How the state of a filter is read and its truth is written."""
+    """Reading of the state of a filter, and writing of its truth."""
 
     attitude: Callable[[Any], Array]  # mean -> q_ib
     bias: Callable[[Any], Array]
@@ -266,7 +266,7 @@ def react(
     move: Callable = _MOVES,
     look: Callable = _LOOKS,
 ):
-    """The loop one step on: control acts on what is believed, sensors see what comes of it.
+    """Move the loop on by a step: control acts on the estimate, sensors observe the result.
 
     Args:
         form: how the state of the filter is read.

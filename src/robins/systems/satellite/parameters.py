@@ -90,7 +90,7 @@ class Slew(Parameters):
 
 
 class Gyro(Parameters):
-    """A gyro triad whose noise has several sources; each is drawn anew in each run."""
+    """A gyro triad whose noise has several sources; each is drawn in each run."""
 
     random_walk: q.AngleWalk = default("1.2 arcsec/sqrt(s)")
     rate_walk: q.RateWalkSize = default("0.005 arcsec/s/sqrt(s)")
@@ -148,7 +148,7 @@ class Star(Parameters):
 
 
 class Believed(Parameters):
-    """What filters believe; ``drift`` is the random walk of the gyro's rate, Markov drift included.
+    """Assumptions of filters; ``drift`` is the random walk of the gyro's rate, with Markov drift.
 
     Where it is left out they believe the equivalent of the true one.
     """

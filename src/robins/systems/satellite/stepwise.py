@@ -1,6 +1,6 @@
-"""A gain designed anew at every star frame, by the LMI of the plant as it turns at that moment.
+"""A gain designed again at every star frame, by the LMI of the plant as it turns at that moment.
 
-This is the patent's filter as it says it: at every step the transition is formed from the rate that
+This is the patent's filter as stated: at every step the transition is formed from the rate that
 the gyro reports, and the mixed H2/H-infinity inequality is solved for it. The plant is that of the
 error of attitude and gyro bias, from star frame to star frame (period T), in arcsec and s:
 
@@ -62,11 +62,11 @@ class Frozen(NamedTuple):
 
 
 def frozen(b: SensorNoise, spec: GainSpec, sample_s: float) -> Frozen:
-    """What three axes are designed with, from what is believed of the sensors.
+    """Design data of three axes, from the believed noise of the sensors.
 
     Args:
         b: noise of gyro and star sensor.
-        spec: where n enters, and the share of the Kalman filter's norm that an axis may have.
+        spec: input of n, and the share of the Kalman filter's norm that an axis may have.
         sample_s: of the gyro [s].
     """
     noise, error, star = np.zeros((6, 6)), np.zeros((6, 3)), np.zeros(3)
@@ -105,7 +105,7 @@ def gain_at(rate_b: Any, of: Frozen) -> tuple[np.ndarray, np.ndarray]:
 
     Returns:
         (6, 3) gain of attitude and bias [1, 1/s], and () bool, whether there is one: an answer
-        whose true norms are not what was asked is none.
+        whose true norms do not meet the request is none.
     """
     known = Frozen(*(np.asarray(x, float) for x in of))
     each = _designer(*((x.shape, x.tobytes()) for x in known))
@@ -118,7 +118,7 @@ def gain_at(rate_b: Any, of: Frozen) -> tuple[np.ndarray, np.ndarray]:
 @lru_cache(maxsize=16)
 def _designer(*numbers: tuple[tuple[int, ...], bytes]) -> EveryStep:
     of = Frozen(*(np.frombuffer(data).reshape(shape) for shape, data in numbers))
-    with warnings.catch_warnings():  # the page of the filter says it
+    with warnings.catch_warnings():  # documented on the page of the filter
         warnings.simplefilter("ignore", FrozenTimeWarning)
         return EveryStep(1.0, like=plant_at(np.zeros(3), of))
 
@@ -168,7 +168,7 @@ class LmiStep(Rule):
         return memory, posterior, info.noted(NAME, **{_FAILED: ~passed})
 
     def report(self, start: Redesigned, final: Redesigned, again: Any, time: Any) -> None:
-        """Tell of the designs of a run that did not pass; in a stream each note does.
+        """Report the designs of a run that did not pass; in a stream each note does.
 
         Warns:
             StepWarning: there are such.

@@ -1,4 +1,4 @@
-"""The study "attitude-loop": each filter with what it believes in the loop, and what is claimed.
+"""The study "attitude-loop": each filter with its assumptions in the loop, and claims.
 
 Claims are the document's, and those of robins marked so.
 """
@@ -54,7 +54,7 @@ class FilterSpec(NamedTuple):
 
     build: Build
     gain: GainSpec | None = None  # of its gains; of a Kalman filter, of what its Q is inflated by
-    drift: float | None = None  # variance of the bias' walk over the believed; None: told the truth
+    drift: float | None = None  # variance of the bias' walk over the believed; None: the true one
     on_host: str = ""  # as of a `Contender`; such a filter runs only where it is named
 
 
@@ -66,7 +66,7 @@ FILTERS: Mapping[str, FilterSpec] = {
     # a bank of them over the scale of the process noise
     "adaptive": FilterSpec("adaptive", None, 1.0),
     "mekf-tuned": FilterSpec("mekf", None, 30.0),  # the same, noise of the bias times 30
-    "mekf-informed": FilterSpec("mekf", None, None),  # the same, told the true drift
+    "mekf-informed": FilterSpec("mekf", None, None),  # the same, given the true drift
     "ekf-quaternion": FilterSpec("quaternion", None, 1.0),  # additive EKF of seven states
     "h2": FilterSpec("fixed", GainSpec("h2"), 1.0),  # steady Kalman gain
     "mixed-lmi": FilterSpec("fixed", GainSpec("lmi", 0.5), 1.0),  # mixed, by LMI, n on the rate
@@ -101,7 +101,7 @@ def believed_walk(given: AttitudeLoop, spec: FilterSpec) -> float:
 
 
 class Surroundings(NamedTuple):
-    """What surrounds a filter, as data: the loop, the first belief, and a constant gain."""
+    """Environment of a filter as data: the loop, the first belief, and a constant gain."""
 
     given: Given
     steps: Step  # leading axis E
@@ -117,7 +117,7 @@ _REACTS = {False: partial(react, model.MULTIPLICATIVE), True: partial(react, mod
 
 
 def as_case(additive: bool, build: Build, around: Surroundings, world: World) -> Case:
-    """What a filter takes of a run; pure."""
+    """Case of a filter in a run; pure."""
     given = around.given._replace(gyro_matrix=world.gyro_matrix, star_key=world.star_key)
     rows = Row(around.steps, world.gyro_angle, world.gyro_bias, world.star_error)
     start: Any = model.start(world.start_q_ib, around.attitude_rad, around.bias_rad_s, additive)
@@ -174,12 +174,12 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
 
 
 def attitude_metrics(statistics: Any) -> dict[str, Any]:
-    """Of "attitude-loop": components 0 to 2 are the attitude's, body axes.
+    """Metrics of "attitude-loop": components 0 to 2 are the attitude's, body axes.
 
     ``attitude_rms_arcsec`` is the root sum square of the three axes of the error of attitude
     determination, pooled over epochs and runs, ``attitude_rms_spread_arcsec`` the standard
-    deviation of the same figure from run to run, ``pointing_rms_arcsec`` that of where the craft
-    points, whoever is to blame. Peaks are the greatest lengths of each, mean over the runs.
+    deviation of the same figure from run to run, ``pointing_rms_arcsec`` that of the
+    pointing error, control included. Peaks are the greatest lengths of each, mean over the runs.
     """
     s = statistics
     axes = np.sqrt(np.mean(s.run_rms[:, :3] ** 2, axis=0)) / ARCSEC
@@ -224,7 +224,7 @@ _TEXTS = {
         "a Kalman filter with more noise on the bias", "mekf-tuned"
     ),
     "improves-on-informed": _IMPROVES.format(
-        "a Kalman filter told the true drift", "mekf-informed"
+        "a Kalman filter with the true drift", "mekf-informed"
     ),
     "steadier": "The mixed filter's error varies less from run to run (ours); value: the spread of "
     "its RMS error over that of the nominal MEKF",
@@ -237,7 +237,7 @@ CLAIMS = ratio_claims(_RATIOS, _TEXTS)
 
 
 def faults(given: AttitudeLoop, time_s: np.ndarray) -> dict[str, np.ndarray]:
-    """When gyro and star sensor are other than the filters believe.
+    """Masks (E,) of the epochs at which gyro and star sensor differ from the filters' belief.
 
     Noise, drift as believed and false stars are no faults.
     """
@@ -253,7 +253,7 @@ def faults(given: AttitudeLoop, time_s: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def view(given: AttitudeLoop, course: Course) -> View:
-    """What is reported: attitude, gyro bias, where the craft points, what its wheels hold."""
+    """Report: attitude, gyro bias, pointing error, momentum of the wheels."""
     counted = int(np.searchsorted(course.time_s, given.counted_from + 1e-9))
     lost = (course.due & ~np.asarray(course.steps.star.seen)).astype(np.int8)
     outage = array("outage", lost, long_name="star sensor lost") if np.any(lost) else {}

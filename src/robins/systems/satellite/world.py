@@ -1,4 +1,4 @@
-"""What all runs share (orbit, field, reference, star frames), and what is drawn for one of them."""
+"""Data of all runs (orbit, field, reference, star frames), and draws for one of them."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from robins.systems.parts import outside
 from robins.systems.satellite.nodes import Given, Lens, StarSays, Step
 from robins.systems.satellite.parameters import AttitudeLoop, Craft, Gyro, Star, Wheels
 
-# Folded into the key of the gyro beside the streams of `robins.sim.gyro`.
+# Folded into the key of the gyro next to the streams of `robins.sim.gyro`.
 _BIAS, _RAMP = 16, 17
-_CAMERA = 16  # into that of the star sensor, beside the streams of `robins.sim.star_sensor`
+_CAMERA = 16  # into that of the star sensor, next to the streams of `robins.sim.star_sensor`
 
 
 class Course(NamedTuple):

@@ -1,7 +1,7 @@
 """The airship on the bench: inertial navigation, radar, stars, air data, and the computer.
 
-Any filter of the study flies that takes what the paper's do, with or without the wind. A step is an
-epoch of the filter; what an instrument does not say in a step is missing in it.
+Any filter of the study flies that takes the measurements of the paper's, with or without the wind.
+A step is an epoch of the filter; a measurement that is not sent in a step is missing in it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The kit of a flight of the airship, its parts, and what came of it."""
+"""The kit of a flight of the airship, its parts, and its evaluation."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _ARCSEC = math.pi / 648000.0
 
 
 class Kit(NamedTuple):
-    """A flight, to the last number; E epochs."""
+    """Complete input of a flight; E epochs."""
 
     step_ns: int
     filter: str
@@ -51,7 +51,7 @@ class Kit(NamedTuple):
 
 
 def filters() -> Sequence[str]:
-    """Those that take what the wire carries."""
+    """Names of the filters that need only what the wire carries."""
     of = {name: c for name, c in CANDIDATES.items() if c.states is NINE}
     fit = [name for name, c in of.items() if all(i in _TAKEN for i in c.instruments)]
     return ["ukf", *(name for name in fit if name != "ukf")]
@@ -64,7 +64,7 @@ def timing(given: Airship) -> Timing:
 
 
 def prepare(setup: Any, given: Airship) -> Kit:
-    """The kit of run 0 of a campaign of this seed."""
+    """Kit of run 0 of a campaign of this seed."""
     (study,) = SYSTEM.studies.values()
     problem = study.problem(given, (setup.filter,), setup.seed)
     of = problem.contenders[setup.filter]
@@ -76,7 +76,7 @@ def prepare(setup: Any, given: Airship) -> Kit:
 
 
 def _says(part: str, message: str, rows: Mapping[str, np.ndarray]) -> Part:
-    """A part that says row after row."""
+    """Part that sends row after row."""
 
     def act(state: None, k: int, inputs: Inputs):
         said = {name: x[k] for name, x in rows.items() if k < len(x)}
@@ -120,7 +120,7 @@ def navigation(kit: Kit) -> Part:
     """The navigation computer: any filter that takes what comes; what does not come is missing."""
     windy = WIND in kit.y
     begin = Increments(*(np.asarray(x)[0] for x in kit.u))
-    online: list[OnlineFilter] = []  # made when it is needed, not by who asks what it takes
+    online: list[OnlineFilter] = []  # made when it is needed, not where only its inputs are queried
     starts: list[Any] = []
 
     def first() -> Navigating:

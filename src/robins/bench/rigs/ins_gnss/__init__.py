@@ -1,8 +1,8 @@
 """INS/GNSS on the bench: inertial unit, receiver, navigation computer, each on its own line.
 
-The plant is a simulated drive or a recorded log, or there is none: boards speak. The computer runs
-`robins.systems.ins_gnss.LiveInsGnss`, whose epochs are those of `robins replay`. The computer can
-also be a program: `aboard`, and the C beside it.
+The plant is a simulated drive or a recorded log, or there is none: boards send the samples. The
+computer runs `robins.systems.ins_gnss.LiveInsGnss`, whose epochs are those of `robins replay`. The
+computer can also be a program: `aboard`, and the C in its folder.
 """
 
 from __future__ import annotations

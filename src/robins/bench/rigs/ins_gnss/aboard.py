@@ -1,10 +1,10 @@
 """The navigation computer of INS/GNSS as a program: its filter, and its loop in C.
 
-What `LiveInsGnss` does around the filter is in C beside this file: `navigation_blocks.h` integrates
-samples and cuts them into blocks, `navigation_rest.h` tells when the vehicle rests,
-`navigation_start.h` finds the start, `navigation_board.c` has epochs, late fixes and the wire. By
-the drive or the log of the flight the filter is traced and tried, and the rates of samples and
-fixes are known.
+What `LiveInsGnss` does around the filter is in C next to this file: `navigation_blocks.h`
+integrates samples and cuts them into blocks, `navigation_rest.h` detects when the vehicle rests,
+`navigation_start.h` finds the start, `navigation_board.c` has epochs, late fixes and the wire. The
+drive or the log of the flight gives the rates of samples and fixes, and the data on which the
+filter is traced and tried.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def aboard(flight: Any) -> Aboard:
     """Filter, problem and C files of the part `navigation`, for the drive or the log of a flight.
 
     Raises:
-        RigError: nobody speaks as imu or gnss, the log cannot be navigated, or the part is asked
-            for what the loop does not do.
+        RigError: nothing sends as imu or gnss, the log cannot be navigated, or the part needs
+            what the loop does not do.
         robins.logs.LogError: a file of the log cannot be read.
     """
     kit: Kit = flight.rig.prepare(flight.setup, flight.given)
@@ -118,7 +118,7 @@ def _told_wrong(suspects: tuple[str, ...]) -> str:
 def _given_h(
     given: Replay, rates_hz: tuple[float, float], world: Case, macros: Mapping[str, str]
 ) -> str:
-    """`navigation_given.h`: what the part is told, and room for what it keeps."""
+    """`navigation_given.h`: the constants of the part, and room for its memory."""
     g, aids, longest_s = given.gnss, given.aids, given.update.longest_block
     sample_s, fix_s = (1.0 / rate for rate in rates_hz)
     window_s = fix_s if g.velocity_window is None else g.velocity_window
@@ -145,7 +145,7 @@ def _given_h(
         "QUIET_ACCEL": aids.quiet_accel,
         "REST_WIDTH": max(2, round(aids.window / sample_s)),
         "LEVEL_WIDTH": max(2, round(2.0 * aids.window / sample_s)),
-        "WAIT_S": 1.5 * max(1.0, fix_s),  # for which a fix tells whether the vehicle moves
+        "WAIT_S": 1.5 * max(1.0, fix_s),  # for which a fix shows whether the vehicle moves
         "MOST_START_S": _MOST_START_S,
         "STEPS": math.ceil(1.1 * _MOST_START_S / sample_s),
         "FIXES": math.ceil(1.1 * _MOST_START_S / fix_s) + 64,

@@ -1,4 +1,4 @@
-"""The journey, its three parts, and what came of a run."""
+"""The journey, its three parts, and its evaluation."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Journey(Replay):
     """Beliefs of the navigation computer, and the source of the samples.
 
     A configuration of a replay, with the files of a ``log``; or a scenario of a simulated drive,
-    whose sensors are believed as they are drawn. With neither, boards at ``imu`` and ``gnss`` speak
+    whose sensors are believed as they are drawn. With neither, boards at ``imu`` and ``gnss`` send
     at ``imu_rate`` and ``fix_rate``, for the ``duration``.
     """
 
@@ -71,14 +71,14 @@ class Journey(Replay):
 
 
 class Kit(NamedTuple):
-    """A run, to the last number."""
+    """Complete input of a run."""
 
     step_ns: int
     given: Replay
     filter: str
     machine: str | None  # that steps the filter; None: as `LiveInsGnss` chooses
     rates_hz: tuple[float, float]  # of samples and fixes
-    dataset: Dataset | None  # rates along the unit's axes and fixes in NED; None: boards speak
+    dataset: Dataset | None  # rates along the unit's axes and fixes in NED; None: boards send
     frames: tuple[int, ...] = (0,)  # all steps are computed alike
 
 
@@ -120,7 +120,7 @@ def prepare(setup: Any, given: Journey) -> Kit:
     """The kit of a run.
 
     Raises:
-        RigError: nobody speaks as imu or gnss.
+        RigError: nothing sends as imu or gnss.
         robins.logs.LogError: a file of the log cannot be read.
     """
     believed, dataset = Replay(**{k: getattr(given, k) for k in Replay.model_fields}), None
@@ -184,15 +184,15 @@ class Navigating(NamedTuple):
     """State of the navigation computer; the object in it is always the same, and changes."""
 
     live: LiveInsGnss
-    waiting: tuple[Navigation, ...]  # epochs that have not been told: one is told a step
+    waiting: tuple[Navigation, ...]  # epochs that have not been sent: one is sent a step
 
 
 def navigation(kit: Kit) -> Part:
-    """The navigation computer: says what `LiveInsGnss` says."""
+    """The navigation computer: sends what `LiveInsGnss` reports."""
     made: list[LiveInsGnss] = []
 
     def begin() -> Navigating:
-        if not made:  # which compiles, and is not needed by who only asks what it takes
+        if not made:  # which compiles, and is not needed where only its inputs are queried
             made.append(LiveInsGnss(kit.given, *kit.rates_hz, kit.filter, machine=kit.machine))
         made[0].start_over()
         return Navigating(made[0], ())
@@ -286,7 +286,7 @@ def _nav(flown: Flown, message: str, rows: Any = slice(None)) -> Nav:
 
 
 def epochs_of(flown: Flown) -> np.ndarray:
-    """Steps in which the filter's last word on each epoch was told, in the order of epochs."""
+    """Steps in which the filter's final report of each epoch was sent, in the order of epochs."""
     heard = np.flatnonzero(flown["epoch.time"] > 0)[::-1]
     return heard[np.unique(flown["epoch.time"][heard], return_index=True)[1]]
 

@@ -1,11 +1,11 @@
 """The whole test bench of a satellite: dynamics, kinematics and a star simulator of their own.
 
-It is the rig `satellite` but for three parts. The plant is two computers: `dynamics` says how the
-craft turns in a step, `kinematics` where it then points, which dynamics hears in the next step.
+It is the rig `satellite` but for three parts. The plant is two computers: `dynamics` sends how the
+craft turns in a step, `kinematics` where it then points, which dynamics receives in the next step.
 `sky` is the star simulator: it shows the stars before the star sensor, whose camera adds its
-errors, knows the stars again and solves. So a real star sensor can be shown a sky.
+errors, identifies the stars and solves. So a real star sensor can be shown a sky.
 
-All messages of the satellite are also those of this rig; `turn` and `stars` come beside them.
+All messages of the satellite are also those of this rig, with `turn` and `stars` in addition.
 
 - `parts`: the parts that are new, and the same run inside one program.
 - `faults`: of the star simulator.
@@ -65,7 +65,7 @@ BUILD = {part: build for part, build in satellite.BUILD.items() if part != "plan
     "sky": sky,
     "star": star,
 }
-"""How each part is made of a kit."""
+"""Functions that make each part from a kit."""
 
 
 def _flies() -> dict[str, Path]:

@@ -1,4 +1,4 @@
-"""Faults of the star simulator, beside those of the satellite."""
+"""Faults of the star simulator, in addition to those of the satellite."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _dark(said: Mapping[str, Any], *_: Any) -> dict[str, Any]:
 
 
 def _hidden(said: Mapping[str, Any], fault: Any, _: int) -> Mapping[str, Any]:
-    """Without the brightest stars."""
+    """Stars without the brightest."""
     said["vectors_s"][: 3 * fault.stars] = np.nan
     said["magnitude"][: fault.stars] = np.nan
     return said
@@ -45,5 +45,5 @@ def said() -> tuple[Mapping[str, Said], Mapping[str, Any]]:
 
 
 def view() -> View:
-    """What the page shows: that of the satellite, with these faults."""
+    """Page of the satellite, with these faults."""
     return VIEW._replace(offered=(*VIEW.offered, *_OFFERED))

@@ -73,10 +73,10 @@ _follows = jax.jit(partial(apart, spacecraft.kinematics))
 
 
 def dynamics(kit: Kit) -> Part:
-    """How the craft turns in a step: its momentum, under all torques.
+    """Part that computes how the craft turns in a step: its momentum, under all torques.
 
-    The attitude at the beginning of the step is what kinematics said last; if nothing came, it is
-    where the turn before led.
+    The attitude at the beginning of the step is the last of kinematics; if nothing came, it is
+    the end of the turn before.
     """
     wheels = len(kit.vehicle.craft.wheel_h)
     turns = driven(kit, _turns)
@@ -106,7 +106,7 @@ class Pointing(NamedTuple):
 
 
 def kinematics(kit: Kit) -> Part:
-    """Where the craft points after each turn; if none comes, it turns as in the step before."""
+    """Part that computes the attitude after each turn; if none comes, the last is repeated."""
     craft = kit.vehicle.craft
     omega = np.asarray(rate_b(kit.given.craft, craft))
     first = Pointing(np.asarray(craft.q_ib), 0.5e-9 * kit.step_ns * omega, omega)
@@ -138,7 +138,7 @@ _shows = jax.jit(partial(apart, _sky))
 
 
 def _sensor(given: Given, vectors_s, magnitude, looks_q_ib, before, row: Row) -> Frame:
-    """What the star sensor makes of what it is shown; as `nodes.star`."""
+    """Frame of the star sensor from the stars that it is shown; as `nodes.star`."""
     assert given.lens is not None
     solves = partial(_solves, given.lens, given.star_key)
     seen, number = row.course.star.seen, row.course.number
@@ -187,10 +187,10 @@ _expected = jax.jit(nodes.expected)
 
 
 def star(kit: Kit) -> Part:
-    """The star sensor: a camera that knows the stars again near where it is thought to look.
+    """The star sensor: a camera that identifies stars near its predicted attitude.
 
-    That is what attitude determination said last, turned by the gyro. As long as it says nothing,
-    or that its estimate is not to be relied on, the sensor goes by its own last attitude.
+    That is the last of attitude determination, turned by the gyro. As long as there is none, or
+    its estimate is marked as unreliable, the sensor uses its own last attitude.
     """
     sees = driven(kit._replace(machine="jax"), _sensor)  # an image has no place in a program
     q_first, bias = (f(kit.belief.mean) for f in (jax.jit(kit.form.attitude), kit.form.bias))

@@ -1,11 +1,11 @@
-"""A multirotor on the bench, flown by PX4 or ArduPilot, each as its makers built it, or by ours.
+"""A multirotor on the bench, flown by PX4 or ArduPilot, unchanged, or by our autopilot.
 
 The craft, its inertial unit with compass and barometer, its receiver and its autopilot, each on its
 own line. The part `autopilot` is ours, or the end of a socket that PX4's or ArduPilot's SITL is at.
 
-- `flight`: what a scenario may say, and what came of a run.
+- `flight`: parameters of a scenario, and evaluation of a run.
 - `craft`: the physics and the instruments.
-- `autopilots`: who flies.
+- `autopilots`: the autopilots.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from robins.scenario import Quantity, default
 __all__ = ["MOTORS", "RIG", "WIRE"]
 
 MOTORS = ("front right", "rear left", "front left", "rear right")
-"""As PX4 and ArduPilot number those of a quadrotor in X, from 0 here."""
+"""Motors in the order of PX4 and ArduPilot for a quadrotor in X, from 0 here."""
 _RATE, _FORCE, _SPEED, _FAR = 1e4, 1e4, 1e3, 1e5  # rad/s, m/s^2, m/s, m: far beyond any flight
 
 WIRE = Wire(
@@ -81,7 +81,7 @@ def _blind(said: Mapping[str, Any], *_: Any) -> dict[str, Any]:
 
 
 def _motor(said: Mapping[str, Any], fault: Any, _: int) -> dict[str, Any]:
-    """A motor that gives a share of what is asked, or nothing."""
+    """A motor that gives a share of its command, or nothing."""
     share = np.ones(len(MOTORS))
     share[fault.motor] = fault.left
     return {**said, "control": said["control"] * share}

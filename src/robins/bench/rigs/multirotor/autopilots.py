@@ -1,4 +1,4 @@
-"""Who flies the multirotor: our autopilot, or PX4's or ArduPilot's SITL at the end of a socket.
+"""Autopilots of the multirotor: ours, or PX4's or ArduPilot's SITL at the end of a socket.
 
 Another program is waited for in `Part.rare`: once, in the process of the part, before its hello.
 """
@@ -30,7 +30,7 @@ _AGAIN = "begin the run anew, then start the autopilot's SITL again"
 
 
 def autopilot(kit: Kit) -> Part:
-    """The autopilot that was asked for."""
+    """The selected autopilot."""
     return {"own": own, "px4": px4, "ardupilot": ardupilot}[kit.autopilot](kit)
 
 
@@ -50,7 +50,7 @@ _UNMIX = np.linalg.inv(np.vstack([np.ones(4), craft.MIXER]))  # thrusts of a for
 
 
 class Mind(NamedTuple):
-    """What ours believes of the craft, and the acceleration with which it leans on the wind."""
+    """Estimates of our autopilot, and the acceleration with which it leans against the wind."""
 
     q_nb: Any  # (4,)
     v_n: Any  # (3,) m/s
@@ -137,7 +137,7 @@ def own(kit: Kit) -> Part:
 
 @contextmanager
 def _until_lost(line: of_px4.Px4Simulator | of_ardupilot.ArduPilotPhysics) -> Iterator[None]:
-    """What goes wrong ends the line, and says what to do about it."""
+    """Close the line at an error, and name the fix."""
     try:
         yield
     except BridgeClosed as error:

@@ -1,6 +1,6 @@
 """The physics of the multirotor, and its instruments.
 
-Four motors in an X, each a first-order lag behind what is asked; a rigid body under their thrust,
+Four motors in an X, each a first-order lag behind its command; a rigid body under their thrust,
 their reaction, drag against the wind, gravity, and the ground that it stands on:
 
     m v' = -C_nb (0, 0, sum T) - c (v - w) + m g,   J omega' = M T - d omega - omega x J omega
@@ -55,7 +55,7 @@ def at_rest() -> Airframe:
 
 @jax.jit
 def moved(s: Airframe, control: Any, wind_n: Any, dt: Any) -> Airframe:
-    """A step of dt [s] on, with what is asked of the motors (4,) in [0, 1]; wind (3,) [m/s] NED."""
+    """Step of dt [s] under motor commands (4,) in [0, 1] and the wind (3,) [m/s] NED."""
     down, inertia = jnp.asarray(DOWN), jnp.asarray(INERTIA_KG_M2)
     thrust = s.thrust + (1.0 - jnp.exp(-dt / LAG_S)) * (MOST_N * control - s.thrust)
     gyroscopic = jnp.cross(s.omega_b, inertia * s.omega_b)
@@ -73,7 +73,7 @@ def moved(s: Airframe, control: Any, wind_n: Any, dt: Any) -> Airframe:
 
 
 def craft(kit: Kit) -> Part:
-    """The craft; what was asked of the motors stands until the next."""
+    """The craft; a motor command stands until the next."""
     wind_n, dt = np.asarray(kit.given.wind), kit.step_ns * 1e-9
     begin = (at_rest(), np.zeros(4))
 

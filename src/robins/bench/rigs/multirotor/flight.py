@@ -1,4 +1,4 @@
-"""What a scenario may say of a flight, the numbers that its parts share, and what came of it."""
+"""Parameters of a flight, the numbers that its parts share, and its evaluation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from robins.scenario import Parameters, Quantity, default
 
 
 class Multirotor(Parameters):
-    """Where it hovers, in which wind, and the noise of its instruments (standard deviations).
+    """Hover point, wind, and noise of the instruments (standard deviations).
 
     It starts on the ground at ``lat``, ``lon``, ``alt`` (above mean sea level), level and with its
     nose to the north; ``wind`` is north, east, down. Errors are those against the point ``height``
@@ -61,7 +61,7 @@ class Kit(NamedTuple):
     port: int
     field_n_T: np.ndarray  # (3,) of the Earth
     m_per_rad: np.ndarray  # (2,) of latitude and longitude
-    frames: tuple[int, ...] = ()  # an autopilot is asked nothing before the first step
+    frames: tuple[int, ...] = ()  # an autopilot is not called before the first step
 
     def place(self, p_n: np.ndarray) -> np.ndarray:
         """Latitude, longitude [rad] and height [m] of a point (3,) [m] NED of the start."""
@@ -84,7 +84,7 @@ def prepare(setup: Any, given: Multirotor) -> Kit:
 
 
 def judge(flight: Any, ran: Any) -> Judged:
-    """How far it was from where it is to hover, how it leaned, and where its nose was."""
+    """Figures of a run: distance from the hover point [m], tilt and heading [deg]."""
     flown, height_m = ran.flown, flight.given.height
     off_n = flown["motion.p_n"] + np.array([0.0, 0.0, height_m])
     known = np.isfinite(off_n).all(axis=1)

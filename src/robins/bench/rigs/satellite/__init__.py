@@ -1,12 +1,12 @@
 """The satellite on the bench: seven parts, each a function of what reaches it over its line.
 
-- `messages`: what they say. `faults`: what may go wrong with sensors and actuators.
+- `messages`: their messages. `faults`: faults of sensors and actuators.
 - `kit`: the numbers that they are given before a run; `preparing` makes them.
 - `vehicle`: plant, rate table, actuators, gyro, star sensor.
-- `computers`: attitude determination and control. `reference`: where the craft is to point.
-- `errors`, `judging`, `view`: what came of it, for people.
+- `computers`: attitude determination and control. `reference`: target attitude.
+- `errors`, `judging`, `view`: evaluation of a run, and its page.
 
-What processes of parts do not need is imported when it is asked for: so they start sooner.
+What processes of parts do not need is imported where it is used, so they start sooner.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ BUILD = {
     "acm": acm,
     "actuators": actuators,
 }
-"""How each part is made of a kit."""
+"""Functions that make each part from a kit."""
 
 
 def _flies() -> dict[str, Path]:

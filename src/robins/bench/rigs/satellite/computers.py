@@ -1,10 +1,10 @@
 """The computers on board: attitude determination by any filter of the family, and control.
 
-What they do when a sensor fails: the star sensor may be silent for as long as it likes, then the
-attitude is that of the gyro alone. A gyro's sample stands for one period more. After that nobody
-knows how the craft turns: the estimate says "safe: do not steer by this", control lets wheels and
-magnetorquers rest, and when the gyro is back the filter begins anew from the next star frame. So it
-does when the operator resets it, with the bias that it began with.
+When a sensor fails: the star sensor may be silent for any time, then the attitude is that of the
+gyro alone. A gyro's sample stands for one period more. After that the rate is not known: the
+estimate is flagged "safe: do not steer by this", control lets wheels and magnetorquers rest, and
+when the gyro is back the filter starts again from the next star frame. It does the same when the
+operator resets it, with the bias of its first start.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from robins.systems.satellite import nodes
 from robins.systems.satellite.model import GATE, make_filter, start
 from robins.systems.satellite.nodes import NO_GAIN, STAR, Command, Given, Row
 
-SILENT_PERIODS = 4  # of the star sensor without a frame, after which it is said to be silent
+SILENT_PERIODS = 4  # of the star sensor without a frame, after which it is flagged as silent
 _LIMIT = float(chi_square(GATE, 3))
 
 
@@ -53,10 +53,10 @@ def sample_of(gyro: Any) -> np.ndarray | None:
 
 
 def late(part: Part, forgets: Callable[[Any], Any]) -> Part:
-    """A part that knows, where its first step is not that of the run, that its state is not so.
+    """Wrap a part so that it forgets its state where its first step is not that of the run.
 
-    It has lost its power: determination then waits for a star frame to begin with, and control
-    rests until it hears an estimate.
+    It has lost its power: determination then waits for a star frame to start from, and control
+    rests until it receives an estimate.
     """
     first = part.begin()
 
@@ -72,7 +72,7 @@ class Determined(NamedTuple):
     filter: FilterState
     gyro: Held
     since_star: int = 0  # steps
-    lost: bool = False  # waits for a star frame to begin anew
+    lost: bool = False  # waits for a star frame to start again
 
 
 def adm(kit: Kit) -> Part:
@@ -92,7 +92,7 @@ def adm(kit: Kit) -> Part:
         factor = belief.factor if rows is None else rows @ belief.factor
         return q, form.bias(belief.mean), jnp.sqrt(jnp.sum(factor * factor, -1))
 
-    # A filter that refuses a frame does not say how far off it is; one without rules does.
+    # A filter that refuses a frame gives no distance; one without rules does.
     plain, sensor = make_filter("quaternion" if additive else "mekf"), kit.model.sensor(STAR)
 
     @partial(compiled, kit)
@@ -186,7 +186,7 @@ def _innovation(innovation: Any, sigma: Any, nis: Any) -> dict[str, Any]:
 
 
 class Steered(NamedTuple):
-    """State of the attitude control: what it heard last, and where it points."""
+    """State of the attitude control: its last inputs, and the target."""
 
     estimate: Held  # q_ib, bias, whether it may be steered by
     theta: Held
@@ -211,7 +211,7 @@ def acm(kit: Kit) -> Part:
 
     def act(state: Steered, k: int, inputs: Inputs):
         estimate, gyro, speeds = inputs["estimate"], inputs["gyro"], inputs["wheels"]
-        if k > 0:  # before the first step nobody has said anything
+        if k > 0:  # before the first step there are no messages
             known = estimate and (
                 estimate["q_ib"],
                 estimate["gyro_bias"],

@@ -73,8 +73,9 @@ def inside(
 
     Args:
         kit: of the run.
-        steps: how many of its first are done; None: all.
-        said: by the operator. In one program computers cannot stand by or be reset: None.
+        steps: number of first steps that are done; None: all.
+        said: messages of the operator. One program cannot put computers on standby or reset them:
+            the result is then None.
         react: the loop one step on, as of `robins.systems.satellite.nodes`.
     """
     if any(one.message != "reference" for one in said):
@@ -99,7 +100,7 @@ def inside(
 
 
 def _rows(kit: Kit, said: list[Said]) -> Row:
-    """What drives each step, where the craft points as the operator says."""
+    """Inputs of each step, with the target attitudes that the operator sent."""
     if not said:
         return kit.rows
     q, omega, alpha = (np.stack(x) for x in zip(*followed(kit, said), strict=True))

@@ -61,7 +61,7 @@ PARAMETERS: dict[str, Any] = {
 
 
 def said() -> tuple[Mapping[str, Said], Mapping[str, Any]]:
-    """Its faults, and their parameters."""
+    """Faults of the satellite, and their parameters."""
     return SAID, PARAMETERS
 
 

@@ -62,11 +62,11 @@ def judge(flight: Flight, ran: Ran) -> Judged:
 
 
 def warnings(error: np.ndarray, unfit: np.ndarray) -> list[str]:
-    """Why a reader should doubt the figures.
+    """Reasons to doubt the figures.
 
     Args:
         error: (E, 3) of the attitude, over the counted steps; NaN where it is not known.
-        unfit: (E,) whether the estimate was marked as not to be steered by.
+        unfit: (E,) true where the estimate was marked as not to be steered by.
     """
     known = np.all(np.isfinite(error), axis=-1)
     unusable = (

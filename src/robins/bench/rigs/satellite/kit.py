@@ -1,4 +1,4 @@
-"""What the parts of the satellite are given before a run: numbers only, so that they can travel.
+"""Input of the parts of the satellite before a run: numbers only, so that it can be sent.
 
 The bench computes it once, and hands each process a copy; a part started by hand on another
 machine computes the same.
@@ -26,7 +26,7 @@ _BLOCK = 1024  # rows of a run that a part has as vectors at a time
 
 
 class Kit(NamedTuple):
-    """A run of the satellite, to the last number; E steps."""
+    """Complete input of a run of the satellite; E steps."""
 
     step_ns: int
     due: np.ndarray  # (E,) bool, whether a step ends with a star frame
@@ -47,12 +47,12 @@ class Kit(NamedTuple):
 
     @property
     def belief(self) -> Belief:
-        """What the filter believes before the first step."""
+        """Belief of the filter before the first step."""
         return self.start.belief if isinstance(self.start, FilterState) else self.start
 
     @property
     def form(self) -> StateForm:
-        """How its state is read."""
+        """Form of its state."""
         return ADDITIVE if self.build == "quaternion" else MULTIPLICATIVE
 
     @property
@@ -92,7 +92,7 @@ def driven(kit: Kit, node: Callable) -> Callable:
 
     Returns:
         ``(step, *args, begins=()) -> out``; a step beyond the last has the row of the last, so that
-        a part may be asked for more. ``begins`` takes the place of the first numbers of the row.
+        a part may compute beyond it. ``begins`` takes the place of the first numbers of the row.
     """
     columns, shape = jax.tree_util.tree_flatten(kit.rows)
     steps = len(kit.due)

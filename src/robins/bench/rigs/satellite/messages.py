@@ -1,4 +1,4 @@
-"""What the seven parts of the satellite tell each other, and what the operator tells them."""
+"""Messages between the seven parts of the satellite, and from the operator to them."""
 
 from __future__ import annotations
 

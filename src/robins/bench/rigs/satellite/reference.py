@@ -1,8 +1,8 @@
-"""Where the craft is to point: along the course of its scenario, or where the operator says.
+"""Target attitude: along the course of the scenario, or as the operator commands.
 
-An attitude that is said is come to by a turn about one axis, from rest to rest, from where the
-craft was to point then; back to the course likewise. It is a pure function of what was said, with
-the same bits in the control, in the run inside one program, and in what a run is judged by.
+A commanded attitude is reached by a turn about one axis, from rest to rest, from the target
+attitude of that moment; back to the course likewise. It is a pure function of the commands, with
+the same bits in the control, in the run inside one program, and in the evaluation of a run.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from robins.sim.attitude_reference import PEAK_ACCELERATION, PEAK_RATE, Referenc
 from robins.systems.satellite.nodes import UNIT
 
 SHARE = 0.5  # of what the wheels can give, that a slew takes
-_AS_IT_CAN = 0.5  # of the greatest rate, where none is said
+_AS_IT_CAN = 0.5  # of the greatest rate, where none is commanded
 _OFF = 2.0 * UNIT  # of the square of the length of a quaternion
 _BRAKES = 4.0  # greatest acceleration times length over rate, of a rate that dies away; 3.94
 
-Said = tuple[int, np.ndarray, float]  # first step that heard it, q_ib, rate
+Said = tuple[int, np.ndarray, float]  # first step that received it, q_ib, rate
 
 
 class Wanted(NamedTuple):
-    """Where the craft is to point at an edge of two steps; in the order of a row of the course."""
+    """Target attitude at an edge of two steps; in the order of a row of the course."""
 
     q_ib: Any  # (4,)
     omega_b: Any  # (3,) rad/s
@@ -35,11 +35,11 @@ class Wanted(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """What the operator said last, and the way there."""
+    """Last command of the operator, and the turn to it."""
 
-    edge: int  # at which it was heard: the beginning of the step of that number
+    edge: int  # at which it was received: the beginning of the step of that number
     q_ib: np.ndarray  # (4,) to point at; NaN: the course
-    turn: np.ndarray  # (3,) rad from there to where the craft was to point at the edge
+    turn: np.ndarray  # (3,) rad from there to the target attitude at the edge
     rate: np.ndarray  # (3,) rad/s of the latter against the former
     length_s: float  # of the way
 
@@ -48,7 +48,7 @@ _STILL = np.zeros(3)
 
 
 def wanted(kit: Kit, plan: Plan | None, edge: int) -> Wanted:
-    """Where the craft is to point at an edge, 0 to E, by the last plan before it."""
+    """Target attitude at an edge, 0 to E, by the last plan before it."""
     if plan is None or np.isnan(plan.q_ib[0]):
         course, last = kit.rows.course, len(kit.due) - 1
         k = min(edge, last)
@@ -61,21 +61,21 @@ def wanted(kit: Kit, plan: Plan | None, edge: int) -> Wanted:
     since_s = (edge - plan.edge) * kit.step_ns * 1e-9
     if since_s >= plan.length_s:
         return base
-    # one epoch at a time, so that all who ask have the same bits
+    # one epoch at a time, so that all callers get the same bits
     one = Reference(*(x[None] for x in base))
     way = handed_over(one, plan.turn, plan.rate, plan.length_s, np.array([since_s]))
     return Wanted(*(np.asarray(x)[0] for x in way))
 
 
 def told(kit: Kit, plan: Plan | None, edge: int, q_ib: np.ndarray, rate: float) -> Plan | None:
-    """The plan after the operator has said something.
+    """Plan after a command of the operator.
 
     Args:
         kit: of the run.
         plan: until then.
-        edge: at which it was heard.
+        edge: at which it was received.
         q_ib: (4,) to point at; NaN: back to the course. One whose length is not one is not
-            followed, as `believable` has it of the star sensor.
+            followed, as by `believable` for the star sensor.
         rate: greatest of the slew [rad/s]; 0: half of what the wheels allow.
     """
     square = float(np.sum(q_ib * q_ib))
@@ -121,11 +121,11 @@ def limits(kit: Kit) -> tuple[float, float]:
 
 
 def followed(kit: Kit, said: Iterable[Said]) -> list[Wanted]:
-    """Where the craft is to point at each edge of its E steps, E + 1 of them.
+    """Target attitudes at each edge of the E steps, E + 1 of them.
 
     Args:
         kit: of the run.
-        said: what the operator said, in its order; of two in one step the later one stands.
+        said: commands of the operator, in their order; of two in one step the later one stands.
     """
     heard = {step: (q_ib, rate) for step, q_ib, rate in said}
     out: list[Wanted] = []
@@ -138,8 +138,8 @@ def followed(kit: Kit, said: Iterable[Said]) -> list[Wanted]:
 
 
 def said_in(flown: Mapping[str, np.ndarray], steps: int) -> list[Said]:
-    """What was said by the end of so many steps; its rate is a number, even if its attitude is
-    none.
+    """Commands sent by the end of so many steps; their rate is a number, even where the attitude is
+    NaN.
     """
     rate = flown["reference.rate"][:steps]
     heard = np.flatnonzero(np.isfinite(rate))
@@ -147,7 +147,7 @@ def said_in(flown: Mapping[str, np.ndarray], steps: int) -> list[Said]:
 
 
 def wanted_after(kit: Kit, flown: Mapping[str, np.ndarray], steps: int) -> Wanted:
-    """Where the craft is to point after so many steps."""
+    """Target attitude after so many steps."""
     plan = None
     for step, q_ib, rate in said_in(flown, steps):
         plan = told(kit, plan, step, q_ib, rate)
@@ -155,14 +155,14 @@ def wanted_after(kit: Kit, flown: Mapping[str, np.ndarray], steps: int) -> Wante
 
 
 def reference_q_ib(kit: Kit, flown: Mapping[str, np.ndarray], steps: int) -> np.ndarray:
-    """(steps, 4) where the craft is to point at the end of each step."""
+    """Target attitudes (steps, 4) at the end of each step."""
     if not (said := said_in(flown, steps)):
         return np.asarray(kit.rows.course.ref_end_q_ib)[:steps]
     return np.array([at.q_ib for at in followed(kit, said)[1 : steps + 1]])
 
 
 def refuses(message: str, values: Mapping[str, Any]) -> str:
-    """Why the operator cannot say this."""
+    """Reason why the operator cannot send this; empty if it can be sent."""
     q = values.get("q_ib", np.full(4, np.nan))
     square = float(np.sum(q * q))
     if not np.any(np.isfinite(q)) or abs(square - 1.0) <= _OFF:
@@ -172,6 +172,6 @@ def refuses(message: str, values: Mapping[str, Any]) -> str:
 
 
 def rehearse(kit: Kit) -> None:
-    """Compile what is computed when something is said."""
+    """Compile what is computed at a command."""
     plan = told(kit, None, 0, np.array([0.5, 0.5, 0.5, 0.5]), 0.0)
     wanted(kit, plan, 1)

@@ -1,4 +1,4 @@
-"""The rate table, as a run on the bench may say it."""
+"""Parameters of the rate table of a run on the bench."""
 
 from __future__ import annotations
 
@@ -18,5 +18,5 @@ class Carrier(Parameters):
     )
 
     def table(self) -> RateTable:
-        """As the simulation has it."""
+        """Rate table of the simulation."""
         return rate_table(self.lag, self.rate_limit, self.acceleration_limit)

@@ -1,4 +1,4 @@
-"""What viewers and ROS 2 get of the satellite's messages."""
+"""Topics for viewers and ROS 2, from the satellite's messages."""
 
 from __future__ import annotations
 

@@ -22,24 +22,24 @@ HELD = 1  # steps for which what came last stands for what did not come
 
 
 class Held(NamedTuple):
-    """What came last, and for how many steps nothing has come since."""
+    """Last values received, and the number of steps without any since."""
 
     values: Any
     age: int = 0
 
 
 def renew(held: Held, came: Any) -> Held:
-    """What is to be acted on in this step; `trusted` says for how long."""
+    """Values to act on in this step; `trusted` limits for how long."""
     return Held(held.values, held.age + 1) if came is None else Held(came, 0)
 
 
 def trusted(held: Held) -> bool:
-    """Whether what came last still stands."""
+    """True if the last values are still valid."""
     return held.age <= HELD
 
 
 def stale(held: Held) -> Held:
-    """The same, come so long ago that it no longer stands."""
+    """The same values, marked as no longer valid."""
     return held._replace(age=HELD + 1)
 
 
@@ -51,12 +51,12 @@ def padded(torque: Any) -> np.ndarray:
 
 
 def rest() -> dict[str, np.ndarray]:
-    """A command, or what comes of it, that does nothing."""
+    """A command, or an actuation, of zero."""
     return {"wheel_torque": np.zeros(WHEELS), "dipole_b": np.zeros(3)}
 
 
 def acting(held: Held, came: Any, wheels: int) -> tuple[Held, Any, Any]:
-    """What acts in this step: torques and dipole that came, or came last, or none."""
+    """Torques and dipole that act in this step: those that came, the last ones, or none."""
     held = renew(held, came)
     use = held.values if trusted(held) else rest()
     return held, use["wheel_torque"][:wheels], use["dipole_b"]
@@ -171,7 +171,7 @@ def gyro(kit: Kit) -> Part:
 
 
 def star(kit: Kit) -> Part:
-    """The star sensor; a camera is told where to look for its stars."""
+    """The star sensor; a camera is given the direction in which to look for its stars."""
     lens = kit.given.lens
     # An image has no place in a program.
     sees = driven(kit if lens is None else kit._replace(machine="jax"), nodes.star)

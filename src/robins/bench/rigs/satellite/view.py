@@ -1,4 +1,4 @@
-"""What the page shows of the satellite, and what is told of its estimates."""
+"""Page of the satellite, and notices of its estimates."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from robins.bench.run.telemetry import Flown
 from robins.rotation import from_rotvec, multiply
 
 _XYZ = ("x", "y", "z")
-_OF_FRAMES = USED | REFUSED | SHORT  # said of a star frame, so nothing between two frames
+_OF_FRAMES = USED | REFUSED | SHORT  # flags of a star frame, so none between two frames
 
 
 def signals(given: Any) -> list[Signal]:
-    """What the page draws; of the parameters of an attitude loop."""
+    """Signals on the page, by the parameters of an attitude loop."""
 
     def three(plot: str, unit: str, sigma: bool = False) -> list[Signal]:
         found = []
@@ -94,7 +94,7 @@ def sample(flown: Flown, kit: Kit, since: int, step: int) -> list[float]:
 
 
 def counts(flown: Flown, done: int) -> dict[str, int]:
-    """What is counted on the page."""
+    """Counts on the page."""
     return {"refused_measurements": int(np.sum(flag(flown, "star refused")[:done]))}
 
 
@@ -102,22 +102,22 @@ class Alarms:
     """Listens to the flags of one estimate after another."""
 
     def __init__(self) -> None:
-        self._stands = 0  # flags that were said to have begun and not to have ended
+        self._stands = 0  # flags whose start was reported and whose end was not
         self._frames = 0  # refused in a row
 
     def hear(self, flown: Flown, step: int) -> list[Told]:
-        """What there is to say of the estimate of a step."""
+        """Notices of the estimate of a step."""
         flags = int(flown["estimate.flags"][step])
         return [one._replace(text=f"adm: {one.text}") for one in self.said(flags)]
 
     def said(self, flags: int) -> list[Told]:
-        """What there is to say of the next estimate.
+        """Notices of the next estimate.
 
-        A sensor whose frames are refused one after another is said so once, and how many there were
-        when one is used again.
+        Frames that are refused one after another are reported once, and their number when one
+        is used again.
         """
         now, begun = flags, self._stands
-        if not flags & _OF_FRAMES:  # no frame: what was said of the last one stands
+        if not flags & _OF_FRAMES:  # no frame: the flags of the last one stand
             now |= begun & (REFUSED | SHORT | KEPT)
         new, over = now & ~begun, begun & ~now
         if flags & REFUSED:
@@ -140,7 +140,7 @@ class Alarms:
 
 
 def _turned(flown: Flown, kit: Kit, step: int, turn_rad: np.ndarray) -> tuple[str, dict[str, Any]]:
-    """An attitude that is turned from where the craft is to point now; it stays inertial."""
+    """Attitude turned from the present target; it stays inertial."""
     now = wanted_after(kit, flown, step + 1).q_ib
     return "reference", {"q_ib": np.asarray(multiply(now, from_rotvec(jnp.asarray(turn_rad))))}
 
@@ -157,6 +157,6 @@ SAYS = {
     "control: run": lambda flown, kit, step: ("mode", {"mode": RUN}),
     "determination: reset": lambda flown, kit, step: ("mode", {"mode": AS_IT_IS, "reset": 1}),
 }
-"""What the page offers to say."""
+"""Operator messages that the page offers."""
 
 VIEW = View(signals, sample, Alarms, counts, OFFERED, SAYS)

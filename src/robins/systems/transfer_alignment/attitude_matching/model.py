@@ -185,7 +185,7 @@ def matching_matrix(C_nm: np.ndarray, C_nominal: np.ndarray, flexible: bool = Fa
 def linear_system(
     given: AttitudeMatching, updates: int, flexure: Flexure | None = None
 ) -> LinearSystem:
-    """The system along a bank turn, in radians, as a filter is told it.
+    """The system along a bank turn, in radians, as a filter believes it.
 
     With the period T of the updates, Phi = I + F T and Q = diag(N^2 T I, 0, 0); gyro noise is white
     on all axes alike, so no rotation changes it. The attitudes in F and H are those of the
@@ -194,7 +194,7 @@ def linear_system(
 
     Args:
         given: the scenario.
-        updates: how many.
+        updates: their number.
         flexure: adds six states that swing so; its bending and tails are not modelled.
     """
     turn, T, spread = given.manoeuvre, given.period, given.believed

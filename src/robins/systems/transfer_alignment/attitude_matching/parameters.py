@@ -1,4 +1,4 @@
-"""What a scenario of attitude matching states: manoeuvre, errors, flexure, what filters believe."""
+"""Parameters of attitude matching: manoeuvre, errors, flexure, assumptions of filters."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ class Slave(Parameters):
 
 
 class Mounting(Parameters):
-    """How the slave sits on the master: as drawn, and the true error (slave axes)."""
+    """Mounting of the slave on the master: nominal, and the true error (slave axes)."""
 
     nominal: q.Angles = default("0 deg")  # rotation vector
     error: Annotated[q.Three, Quantity("angle", least="-30 deg", most="30 deg")]
 
 
 class Flexing(Parameters):
-    """How the structure moves between the two, in axes right, forward, up of the master."""
+    """Motion of the structure between the two, in axes right, forward, up of the master."""
 
     sigma: q.AngleSizes
     time: q.Durations = default("1 s")
@@ -59,7 +59,7 @@ class Flexing(Parameters):
 
 
 class BelievedSpread(Parameters):
-    """Standard deviations that filters are told of the start, and of flexure over the true ones."""
+    """Standard deviations that filters believe of the start, and of flexure over the true ones."""
 
     attitude: q.Spread
     gyro_bias: q.AngleRate
@@ -69,7 +69,7 @@ class BelievedSpread(Parameters):
 
 
 class HInfinity(Parameters):
-    """What is asked of the H-infinity filters."""
+    """Requirements of the H-infinity filters."""
 
     gamma: Positive = 50.0  # of those with R = 1 unit^2, in their unit
     weighted_over_least: Positive = 1.05  # of the weighted one: gamma over its least

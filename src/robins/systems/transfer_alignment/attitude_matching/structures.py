@@ -1,15 +1,14 @@
-"""The filter that is told nothing of the structure: hypotheses of it, side by side.
-
-Attitudes alone do not tell a swing of the structure from an error of the slave's attitude, unless
-it is known how fast and how far it swings. So a bank (`robins.filters.composite.imm`) holds a
-filter of fifteen states for each hypothesis,
+"""The filter without knowledge of the structure: hypotheses of it, side by side.  Attitudes alone
+do not separate a swing of the structure from an error of the slave's attitude, unless it is known
+how fast and how far it swings. So a bank (`robins.filters.composite.imm`) holds a filter of fifteen
+states for each hypothesis,
 
     stiff, or swings by 4.6', 10', 22' or 46' (three a decade) in 1 s or 10 s
     flutters not at all, or by three times the noise of the records
 
-each with Huber's rule; it is stiff as likely as not. None is of louder gyros: attitudes alone do
-not tell those from a swing, and a bank that has them is lost where nothing flexes. The numbers were
-chosen on the random seed 100. The times are decades, and those of two scenarios by that.
+each with Huber's rule; it is stiff as likely as not. None is of noisier gyros: attitudes alone do
+not separate those from a swing, and a bank that has them is lost where nothing flexes. The numbers
+were chosen on the random seed 100. The times are decades, and those of two scenarios by that.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ _OTHER = 1e-5  # that a structure becomes each other one in a step
 
 _ARCMIN = units.parse("1 arcmin", "angle")
 START = Flexure(np.full(3, 10.0 * _ARCMIN), np.full(3, 1.0))
-"""How uncertain the states of a structure are at the start, of which nothing is known."""
+"""Uncertainty at the start of the states of an unknown structure."""
 
 
 class Supposed(NamedTuple):
@@ -87,7 +86,7 @@ def _mode(weight: Rule, given: tuple[Numbers, ...], row: Supposed) -> Mode:
 def supposed(
     system: am.LinearSystem, noise_rad: float, period_s: float
 ) -> Callable[[Supposed], Mode]:
-    """What makes the filter of a hypothesis (see `blind`)."""
+    """Function that makes the filter of a hypothesis (see `blind`)."""
     given = system.G[:, :3], noise_rad, period_s
     return Partial(_mode, huber(_WEIGHED), tuple(number("numbers are real", x) for x in given))
 

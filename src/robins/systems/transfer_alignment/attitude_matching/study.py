@@ -1,6 +1,6 @@
-"""The study "attitude-matching": filters, what is known of them without a run, and what is claimed.
+"""The study "attitude-matching": filters, their properties without a run, and claims.
 
-All filters work in radians and differ in what they are told. The paper's H-infinity filter has
+All filters work in radians and differ in their assumptions. The paper's H-infinity filter has
 R = I and L = I in an unstated unit u of angle, which is R = u^2 and gamma in u here; with its P0
 that is all a unit changes. Covariances do not depend on data in this system, so neither do
 gamma_min and feasibility.
@@ -76,7 +76,7 @@ def weighted_filter() -> Filter:
 
 
 def contender(given: AttitudeMatching, course: Course, name: str) -> Contender:
-    """A filter of `FILTERS` with what it is told."""
+    """A filter of `FILTERS` with its assumptions."""
     flexure, updates = given.flexure, len(course.epoch_s)
     sizes = {
         "noise": given.master.attitude_noise,
@@ -131,7 +131,7 @@ def _contender(
 
 
 def _case(start: Any, F: Any, H: Any, world: World) -> Case:
-    """What a filter of n states takes of a run; F is (E, n, n) and H (E, 3, n)."""
+    """Case of a filter of n states in a run; F is (E, n, n) and H (E, 3, n)."""
     truth = world.state[:, : F.shape[-1]]
     return Case(start, F, {am.ATTITUDE: world.measured}, {am.ATTITUDE: H}, truth)
 
@@ -147,8 +147,8 @@ def existence(
     """Facts on an H-infinity filter, found by running it over nothing but zeros.
 
     A filter that does not exist has no result: its figures are there, and empty. The filter has
-    one `h_infinity` rule and is told of the system and a measurement noise [rad]; gamma is asked
-    for in the units of its L x, or as `over_least` times the least.
+    one `h_infinity` rule and is given the system and a measurement noise [rad]; gamma is in the
+    units of its L x, or `over_least` times the least.
     """
     model, (u, aux) = system.model(sigma_rad), system.inputs()
     y = np.where(course.heard[:, None], np.zeros((len(course.heard), 3)), np.nan)
@@ -165,8 +165,8 @@ def existence(
             time_s=course.epoch_s,
         ).steps
 
-    # No gamma below the largest local bound of the Kalman filter exists, and the refusal says
-    # which one would.
+    # No gamma below the largest local bound of the Kalman filter exists, and the refusal names
+    # the least one that would.
     least, largest = 0.0, float(np.max(attempt(np.inf)[0]))
     try:
         if largest > 0.0:  # something is measured
@@ -200,7 +200,7 @@ def _existing(step: Step):
 
 
 def view(given: AttitudeMatching, course: Course) -> View:
-    """What is reported of every filter."""
+    """Report of every filter."""
     roll, count = am.roll_rad(given.manoeuvre, course.epoch_s), len(course.epoch_s)
     return View(
         epoch_s=course.epoch_s,

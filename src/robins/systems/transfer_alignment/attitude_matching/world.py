@@ -31,7 +31,7 @@ from robins.systems.transfer_alignment.attitude_matching.parameters import Attit
 
 
 class Course(NamedTuple):
-    """What all runs share; N steps of the truth, E updates."""
+    """Data that all runs share; N steps of the truth, E updates."""
 
     q_nm: np.ndarray  # (N + 1, 4) master to n
     turned_n: np.ndarray  # (N, 4) exp(omega_in dt), by how much n turns in a step

@@ -1,6 +1,6 @@
 """The filters of the product model; one of them has no information on the disturbance.
 
-That one, "adaptive", is a bank of hypotheses. A single innovation does not say whether the
+That one, "adaptive", is a bank of hypotheses. A single innovation does not show whether the
 record or the gyros are disturbed. The following innovations do, and so does the velocity, which
 neither flexure nor gyro noise affects directly. So several filters of the same 24 states run side
 by side, each with a hypothesis of its own, as an interacting multiple model
@@ -13,8 +13,8 @@ by side, each with a hypothesis of its own, as an interacting multiple model
     drifting    and a bias that walks     likewise, for some tens of seconds
 
 Each weighs outliers by Huber's rule. A structure is stiff or flexes for good, so nothing is mixed
-between the two halves but one part in 10^5. It is told of no structure, not even of the one that is
-believed: one that is wrong costs more than none. The numbers are the same everywhere. The factor of
+between the two halves but one part in 10^5. It uses no structure, not even the believed
+one: one that is wrong costs more than none. The numbers are the same everywhere. The factor of
 the gyros and the structure are no scenario's own; they were chosen on runs of A to D and on wrong
 structures, random seed 100. The strength of a kick and the probabilities are older, and were chosen
 with B to D in view.
@@ -47,7 +47,7 @@ _WEIGHED = 0.99  # share of right records that keep their weight
 
 
 class Hypothesis(NamedTuple):
-    """What process noise is multiplied by."""
+    """Factors on process noise."""
 
     gyro: ArrayLike = 1.0  # noise of the gyros
     walk: ArrayLike = 0.0  # rad/s/sqrt(s) of the gyro biases in units of the gyro noise: 1/s
@@ -142,13 +142,13 @@ UNKNOWN = Structure(sigma=(_TEN_ARCMIN, _TEN_ARCMIN, _TEN_ARCMIN), time=(5.0, 5.
 
 
 class Variant(NamedTuple):
-    """How a filter of a name is made, and when the model it runs on has flexure states."""
+    """Construction of a named filter, and the condition on which its model has flexure states."""
 
     flexes: Literal["never", "believed", "always", "untold"]
     make: Callable[[], Filter]
 
     def flexure(self, believed: Structure | None) -> Flexure | None:
-        """What the flexure states of the filter stand for; None where it has none."""
+        """Flexure that the states of the filter stand for; None where it has none."""
         if self.flexes == "untold" or (self.flexes == "always" and believed is None):
             return UNKNOWN.flexure
         return None if believed is None or self.flexes == "never" else believed.flexure

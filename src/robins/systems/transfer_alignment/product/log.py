@@ -1,10 +1,10 @@
 """Align a recorded slave to its recorded master, with the results and their accuracy.
 
 The tables of a `Dataset` hold the slave's samples (``imu``) and the master's records (``master``).
-The slave begins where the first whole record of the master puts it. What is unknown about that, the
-mounting, the flexure and the noise of the record, is in its attitude too, so the initial covariance
+The slave starts at the state that the first whole record of the master gives. The unknowns of that,
+mounting, flexure and noise of the record, are in its attitude too, so the initial covariance
 correlates them. A gap in the slave's samples that is too long to bridge ends a piece; the next one
-is aligned anew.
+is aligned again.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def pieces_of(recorded: Recorded, parameters: Replay) -> tuple[list[PairPiece], 
     """The pieces made ready for filters, and a sentence for each stretch that cannot be used.
 
     Raises:
-        ValueError: no stretch can be used; the sentence says why.
+        ValueError: no stretch can be used; the message gives the reason.
     """
     longest = parameters.recording.longest_gap
     prepare = partial(_prepare, recorded, parameters)
@@ -180,7 +180,7 @@ def _gyro_rate(
 
 @jax.jit
 def _slave_of(master: Nav, at: Installation, omega_b) -> Nav:
-    """Where a record of the master puts the slave: nominal mounting, lever arm, no flexure."""
+    """State of the slave by a record of the master: nominal mounting, lever arm, no flexure."""
     q_nm, v_n, place = master
     arm_n = q_nm.apply(at.lever_m)
     omega_in = earth_rate_n(place.lat) + transport_rate_n(place.lat, place.alt, v_n)
@@ -243,9 +243,9 @@ REPORTED = Reported(
     estimates=_estimates,
     causes="Likely causes: a delay of the master that is not stated, a sign or frame of its "
     "velocity or attitude (down for up, heading counterclockwise), a nominal mounting or lever arm "
-    "that is wrong, flexure without states for it, or noise of master and slave told too small.",
+    "that is wrong, flexure without states for it, or noise of master and slave stated too small.",
 )
-_FOUND = ("gyro_bias", "accel_bias", "mounting")  # what an alignment is for, beside the attitude
+_FOUND = ("gyro_bias", "accel_bias", "mounting")  # what an alignment is for, besides the attitude
 _UNKNOWN = 0.7  # of the sigma at the start; what keeps more of it was hardly seen
 _LARGE_RAD = np.deg2rad(5.0)
 
@@ -305,10 +305,10 @@ def replay(
     filters: tuple[str, ...] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Align the slave of a recorded pair, examined and cleaned, as `System.replay` says.
+    """Align the slave of a recorded pair, examined and cleaned; see `System.replay`.
 
     Raises:
-        ValueError: no such filter; or the pair cannot be aligned, the sentence says why.
+        ValueError: no such filter; or the pair cannot be aligned, the message gives the reason.
     """
     recorded = on_one_clock(dataset)
     pieces, problems = pieces_of(recorded, parameters)

@@ -82,14 +82,14 @@ class ProductState(NamedTuple):
 
 
 class Installation(NamedTuple):
-    """Where the slave sits, as far as it is known."""
+    """Place of the slave on the vehicle, as far as it is known."""
 
     q_ms: Rotation  # C_nominal, slave axes to master axes
     lever_m: Array  # (3,) m, master to slave, master axes
 
 
 class Lag(NamedTuple):
-    """What a reading of the master needs besides the state.
+    """Inputs of a reading of the master, besides the state.
 
     The slave's raw increments from when the record was true to now, and the master's turn rate.
     """
@@ -288,7 +288,7 @@ def product_model(
 
 
 def lag_of(increments: Increments, delay_s: ArrayLike, omega_m: ArrayLike) -> Lag:
-    """How each record of the master lags behind, from the slave's own increments.
+    """Lag of each record of the master, from the slave's own increments.
 
     Args:
         increments: raw blocks of the slave, dt (E, K), theta and dv (E, K, 3); epoch e is the end

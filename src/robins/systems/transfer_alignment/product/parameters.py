@@ -1,7 +1,7 @@
 """Parameters of a master and a slave on one vehicle, of the study "product", and of a recording.
 
-A scenario class takes those of the pair by inheriting `PairParameters` beside `Scenario`. Vectors
-along the body are forward, right, down; along the Earth north, east, down.
+A scenario class takes those of the pair by inheriting `PairParameters` as well as `Scenario`.
+Vectors along the body are forward, right, down; along the Earth north, east, down.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ class Master(Parameters):
 
 
 class Mounting(Parameters):
-    """How the slave sits: ``C_ms = C(nominal) exp(error x)``, the error in slave axes."""
+    """Mounting of the slave: ``C_ms = C(nominal) exp(error x)``, the error in slave axes."""
 
     nominal: q.Angles = default("0 deg")  # roll, pitch, yaw of the slave
     error: q.Angles = default("0 deg")  # the same in every run
@@ -163,7 +163,7 @@ class Mounting(Parameters):
 
 
 class Structure(Parameters):
-    """What bends and swings between master and slave, in master axes: roll, pitch, heading."""
+    """Flexure between master and slave, in master axes: roll, pitch, heading."""
 
     sigma: q.AngleSizes = default("0 deg")
     time: q.Durations = default("1 s")
@@ -180,7 +180,7 @@ class Structure(Parameters):
 
 
 class Disturbance(Parameters):
-    """What no filter is told of, unless a scenario says so."""
+    """Disturbances unknown to the filters, unless a scenario states otherwise."""
 
     # records of the master with attitude and velocity noise that many times as large
     outlier_share: Share = 0.0
@@ -229,7 +229,7 @@ class PairParameters(Parameters):
 
 
 class Believed(Parameters):
-    """What the filters are told; without a word the stated noise, start and mounting are true."""
+    """Assumptions of the filters; left out: the stated noise, start and mounting are true."""
 
     mounting: q.AngleSizes = default("0.3 deg")  # one sigma of the mounting error
     # flexure states are for what is given here; tails and bending are not modelled
@@ -252,7 +252,7 @@ class Product(Scenario, PairParameters):
 
 
 class Replay(Product):
-    """What is believed of a recorded pair; the log brings its own motion."""
+    """Assumptions on a recorded pair; the log brings its own motion."""
 
     manoeuvre: (  # pyright: ignore[reportIncompatibleVariableOverride]
         Annotated[Aircraft | Ship | Vehicle, pydantic.Field(discriminator="kind")] | None

@@ -1,7 +1,7 @@
 """The study "product": a slave on an aircraft, a ship or a vehicle, aligned closed loop.
 
-The truth of a run is drawn from what the filter "product" is told: initial errors, biases, noise,
-mounting error and flexure, from the sigmas of the scenario. So a right filter is consistent.
+The truth of a run is drawn from the assumptions of the filter "product": initial errors, biases,
+noise, mounting error and flexure, from the sigmas of the scenario. So a right filter is consistent.
 """
 
 from __future__ import annotations
@@ -66,13 +66,13 @@ _LEAST = np.repeat([1e-9, 1e-6, 1e-3, 1e-12, 1e-8, 1e-9], 3)
 
 
 def installation_of(pair: PairParameters) -> pm.Installation:
-    """Where the slave sits, as far as it is known."""
+    """Place of the slave on the vehicle, as far as it is known."""
     q_ms = Rotation.from_euler(*pair.mounting.nominal)
     return pm.Installation(q_ms, jnp.asarray(pair.lever_arm, float))
 
 
 def model_of(pair: PairParameters, believed: Believed, flexure: Flexure | None) -> Model:
-    """The product model as parameters tell it.
+    """The product model by its parameters.
 
     Raises:
         ValueError: a noise of the master is zero, so that its records could not be weighed.
@@ -111,7 +111,7 @@ def start_sigma(pair: PairParameters, believed: Believed, flexure: Flexure | Non
 
 
 def _case(matched: tuple[str, ...], start: tuple[Array, Array], run: PairRun) -> Case:
-    """What a filter is given of a pair, and what it should find.
+    """Case of a filter for a pair: its inputs and the truth.
 
     It uses the records of the master that are `matched`, and starts with a sigma (n,) and the delay
     [s] of the records.
@@ -161,7 +161,7 @@ def product_contender(
     """A filter of the product model, for a problem that simulates a `PairRun`.
 
     Args:
-        pair: what the filter is told of both units, the start and the seat. It knows nothing of
+        pair: assumptions of the filter on both units, the start and the mounting. It does not use
             `pair.disturbance`, `pair.flexure` and the true mounting error.
         name: one of `FILTERS`.
         believed: of mounting and flexure; by default 0.3 deg and none.
@@ -237,12 +237,12 @@ def _contender(given: Product, course: Course, name: str) -> Contender:
 
 
 def tracks(means: Mapping[str, pm.ProductState]) -> dict[str, Any]:
-    """Where each filter thought the slave was."""
+    """Estimated positions of the slave, by filter."""
     return track_arrays((mean.ins.position for mean in means.values()), "{} of the slave")
 
 
 def faults(given: PairParameters, epoch_s: np.ndarray) -> dict[str, np.ndarray]:
-    """When the gyros of the slave, the flexure or the mounting is other than its noise says."""
+    """Masks of the epochs at which gyros, flexure or mounting differ from their stated noise."""
     d = given.disturbance
     louder = d.gyro_noise_factor > 1.0
     gyros = during([d.gyro_noise_window] if louder else [], epoch_s)

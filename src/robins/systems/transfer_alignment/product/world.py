@@ -61,7 +61,7 @@ _MASTER = unit(Component.IMU, 1)
 
 
 class Course(NamedTuple):
-    """What all runs share: the motion, and increments of an ideal slave.
+    """Data that all runs share: the motion, and increments of an ideal slave.
 
     This slave has its nominal mounting and its lever arm, no flexure, no mounting error and no
     sensor errors; `simulate_pair` adds these run by run.
@@ -213,7 +213,7 @@ class PairRun(NamedTuple):
     initial_error: Any  # (9,) of attitude, velocity, position: true = retract(estimate, error)
     master: Nav  # leading axis E, as reported; NaN where missing
     master_omega_b: Any  # (E, 3) rad/s, omega_ib_b of the master at the time of its record
-    truth: ProductState | None  # of the slave, leading axis E; None where nobody knows it
+    truth: ProductState | None  # of the slave, leading axis E; None where it is not known
 
 
 def simulate_pair(pair: PairParameters, course: Course, seed: int, index: Array) -> PairRun:
@@ -281,7 +281,7 @@ def _felt(course: Course, d: Float[Array, "n 4"]) -> tuple[Array, Array]:
 def _slave_errors(pair: PairParameters, course: Course, key: Array) -> tuple[Array, ...]:
     """Errors of theta and dv, biases of gyros and accelerometers after each sample; (N, 3) each.
 
-    All errors add, so the unit is asked what it reports of a body at rest in free fall.
+    All errors add, so they are the reports of the unit for a body at rest in free fall.
     """
     s, dt, still = pair.slave, jnp.asarray(course.dt), jnp.zeros((len(course.dt), 3))
     slow = (
@@ -310,7 +310,7 @@ def _slave_errors(pair: PairParameters, course: Course, key: Array) -> tuple[Arr
 
 
 def _records(pair: PairParameters, course: Course, seed: int, index: Array) -> Nav:
-    """What the master reports at each epoch, NaN where its record is lost."""
+    """Records of the master at each epoch, NaN where one is lost."""
     d, count, key = pair.disturbance, len(course.epoch_s), stream(seed, index, _MASTER)
     struck = outlier_factor(
         stream(seed, index, Component.FAULT), (count,), d.outlier_share, d.outlier_factor

@@ -3,7 +3,7 @@
 The model of a patent on transfer alignment (Southeast University), its eqs. (1) to (5), in its
 frames: navigation n east-north-up, body b right-forward-up, heading clockwise from north. The slave
 navigates with its vertical channel held (VU = 0, height as at the start); nothing is fed back, so
-its errors grow as the linear model says, as long as they are small. The state is
+its errors grow by the linear model, as long as they are small. The state is
 
     x = [dL, dlon, dVE, dVN, phi_E, phi_N, phi_U, nabla_x, nabla_y, eps_x, eps_y, eps_z]
 
@@ -59,7 +59,7 @@ STEEPEST_RAD = math.radians(85.0)
 
 
 class Flight(NamedTuple):
-    """How the slave flies."""
+    """Flight of the slave."""
 
     lat_rad: Array  # ()
     alt_m: Array  # ()
@@ -69,7 +69,7 @@ class Flight(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """What the motion is told of the time between two epochs."""
+    """Inputs of the motion between two epochs."""
 
     flight: Flight  # on average
     dt_s: Array  # ()
@@ -178,7 +178,7 @@ def euler_difference(slave_q_enu: ArrayLike, master_q_enu: ArrayLike) -> Float[A
 
 
 def refuse_steep(time_s: np.ndarray, q_nb: ArrayLike) -> None:
-    """Refuse attitudes (N, 4), NED/FRD, at which roll and heading are hard to tell apart.
+    """Refuse attitudes (N, 4), NED/FRD, at which roll and heading are hard to separate.
 
     Outside compiled code.
 
@@ -207,7 +207,7 @@ _Q, _V, _V_DOWN, _LAT, _ALT = slice(0, 4), slice(4, 7), 6, 7, 9  # places in the
 
 
 def start_with_error(start: Nav, error: ArrayLike) -> Nav:
-    """Where the slave believes it starts.
+    """Believed start of the slave.
 
     Args:
         start: the truth, NED/FRD.
@@ -241,7 +241,7 @@ def navigate(start: Nav, increments: Increments) -> tuple[Nav, Flight]:
         return x, x
 
     def average(x: Array) -> Array:
-        """Over blocks, of something given at both ends of each sample."""
+        """Mean over blocks of a quantity given at both ends of each sample."""
         middle = 0.5 * (x[1:] + x[:-1])
         return jnp.mean(middle.reshape(E, K, *x.shape[1:]), 1)
 
@@ -261,17 +261,16 @@ def navigate(start: Nav, increments: Increments) -> tuple[Nav, Flight]:
 
 
 def as_master_sees(own: Nav, flight: Flight, master: Nav) -> tuple[Flight, Float[Array, "e 3 3"]]:
-    """The slave's flight and attitudes with what the master reports in place of what is off.
-
-    A model linearised there errs less than one about the slave's own idea, whose attitude is off by
-    degrees. Each interval is turned and shifted by the difference at its end, so that the slave's
-    samples still say what happened within it.
+    """The slave's flight and attitudes, corrected by the reports of the master.  A model linearised
+    there errs less than one about the slave's own estimate, whose attitude is off by degrees. Each
+    interval is turned and shifted by the difference at its end, so that the motion within it is
+    still that of the slave's samples.
 
     Args:
         own: what the slave computes at each epoch.
         flight: over the intervals that end there, likewise.
         master: as reported at each epoch, of a box aligned with the slave's; NaN where missing, and
-            there the slave's own idea stands.
+            there the slave's own estimate stands.
 
     Returns:
         The flight over the intervals, and C from body RFU to ENU at the epochs.

@@ -5,10 +5,10 @@ twelve states of `velocity_attitude.model`, open loop. Scenarios disturb the mea
 outliers), the motion (gyro noise, a step of drift), both, or leave mounting angles that no state
 stands for.
 
-What filters are told is white noise of a variance at each time. The plain ones believe in the
+Filters assume white noise of a variance at each time. The plain ones believe in the
 stated noise of sensors and master; a slow drift of the gyros (`Slave`) they believe to walk.
 "told-r" also knows the variance of flexure and outliers, but not that flexure is correlated in
-time, for which a white R has no word. "told-q" also knows the gyro noise in its window, and that
+time, which a white R cannot express. "told-q" also knows the gyro noise in its window, and that
 from its step on the drift may walk, as far until the end as the step was large. The model is
 linearised about what the master reports.
 """
@@ -64,7 +64,7 @@ from robins.systems.transfer_alignment.velocity_attitude import model as va
 ARCMIN = units.parse("1 arcmin", "angle")
 ATTITUDE_ROWS = np.eye(va.STATES)[va.PHI] / ARCMIN  # L of the H-infinity filters
 
-# What Kalman filters are told of beside the stated noise.
+# Knowledge of the Kalman filters in addition to the stated noise.
 TOLD = {"kf": (), "kf-told-r": ("r",), "kf-told-q": ("q",), "kf-told-both": ("r", "q")}
 FIXED = {"hinf-fixed": 1.05, "hinf-fixed-3": 3.0}  # gamma over gamma_min
 ADAPTIVE: dict[str, dict[str, Any]] = {
@@ -74,13 +74,13 @@ ADAPTIVE: dict[str, dict[str, Any]] = {
     "hinf-patent-weights": {"weight": np.ones(va.STATES)},  # L = I, and R = I below
 }
 # Of the product model: closed loop, with states for the mounting. A scenario has the first by
-# itself; the others, one filter under two names, are the bank of seven that runs beside.
+# itself; the others, one filter under two names, are the bank of seven that runs in addition.
 PRODUCT = ("product", "adaptive", "product-adaptive")
 FILTERS = (*TOLD, *FIXED, *ADAPTIVE, *PRODUCT)
 
 
 class Informed(Parameters):
-    """What the told filters are told of, whether it happens or not."""
+    """Disturbances that the "told" filters assume, whether they happen or not."""
 
     flexure: Structure = pydantic.Field(default_factory=Structure)
     disturbance: Disturbance = pydantic.Field(default_factory=Disturbance)
@@ -113,7 +113,7 @@ class World(NamedTuple):
 
 @dataclass(frozen=True)
 class Course:
-    """What all runs share."""
+    """Data that all runs share."""
 
     given: VelocityAttitude
     pair: product.Course
@@ -183,11 +183,11 @@ def simulate(given: VelocityAttitude, course: Course, seed: int, index: Array) -
     )
 
 
-# --------------------------------------------------------------------------- what filters are told
+# ------------------------------------------------------------------------- assumptions of filters
 
 
 class Noise(NamedTuple):
-    """What a filter believes of the noise at each epoch, standard deviations."""
+    """Believed noise at each epoch, standard deviations."""
 
     process: Any  # (E, 12)
     velocity: Any  # (E, 2) m/s
@@ -197,8 +197,8 @@ class Noise(NamedTuple):
 def believed_noise(given: VelocityAttitude, name: str, epoch_s: np.ndarray) -> Noise:
     """The noise that a filter believes in: that of the data sheets, worst axis where axes differ.
 
-    One that is told "r" adds the variance of outliers in all measurements and of flexure in
-    attitude; one told "q" the gyro noise in its window, and a drift that walks from its step on.
+    A filter "told r" adds the variance of outliers in all measurements and of flexure in
+    attitude; one "told q" the gyro noise in its window, and a drift that walks from its step on.
     """
     s, m, told, d = given.slave, given.master, TOLD.get(name, ()), given.told.disturbance
     sigma = va.process_sigma(max(s.gyro_noise), max(s.accel_noise), 1.0 / m.rate)
@@ -241,7 +241,7 @@ def start_sigma(given: VelocityAttitude) -> np.ndarray:
 
 
 def _case(noise: Noise, sigma: Array, dt_s: Array, world: World) -> Case:
-    """What a filter of twelve states takes of a run; pure, and its numbers are data."""
+    """Case of a filter of twelve states in a run; pure, and its numbers are data."""
     count = world.error.shape[0]
     return Case(
         start=Belief(jnp.zeros(va.STATES), jnp.diag(sigma)),
@@ -272,7 +272,7 @@ def make_filter(name: str, gamma: float = math.inf) -> Filter:
 
 
 def contender(given: VelocityAttitude, course: Course, name: str) -> Contender:
-    """A filter of `FILTERS` with what it is told."""
+    """A filter of `FILTERS` with its assumptions."""
     if name in PRODUCT:
         return of_product(given, name)
     facts: dict[str, Any] = {}
@@ -292,7 +292,7 @@ def contender(given: VelocityAttitude, course: Course, name: str) -> Contender:
 def of_product(given: VelocityAttitude, name: str, believed: Believed | None = None) -> Contender:
     """A filter of the product model that reports as the others do.
 
-    It is told no more than the plain ones, unless it is said what it believes.
+    It has the assumptions of the plain ones, unless `believed` is given.
     """
     blocks = ("attitude", "velocity", "gyro_bias", "accel_bias")
     made = product_contender(given, name, believed, blocks=blocks, frame="ENU")
@@ -306,7 +306,7 @@ def _of_pair(case: Callable[[product.PairRun], Case], world: World) -> Case:
 
 
 def view(given: VelocityAttitude, course: Course) -> View:
-    """What is reported of every filter, errors being true minus estimated."""
+    """Report of every filter, errors being true minus estimated."""
     epoch_s, path = course.pair.epoch_s, course.pair.path
     roll, _, heading = (np.asarray(a) for a in to_euler(jnp.asarray(path.q_nb.wxyz)))
     return View(
@@ -372,10 +372,10 @@ _RATIOS = {
 }
 _TEXTS = {
     "beats-kf": "Under noise that is unknown and not Gaussian the adaptive H-infinity filter "
-    "aligns more accurately than a Kalman filter that is told of the stated noise alone (the "
+    "aligns more accurately than a Kalman filter that assumes the stated noise alone (the "
     "patent); value: ratio of their attitude RMS over all axes",
-    "kf-suffers": "Not told of the noise that is there, a Kalman filter loses accuracy (the "
-    "patent); value: its attitude RMS over that of one told of it",
+    "kf-suffers": "Without knowledge of the noise, a Kalman filter loses accuracy (the "
+    "patent); value: its attitude RMS over that of one that knows it",
     "beats-fixed": "A bound that adapts to the environment serves better than a fixed one (the "
     "patent), here 1.05 times the least there is; value: ratio of attitude RMS",
     "compensation": "Compensating P where the bound does not hold raises the accuracy (the "
