@@ -1,4 +1,4 @@
-"""How the numbers of the default filter of transfer alignment were chosen.
+"""Choice of the numbers of the default filter of transfer alignment.
 
     python benchmarks/alignment_choice.py [--runs 8] [--seed 100]
 

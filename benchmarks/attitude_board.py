@@ -85,7 +85,7 @@ class Trial(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What one estimator makes of a trial."""
+    """Result of one estimator on a trial."""
 
     total: float
     heading: float

@@ -1,4 +1,4 @@
-"""What the heading NEES of a trial would be if the filter were right, beside what it is.
+"""Heading NEES of a trial, against the one that it would have if the filter were right.
 
     python benchmarks/attitude_consistency.py --broad FOLDER --repoimu FOLDER
 

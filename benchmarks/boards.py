@@ -59,7 +59,7 @@ M7 = Board("Cortex-M7", "cortex-m7", "fpv5-d16", "mps2-an500")
 
 
 class Ran(NamedTuple):
-    """What a test of a library printed."""
+    """Figures printed by the test of a library."""
 
     said: str  # its line on codes and numbers
     bits: str  # checksum of the bits of all reals
@@ -68,14 +68,14 @@ class Ran(NamedTuple):
 
 
 class Built(NamedTuple):
-    """What a library takes on a board, in bytes."""
+    """Memory of a library on a board, in bytes."""
 
     flash: int  # code and constants of the library, without libm
     stack: int  # of its deepest entry point: sums of frames by -fstack-usage
 
 
 def missing() -> str:
-    """What is not here of all that is needed; nothing if all is."""
+    """Missing tools, in words; empty if all are here."""
     absent = [name for name in (GCC, QEMU) if shutil.which(name) is None]
     if not absent:
         told = [GCC, "-mcpu=cortex-m4", "-mthumb", "-print-file-name=rdimon.specs"]
@@ -121,7 +121,7 @@ def _ran(command: list[str]) -> Ran:
 
 
 def apart(one: Ran, other: Ran) -> str:
-    """How far the numbers of two runs are apart, in parts of a field."""
+    """Largest difference of the numbers of two runs, in parts of a field."""
     if one.bits == other.bits:
         return "to the bit"
     a, b = one.reals, other.reals

@@ -1,4 +1,4 @@
-"""How XLA's settings trade the time to compile a campaign for the time it then takes.
+"""Settings of XLA: the time to compile a campaign against the time that it then takes.
 
 For each system a batch of runs of one filter, in a process of its own for each setting; processor
 time, so that other work on the machine counts little. Ratios are to XLA's own settings; below one

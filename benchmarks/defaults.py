@@ -67,7 +67,7 @@ SCALES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 
 
 class Score(NamedTuple):
-    """Of a filter on the runs of a scenario."""
+    """Figures of a filter on the runs of a scenario."""
 
     error: float  # RMS length, display unit
     nees: float  # of a component
@@ -267,7 +267,7 @@ class Kept:
 
 
 def score(problem: Problem, name: str, block: str, batches: list[tuple[Any, int]]) -> Score:
-    """Of one filter on worlds that all filters share."""
+    """Figures of one filter on worlds that all filters share."""
     where = next(b for b in problem.blocks if b.name == block)
     at = slice(problem.count_from, problem.count_to)
     square: list[float] = []

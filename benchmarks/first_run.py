@@ -19,7 +19,7 @@ COMPILED, FOUND = "Finished XLA compilation of", "Persistent compilation cache h
 
 
 class Spent(NamedTuple):
-    """What a process took."""
+    """Time and memory of a process."""
 
     wall_s: float
     processor_s: float

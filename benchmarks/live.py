@@ -1,4 +1,4 @@
-"""What an answer of the live objects costs: every sample of a made log, pushed one by one.
+"""Time of an answer of the live objects: every sample of a made log, pushed one by one.
 
 The sample in the middle, the mean, and the slowest of a hundred, after the start, in wall time and,
 in brackets, in time of all processors, which other programs disturb less; samples at the end of a

@@ -22,7 +22,7 @@ from robins.workbench.scenarios import read_scenario
 
 
 def nodes(scenario: str, name: str) -> dict[str, int]:
-    """By entry point, how many nodes its program has."""
+    """Numbers of nodes of the programs, by entry point."""
     problem = read_scenario(scenario, ("runs=1",)).problem((name,), 1)
     contender = problem.contenders[name]
     run = board_runs(problem, name, 1)[0]

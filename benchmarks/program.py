@@ -185,7 +185,7 @@ class Pools(NamedTuple):
 
     @classmethod
     def of(cls, tree: Any, runs: int, lead: int = 0) -> "Pools":
-        """Those of some runs, where so many axes come before that of runs."""
+        """Arrays of some runs, where so many axes come before that of runs."""
         found = []
         for leaf in map(np.asarray, jax.tree.leaves(tree)):
             x = np.moveaxis(leaf, lead, -1)[..., :runs]
@@ -200,7 +200,7 @@ class Pools(NamedTuple):
 
 
 def lanes_here() -> int:
-    """How many runs at a time the processor takes."""
+    """Number of runs that the processor takes at a time."""
     text = header("lanes.h") + 'extern "C" int lanes(void) { return LANES; }\n'
     return ctypes.CDLL(str(build(text, LANE_FLAGS, CPP))).lanes()
 

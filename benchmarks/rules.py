@@ -1,4 +1,4 @@
-"""What each rule adds to one step of a 9-state filter, timed in turns with the bare filter."""
+"""Time that each rule adds to a step of a 9-state filter, taken in turns with the bare filter."""
 
 import time
 

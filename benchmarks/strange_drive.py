@@ -82,7 +82,7 @@ OFF_M = (0.5, 8.0)
 
 
 class Told(NamedTuple):
-    """What only the simulation knows of the fixes of a run."""
+    """Truth of the fixes of a run, known to the simulation alone."""
 
     error_m: np.ndarray  # (M, 3) north, east, down
     sigma_m: np.ndarray  # (3,) true

@@ -1,4 +1,4 @@
-"""What the default filters find wrong, against what the scenarios do.
+"""Suspects of the default filters, against the faults of the scenarios.
 
     python benchmarks/suspects.py [SYSTEM/SCENARIO ...] [--runs 20] [--seed 0] [--out table.md]
 

@@ -38,7 +38,7 @@ SMOOTHED = "from robins.systems.ins_gnss.log import NAMES; print(*NAMES, sep=','
 
 
 def commands(python: list[str], source: Path) -> dict[str, list[str]]:
-    """By the name of their folder the command lines to compare."""
+    """Command lines to compare, by the name of their folder."""
     listed = subprocess.run([*python, "list"], capture_output=True, text=True, check=True).stdout
     found = {
         name.replace("/", "-"): ["run", name, "--runs", "2"] for name in LISTED.findall(listed)

@@ -1,4 +1,4 @@
-"""What the tests and the promised commands cost, and their ceilings, as tables for people."""
+"""Costs of the tests and the promised commands, and their ceilings, as tables."""
 
 import sys
 from pathlib import Path

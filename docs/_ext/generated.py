@@ -1,4 +1,4 @@
-"""What the tables of the documents share: Markdown, and files that pages include."""
+"""Common parts of the tables of the documents: Markdown, and files that pages include."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path

@@ -28,7 +28,7 @@ from robins.systems.judgement import Claim, ratio
 
 
 class Balloon(Scenario):
-    """What a scenario may say; everything has a unit and a default."""
+    """Parameters of a scenario; everything has a unit and a default."""
 
     title: str = "A balloon climbs"
     duration: Annotated[float, Quantity("time", above="0 s")] = default("300 s")
@@ -42,7 +42,7 @@ class Balloon(Scenario):
 
 
 class Course(NamedTuple):
-    """What all runs share."""
+    """Data that all runs share."""
 
     epoch_s: np.ndarray  # (E,)
     F: np.ndarray  # (2, 2)
@@ -91,14 +91,14 @@ def read(x, aux):
 
 def contender(given: Balloon, course: Course, name: str) -> Contender:
     """A filter with the model it believes in: it knows nothing of outliers."""
-    # with its numbers as data a model with others is not compiled anew
+    # with its numbers as data a model with others is not compiled again
     moves = Motion(Partial(climb, course.F), jnp.asarray(course.L))
     barometer = Sensor(read, jnp.array([given.barometer]), name="barometer")
     return Contender(kalman(rules=FILTERS[name]), Model(moves, (barometer,)))
 
 
 def view(given: Balloon, course: Course) -> View:
-    """What is reported of every filter."""
+    """Report of every filter."""
     height = StateBlock("height", slice(0, 1), "m", "m", "up", ("height",))
     climb = StateBlock("climb", slice(1, 2), "m/s", "m/s", "up", ("climb rate",))
     return View(course.epoch_s, (height, climb), {"barometer": SensorAxes("m", "up", ("height",))})

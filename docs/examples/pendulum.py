@@ -41,7 +41,7 @@ WIRE = Wire(
 
 
 class Pendulum(Parameters):
-    """What a scenario may say."""
+    """Parameters of a scenario."""
 
     duration: Annotated[float, Quantity("time", above="0 s")] = default("20 s")
     step: Annotated[float, Quantity("time", above="0 s")] = default("20 ms")

@@ -1,4 +1,4 @@
-"""What each slip in an error model of large misalignments costs, against two mechanisations.
+"""Cost of each slip in an error model of large misalignments, against two mechanisations.
 
 python docs/studies/airship_error_model.py
 

@@ -19,7 +19,7 @@ S_TURN = ("a", "b", "c", "d", "e")  # all axes
 
 
 def summary_of(name: str) -> dict:
-    """What a scenario finds."""
+    """Results of a scenario."""
     return plain(run(f"transfer-alignment/{name}").summary)
 
 

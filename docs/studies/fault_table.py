@@ -145,7 +145,7 @@ def world(seed: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
 
 def faults() -> dict:
-    """By row of the table: the change of (truth, readings, start), and of what is believed."""
+    """Changes of (truth, readings, start), and of the beliefs, by row of the table."""
     span, t = slice(HALF, HALF + 40), np.arange(STEPS)[:, None]
 
     def of(sensor, change, **believed):

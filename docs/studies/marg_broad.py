@@ -111,7 +111,7 @@ def from_the_midst(log: Dataset) -> Dataset:
 
 
 def changes() -> Iterator[tuple[str, Callable[[Dataset, int], Dataset]]]:
-    """What is done to the trials, by name."""
+    """Changes of the trials, by name."""
     for size in (4.0, 8.0, 20.0, 100.0):
         yield (
             f"magnet of {size:g} uT",

@@ -1,4 +1,4 @@
-"""One filter against flexure, outliers, gyro noise and drift, told of none of them.
+"""One filter against flexure, outliers, gyro noise and drift, without knowledge of them.
 
     python docs/studies/robust_alignment.py [--runs 100] [--seed 0]
 
@@ -8,8 +8,8 @@ are printed, pooled over the runs from 30 s on, of
 
 - Kalman filters of the patent's twelve states, open loop, plain and told of the trouble: "told R"
   of that in B, "told Q" of that in C, "told both";
-- filters of the product model, closed loop, that are told of nothing, with unknown mounting;
-- an informed product filter, which is told what happens, how strong it is and when: flexure states
+- filters of the product model, closed loop, without knowledge of any, with unknown mounting;
+- an informed product filter, which is given what happens, how strong it is and when: flexure states
   only where there is flexure, the gyro noise in its window, the drift at its step, Huber's rule
   where there are outliers.
 

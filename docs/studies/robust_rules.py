@@ -47,7 +47,7 @@ def moved(rng: np.random.Generator) -> np.ndarray:
 
 
 def faults(rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """By name the fault (RUNS, STEPS, 2), in standard deviations of the noise."""
+    """Faults (RUNS, STEPS, 2) by name, in standard deviations of the noise."""
 
     def towards(count: int) -> np.ndarray:
         """Directions: one for a run, or one for each measurement."""

@@ -32,7 +32,7 @@ KINDS = {  # what a sentence has, and the words of the table
     "beyond 3 sigma, before": "far off",
     "differed by more than": "local filters differ",
 }
-# Nothing fails, and the world is drawn from what the best informed filter is told.
+# Nothing fails, and the world is drawn from the assumptions of the best informed filter.
 NOMINAL = [
     "ins-gnss/drive",
     *(f"transfer-alignment/{name}" for name in ("a", "aircraft", "ship", "vehicle", "s1")),
@@ -91,7 +91,7 @@ def shortened(sentence):
 
 
 def reason(*of):
-    """Why a warning is true, as far as it is known."""
+    """Reason why a warning is true, as far as it is known."""
     fits = (why for key, why in REASONS.items() if all(map(fnmatchcase, of, key)))
     return next(fits, "**not explained**")
 

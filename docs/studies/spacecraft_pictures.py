@@ -36,7 +36,7 @@ AXES = np.column_stack([np.eye(3), np.full(3, DIAGONAL)])
 
 
 def one_orbit() -> dict[str, np.ndarray]:
-    """Pointing down with a roll from side to side, begun 10 deg off with wheels that spin."""
+    """Pointing down with a roll from side to side, started 10 deg off with wheels that spin."""
     craft = spacecraft(INERTIA, AXES, 5e-3, 0.1, 5.0, [0.05, -0.03, 0.04])
     gains, pinv = controller(INERTIA), jnp.asarray(allocation_matrix(AXES))
     time = DT * np.arange(COUNT)

@@ -1,4 +1,4 @@
-"""What a star camera can tell: attitude against its bound, and stars named rightly or not at all.
+"""Accuracy of a star camera: attitude against its bound, and stars named rightly or not at all.
 
 python docs/studies/star_attitude.py [--pointings 1000] [--pictures]
 
@@ -51,7 +51,7 @@ class Batch(NamedTuple):
 
 
 def images(stars: Stars, camera: StarCamera, count: int, seed: int) -> Batch:
-    """Of a camera whose axes are the body's."""
+    """Images of a camera whose axes are the body's, with the true attitudes."""
     true = Rotation.random(count, rng=np.random.default_rng(seed))
     keys = jax.vmap(lambda run: stream(seed, run, Component.STAR_SENSOR))(jnp.arange(count))
     q = jnp.asarray(true.as_quat(scalar_first=True))
@@ -62,7 +62,7 @@ def images(stars: Stars, camera: StarCamera, count: int, seed: int) -> Batch:
 
 
 def attitudes(image: StarImage, stars: Stars) -> dict:
-    """What each method makes of images whose stars are known."""
+    """Results of each method on images whose stars are known."""
     weight = jnp.asarray(np.where(image.star >= 0, 1.0 / image.sigma_rad**2, 0.0))
     given = jnp.asarray(image.vectors_b), jnp.asarray(stars.unit_i[image.star]), weight
     return {name: jax.jit(method)(*given) for name, method in METHODS.items()}
@@ -98,7 +98,7 @@ def rms_of_worst(one: Rotation, q: np.ndarray) -> float:
 
 
 class Tally(NamedTuple):
-    """What became of many images."""
+    """Counts and times of the identification of many images."""
 
     named: int  # images with names
     wrong: int  # images with a wrong name

@@ -1,4 +1,4 @@
-"""Who follows a true change without following outliers? Seven filters, four kinds of data.
+"""Comparison of filters on true changes and on outliers: seven filters, four kinds of data.
 
     python docs/studies/strong_tracking_table.py [--runs 200] [--seed 1]
 

@@ -1,4 +1,4 @@
-"""What mixed designs cost: by LMI, retuned, by Riccati equation, in closed form and by search.
+"""Cost of mixed designs: by LMI, retuned, by Riccati equation, in closed form and by search.
 
 python docs/studies/synthesis_tables.py
 
@@ -78,7 +78,7 @@ def letter(rate_rad_s: float, step_s: float, ss: float = 0.5) -> Plant:
 
 
 def infeasible() -> None:
-    """What Clarabel says of the full-order LMI where it has no solution; robins does not ask it."""
+    """Print the answers of Clarabel to full-order LMIs that have no solution."""
     print(
         "\nFull order for a quaternion, gamma 3: rho(A), R >= this, the solver's status, sqrt(cost)"
     )

@@ -45,7 +45,7 @@ G = 0.03 * jnp.kron(jnp.array([[0.5], [1.0]]), jnp.eye(2))
 
 
 def probability(k: float) -> float:
-    """That the two components of a measurement are within k standard deviations."""
+    """Probability that both components of a measurement are within k standard deviations."""
     return -math.expm1(-0.5 * k**2)
 
 

@@ -81,7 +81,7 @@ def of(unit: str, P0: str) -> Row:
 
 
 def weighted(unit: str) -> Row:
-    """R = (1 arcmin)^2, L the attitude, gamma an angle: told in a unit."""
+    """R = (1 arcmin)^2, L the attitude, gamma an angle: given in a unit."""
     per_rad = float(units.from_si(1.0, unit))
     noise, gamma = S0.master.attitude_noise * per_rad, WEIGHTED_ARCMIN * ARCMIN * per_rad
     return Row(ATTITUDE_ONLY, physical().in_unit(unit), noise, gamma, per_rad)

@@ -1,4 +1,4 @@
-"""What an H-infinity filter guarantees, found without its Riccati equation.
+"""Guarantee of an H-infinity filter, found without its Riccati equation.
 
 python docs/studies/worst_case_gain.py [picture]
 

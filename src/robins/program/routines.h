@@ -31,7 +31,7 @@ static inline whole whole_sign(whole a)
 
 static inline flag real_is_finite(real a) { return real_le(real_abs(a), REAL(DBL_MAX)); }
 
-/* The total order of numbers: -0 before 0 is not told apart here, NaN comes last. */
+/* The total order of numbers: -0 and 0 are not distinguished here, NaN comes last. */
 static inline flag real_lt_to(real a, real b)
 {
     return real_lt(a, b) | (real_ne(b, b) & real_eq(a, a));
@@ -39,7 +39,7 @@ static inline flag real_lt_to(real a, real b)
 
 static inline flag real_le_to(real a, real b) { return real_le(a, b) | real_ne(b, b); }
 
-/* Sine and cosine of any angle, by `real_turned`, in whose file they are said to err how far. */
+/* Sine and cosine of any angle, by `real_turned`, in whose file their errors are stated. */
 static inline real real_sin(real x)
 {
     real s, c;
@@ -286,7 +286,7 @@ static inline void reflect(int m, int n, int columns, int k, int j, real g, cons
 
 /* R (width, n) of the QR of a matrix (m, n), by reflections I + g v v', v = (alpha - beta, tail),
    g = -1 / (beta (beta - alpha)); the signs are LAPACK's. R is made in the place of the matrix,
-   with the v in its lower triangle and its diagonal beside it. */
+   with the v in its lower triangle and its diagonal separately. */
 static inline void triangle(int m, int n, int width, real *in, real *r)
 {
     const int last = m - 1 < n ? m - 1 : n;
@@ -352,7 +352,7 @@ static inline void eigh(int n, real *in, real *out)
         for (int p = 0; p < n; ++p) {
             for (int q = p + 1; q < n; ++q) {
                 const real apq = in[p * n + q], app = in[p * n + p], aqq = in[q * n + q];
-                /* What is lost beside both of its neighbours on the diagonal is zero. */
+                /* What is lost against both of its neighbours on the diagonal is zero. */
                 const flag small = real_eq(real_abs(app) + real_abs(apq) * 0.01, real_abs(app))
                                    & real_eq(real_abs(aqq) + real_abs(apq) * 0.01, real_abs(aqq));
                 const flag none = small | real_eq(apq, REAL(0.0));

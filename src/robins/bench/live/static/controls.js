@@ -1,4 +1,4 @@
-// What the page asks of the bench.
+// Commands of the page to the bench.
 
 import { say } from "./format.js";
 
@@ -12,7 +12,7 @@ const form = document.getElementById("inject");
 let before = "";
 let times = 0;
 
-/** Say what became of a command; what is said again and again is counted. */
+/** Show the outcome of a command; repeated ones are counted. */
 export function told(text, good) {
   times = text === before ? times + 1 : 1;
   before = text;
@@ -34,7 +34,7 @@ export function allow(open, state) {
   form.querySelector("[type=submit]").setAttribute("aria-disabled", String(off.clear || form.classList.contains("none")));
 }
 
-/** Join the buttons with what sends a command; gives what sends another and says if that fails. */
+/** Join the buttons with what sends a command; gives a function that sends another, and reports a failure. */
 export function wire(send) {
   const press = (command) => {
     if (!send(command)) told("not sent: the page has no server now", false);

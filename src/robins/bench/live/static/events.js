@@ -5,11 +5,11 @@ import { clock, count, element, say, seconds } from "./format.js";
 const byId = (id) => document.getElementById(id);
 const MOST = 200;
 
-/** What was said, and how often. */
+/** Events, and how often each came. */
 const words = ({ text, count: times }) => (times > 1 ? `${text}  ×${count(times)}` : text);
 
 export class EventList {
-  /** `go(event)` shows its time; `acknowledge(ids)` is asked for; `changed()` says that it is another list. */
+  /** `go(event)` shows its time; `acknowledge(ids)` is requested; `changed()` says that it is another list. */
   constructor({ go, acknowledge, changed }) {
     this.list = byId("events");
     this.lines = new Map(); // by id, the oldest first
@@ -31,12 +31,12 @@ export class EventList {
     return [...this.lines.values()].map((one) => one.event);
   }
 
-  /** Alarms that nobody has acknowledged. */
+  /** Alarms that are not acknowledged. */
   get waiting() {
     return this.all.filter((one) => one.level === "alarm" && !one.acknowledged);
   }
 
-  /** Begin anew with what is known. */
+  /** Start again with what is known. */
   show(events) {
     this.list.replaceChildren();
     this.lines.clear();

@@ -1,9 +1,9 @@
-// The websocket: connects, connects again, tells what came.
+// The websocket: connects, connects again, passes on what came.
 
 const FIRST_WAIT_MS = 100;
 const LONGEST_WAIT_MS = 1000;
 const CONNECT_MS = 3000;
-const SILENT_MS = 1700; // the server is heard twice a second
+const SILENT_MS = 1700; // the server sends twice a second
 
 export class Feed {
   /** `told(message)` for texts, `sampled(DataView)` for samples, `changed(open)` for the line. */

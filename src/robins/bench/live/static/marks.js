@@ -32,7 +32,7 @@ export function drawBands({ ctx, bbox }, span, spans, now, colours, named) {
   ctx.restore();
 }
 
-/** A line at each event; that which was asked for is whole and bold. */
+/** A line at each event; the selected one is whole and bold. */
 export function drawEvents({ ctx, bbox }, span, events, chosen, colours) {
   ctx.save();
   for (const { time_s: time, level, id } of events) {

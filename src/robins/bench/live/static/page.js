@@ -41,8 +41,8 @@ let pointed = false; // the cursor is elsewhere
 let cursor = null; // time at it
 let due = 0; // when the next picture of new samples is
 let rested = 0;
-let status = null; // the latest that the bench said of itself
-let chosen = null; // the event that was asked for
+let status = null; // the latest status of the bench
+let chosen = null; // the event that was selected
 
 const redraw = () => (dirty = true);
 const timeline = new Timeline(redraw);
@@ -91,7 +91,7 @@ function arrange() {
 
 function hello(message) {
   bench.hellos++;
-  if (!message.bench && bench.run !== null) return; // a server that came anew; the bench is to speak
+  if (!message.bench && bench.run !== null) return; // a restarted server; wait for the bench
   const anew = message.run !== bench.run || JSON.stringify(message.signals) !== signals;
   if (anew && message.bench) {
     bench.run = message.run;

@@ -1,4 +1,4 @@
-// Everything beside the plots but the events: clock, links, commands to the parts, faults, counts.
+// Everything next to the plots but the events: clock, links, commands to the parts, faults, counts.
 
 import { clock as timeOf, count, element, number, say, seconds } from "./format.js";
 
@@ -109,7 +109,7 @@ function showCounts(counts = {}) {
   );
 }
 
-/** The latest that the bench said of itself. */
+/** The latest status of the bench. */
 export function showStatus(status) {
   const given = status ?? {};
   showDeadlines(given.deadlines, given.clock);
@@ -122,7 +122,7 @@ export function showStatus(status) {
   document.body.dataset.bench = state;
 }
 
-/** What can be said to the parts, a button each; none, no section. */
+/** Operator messages, a button each; none, no section. */
 export function offerSays(says) {
   const buttons = says.map((label) => {
     const button = element("button", "small", label);

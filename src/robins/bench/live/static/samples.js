@@ -48,7 +48,7 @@ export class Samples {
     return firstFrom(this.time, this.length, time);
   }
 
-  /** What is to be drawn of a span of time, and one sample beside it on each side. */
+  /** What is to be drawn of a span of time, and one sample more on each side. */
   slice(from, to) {
     const { past } = this;
     const begin = this.from(from);
@@ -64,7 +64,7 @@ export class Samples {
     return new Slice(parts);
   }
 
-  /** A signal at a time, or what was said of it last; NaN where it is not known. */
+  /** A signal at a time, or its last value; NaN where it is not known. */
   valueAt(k, time) {
     const column = this.values[k];
     if (this.length && time >= this.time[0]) {

@@ -1,7 +1,7 @@
 // The span of time that the plots show: the latest of the run, or one that is held.
 
 const SHORTEST = 0.5; // s
-const LEAST_WHOLE = 10; // s: a run that has just begun fills not all
+const LEAST_WHOLE = 10; // s: a run that has just started does not fill all
 
 export class Timeline {
   /** `changed()` is called when another span is to be drawn. */

@@ -6,7 +6,7 @@
  *
  * the second in that folder, with this file and its neighbours in it. It does what the part "adm"
  * does: predicts with the gyro, updates with the star sensor, reports. A sample of the gyro stands
- * for one step more; then nobody knows how the craft turns, and the filter begins anew with the next
+ * for one step more; then the rate is not known, and the filter starts again with the next
  * star frame after the gyro is back. */
 #include <math.h>
 
@@ -17,16 +17,16 @@
 #ifndef STAR_STEPS
 #define STAR_STEPS 5u /* between two frames of the star sensor */
 #endif
-#define SILENT_STEPS (4u * STAR_STEPS) /* after which it is said to be silent */
+#define SILENT_STEPS (4u * STAR_STEPS) /* after which it counts as silent */
 #define UNIT 1e-3 /* that the length of a quaternion may be off by */
 #define LIMIT 27.906455492522596 /* of the squared innovation: chi-square of 3 at 0.9999962 */
 
 enum { USED = 1, REFUSED = 2, HELD = 4, SAFE = 8, SILENT = 16, SHORT = 32 }; /* of the estimate */
 
 static robins_state filter;
-static robins_predict_input turn; /* of the last step that the gyro told */
+static robins_predict_input turn; /* of the last step with a sample of the gyro */
 static uint32_t gyro_age, since_star;
-static int lost; /* waits for a star frame to begin anew */
+static int lost; /* waits for a star frame to start again */
 
 static robins_gyro gyro; /* what came, and the ends of its steps */
 static robins_star star;
@@ -60,7 +60,7 @@ static int predicts(uint64_t time_ns) {
   gyro_age = came ? 0 : gyro_age + 1;
   lost |= gyro_age > 1;
   lost |= !next && time_ns > step_ns; /* it was without power until now */
-  if (reset_ns == time_ns - step_ns) robins_init(&filter), lost = 1; /* said after the step before */
+  if (reset_ns == time_ns - step_ns) robins_init(&filter), lost = 1; /* sent after the step before */
   if (!lost) robins_predict(&filter, &turn, &moved);
   return came ? 0 : HELD;
 }

@@ -1,9 +1,9 @@
 /* The loop of a part of the test bench, see docs/wire.md. A part defines PART, its number, then
  * includes this file, and has the four functions below.
  *
- * It says hello until the bench answers with begin. A tick asks for a step, done tells that all of its
+ * It sends hello until the bench answers with begin. A tick requests a step, done tells that all of its
  * answer has been sent; a tick that comes again, since an answer was lost, has the same answer again.
- * After stop, or a begin of another run, all begins anew. */
+ * After stop, or a begin of another run, all starts again. */
 #include "platform.h"
 
 static void begin_anew(void); /* a run begins */

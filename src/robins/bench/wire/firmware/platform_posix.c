@@ -6,7 +6,7 @@
  * A PC does not turn, so its gyro is a perfect one on a simulated rate table: the sample is the turn
  * between the attitudes of the table at both ends of the step. In the first step of a run, and where
  * no attitude came, it is NaN; the next sample then has the turn of all that was left out, as that of
- * a gyro that adds up. For a board, write these functions anew: its UART, timer and sensor. */
+ * a gyro that adds up. For a board, write these functions again: its UART, timer and sensor. */
 #define _XOPEN_SOURCE 600
 #define _DEFAULT_SOURCE /* speeds above 38400 baud */
 #define _DARWIN_C_SOURCE
