@@ -28,14 +28,16 @@ time of a step, so that they do not depend on how often fixes come.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
+from robins.earth import Geodetic
 from robins.filters import Belief, Filter, Model, Motion, Rule, Sensor, kalman, taylor
 from robins.filters.composite.bank import EVERY, Row, bank, louder, stacked, transitions
 from robins.filters.composite.imm import Mode
@@ -156,29 +158,30 @@ def navigation(x: Any) -> InsState:
     return x.ins if isinstance(x, Wide) else x
 
 
-def _left(lasting: Array | None, u: Block) -> Any:
-    """The share of z that a step leaves; 0 where there is none."""
-    return 0.0 if lasting is None else jnp.exp(-jnp.sum(u.increments.dt) / lasting[1])
-
-
-def _moved(of: Hypothesis, left: Any, x: Wide) -> Wide:
+def _moved(of: Hypothesis, x: Wide) -> Wide:
     place = x.ins.position.retract(of.taken * x.offset)
-    z = None if x.lasting is None else left * x.lasting
-    return x._replace(ins=x.ins._replace(position=place), lasting=z, offset=of.kept * x.offset)
+    return x._replace(ins=x.ins._replace(position=place), offset=of.kept * x.offset)
+
+
+def _faded(lasting: Array | None, x: Wide, u: Block) -> tuple[Wide, Array | None]:
+    """The state with what a step leaves of z, and the share that it leaves."""
+    if lasting is None or x.lasting is None:
+        return x, None
+    left = jnp.exp(-jnp.sum(u.increments.dt) / lasting[1])
+    return x._replace(lasting=left * x.lasting), left
 
 
 def _step(motion: Motion, of: Hypothesis, lasting: Array | None, x: Wide, u: Block) -> Wide:
-    x = _moved(of, _left(lasting, u), x)
+    x, _ = _faded(lasting, _moved(of, x), u)
     return x._replace(ins=motion.step(x.ins, u))
 
 
 def _step_linear(motion: Motion, of: Hypothesis, lasting: Array | None, x: Wide, u: Block):
     assert motion.linear is not None
-    left = _left(lasting, u)
-    x = _moved(of, left, x)
+    x, left = _faded(lasting, _moved(of, x), u)
     ins, Phi, factor = motion.linear(x.ins, u)
     factor = jnp.sqrt(of.scale) * factor
-    if x.lasting is not None:
+    if left is not None:
         Phi = block_diagonal(Phi, left * jnp.eye(3))
         factor = block_diagonal(factor, jnp.sqrt(1.0 - left**2) * jnp.eye(3))
     free = 0 if x.share is None else 1
@@ -195,21 +198,21 @@ def _read(read: Any, x: Wide, aux: Any):
     return read(x.ins, aux)
 
 
-def _read_off(read: Any, off: Any, x: Wide, aux: Any):
-    return read(x.ins, aux).retract(off * x.offset)
+def _read_off(read: Callable[..., Geodetic], off: ArrayLike, x: Wide, aux: Fix):
+    return read(x.ins, aux).retract(jnp.asarray(off) * x.offset)
 
 
-def _read_lasting(read: Any, off: Any, lasting: Array, x: Wide, fix: Fix):
+def _read_lasting(read: Callable[..., Geodetic], off: ArrayLike, lasting: Array, x: Wide, fix: Fix):
     assert x.lasting is not None
     error = jnp.sqrt(lasting[0]) * jnp.asarray(fix.sigma) * x.lasting
-    return read(x.ins, fix).retract(off * x.offset + error)
+    return read(x.ins, fix).retract(jnp.asarray(off) * x.offset + error)
 
 
-def _white(sigma: Any, lasting: Array, x: Wide, fix: Fix):
+def _white(sigma: Callable[..., Array], lasting: Array, x: Wide, fix: Fix):
     return jnp.sqrt(1.0 - lasting[0]) * sigma(x.ins, fix)
 
 
-def _aged(fix: Velocity, share: Any) -> Velocity:
+def _aged(fix: Velocity, share: ArrayLike) -> Velocity:
     gained, age = share * jnp.asarray(fix.gained_b), share * jnp.asarray(fix.age_s)
     return fix._replace(gained_b=gained, age_s=age)
 
