@@ -10,6 +10,7 @@ decimals were lost, and the stamp is the middle of its rows.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import TypeVar
 
 import numpy as np
@@ -22,7 +23,9 @@ _SHARED = 0.05  # share of rows with the stamp of the row before
 _BURST = 0.3  # share of rows that follow the row before much faster than the mean
 _FAST = 8.0  # how much faster that is
 _BLOCK = 64  # rows over which the mean is taken, so that gaps do not count
-_GAP = 1.5  # usual intervals of a row: where more have passed, batches are missing
+_LOST = 0.75  # of the time between batches, more than there should be: one was lost
+_AROUND = 15  # batches to either side over which stamps are averaged
+_ENOUGH = 8  # batches that tell the rate
 _VALUES = {ImuTable: ("gyro", "accel"), MagTable: ("field_t",), AttitudeTable: ("q_nb",)}
 AnyTable = TypeVar("AnyTable", bound=Table)
 
@@ -56,25 +59,46 @@ def resolution_ns(time_ns: np.ndarray) -> int:
 
 
 def spread(table: AnyTable) -> AnyTable:
-    """The table with the rows of each batch spread evenly; itself where there are no batches."""
+    """The table with the rows of each batch spread evenly; itself where there are no batches.
+
+    Between lost batches the rate is that of rows over time, and times follow the stamps in the mean
+    of some batches: one stamp is late, or rounded, by up to a batch.
+    """
     first = batches_of(table)
     if first is None:
         return table
-    sizes = np.diff(np.append(first, len(table)))
-    stamps = table.time_ns[first + sizes - 1]
-    apart = np.diff(stamps)
-    each = apart / sizes[1:]
-    usual = float(np.median(each))
-    each = np.append(usual, np.where((each > 0.0) & (each < _GAP * usual), each, usual))
-    rounded = resolution_ns(stamps)
-    decimals = 2 * rounded > np.median(apart) and str(rounded).strip("0") == "1"
-    late = (rounded - each) / 2.0 if decimals else np.zeros(len(each))
-    if decimals:  # the recording ended within the last one
-        late[-1] -= max(rounded - sizes[-1] * each[-1], 0.0)
-    behind = np.repeat(first + sizes - 1, sizes) - np.arange(len(table))
-    since = np.repeat(stamps - stamps[0], sizes) + np.repeat(late, sizes)
-    time_ns = np.rint(since - behind * np.repeat(each, sizes)).astype(np.int64) + stamps[0]
-    return dataclasses.replace(table, time_ns=time_ns)
+    sizes = np.diff(first, append=len(table))
+    last = first + sizes - 1
+    begin = int(table.time_ns[last[0]])
+    since = table.time_ns[last] - begin
+    apart = np.diff(since)
+    batch = np.median(apart)
+    behind = apart - sizes[1:] * np.median(apart / sizes[1:])
+    behind[-1] -= batch  # the recording may end within a batch
+    broken = (behind > _LOST * batch) | (apart < 0)
+    whole = ~broken
+    usual = float(apart[whole].sum() / sizes[1:][whole].sum()) if whole.any() else float(batch)
+    rounded = resolution_ns(since)
+    decimals = 2 * rounded > batch and str(rounded).strip("0") == "1"
+    late = 0.5 * (rounded - usual) if decimals else 0.0
+    times = np.empty(len(table))
+    bounds = [0, *(np.flatnonzero(broken) + 1).tolist(), len(first)]
+    for a, b in itertools.pairwise(bounds):
+        # Of a batch that is not whole the decimals tell nothing.
+        known = slice(a, b - 1 if decimals and b - a > 1 else b)
+        row = np.arange(first[a], last[b - 1] + 1)
+        times[row] = _even(row, last[known], since[known].astype(float), usual)
+    return dataclasses.replace(table, time_ns=np.rint(times + late).astype(np.int64) + begin)
+
+
+def _even(row: np.ndarray, at: np.ndarray, since: np.ndarray, usual: float) -> np.ndarray:
+    """Times of rows by the stamps of some of them, at a rate that hardly changes."""
+    x = at - at.mean()
+    each = float(x @ since / (x @ x)) if len(at) >= _ENOUGH else usual
+    rest = np.concatenate([[0.0], np.cumsum(since - each * at)])
+    k = np.arange(len(at))
+    low, high = np.maximum(k - _AROUND, 0), np.minimum(k + _AROUND + 1, len(at))
+    return each * row + np.interp(row, at, (rest[high] - rest[low]) / (high - low))
 
 
 def spread_counts(kind: str, table: AnyTable, even: AnyTable) -> dict[str, int]:

@@ -21,7 +21,7 @@ from robins.ins.plausible import (
     is_near,
     rate_across,
 )
-from robins.logs.findings import Finding
+from robins.logs.findings import Finding, Value
 from robins.logs.quiet import (
     Signal,
     Windows,
@@ -35,6 +35,7 @@ from robins.logs.quiet import (
     windows_of,
 )
 
+_LIVELY = 5.0  # times gravity: more than vehicles feel but for moments
 _GRAVITY = (9.7, 9.9)  # m/s^2, every place where people live
 
 
@@ -122,7 +123,13 @@ def _rates_for_increments(imu: ImuTable, step_s: float) -> Iterator[tuple[str, s
 def _increments_for_rates(
     imu: ImuTable, step_s: float, measured: float
 ) -> Iterator[tuple[str, str]]:
-    """Increments taken for rates: gravity shows as what it adds up to over one step."""
+    """Increments taken for rates: gravity shows as what it adds up to over one step.
+
+    So does a bias that is left where gravity was taken off, but then the motion is far larger.
+    """
+    moving = np.nanpercentile(np.linalg.norm(imu.accel, axis=1), 99.0)
+    if moving > _LIVELY * measured:
+        return
     for scale, unit, summed in _READINGS:
         if imu.kind == "rate" and is_near(measured, scale * step_s):
             yield (
@@ -263,8 +270,9 @@ def check_columns(imu: ImuTable) -> Iterator[Finding]:
                     "noise: the axis is dead, not connected, or this is another column."
                 )
                 continue
-            yield from _stuck(imu, name, column, step_s)
-            yield from _saturated(imu, name, column, good & fresh, step_s)
+            stops = list(_saturated(imu, name, column, good & fresh, step_s))
+            yield from stops
+            yield from _stuck(imu, name, column, step_s, {f.value for f in stops})
             yield from _coarse(imu, name, column, good)
 
 
@@ -282,8 +290,10 @@ def _missing(imu: ImuTable, name: str, column: np.ndarray, good: np.ndarray) -> 
     )
 
 
-def _stuck(imu: ImuTable, name: str, column: np.ndarray, step_s: float) -> Iterator[Finding]:
-    start, length = longest_run(np.diff(column) == 0.0)
+def _stuck(
+    imu: ImuTable, name: str, column: np.ndarray, step_s: float, stops: set[Value]
+) -> Iterator[Finding]:
+    start, length = longest_run((np.diff(column) == 0.0) & ~np.isin(column[1:], list(stops)))
     if length >= _STUCK_SAMPLES and length * step_s >= _STUCK_S:
         yield warning(imu, "axis_stuck_for_a_while", length, start)(
             f"{name} stays at {column[start]:g} for {length + 1} samples ({length * step_s:.1f} s) "
@@ -308,7 +318,7 @@ def _saturated(
     step = float(np.median(steps[steps > least])) if np.any(steps > least) else np.inf
     if np.ptp(distinct) < _FEW_STEPS * step:
         return
-    inside = max(_INSIDE * step, 0.01 * float(np.ptp(distinct)))
+    inside = max(_INSIDE * step, least)
     for extreme in (float(distinct[-1]), float(distinct[0])):
         away = np.abs(values - extreme)
         count, near = np.count_nonzero(away <= least), np.count_nonzero(away <= inside)
