@@ -93,12 +93,13 @@ def spread(table: AnyTable) -> AnyTable:
 
 def _even(row: np.ndarray, at: np.ndarray, since: np.ndarray, usual: float) -> np.ndarray:
     """Times of rows by the stamps of some of them, at a rate that hardly changes."""
-    x = at - at.mean()
-    each = float(x @ since / (x @ x)) if len(at) >= _ENOUGH else usual
-    rest = np.concatenate([[0.0], np.cumsum(since - each * at)])
+    x, begin = at - at.mean(), since[0]
+    each = float(x @ (since - begin) / (x @ x)) if len(at) >= _ENOUGH else usual
+    rest = np.concatenate([[0.0], np.cumsum(since - begin - each * (at - at[0]))])
     k = np.arange(len(at))
     low, high = np.maximum(k - _AROUND, 0), np.minimum(k + _AROUND + 1, len(at))
-    return each * row + np.interp(row, at, (rest[high] - rest[low]) / (high - low))
+    mean = (rest[high] - rest[low]) / (high - low)
+    return begin + each * (row - at[0]) + np.interp(row, at, mean)
 
 
 def spread_counts(kind: str, table: AnyTable, even: AnyTable) -> dict[str, int]:

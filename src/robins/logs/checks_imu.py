@@ -243,6 +243,7 @@ _INSIDE = 4  # steps of a column; the outermost one of a sine holds no more than
 _FEW_STEPS = 16  # between the extremes of a column that is too coarse to show a stop
 _SHIFTED = 0.02  # m/s^2 of a mean, that is worth stating
 _COARSE = 64  # distinct values of a column
+_REPEATED = 0.4  # share of readings equal to the one before; 0.28 where a step is the noise
 _FULL_SCALES = {
     "gyro": [np.deg2rad(v) for v in (125, 245, 250, 450, 500, 1000, 2000, 4000)],
     "accel": [9.80665 * v for v in (2, 4, 6, 8, 16, 24, 30, 32, 40)],
@@ -369,7 +370,8 @@ def _coarse(imu: ImuTable, name: str, column: np.ndarray, good: np.ndarray) -> I
     if len(values) < 1000:
         return
     distinct = np.unique(values)
-    if len(distinct) <= _COARSE:
+    # Noise of a step or more makes the mean of coarse numbers as good as that of fine ones.
+    if len(distinct) <= _COARSE and np.mean(np.diff(values) == 0.0) > _REPEATED:
         step = float(np.median(np.diff(distinct)))
         yield warning(imu, "coarse", step)(
             f"{name} takes only {len(distinct)} different values, {step:.3g} apart. The recording "
