@@ -414,21 +414,13 @@ def _cluster_sizes(clusters: ArrayLike | None, lengths: np.ndarray) -> np.ndarra
 
 
 def _longest(lengths: np.ndarray) -> int:
-    """Largest size of which stretches long enough for a difference hold enough clusters.
-
-    Raises:
-        ValueError: there is none.
-    """
-    low, high = 0, int(lengths.sum()) // _FEWEST_CLUSTERS
+    """Largest size of which stretches long enough for a difference hold enough clusters."""
+    # Half of the steps at least are no gaps, so there are enough of one sample.
+    low, high = 1, int(lengths.sum()) // _FEWEST_CLUSTERS
     while low < high:
         m = (low + high + 1) // 2
         enough = np.sum(lengths[lengths >= 2 * m] // m) >= _FEWEST_CLUSTERS
         low, high = (m, high) if enough else (low, m - 1)
-    if low < 1:
-        raise ValueError(
-            f"the {len(lengths)} stretches between gaps have {lengths.max()} samples at most: an "
-            "Allan deviation needs neighbouring ones"
-        )
     return low
 
 

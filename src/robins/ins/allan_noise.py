@@ -27,7 +27,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 TERMS = "QNBKR"
 _SECOND_DIFFERENCE = ((0, 1.0), (1, -2.0), (2, 1.0))
@@ -61,7 +60,9 @@ def mean_variances(tau_s: np.ndarray) -> np.ndarray:
     return np.stack([3.0 / tau_s**2, 1.0 / tau_s, flat, tau_s / 3.0, tau_s**2 / 2.0], axis=-1)
 
 
-def moments(clusters: np.ndarray, n_samples: ArrayLike, dt_s: float) -> Moments:
+def moments(
+    clusters: np.ndarray, n_samples: int | tuple[int, ...] | np.ndarray, dt_s: float
+) -> Moments:
     """Moments of the overlapping Allan variances of n rate samples at the cluster sizes given.
 
     Args:
@@ -88,11 +89,11 @@ def moments(clusters: np.ndarray, n_samples: ArrayLike, dt_s: float) -> Moments:
     return Moments(mean, quadratic, ramp)
 
 
-def _beyond(lengths: np.ndarray, least: ArrayLike) -> np.ndarray:
-    """Sum of what each of the ascending lengths (S,) is above a least one, by the least ones."""
+def _beyond(lengths: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """Sum (L,) of what each of the ascending lengths (S,) is above a least one (L,)."""
     sums = np.append(np.cumsum(lengths[::-1])[::-1], 0)
     first = np.searchsorted(lengths, least)
-    return sums[first] - (len(lengths) - first) * np.asarray(least)
+    return sums[first] - (len(lengths) - first) * least
 
 
 def _lags(m: int, m_large: int, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -113,8 +114,9 @@ def _lags(m: int, m_large: int, lengths: np.ndarray) -> tuple[np.ndarray, np.nda
     weights = 0.5 * (np.concatenate([[1], step]) + np.concatenate([step, [1]]))
     # A stretch of n samples has n + 1 less this number of pairs at a lag.
     reach = np.maximum(2 * m_large + np.maximum(grid, 0), 2 * m + np.maximum(-grid, 0))
-    pairs, all_, all_large = (_beyond(lengths + 1, x) for x in (reach, 2 * m, 2 * m_large))
-    return grid, weights * pairs / (float(all_) * all_large)
+    found = _beyond(lengths + 1, np.append(reach, [2 * m, 2 * m_large]))
+    pairs, all_, all_large = found[:-2], float(found[-2]), float(found[-1])
+    return grid, weights * pairs / (all_ * all_large)
 
 
 def _cross_covariance(lags: np.ndarray, m: int, m_large: int) -> np.ndarray:
