@@ -59,10 +59,11 @@ def check_time(table: Table, unit_known: bool = False) -> Iterator[Finding]:
     if not np.isfinite(usual):
         yield error(table, "time_stands", 0.0)(_STANDS)
         return
-    even = spread(table)
-    if even is not table:
-        yield _shared(table, even)
-        table, usual = even, usual_step_s(even.time_ns)
+    if (first := batches_of(table)) is not None:
+        even = spread(table)
+        usual = usual_step_s(even.time_ns)
+        yield _shared(table, float(np.median(np.diff(first, append=len(table)))), usual)
+        table = even
     yield from _slow(table, usual) if unit_known else _unit(table, usual)
     keep = increasing(table.time_ns)
     yield from _duplicates(table)
@@ -112,10 +113,8 @@ def _unit(table: Table, usual: float) -> Iterator[Finding]:
         )
 
 
-def _shared(table: Table, even: Table) -> Finding:
-    """Batches of samples with one stamp, or stamped in a burst."""
-    sizes = np.diff(batches_of(table), append=len(table))
-    size, step_s = float(np.median(sizes)), usual_step_s(even.time_ns)
+def _shared(table: Table, size: float, step_s: float) -> Finding:
+    """Batches of samples of a usual size with one stamp, or stamped in a burst."""
     many_s = size * step_s
     again = np.diff(table.time_ns) == 0
     how = (
