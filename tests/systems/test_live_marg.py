@@ -243,7 +243,7 @@ def test_a_field_in_another_unit_is_refused_and_a_stray_one_counted(live):
             told.append(str(error))
     assert live.counts["field_implausible"] == 11
     assert len(told) == 1
-    assert "field: reads 47.4, which is no field in tesla, but one in uT" in told[0]
+    assert "field: reads 47.42, which is no field in tesla, but one in uT" in told[0]
 
 
 @pytest.mark.parametrize(
