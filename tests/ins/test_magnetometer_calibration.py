@@ -168,6 +168,39 @@ def test_a_sphere_may_be_asked_for():
     assert found.after_t > 2.0 * calibrate(samples(TURNED)).after_t
 
 
+def circle(share=1.0, tilt=0.0, **of):
+    """Samples of a vehicle that turns about the vertical, by a share of a circle."""
+    rng = np.random.default_rng(8)
+    heading, lean = np.linspace(0.0, 2.0 * np.pi * share, COUNT), tilt * rng.normal(size=COUNT)
+    return samples(Rotation.from_euler("ZYX", np.stack([heading, lean, 0.0 * lean], 1)), **of)
+
+
+def test_a_vehicle_that_cannot_tilt_is_calibrated_in_the_horizontal_plane():
+    """Soft iron couples the vertical field into the plane: there it is an offset."""
+    soft = SOFT * [[1, 1, 0], [1, 1, 0], [0, 0, 1]]
+    z = circle(soft=soft)
+    found = calibrate(z, level=True)
+    assert found.level
+    assert found.soft_iron
+    W = np.linalg.inv(soft[:2, :2])
+    W /= np.sqrt(np.linalg.det(W))
+    error = np.append(found.offset_t[:2] - HARD[:2], [(found.matrix[:2, :2] - W)[e] for e in
+                      ((0, 0), (1, 1), (0, 1))])  # fmt: skip
+    sigma = np.sqrt(np.diag(found.covariance))[[0, 1, 3, 4, 8]]
+    assert np.all(np.abs(error) < 4.0 * sigma)
+    assert np.all(sigma[:2] < 0.1e-6)
+    np.testing.assert_array_equal(found.matrix[2], [0.0, 0.0, 1.0])
+    assert found.offset_t[2] == 0.0
+    b = calibrated(z, found.offset_t, found.matrix)
+    heading = np.unwrap(np.arctan2(-b[:, 1], b[:, 0]))
+    assert np.abs(heading - np.linspace(0.0, 2.0 * np.pi, COUNT)).max() < 0.12
+    z = z - [0.0, 0.0, HARD[2]]
+    given = calibrate(z, STRENGTH, level=True)
+    down = np.median(z[:, 2])
+    size = np.linalg.norm(calibrated(z, given.offset_t, given.matrix)[:, :2], axis=1)
+    assert np.mean(size) == pytest.approx(np.sqrt(STRENGTH**2 - down**2), rel=1e-3)
+
+
 FLAT = Rotation.from_euler("Z", np.linspace(0.0, 6.0, COUNT)[:, None])
 REFUSED = {
     "in a plane": lambda: [samples(FLAT)],
@@ -176,6 +209,9 @@ REFUSED = {
     "do not tell the ellipsoid": lambda: [samples(cone(0.9, 60), sigma=6e-6)],
     "must have shape": lambda: [np.ones(3)],
     "strength_t must be": lambda: [samples(TURNED), -1.0],
+    "not turned about the vertical only": lambda: [circle(tilt=0.5), None, None, True],
+    "it has a hard iron of its own": lambda: [circle(), 40e-6, None, True],
+    "the vehicle hardly turned": lambda: [circle(0.02, sigma=0.0), None, None, True],
 }
 
 

@@ -113,6 +113,16 @@ def since_start(factor=1, offset_ns=0):
     return lambda time_ns: (time_ns - START_NS + offset_ns) * factor
 
 
+def read_at_once(time_ns):
+    """Stamps of a buffer of ten samples: each has that of its last one."""
+    return time_ns[np.minimum(np.arange(len(time_ns)) // 10 * 10 + 9, len(time_ns) - 1)]
+
+
+def in_bursts(time_ns):
+    """Stamps of ten samples that arrive 0.2 ms after each other."""
+    return read_at_once(time_ns) - 200_000 * (9 - np.arange(len(time_ns)) % 10)
+
+
 def good_gyro(factor=1.0):
     """Two minutes of rest of a gyro that sees the Earth turn."""
     rng = np.random.default_rng(4)

@@ -245,6 +245,7 @@ HEALTHY = {
     "honest floats": gnss(quality=FLOAT, sigma_m=times(np.where(FLOAT == 2, 5.0, 1.0)[:, None])),
     "field": lambda: tumble().mag,
     "path": lambda: replace(drive(), truth=a_path()),
+    "path of motion capture": spoil(a_path, time_ns=lambda t: t[0] + (t - t[0]) // 200),
     "pair": pair,
     "pair of increments": partial(make_pair, 1, "increment"),
     "stated delay": late(0.1, stated_s=0.1),

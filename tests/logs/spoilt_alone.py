@@ -14,16 +14,19 @@ from made_spoilt import (
     gnss,
     good_gyro,
     imu,
+    in_bursts,
     known_slow,
     mag,
     magnet,
     plus,
     put,
+    read_at_once,
     shift,
     since_start,
     times,
     tumble,
     turned,
+    with_imu,
     without,
 )
 
@@ -32,6 +35,9 @@ G = 9.80665
 ALL = slice(None)
 FLOAT = 1 + (np.arange(M) > 300)
 STOP = np.deg2rad(250.0)  # rad/s
+VIBRATION = (
+    1.5 * G * np.sin(np.arange(N) * 2.7458)[:, None] * [0, 0, 1] * (np.arange(N)[:, None] > 3000)
+)
 JITTER = np.random.default_rng(0).integers(-3_000_000, 3_000_000, N)
 
 TIME = {
@@ -50,6 +56,21 @@ TIME = {
         (imu(time_ns=shift([100, 200], -S // 100)), "warning line 102", 2),
         (imu(rows=np.arange(2 * N) // 2), "warning: faster than the sensor", N),
     ],
+    "stamps_shared": [
+        *(
+            (imu(time_ns=read_at_once, kind=kind, gyro=times(k), accel=times(k)), says, 10.0)
+            for kind, k in (("rate", 1.0), ("increment", 0.01))
+            for says in ("warning line 3: 10 samples share each stamp ... evenly, 10 ms apart",)
+        ),
+        (imu(time_ns=in_bursts), "warning: in bursts of 10, one burst every 0.1 s", 10.0),
+        (imu(time_ns=lambda t: t // 10**10 * 10**10), "error line 3: nothing can be timed", 1000.0),
+    ],
+    "stamps_rounded": [
+        (
+            imu(time_ns=lambda t: (t + 3_500_000) // 7_000_000 * 7_000_000),
+            "note: of 0.007 s ... 100",
+        )
+    ],
     "time_backward": [
         (imu(time_ns=shift([500, 900], -back)), "warning line 502", 2)
         for back in (15_000_000, S, 3600 * S)
@@ -57,7 +78,7 @@ TIME = {
     "clock_set_back": [
         (imu(time_ns=shift(slice(5000, None), -round(back_s * 1e9))), f"error line 5002: {cause}")
         for back_s, cause in {
-            1.0: "This is a leap second",
+            1.0: "It fits a leap second",
             7200.0: "a change of time zone",
             86_400.0: "at midnight",
             604_800.0: "the second of the GPS week",
@@ -72,8 +93,8 @@ TIME = {
         (imu(time_ns=shift(slice(5000, None), ahead_s * S)), says)
         for ahead_s, says in {
             1: "warning line 5002: a leap second",
-            18: "error line 5002: 18 leap",
-            3600: "error line 5002: zone",
+            18: "warning line 5002: a gap, or a clock set ahead by 18 s. It fits the 18 leap",
+            3600: "warning line 5002: zone",
         }.items()
     ],
     "gap_short": [
@@ -87,7 +108,7 @@ TIME = {
     ],
     "gap_long": [
         (imu(rows=without(5000, 1234, N)), "warning line 6236", near(12.35)),
-        (gnss(rows=without(200, 40, M)), "note"),
+        *((gnss(rows=without(200, n, M)), "note", near((n + 1) / 5)) for n in (40, 89, 94)),
     ],
     "time_jitter": [
         (imu(time_ns=shift(ALL, JITTER)), "note: 100 Hz"),
@@ -112,12 +133,17 @@ COLUMNS = {
             imu(gyro=lambda gyro: np.clip(gyro * [1, 1, 40], -STOP, STOP)),
             "warning: a usual full scale (4.363 rad/s)",
             near([STOP, -STOP], abs=5e-4),
-            "axis_stuck_for_a_while",
+            "",
             2,
         ),
         (
+            imu(accel=lambda accel: np.clip(accel + VIBRATION, -2 * G, 2 * G)),
+            "warning: a usual full scale (19.61 m/s^2) ... shifts the mean of accel_z by +",
+            near(-2 * G),
+        ),
+        (
             imu(accel=put((slice(3000, 3005), 2), 4 * G)),
-            "warning line 3002: in 5 samples, 5 in a row",
+            "warning line 3002: in 5 readings (0.1% of all), this one first",
         ),
     ],
     "coarse": [(imu(accel=np.round), "warning", None, "axis_stuck_for_a_while gravity_bias", 3)],
@@ -160,19 +186,31 @@ IMU = {
     ],
     "z_axis_reversed": [
         *(
-            (imu(**turned(C)), "error: +9.8 m/s^2 on accel_z")
-            for C in (np.diag([1, -1, -1]), np.diag([1, 1, -1]), [[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+            (with_imu(**turned(C)), "error: +9.8 m/s^2 on accel_z", None, others)
+            for C, others in (
+                (np.diag([1, -1, -1]), ""),
+                (np.diag([1, 1, -1]), "left_handed"),
+                ([[0, 1, 0], [1, 0, 0], [0, 0, -1]], "forward_axis"),
+            )
         ),
-        (imu(body="RFU"), "error"),
+        (with_imu(body="RFU"), "error", None, "forward_axis"),
     ],
     "not_level": [
-        (imu(**turned([[0, 0, -1], [0, 1, 0], [1, 0, 0]])), "warning", near(1.0, abs=0.01))
+        (with_imu(**turned([[0, 0, -1], [0, 1, 0], [1, 0, 0]])), "warning", near(1.0, abs=0.01))
     ],
-    "sensor_axes": [(tumble, "note: (-0.00, +0.00, +1.00) of x, y, z")],
+    "sensor_axes": [
+        (tumble, "note: (-0.00, +0.00, +1.00) of x, y, z"),
+        (imu(**turned(np.diag([1, -1, -1]))), "note: (+0.00, +0.00, +1.00) of x, y, z"),
+    ],
     "gyro_unit": [
-        (imu(gyro=times(60 * 180 / np.pi)), "error: in deg/s: multiply by pi/180."),
-        (imu(gyro=times(3600 * 180 / np.pi)), "error: in deg/h: multiply by pi/180"),
-        (imu(rows=slice(0, 1100), gyro=np.rad2deg), "error line 2: at rest the gyros show 0.2"),
+        *(
+            (imu(rows=rows, gyro=times(k)), f"error: {says} ... not in rad/s ... data sheet")
+            for rows, k, says in (
+                (slice(1300, None), 60 * 180 / np.pi, "the gyros reach"),
+                (ALL, 1e3, "at rest the gyros read 2.2"),
+                (ALL, 131 * 180 / np.pi, "at rest the gyros read"),
+            )
+        ),
         (partial(good_gyro, 180 / np.pi), "warning: Earth's 15.04 deg/h in deg/s"),
         (partial(good_gyro, 648e3 / np.pi), "error: Earth's 15.04 deg/h in deg/h"),
     ],

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from made_logs import rows_of, with_gnss, with_imu
+from made_spoilt import in_bursts, read_at_once
 
 from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.ins.increments import from_imu
@@ -226,6 +227,38 @@ def test_nan_for_ever_is_refused_with_the_reason():
     message = r"imu.csv: fewer than two of 200 .*\(refused: 200 nan\); the"
     with pytest.raises(LogError, match=message):
         clean(with_imu(DATA, gyro=np.full((N, 3), np.nan)))
+
+
+@pytest.mark.parametrize("stamps", [read_at_once, in_bursts])
+@pytest.mark.parametrize("kind", ["rate", "increment"])
+def test_samples_read_at_once_are_spread_evenly(stamps, kind):
+    """With them the field of the same file, whose readings may repeat within a batch."""
+    imu = dataclasses.replace(IMU, kind=kind)
+    field_t = np.repeat(np.random.default_rng(4).normal(size=(N // 10, 3)), 10, axis=0) * 1e-5
+    data = dataclasses.replace(DATA, imu=imu, mag=MagTable(IMU.time_ns, field_t))
+    at_once = dataclasses.replace(imu, time_ns=stamps(imu.time_ns))
+    got = clean(dataclasses.replace(data, imu=at_once, mag=MagTable(at_once.time_ns, field_t)))
+    assert_all_same(got, data)
+    assert refused(got.counts) == {"imu_spread": N - N // 10, "mag_spread": N - N // 10}
+    assert got.imu_gaps == []
+
+
+def test_lost_decimals_cost_half_of_the_last_one():
+    rounded = (IMU.time_ns + 5_000_000) // 10_000_000 * 10_000_000
+    got = clean(with_imu(DATA, time_ns=rounded))
+    assert np.abs(got.imu.time_ns - IMU.time_ns).max() <= 5_000_000
+    assert np.all(np.abs(np.diff(got.imu.time_ns)[1:] - 5_000_000) < 10)
+
+
+def test_a_lost_batch_is_a_gap_and_repeated_rows_are_no_batch():
+    keep = np.delete(np.arange(N), np.r_[100:110])
+    at_once = dataclasses.replace(rows_of(IMU, keep), time_ns=read_at_once(IMU.time_ns)[keep])
+    got = cleaned(imu=at_once)
+    assert_same(got.imu, rows_of(IMU, keep))
+    assert got.imu_gaps == [(IMU.time_ns[99], IMU.time_ns[110])]
+    twice = clean(with_imu(DATA, **vars(rows_of(IMU, np.arange(2 * N) // 2))))
+    assert_same(twice.imu, IMU)
+    assert refused(twice.counts) == {"imu_duplicate": N}
 
 
 # ------------------------------------------------------------------------------------- GNSS

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from made_logs import rows_of
 from made_nine_axis import tumble_dataset
-from made_spoilt import mag, plus, put
+from made_spoilt import mag, plus, put, turned, with_imu
 
 from robins.dataset import Dataset, MagTable
 from robins.logs import examine, load_dataset
@@ -66,8 +66,11 @@ def test_a_slow_magnetometer_is_no_wrong_unit_of_time(data):
 
 
 def test_a_vehicle_has_a_top_and_a_sensor_has_none(data):
-    """The same samples by themselves are those of a vehicle that lies on its back."""
-    assert "z_axis_reversed" in found(data.imu, "error")
+    """A vehicle is known by its fixes; who wants the sensor's attitude lets it lie as it likes."""
+    log = with_imu(**turned(np.diag([1, -1, -1])))()
+    assert found(log) == ["z_axis_reversed"]
+    assert [(f.severity, f.code) for f in examine(log, "attitude")] == [("note", "sensor_axes")]
+    assert found(data.imu, "error") == []
     assert found(data, "error") == []
     assert found([data], "error") == []
     bare = Dataset("bare", data.imu, mag=data.mag)
@@ -103,9 +106,9 @@ def test_axes_are_not_judged_without_turning_or_with_wrong_gyros(data):
     rest = dataclasses.replace(data, **still)
     assert found(changed(rest, field_t=rest.mag.field_t @ wrong)) == []
     degrees = dataclasses.replace(data.imu, gyro=np.rad2deg(data.imu.gyro))
-    turned = changed(dataclasses.replace(data, imu=degrees), field_t=data.mag.field_t @ wrong)
-    assert "gyro_unit" in found(turned, "error")
-    assert "field_axes" not in found(turned)
+    both = changed(dataclasses.replace(data, imu=degrees), field_t=data.mag.field_t @ wrong)
+    assert "gyro_unit" in found(both, "error")
+    assert "field_axes" not in found(both)
 
 
 @pytest.mark.parametrize(

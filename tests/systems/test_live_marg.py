@@ -12,7 +12,7 @@ from robins.logs.broad import read_broad
 from robins.logs.ordering import rows_where
 from robins.systems.marg import LiveMarg, Replay, replay
 from robins.systems.marg.saturation import Range, levels
-from robins.systems.streaming import Door, Flag, LiveError
+from robins.systems.streaming import Door, Flag, LiveError, refuse_units
 
 PARAMETERS = Replay()
 RATE_HZ = 100.0
@@ -212,6 +212,38 @@ def test_a_sample_of_another_kind_is_refused_and_the_next_one_taken(live):
         found = live.push(k * 10_000_000, still.astype(np.float32), force.tolist(), field)
     assert found.flags == REST
     assert not any(live.counts.values())
+
+
+@pytest.mark.parametrize(
+    ("rate", "force", "word"),
+    [
+        ([0.4, 0.0, 0.1], [0.0, 0.0, -9.8], "gyro: reads 0.4 across gravity"),
+        ([0.0, 0.0, 90.0], [0.0, 0.0, -9.8], "gyro: reads up to 90"),
+        ([0.0, 0.0, 0.0], [0.0, 0.0, -1000.0], "accel: .* gravity in milli-g"),
+        ([0.0, 0.0, 4.0], [0.0, 0.0, -9.8], None),  # a turn about the vertical
+    ],
+)
+def test_units_are_judged_as_the_doctor_does(rate, force, word):
+    rows = np.tile(rate, (50, 1)), np.tile(force, (50, 1))
+    if word is None:
+        refuse_units(*rows)
+        return
+    with pytest.raises(LiveError, match=word):
+        refuse_units(*rows)
+
+
+def test_a_field_in_another_unit_is_refused_and_a_stray_one_counted(live):
+    still, force = np.zeros(3), np.array([0.0, 0.0, -9.81])
+    told = []
+    for k in range(40):
+        field = [20.0, 0.0, 43.0] if 5 < k < 16 else [2e-5, 0.0, 4.3e-5 + 0.1 * (k == 3)]
+        try:
+            live.push(k * 10_000_000, still, force, np.array(field))
+        except LiveError as error:
+            told.append(str(error))
+    assert live.counts["field_implausible"] == 11
+    assert len(told) == 1
+    assert "field: reads 47.42, which is no field in tesla, but one in uT" in told[0]
 
 
 @pytest.mark.parametrize(

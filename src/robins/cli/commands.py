@@ -260,12 +260,14 @@ def allan(log: Path, out: Path | None, **options: Any) -> None:
     epilog=examples(
         "robins calibrate turned.csv",
         'robins calibrate turned.ulg --field "48.5 uT" --begin "20 s" --end "80 s" --json',
+        "robins calibrate circle.csv --horizontal",
     ),
 )
 @click.argument("log", nargs=-1, required=True, type=LOGS)
 @option("--field", metavar="FIELD", help='Its strength at the place, "48.5 uT"; sets the scale.')
 @option("--begin", metavar="TIME", help='Use samples from "20 s" after the first one on.')
 @option("--end", metavar="TIME", help='Use samples up to "80 s" after the first one.')
+@option("--horizontal", is_flag=True, help="The vehicle cannot tilt: it turned about z only.")
 @COLUMNS
 @publishes
 def calibrate(log: tuple[Path, ...], out: Path | None, **options: Any) -> None:

@@ -63,9 +63,9 @@ def _text(found: Any, log: Sequence[Path], columns: Sequence[Path]) -> str:
         return "\n".join(
             [*lines, "Next:   mend the errors; a run on this log would be wrong or meaningless"]
         )
-    # Without fixes there is no position, but with a magnetic field an attitude.
+    # Without fixes there is no position, but an attitude.
     kinds = {table["kind"] for table in found.tables}
-    system = " --system marg" if "mag" in kinds and "gnss" not in kinds else ""
+    system = "" if "gnss" in kinds else " --system marg"
     declared = [word for path in columns for word in ("--columns", path)]
     words = shlex.join(map(str, [*log, *declared]))
     return "\n".join([*lines, f"Next:   robins replay {words}{system}"])

@@ -75,6 +75,7 @@ class Allan(NamedTuple):
     n_samples: int
     dt_s: float
     confidence: float
+    stretches: tuple[int, ...] = ()  # samples of each part between gaps; () without a gap
 
 
 class Coefficients(NamedTuple):
@@ -117,13 +118,15 @@ def deviation(
     Args:
         rate: (N,) or (N, A) rates or specific forces; divide increments by their interval.
         dt_s: sampling interval [s]; or
-        time_ns: (N,) sampling times, from which the interval is taken and gaps are found.
-        clusters: cluster sizes in samples; ten per decade up to a ninth of the record if not given.
+        time_ns: (N,) sampling times, from which the interval is taken and gaps are found: squares
+            are averaged over the differences within all stretches between them.
+        clusters: cluster sizes in samples; ten per decade while there are nine of the largest if
+            not given.
         confidence: of the interval, between 0 and 1.
 
     Raises:
-        ValueError: neither or both of dt_s and time_ns; a gap, a step back or a repeated time; NaN
-            or infinite data; constant data or a mere drift; too few samples; clusters out of range.
+        ValueError: neither or both of dt_s and time_ns; a step back or a repeated time; NaN or
+            infinite data; constant data or a mere drift; too few samples; clusters out of range.
     """
     x = np.asarray(rate, float)
     x = x[:, None] if x.ndim == 1 else x
@@ -136,12 +139,13 @@ def deviation(
         )
     require(0.0 < confidence < 1.0, "confidence must lie between 0 and 1", confidence)
     _refuse_bad_values(x)
-    interval = _interval(dt_s, time_ns, n)
-    sizes = _cluster_sizes(clusters, n)
+    interval, bounds = _interval(dt_s, time_ns, n)
+    lengths = np.diff(bounds)
+    sizes = _cluster_sizes(clusters, lengths)
 
-    variance = np.stack([_variances(axis, sizes) for axis in x.T], axis=-1)
+    variance = np.stack([_variances(np.split(a, bounds[1:-1]), sizes) for a in x.T], axis=-1)
     # Cluster by cluster: the covariance between clusters is not needed here.
-    single = [moments(m[None], n, interval) for m in sizes]
+    single = [moments(m[None], lengths, interval) for m in sizes]
     mean = np.concatenate([s.mean for s in single])
     white = np.concatenate([s.degrees_of_freedom(_WHITE) for s in single])
     mixes = np.stack([_rough_mix(v, mean, white, np.arange(5)) for v in variance.T])
@@ -150,17 +154,27 @@ def deviation(
     low, high = (chdtri(edf, (1.0 - side * confidence) / 2.0) for side in (1.0, -1.0))
     sigma = np.sqrt(variance)
     lower, upper = sigma * np.sqrt(edf / low), sigma * np.sqrt(edf / high)
-    return Allan(sizes * interval, sigma, lower, upper, edf, sizes, n, interval, confidence)
+    parts = tuple(lengths.tolist()) if len(lengths) > 1 else ()
+    return Allan(sizes * interval, sigma, lower, upper, edf, sizes, n, interval, confidence, parts)
 
 
-def _variances(rate: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    # Without its mean the running sum stays small; second differences do not see the mean.
-    angle = np.concatenate([[0.0], np.cumsum(rate - rate.mean())])
-    out = np.empty(len(sizes))
-    for i, m in enumerate(sizes):
-        z = angle[2 * m :] - 2.0 * angle[m:-m] + angle[: -2 * m]
-        out[i] = z @ z / (2.0 * m * m * len(z))
-    return out
+def stretches(time_ns: np.ndarray) -> np.ndarray:
+    """Bounds (S + 1,) of the rows between gaps of 1.5 usual intervals."""
+    step = np.diff(time_ns)
+    edges = np.flatnonzero(step > 1.5 * np.median(step)) + 1
+    return np.concatenate([[0], edges, [len(time_ns)]])
+
+
+def _variances(parts: list[np.ndarray], sizes: np.ndarray) -> np.ndarray:
+    squares, count = np.zeros(len(sizes)), np.zeros(len(sizes))
+    for rate in parts:
+        # Without its mean the running sum stays small; second differences do not see the mean.
+        angle = np.concatenate([[0.0], np.cumsum(rate - rate.mean())])
+        for i, m in enumerate(sizes[2 * sizes <= len(rate)]):
+            z = angle[2 * m :] - 2.0 * angle[m:-m] + angle[: -2 * m]
+            squares[i] += z @ z
+            count[i] += len(z)
+    return squares / (2.0 * sizes**2 * count)
 
 
 def fit(allan: Allan, terms: str = "NBK", confidence: float = 0.95) -> AllanFit:
@@ -199,7 +213,7 @@ def fit(allan: Allan, terms: str = "NBK", confidence: float = 0.95) -> AllanFit:
     for i, m in enumerate(allan.clusters):
         if m >= 1.5 * allan.clusters[keep[-1]]:
             keep.append(i)
-    expected = moments(allan.clusters[keep], allan.n_samples, allan.dt_s)
+    expected = moments(allan.clusters[keep], allan.stretches or allan.n_samples, allan.dt_s)
     index = np.array(sorted(TERMS.index(t) for t in terms))
     least = max(len(terms) + 3, 6)
     columns = [_explained(v, expected, index, least) for v in (allan.deviation[keep] ** 2).T]
@@ -383,32 +397,43 @@ def _refuse_no_noise(p: np.ndarray) -> None:
         )
 
 
-def _cluster_sizes(clusters: ArrayLike | None, n: int) -> np.ndarray:
+def _cluster_sizes(clusters: ArrayLike | None, lengths: np.ndarray) -> np.ndarray:
     if clusters is None:
-        longest = n // _FEWEST_CLUSTERS
+        longest = _longest(lengths)
         count = 1 + int(np.ceil(_PER_DECADE * np.log10(longest))) if longest > 1 else 1
         return np.unique(np.rint(np.geomspace(1, longest, count)).astype(np.int64))
-    sizes = np.unique(np.asarray(clusters))
+    sizes, most = np.unique(np.asarray(clusters)), int(lengths.max()) // 2
     whole = np.issubdtype(sizes.dtype, np.integer)
-    if sizes.size == 0 or not whole or sizes[0] < 1 or sizes[-1] > n // 2:
+    if sizes.size == 0 or not whole or sizes[0] < 1 or sizes[-1] > most:
         raise ValueError(
-            f"clusters must be whole numbers of samples from 1 to {n // 2}, half of the {n} "
-            f"samples, got {np.asarray(clusters)}"
+            f"clusters must be whole numbers of samples from 1 to {most}, half of the "
+            f"{lengths.max()} samples without a gap, got {np.asarray(clusters)}"
         )
     return sizes.astype(np.int64)
 
 
-def _interval(dt_s: float | None, time_ns: ArrayLike | None, n: int) -> float:
+def _longest(lengths: np.ndarray) -> int:
+    """Largest size of which stretches long enough for a difference hold enough clusters."""
+    # Half of the steps at least are no gaps, so there are enough of one sample.
+    low, high = 1, int(lengths.sum()) // _FEWEST_CLUSTERS
+    while low < high:
+        m = (low + high + 1) // 2
+        enough = np.sum(lengths[lengths >= 2 * m] // m) >= _FEWEST_CLUSTERS
+        low, high = (m, high) if enough else (low, m - 1)
+    return low
+
+
+def _interval(dt_s: float | None, time_ns: ArrayLike | None, n: int) -> tuple[float, np.ndarray]:
+    """Sampling interval [s], and the bounds of the stretches between gaps."""
     if (dt_s is None) == (time_ns is None):
         raise ValueError("give either dt_s, the sampling interval, or time_ns, the sampling times")
     if dt_s is not None:
         require(np.isfinite(dt_s) and dt_s > 0.0, "dt_s must be a positive number of seconds", dt_s)
-        return float(dt_s)
+        return float(dt_s), np.array([0, n])
     time = np.asarray(time_ns)
     if time.shape != (n,) or not np.issubdtype(time.dtype, np.integer):
         raise ValueError(f"time_ns must be {n} integers, got {time.dtype} of shape {time.shape}")
     step = np.diff(time)
-    nominal = np.median(step)
     back = np.flatnonzero(step <= 0)
     if back.size:
         row = int(back[0]) + 1
@@ -416,15 +441,10 @@ def _interval(dt_s: float | None, time_ns: ArrayLike | None, n: int) -> float:
             f"time does not go forward at row {row} (step {step[row - 1] * 1e-9:g} s): remove "
             "repeated and misplaced rows before the Allan analysis"
         )
-    gap = np.flatnonzero(step > 1.5 * nominal)
-    if gap.size:
-        row = int(gap[0]) + 1
-        raise ValueError(
-            f"{gap.size} gap(s) in the data, the first of {step[row - 1] * 1e-9:g} s before row "
-            f"{row} where {nominal * 1e-9:g} s is usual: an Allan deviation needs even sampling; "
-            "use the longest part without gaps"
-        )
-    return float((int(time[-1]) - int(time[0])) * 1e-9 / (n - 1))
+    bounds = stretches(time)
+    lasted = int(time[-1]) - int(time[0]) - int(np.sum(step[bounds[1:-1] - 1]))
+    within = n + 1 - len(bounds)
+    return lasted * 1e-9 / within if within else float(np.median(step)) * 1e-9, bounds
 
 
 def _refuse_bad_values(x: np.ndarray) -> None:

@@ -60,14 +60,18 @@ def mean_variances(tau_s: np.ndarray) -> np.ndarray:
     return np.stack([3.0 / tau_s**2, 1.0 / tau_s, flat, tau_s / 3.0, tau_s**2 / 2.0], axis=-1)
 
 
-def moments(clusters: np.ndarray, n_samples: int, dt_s: float) -> Moments:
+def moments(
+    clusters: np.ndarray, n_samples: int | tuple[int, ...] | np.ndarray, dt_s: float
+) -> Moments:
     """Moments of the overlapping Allan variances of n rate samples at the cluster sizes given.
 
     Args:
-        clusters: (T,) sizes in samples, ascending, at most half of n_samples.
-        n_samples: number of rate samples; the integrated output has one point more.
+        clusters: (T,) sizes in samples, ascending, at most half of the longest stretch.
+        n_samples: number of rate samples; the integrated output has one point more. Of a record
+            with gaps those of each stretch (S,): stretches are taken to be independent.
         dt_s: sampling interval [s].
     """
+    lengths = np.sort(np.atleast_1d(n_samples))
     tau = clusters * dt_s
     mean = mean_variances(tau)
     count = len(clusters)
@@ -75,7 +79,7 @@ def moments(clusters: np.ndarray, n_samples: int, dt_s: float) -> Moments:
     unit = np.array([1.0, dt_s, dt_s**2, dt_s**3])
     for i, m in enumerate(clusters):
         for j in range(i, count):
-            lags, weights = _lags(int(m), int(clusters[j]), n_samples)
+            lags, weights = _lags(int(m), int(clusters[j]), lengths)
             r = _cross_covariance(lags, int(m), int(clusters[j])) * unit[:, None]
             scale = 4.0 * tau[i] ** 2 * tau[j] ** 2
             quadratic[i, j] = quadratic[j, i] = 2.0 * (r * weights) @ r.T / scale
@@ -85,9 +89,16 @@ def moments(clusters: np.ndarray, n_samples: int, dt_s: float) -> Moments:
     return Moments(mean, quadratic, ramp)
 
 
-def _lags(m: int, m_large: int, n_samples: int) -> tuple[np.ndarray, np.ndarray]:
+def _beyond(lengths: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """Sum (L,) of what each of the ascending lengths (S,) is above a least one (L,)."""
+    sums = np.append(np.cumsum(lengths[::-1])[::-1], 0)
+    first = np.searchsorted(lengths, least)
+    return sums[first] - (len(lengths) - first) * least
+
+
+def _lags(m: int, m_large: int, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lags at which to evaluate R and weights that make their sum the mean over all pairs."""
-    rows, rows_large = n_samples + 1 - 2 * m, n_samples + 1 - 2 * m_large
+    rows, rows_large = (int(lengths[-1]) + 1 - 2 * size for size in (m, m_large))
     # Beyond the reach of both differences, -2 m' to 2 m, only flicker is correlated, and R falls
     # off as 1 / l^2: the squares left out are below 1e-3 of the sum.
     first, last = max(1 - rows, -6 * m_large), min(rows_large - 1, 6 * m_large)
@@ -101,8 +112,11 @@ def _lags(m: int, m_large: int, n_samples: int) -> tuple[np.ndarray, np.ndarray]
     # Trapezoids over whole lags: a run of consecutive lags is summed exactly.
     step = np.diff(grid)
     weights = 0.5 * (np.concatenate([[1], step]) + np.concatenate([step, [1]]))
-    pairs = np.minimum(rows, rows_large - grid) - np.maximum(0, -grid)
-    return grid, weights * pairs / (float(rows) * rows_large)
+    # A stretch of n samples has n + 1 less this number of pairs at a lag.
+    reach = np.maximum(2 * m_large + np.maximum(grid, 0), 2 * m + np.maximum(-grid, 0))
+    found = _beyond(lengths + 1, np.append(reach, [2 * m, 2 * m_large]))
+    pairs, all_, all_large = found[:-2], float(found[-2]), float(found[-1])
+    return grid, weights * pairs / (all_ * all_large)
 
 
 def _cross_covariance(lags: np.ndarray, m: int, m_large: int) -> np.ndarray:

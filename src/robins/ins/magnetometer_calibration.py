@@ -19,6 +19,10 @@ iron.
 
 Where the directions do not determine an ellipsoid, a sphere is fitted, the hard iron alone, which
 needs fewer of them; a turn about one axis determines neither and is refused.
+
+A vehicle that cannot tilt turns about the vertical only. There the same fit in the plane gives the
+two horizontal axes, an ellipse on which the horizontal field has one size; the vertical axis stays
+as it reads, so a hard iron along it shows as soon as the vehicle tilts.
 """
 
 from __future__ import annotations
@@ -39,7 +43,6 @@ _VAGUE = 0.1  # of the field, one sigma: what is known no better is not known
 _STRETCHED = 2.0  # axes of the ellipsoid; more is soft iron only if the samples lie on it
 _NEEDLE = 20.0  # axes; more is no ellipsoid that a fit could settle on
 _OFF = 0.1  # of the field, RMS: a surface that samples are further from than that is not theirs
-_SPHERE = np.vstack([np.eye(4, 9)[:3], [[0, 0, 0, 1, 1, 1, 0, 0, 0]]]).T  # (9, 4) free directions
 _FLAT = 0.08  # of the extent along the widest axis; less along the narrowest is a plane
 _REACH = np.deg2rad(30.0)  # of a sample, for the share of directions that are covered
 _PASSES, _SETTLED = 200, 1e-8  # of the extent; far below the resolution of any log
@@ -48,7 +51,10 @@ _NO_ELLIPSOID = (
     "it was turned too little; turn it away from iron, so that each of its axes points up and down "
     "once"
 )
-_PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))  # the six numbers of a symmetric matrix
+_TILTED = 0.2  # of the horizontal field, scatter of the vertical one
+# The numbers of a symmetric matrix by its size, and where those of the horizontal one belong.
+_PAIRS = {2: ((0, 0), (1, 1), (0, 1)), 3: ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))}
+_HORIZONTAL = [0, 1, 3, 4, 8]  # of offset, then matrix
 
 
 class CalibrationError(RobinsError, ValueError):
@@ -77,6 +83,7 @@ class Calibration(NamedTuple):
     covered: float  # share of all directions within 30 deg of one of a sample
     gap: np.ndarray  # (3,) direction of the field, sensor axes, that is furthest from any sample
     gap_rad: float  # how far
+    level: bool = False  # the horizontal axes alone; before, after and gap are of their plane
 
 
 def calibrated(field_t: Any, offset_t: Any, matrix: Any) -> np.ndarray:
@@ -86,15 +93,20 @@ def calibrated(field_t: Any, offset_t: Any, matrix: Any) -> np.ndarray:
 
 
 def calibrate(
-    field_t: Any, strength_t: float | None = None, soft_iron: bool | None = None
+    field_t: Any,
+    strength_t: float | None = None,
+    soft_iron: bool | None = None,
+    level: bool = False,
 ) -> Calibration:
-    """Hard and soft iron of a magnetometer that was turned about all its axes.
+    """Hard and soft iron of a magnetometer that was turned about all its axes, or the vertical.
 
     Args:
         field_t: (N, 3) samples [T] in sensor axes, in order of time; rows with NaN are left out.
         strength_t: size of the field at the place [T], e.g. of `robins.earth.magnetic`; it sets the
             scale of the result. None: the scale is kept on average, ``det W = 1``.
         soft_iron: whether to fit it; None: if the directions determine it.
+        level: it was turned about its third axis only, which was vertical; the other two are
+            calibrated. With a strength their scale follows from it and the vertical reading.
 
     Raises:
         CalibrationError: too few samples; they lie in a plane or a part of the ellipsoid so small
@@ -112,25 +124,44 @@ def calibrate(
             f"there are {len(z)} samples of the field; a calibration needs at least {FEWEST}, "
             "taken while the sensor is turned about all its axes"
         )
+    vertical = 0.0
+    if level:
+        vertical, z = _level(z)
+        strength_t = None if strength_t is None else _horizontal(strength_t, vertical)
     low, high = np.percentile(z, _ENDS, axis=0)
     centre, size = (low + high) / 2.0, float((high - low).max()) / 2.0
     if not size > 0.0:
         raise CalibrationError("all samples of the field are equal: turn the sensor about")
     unit = _evened(((z - centre) / size)[:: -(-len(z) // MOST)])
     _refuse_flat(unit)
+    found = _best(unit, centre, size, strength_t, soft_iron)
+    return _upright(found, vertical) if level else found
+
+
+def _best(
+    unit: np.ndarray,
+    centre: np.ndarray,
+    size: float,
+    strength_t: float | None,
+    soft_iron: bool | None,
+) -> Calibration:
+    """The ellipsoid of samples of unit extent, or the sphere where they do not tell it."""
     why = CalibrationError(_NO_ELLIPSOID)
+    d = unit.shape[1]
     if soft_iron is not False:
         try:
-            fitted = _refined(unit, *_direct_ellipsoid(unit), free=np.eye(9))
-            found = _told(unit, *fitted, np.eye(9), centre, size, strength_t)
+            free = np.eye(d + len(_PAIRS[d]))
+            fitted = _refined(unit, *_direct_ellipsoid(unit), free=free)
+            found = _told(unit, *fitted, free, centre, size, strength_t)
             _refuse_stretched(found)
             return found
         except CalibrationError as error:
             if soft_iron:
                 raise
             why = error
-    fitted = _refined(unit, *_direct_sphere(unit), free=_SPHERE)
-    found = _told(unit, *fitted, _SPHERE, centre, size, strength_t)
+    free = _of_sphere(d)
+    fitted = _refined(unit, *_direct_sphere(unit), free=free)
+    found = _told(unit, *fitted, free, centre, size, strength_t)
     if soft_iron is None and found.after_t > _OFF * found.field_t:
         share = found.after_t / found.field_t
         raise CalibrationError(
@@ -141,13 +172,59 @@ def calibrate(
     return found
 
 
+def _level(z: np.ndarray) -> tuple[float, np.ndarray]:
+    """Usual vertical field, and the horizontal one (N, 2).
+
+    Raises:
+        CalibrationError: the vertical one changes as that of a vehicle that tilts.
+    """
+    across = z[:, :2] - np.mean(z[:, :2], axis=0)
+    horizontal = float(np.sqrt(np.mean(np.sum(across**2, axis=1))))
+    scatter = float(np.std(z[:, 2]))
+    if scatter > _TILTED * horizontal:
+        raise CalibrationError(
+            f"the vertical field scatters by {scatter * 1e6:.3g} uT, the horizontal one by "
+            f"{horizontal * 1e6:.3g} uT: the sensor was not turned about the vertical only",
+            fix="calibrate all three axes, or give a mounting that makes its third axis vertical",
+        )
+    return float(np.median(z[:, 2])), z[:, :2]
+
+
+def _horizontal(strength_t: float, vertical_t: float) -> float:
+    if not strength_t > abs(vertical_t):
+        raise CalibrationError(
+            f"the vertical axis reads {vertical_t * 1e6:.4g} uT, more than the whole field of "
+            f"{strength_t * 1e6:.4g} uT: it has a hard iron of its own",
+            fix="leave the strength out",
+        )
+    return float(np.sqrt(strength_t**2 - vertical_t**2))
+
+
+def _upright(found: Calibration, vertical_t: float) -> Calibration:
+    """The horizontal axes among three, of which the vertical one stays as it reads."""
+    offset, matrix, sigma = np.zeros(3), np.eye(3), np.zeros((3, 3))
+    offset[:2], matrix[:2, :2], sigma[:2, :2] = found.offset_t, found.matrix, found.matrix_sigma
+    covariance = np.zeros((9, 9))
+    covariance[np.ix_(_HORIZONTAL, _HORIZONTAL)] = found.covariance
+    return found._replace(
+        offset_t=offset,
+        matrix=matrix,
+        matrix_sigma=sigma,
+        offset_sigma_t=np.append(found.offset_sigma_t, 0.0),
+        covariance=covariance,
+        field_t=float(np.hypot(found.field_t, vertical_t)),
+        gap=np.append(found.gap, 0.0),
+        level=True,
+    )
+
+
 def _refuse_stretched(found: Calibration) -> None:
     """Refuse axes that differ by much where the samples do not lie on the ellipsoid."""
     axes = np.linalg.eigvalsh(found.matrix)
     share = found.after_t / found.field_t
-    if axes[2] > _STRETCHED * axes[0] and share > 0.5 * _OFF:
+    if axes[-1] > _STRETCHED * axes[0] and share > 0.5 * _OFF:
         raise CalibrationError(
-            f"the axes of the ellipsoid differ by a factor of {axes[2] / axes[0]:.2g}, and the "
+            f"the axes of the ellipsoid differ by a factor of {axes[-1] / axes[0]:.2g}, and the "
             f"samples are {share:.0%} of the field off it",
             fix="if the field was not the same while the sensor was turned, turn it away from iron",
         )
@@ -169,30 +246,37 @@ def _evened(z: np.ndarray) -> np.ndarray:
 
 def _refuse_flat(z: np.ndarray) -> None:
     extent = np.linalg.svd(z - z.mean(axis=0), compute_uv=False)
-    if extent[2] < _FLAT * extent[0]:
+    if extent[-1] < _FLAT * extent[0]:
+        share = f"their extent across it is {extent[-1] / extent[0]:.2g} of that along it"
+        if z.shape[1] == 2:
+            raise CalibrationError(
+                f"the samples lie on a line ({share}): the vehicle hardly turned",
+                fix="turn it by a whole circle",
+            )
         raise CalibrationError(
-            f"the samples lie in a plane (their extent across it is {extent[2] / extent[0]:.2g} of "
-            "that along it): the sensor was turned about one axis only",
-            fix="turn it about two more, so that each of its axes points up and down once",
+            f"the samples lie in a plane ({share}): the sensor was turned about one axis only",
+            fix="turn it about two more, so that each of its axes points up and down once; of a "
+            "vehicle that cannot tilt calibrate the horizontal axes alone",
         )
 
 
 def _direct_ellipsoid(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centre and matrix W with ``|W (z - centre)| = 1`` after Li & Griffiths (2004), k = 4."""
-    x, y, w = z.T
-    squares = np.stack([x * x, y * y, w * w, 2 * y * w, 2 * x * w, 2 * x * y])
+    pairs = _PAIRS[z.shape[1]]
+    d, m = z.shape[1], len(pairs)
+    squares = np.stack([(1.0 + (i != j)) * z[:, i] * z[:, j] for i, j in pairs])
     D = np.concatenate([squares, 2.0 * z.T, np.ones((1, len(z)))])
     S = D @ D.T / len(z)
-    C = np.zeros((6, 6))  # inverse of the matrix of 4 J - I^2, which is positive for ellipsoids
-    C[:3, :3] = np.array([[0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]])
-    C[3:, 3:] = -0.25 * np.eye(3)
-    lower = np.linalg.solve(S[6:, 6:], S[6:, :6])
-    values, vectors = np.linalg.eig(C @ (S[:6, :6] - S[:6, 6:] @ lower))
+    C = np.zeros((m, m))  # inverse of the matrix of 4 J - I^2, which is positive for ellipsoids
+    C[:d, :d] = 0.5 * (1.0 - np.eye(d))
+    C[d:, d:] = -0.25 * np.eye(m - d)
+    lower = np.linalg.solve(S[m:, m:], S[m:, :m])
+    values, vectors = np.linalg.eig(C @ (S[:m, :m] - S[:m, m:] @ lower))
     v = np.real(vectors[:, np.argmax(np.real(values))])
     q = np.concatenate([v, -lower @ v])
-    A = np.array([[q[0], q[5], q[4]], [q[5], q[1], q[3]], [q[4], q[3], q[2]]])
-    centre = -np.linalg.solve(A, q[6:9])
-    level = centre @ A @ centre - q[9]
+    A = _unpacked(np.concatenate([np.zeros(d), v]))[1]
+    centre = -np.linalg.solve(A, q[m:-1])
+    level = centre @ A @ centre - q[-1]
     spread, axes = np.linalg.eigh(A / level)
     if not np.all(spread > 0.0):
         raise CalibrationError(_NO_ELLIPSOID)
@@ -204,7 +288,14 @@ def _direct_sphere(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     design = np.column_stack([2.0 * z, np.ones(len(z))])
     *c, k = np.linalg.lstsq(design, np.sum(z * z, axis=1), rcond=None)[0]
     centre = np.array(c)
-    return centre, np.eye(3) / np.sqrt(k + centre @ centre)
+    return centre, np.eye(len(c)) / np.sqrt(k + centre @ centre)
+
+
+def _of_sphere(d: int) -> np.ndarray:
+    """Free directions of a sphere: its centre, and the diagonal of W as one."""
+    free = np.eye(d + len(_PAIRS[d]), d + 1)
+    free[d : 2 * d, d] = 1.0
+    return free
 
 
 def _refined(
@@ -212,7 +303,7 @@ def _refined(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Least Huber loss of the distances, by Gauss-Newton steps on reweighted squares.
 
-    Steps are combinations of the columns of ``free`` (9, K).
+    Steps are combinations of the columns of ``free`` (9, K), in the plane (5, K).
     """
     noise = _robust_sigma(_distances(z, offset, W, 0.0))
     for _ in range(_PASSES):
@@ -224,7 +315,7 @@ def _refined(
         step = -free @ np.linalg.lstsq(J.T @ J, J.T @ (distance * share), rcond=None)[0]
         offset, W = _unpacked(_packed(offset, W) + step)
         axes = np.linalg.eigvalsh(W)
-        if not (np.all(np.isfinite(step)) and 0.0 < axes[2] < _NEEDLE * axes[0]):
+        if not (np.all(np.isfinite(step)) and 0.0 < axes[-1] < _NEEDLE * axes[0]):
             raise CalibrationError(_NO_ELLIPSOID)
         if np.abs(step).max() < _SETTLED:
             return offset, W
@@ -246,7 +337,7 @@ def _distances(z: np.ndarray, offset: np.ndarray, W: np.ndarray, noise: float) -
 
 
 def _jacobian(z: np.ndarray, offset: np.ndarray, W: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """(N, 9) of the distances by offset and the six numbers of W.
+    """(N, 9) of the distances by offset and the six numbers of W; in the plane (N, 5).
 
     Taken at the nearest points of the ellipsoid: at the samples it would have their noise in it,
     and the products of both would not vanish on average.
@@ -257,19 +348,20 @@ def _jacobian(z: np.ndarray, offset: np.ndarray, W: np.ndarray, distance: np.nda
     b = y @ W
     u = b / np.linalg.norm(b, axis=1, keepdims=True)
     by_offset = -u @ W
-    by_matrix = [u[:, i] * y[:, j] + (i != j) * u[:, j] * y[:, i] for i, j in _PAIRS]
+    by_matrix = [u[:, i] * y[:, j] + (i != j) * u[:, j] * y[:, i] for i, j in _PAIRS[len(offset)]]
     return np.column_stack([by_offset, *by_matrix]) / np.linalg.norm(by_offset, axis=1)[:, None]
 
 
 def _packed(offset: np.ndarray, W: np.ndarray) -> np.ndarray:
-    return np.concatenate([offset, [W[i, j] for i, j in _PAIRS]])
+    return np.concatenate([offset, [W[i, j] for i, j in _PAIRS[len(offset)]]])
 
 
 def _unpacked(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    W = np.empty((3, 3))
-    for (i, j), value in zip(_PAIRS, p[3:], strict=True):
+    d = 2 if len(p) == 5 else 3
+    W = np.empty((d, d))
+    for (i, j), value in zip(_PAIRS[d], p[d:], strict=True):
         W[i, j] = W[j, i] = value
-    return p[:3], W
+    return p[:d], W
 
 
 def _robust_sigma(x: np.ndarray) -> float:
@@ -301,19 +393,20 @@ def _told(unit, offset, W, free, centre, size, strength_t) -> Calibration:
     spread = np.mean(influence**2) / inside**2 * correlated
     covariance = spread * free @ np.linalg.inv(J.T @ J) @ free.T
 
-    field = strength_t / size if strength_t else np.linalg.det(W) ** (-1.0 / 3.0)
-    # (h, W') -> (h, F W'): with F = det^(-1/3) its change is -F tr(W'^-1 dW') / 3.
-    scale = np.diag([1.0] * 3 + [field] * 6)
+    d = len(offset)
+    field = strength_t / size if strength_t else np.linalg.det(W) ** (-1.0 / d)
+    # (h, W') -> (h, F W'): with F = det^(-1/d) its change is -F tr(W'^-1 dW') / d.
+    scale = np.diag([1.0] * d + [field] * len(_PAIRS[d]))
     if strength_t is None:
         inverse = np.linalg.inv(W)
-        by_entry = np.array([inverse[i, j] * (1.0 if i == j else 2.0) for i, j in _PAIRS])
-        scale[3:, 3:] -= field / 3.0 * np.outer(_packed(offset, W)[3:], by_entry)
-    scale[:3] *= size
+        by_entry = np.array([inverse[i, j] * (1.0 if i == j else 2.0) for i, j in _PAIRS[d]])
+        scale[d:, d:] -= field / d * np.outer(_packed(offset, W)[d:], by_entry)
+    scale[:d] *= size
     covariance = scale @ covariance @ scale.T
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    sigma[3:][sigma[3:] < 1e-12] = 0.0  # held, but for rounding
+    sigma[d:][sigma[d:] < 1e-12] = 0.0  # held, but for rounding
     offset_t, matrix, field_t = centre + size * offset, field * W, field * size
-    _refuse_uncertain(sigma, field_t)
+    _refuse_uncertain(sigma[:d], sigma[d:], field_t)
     z = centre + size * unit
     b = calibrated(z, offset_t, matrix)
     after = np.linalg.norm(b, axis=1)
@@ -321,9 +414,9 @@ def _told(unit, offset, W, free, centre, size, strength_t) -> Calibration:
     return Calibration(
         offset_t=offset_t,
         matrix=matrix,
-        soft_iron=free.shape[1] == 9,
+        soft_iron=len(free) == free.shape[1],
         field_t=field_t,
-        offset_sigma_t=sigma[:3],
+        offset_sigma_t=sigma[:d],
         matrix_sigma=_unpacked(sigma)[1],
         covariance=covariance,
         noise_t=noise * size,
@@ -337,8 +430,8 @@ def _told(unit, offset, W, free, centre, size, strength_t) -> Calibration:
     )
 
 
-def _refuse_uncertain(sigma: np.ndarray, field_t: float) -> None:
-    worst = max(sigma[:3].max() / field_t, sigma[3:].max())
+def _refuse_uncertain(offset: np.ndarray, matrix: np.ndarray, field_t: float) -> None:
+    worst = max(offset.max() / field_t, matrix.max())
     if not worst < _VAGUE:
         raise CalibrationError(
             f"the samples do not tell the ellipsoid (one sigma is {worst:.0%} of the field): too "
@@ -350,11 +443,17 @@ def _refuse_uncertain(sigma: np.ndarray, field_t: float) -> None:
 def _coverage(directions: np.ndarray) -> tuple[float, np.ndarray, float]:
     """Share of the sphere near a sample; the direction furthest from any, and how far [rad]."""
     tree = KDTree(directions)
-    grid = _sphere(1000)
+    grid = _sphere(1000) if directions.shape[1] == 3 else _circle(1000)
     chord, _ = tree.query(grid)
     angle = 2.0 * np.arcsin(np.clip(chord / 2.0, 0.0, 1.0))
     furthest = int(np.argmax(angle))
     return float(np.mean(angle <= _REACH)), grid[furthest], float(angle[furthest])
+
+
+def _circle(count: int) -> np.ndarray:
+    """Directions (count, 2) spread evenly."""
+    turn = 2.0 * np.pi * np.arange(count) / count
+    return np.column_stack([np.cos(turn), np.sin(turn)])
 
 
 def _sphere(count: int) -> np.ndarray:

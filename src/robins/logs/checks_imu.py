@@ -11,7 +11,17 @@ from collections.abc import Iterator
 import numpy as np
 
 from robins.dataset import ImuTable
-from robins.logs.findings import Finding
+from robins.ins.plausible import (
+    BIASED,
+    EARTH_RATE,
+    FASTEST,
+    FORCE_UNITS,
+    REST_RATE,
+    G,
+    is_near,
+    rate_across,
+)
+from robins.logs.findings import Finding, Value
 from robins.logs.quiet import (
     Signal,
     Windows,
@@ -25,20 +35,8 @@ from robins.logs.quiet import (
     windows_of,
 )
 
-G = 9.80665
-EARTH_RATE = 7.292115e-5  # rad/s
+_LIVELY = 5.0  # times gravity: more than vehicles feel but for moments
 _GRAVITY = (9.7, 9.9)  # m/s^2, every place where people live
-_BIASED = 0.05  # share of gravity that a bad sensor may be off
-_REST_RATE = 0.2  # rad/s (11 deg/s): more than the bias of almost any gyro
-_FASTEST = 75.0  # rad/s (4300 deg/s): beyond the range of gyros for vehicles
-
-UNITS = {
-    1.0: ("g", "multiply by 9.80665"),
-    1e3: ("milli-g", "multiply by 0.00980665"),
-    100.0 * G: ("cm/s^2", "divide by 100"),
-    1e3 * G: ("mm/s^2", "divide by 1000"),
-    G / 0.3048: ("ft/s^2", "multiply by 0.3048"),
-}
 
 
 def check_imu(imu: ImuTable, in_vehicle: bool = True) -> Iterator[Finding]:
@@ -57,7 +55,8 @@ def check_imu(imu: ImuTable, in_vehicle: bool = True) -> Iterator[Finding]:
     windows = windows_of(signal)
     of_force = list(_gravity(imu, signal, windows))
     yield from of_force
-    yield from _up(imu, windows) if in_vehicle else _free(imu, windows)
+    if not any(f.code == "gravity_missing" for f in of_force):  # what is left has no direction
+        yield from _up(imu, windows) if in_vehicle else _free(imu, windows)
     if not any(f.code in ("rates_as_increments", "increments_as_rates") for f in of_force):
         yield from _rates(imu, signal, windows)
 
@@ -69,7 +68,7 @@ def _gravity(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Findin
     where = "at rest" if windows.at_rest.any() else "at its calmest (it never rests)"
     if _GRAVITY[0] <= measured <= _GRAVITY[1]:
         return
-    if abs(measured / G - 1.0) < _BIASED:
+    if abs(measured / G - 1.0) < BIASED:
         yield note(imu, "gravity_bias", measured, row)(
             f"{where} the specific force is {measured:.3f} m/s^2, gravity is 9.76 to 9.83. The "
             f"unit is right; the accelerometers are off by {measured - 9.8:+.2f} m/s^2 "
@@ -112,7 +111,7 @@ def _rates_for_increments(imu: ImuTable, step_s: float) -> Iterator[tuple[str, s
     windows = windows_of(raw)
     measured = float(np.median(np.linalg.norm(windows.accel[windows.calm], axis=-1)))
     for scale, unit, _ in _READINGS:
-        if _near(measured, scale):
+        if is_near(measured, scale):
             yield (
                 "rates_as_increments",
                 f"The rows are rates in {unit}, not increments over {step_s * 1e3:.4g} ms: "
@@ -124,9 +123,15 @@ def _rates_for_increments(imu: ImuTable, step_s: float) -> Iterator[tuple[str, s
 def _increments_for_rates(
     imu: ImuTable, step_s: float, measured: float
 ) -> Iterator[tuple[str, str]]:
-    """Increments taken for rates: gravity shows as what it adds up to over one step."""
+    """Increments taken for rates: gravity shows as what it adds up to over one step.
+
+    So does a bias that is left where gravity was taken off, but then the motion is far larger.
+    """
+    moving = np.nanpercentile(np.linalg.norm(imu.accel, axis=1), 99.0)
+    if moving > _LIVELY * measured:
+        return
     for scale, unit, summed in _READINGS:
-        if imu.kind == "rate" and _near(measured, scale * step_s):
+        if imu.kind == "rate" and is_near(measured, scale * step_s):
             yield (
                 "increments_as_rates",
                 f"The rows are increments over {step_s * 1e3:.4g} ms in {summed}, not rates: "
@@ -141,13 +146,9 @@ def _g_word(unit: str) -> str:
 def _unit_causes(measured: float) -> list[tuple[str, str]]:
     return [
         ("gravity_unit", f"The unit is probably {unit}: {mend}")
-        for value, (unit, mend) in UNITS.items()
-        if _near(measured, value)
+        for value, (unit, mend) in FORCE_UNITS.items()
+        if is_near(measured, value)
     ]
-
-
-def _near(measured: float, expected: float) -> bool:
-    return abs(measured / expected - 1.0) < _BIASED
 
 
 def _direction(windows: Windows) -> np.ndarray:
@@ -189,39 +190,45 @@ def _up(imu: ImuTable, windows: Windows) -> Iterator[Finding]:
 
 
 def _rates(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Finding]:
-    """Angular rates that no vehicle has, and the Earth's rate in another unit."""
+    """Rates that no vehicle has, and the Earth's rate in another unit.
+
+    The unit has a name only where the Earth's rate tells it: of all others that make a bias or a
+    turn smaller, none fits better than the next.
+    """
     fastest = np.linalg.norm(signal.gyro, axis=-1)
     k = int(np.argmax(fastest))
     calm = windows.at_rest & (windows.restless <= np.percentile(windows.restless, 25))
     rest = windows.gyro[calm] if calm.any() else windows.gyro[:0]
     mean = rest.mean(axis=0) if len(rest) else np.zeros(3)
     size = float(np.linalg.norm(mean))
+    bias = rate_across(mean, windows.accel[calm].mean(axis=0)) if len(rest) else 0.0
+    row = int(signal.rows[windows.first[np.argmax(calm)] if bias > REST_RATE else k])
     if len(rest) >= 30 and (unit := _earth_rate_in(rest, size)):
-        yield finding("error" if size > _REST_RATE else "warning", imu, "gyro_unit", size)(
+        yield finding("error" if size > REST_RATE else "warning", imu, "gyro_unit", size)(
             f"at rest the mean rate is {size:.4g} rad/s, just the Earth's 15.04 deg/h in {unit}. "
             f"The gyro column is in {unit}; convert it to rad/s."
         )
-    elif size > _REST_RATE or fastest[k] > _FASTEST:
-        first = windows.first[np.flatnonzero(calm)[0]] if size > _REST_RATE else k
-        row = int(signal.rows[first])
-        most = max(size, float(fastest[k]))
+    elif bias > REST_RATE or fastest[k] > FASTEST:
+        most = bias if bias > REST_RATE else float(fastest[k])
         shown = (
-            f"at rest the gyros show {size:.3g} rad/s ({np.rad2deg(size):.0f} deg/s)"
-            if size > _REST_RATE
-            else f"the gyros reach {most:.4g} rad/s ({np.rad2deg(most):.0f} deg/s)"
+            f"at rest the gyros read {most:.3g} rad/s ({np.rad2deg(most):.4g} deg/s) across gravity"
+            if bias > REST_RATE
+            else f"the gyros reach {most:.4g} rad/s ({np.rad2deg(most):.4g} deg/s)"
         )
-        # More than 4500 deg/s is beyond the range of gyros as well, so then it is deg/h.
-        unit, mend = ("deg/s", "pi/180") if most < 4500.0 else ("deg/h", "pi/180/3600")
         yield error(imu, "gyro_unit", most, row)(
-            f"{shown}, too much for the gyro of a vehicle. The columns are probably in {unit}: "
-            f"multiply by {mend}."
+            f"{shown}, too much for the gyro of a vehicle. The columns are not in rad/s; these "
+            "numbers alone do not tell in what else (deg/s, mrad/s, counts). Take the unit from "
+            "the data sheet, or compare a turn by a known angle."
         )
 
 
 def _earth_rate_in(rest: np.ndarray, size: float) -> str:
-    """The unit in which a steady mean rate at rest is the Earth's; empty if in none."""
-    scatter = rest.std(axis=0) / np.sqrt(len(rest))
-    if np.linalg.norm(scatter) > 0.01 * size:
+    """The unit in which a steady mean rate at rest is the Earth's; empty if in none.
+
+    The rate of a second must be steady, too, as that of gyros good enough to see the Earth turn: a
+    cheap one may have a bias of that size.
+    """
+    if np.linalg.norm(rest.std(axis=0)) > 0.01 * size:
         return ""
     for unit, factor in (("deg/s", 180.0 / np.pi), ("deg/h", 180.0 / np.pi * 3600.0)):
         if abs(size / (EARTH_RATE * factor) - 1.0) < 0.02:
@@ -231,8 +238,12 @@ def _earth_rate_in(rest: np.ndarray, size: float) -> str:
 
 _STUCK_S = 2.0
 _STUCK_SAMPLES = 100
-_SATURATED_RUN, _SATURATED_LONG = 3, 10
+_STOPPED, _PILED = 5, 3.0  # samples at a stop, and how many times those just inside of it
+_INSIDE = 4  # steps of a column; the outermost one of a sine holds no more than the next four
+_FEW_STEPS = 16  # between the extremes of a column that is too coarse to show a stop
+_SHIFTED = 0.02  # m/s^2 of a mean, that is worth stating
 _COARSE = 64  # distinct values of a column
+_REPEATED = 0.4  # share of readings equal to the one before; 0.28 where a step is the noise
 _FULL_SCALES = {
     "gyro": [np.deg2rad(v) for v in (125, 245, 250, 450, 500, 1000, 2000, 4000)],
     "accel": [9.80665 * v for v in (2, 4, 6, 8, 16, 24, 30, 32, 40)],
@@ -245,8 +256,10 @@ def check_columns(imu: ImuTable) -> Iterator[Finding]:
         return
     step_s = usual_step_s(imu.time_ns)
     for sensor in ("gyro", "accel"):
+        triad = getattr(imu, sensor)
+        fresh = np.concatenate([[True], np.diff(triad, axis=0).any(axis=1)])
         for k, axis in enumerate("xyz"):
-            name, column = f"{sensor}_{axis}", getattr(imu, sensor)[:, k]
+            name, column = f"{sensor}_{axis}", triad[:, k]
             good = np.isfinite(column)
             if not good.all():
                 yield _missing(imu, name, column, good)
@@ -258,8 +271,9 @@ def check_columns(imu: ImuTable) -> Iterator[Finding]:
                     "noise: the axis is dead, not connected, or this is another column."
                 )
                 continue
-            yield from _stuck(imu, name, column, step_s)
-            yield from _saturated(imu, sensor, name, column, good)
+            stops = list(_saturated(imu, name, column, good & fresh, step_s))
+            yield from stops
+            yield from _stuck(imu, name, column, step_s, {f.value for f in stops})
             yield from _coarse(imu, name, column, good)
 
 
@@ -277,8 +291,10 @@ def _missing(imu: ImuTable, name: str, column: np.ndarray, good: np.ndarray) -> 
     )
 
 
-def _stuck(imu: ImuTable, name: str, column: np.ndarray, step_s: float) -> Iterator[Finding]:
-    start, length = longest_run(np.diff(column) == 0.0)
+def _stuck(
+    imu: ImuTable, name: str, column: np.ndarray, step_s: float, stops: set[Value]
+) -> Iterator[Finding]:
+    start, length = longest_run((np.diff(column) == 0.0) & ~np.isin(column[1:], list(stops)))
     if length >= _STUCK_SAMPLES and length * step_s >= _STUCK_S:
         yield warning(imu, "axis_stuck_for_a_while", length, start)(
             f"{name} stays at {column[start]:g} for {length + 1} samples ({length * step_s:.1f} s) "
@@ -288,29 +304,65 @@ def _stuck(imu: ImuTable, name: str, column: np.ndarray, step_s: float) -> Itera
 
 
 def _saturated(
-    imu: ImuTable, sensor: str, name: str, column: np.ndarray, good: np.ndarray
+    imu: ImuTable, name: str, column: np.ndarray, readings: np.ndarray, step_s: float
 ) -> Iterator[Finding]:
-    values = column[good]
-    middle = np.median(values)
-    # A stop is an extreme met several times in a row that is far from the bulk, or held for long;
-    # a coarse column holds its extremes for long without being stopped.
-    fine = len(np.unique(values)) > _COARSE
-    spread = np.subtract(*np.percentile(values, [95, 5])) / 3.3 + 1e-300
-    for extreme in (float(values.max()), float(values.min())):
-        start, length = longest_run(column == extreme)
-        far = abs(extreme - middle) > 4.0 * spread
-        if length < (_SATURATED_RUN if far else _SATURATED_LONG) or not (far or fine):
+    """Extremes of a column with many more readings than just inside of them, in a row or not.
+
+    A signal that merely turns round at its extreme has no more readings there than in the next few
+    steps of the column, a sine at a constant size four fifths of them, noise far fewer.
+    """
+    sensor, unit = ("gyro", "rad/s") if name.startswith("gyro") else ("accel", "m/s^2")
+    values = column[readings]
+    distinct = np.unique(values)
+    least = 1e-9 * np.abs(distinct).max()  # by which turned axes make equal numbers differ
+    steps = np.diff(distinct)
+    step = float(np.median(steps[steps > least])) if np.any(steps > least) else np.inf
+    if np.ptp(distinct) < _FEW_STEPS * step:
+        return
+    inside = max(_INSIDE * step, least)
+    for extreme in (float(distinct[-1]), float(distinct[0])):
+        away = np.abs(values - extreme)
+        count, near = np.count_nonzero(away <= least), np.count_nonzero(away <= inside)
+        scale = min(_FULL_SCALES[sensor], key=lambda scale: abs(abs(extreme) - scale))
+        usual = abs(abs(extreme) / scale - 1.0) < 0.03
+        share = count / len(values)
+        # A value held by most of the readings is the bulk, as of a sensor that reports no noise.
+        if count < _STOPPED or count <= _PILED * (near - count) or not (usual or share < 0.5):
             continue
-        total = int(np.count_nonzero(column == extreme))
-        near = min(_FULL_SCALES[sensor], key=lambda scale: abs(abs(extreme) - scale))
-        unit = "rad/s" if sensor == "gyro" else "m/s^2"
-        usual = abs(abs(extreme) / near - 1.0) < 0.03
-        range_ = f", a usual full scale ({near:.4g} {unit})" if usual else ""
-        yield warning(imu, "saturated", extreme, start)(
-            f"{name} stops at {extreme:.6g}{range_} in {total} samples, {length} in a row here. "
-            "The sensor is saturated and the motion beyond is lost; choose a larger range or damp "
-            "the mounting, and expect a jump of attitude or velocity here."
+        stopped = np.abs(column - extreme) <= least
+        range_ = f", a usual full scale ({scale:.4g} {unit})" if usual else ""
+        shift = _shift(column, stopped, extreme, step_s) if sensor == "accel" else 0.0
+        shift /= step_s if imu.kind == "increment" else 1.0
+        lost = (
+            f"Judged by its other side, that shifts the mean of {name} by {shift:+.2g} m/s^2 while "
+            "it lasts, which a filter takes for a bias"
+            if abs(shift) > _SHIFTED
+            else "Expect a jump of attitude or velocity here"
         )
+        yield warning(imu, "saturated", extreme, int(np.argmax(stopped)))(
+            f"{name} stops at {extreme:.6g}{range_} in {count} readings ({share:.1%} of all), this "
+            "one first. The sensor is saturated and the motion beyond is lost; choose a larger "
+            f"range or damp the mounting. {lost}."
+        )
+
+
+def _shift(column: np.ndarray, stopped: np.ndarray, extreme: float, step_s: float) -> float:
+    """Change of the mean by what is cut off, in the seconds in which it is.
+
+    A vibration reaches as far on both sides of its median: as far as the other side goes beyond the
+    stop, so much is cut off here.
+    """
+    n = max(round(1.0 / step_s), 10)
+    count = len(column) // n
+    cut = stopped[: count * n].reshape(count, n).any(axis=1)
+    part = column[: count * n].reshape(count, n)[cut]
+    part = part[np.isfinite(part)]
+    if not len(part):
+        return 0.0
+    middle = float(np.median(part))
+    sign = np.sign(extreme - middle)
+    beyond = sign * (middle - part) - abs(extreme - middle)
+    return float(-sign * np.mean(np.maximum(beyond, 0.0)))
 
 
 def _coarse(imu: ImuTable, name: str, column: np.ndarray, good: np.ndarray) -> Iterator[Finding]:
@@ -318,7 +370,8 @@ def _coarse(imu: ImuTable, name: str, column: np.ndarray, good: np.ndarray) -> I
     if len(values) < 1000:
         return
     distinct = np.unique(values)
-    if len(distinct) <= _COARSE:
+    # Noise of a step or more makes the mean of coarse numbers as good as that of fine ones.
+    if len(distinct) <= _COARSE and np.mean(np.diff(values) == 0.0) > _REPEATED:
         step = float(np.median(np.diff(distinct)))
         yield warning(imu, "coarse", step)(
             f"{name} takes only {len(distinct)} different values, {step:.3g} apart. The recording "

@@ -16,6 +16,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from robins.dataset import ImuTable, MagTable
+from robins.ins.plausible import EARTH_FIELD_T, FIELD_UNITS
 from robins.logs.checks_motion import words_of
 from robins.logs.findings import Finding, Severity
 from robins.logs.limits import FIELD_LIMIT_T, few_beyond
@@ -23,7 +24,6 @@ from robins.logs.motion import at, signed_permutations, steps_of
 from robins.logs.ordering import increasing
 from robins.logs.quiet import error, finding, longest_run, note, signal_of, usual_step_s, warning
 
-EARTH_T = (20e-6, 70e-6)
 _FEW = 10  # samples below which nothing is judged
 _STUCK_S, _STUCK_SAMPLES = 2.0, 100
 _STOP_T = 80e-6  # no magnetometer has a range as small as the Earth's field
@@ -36,10 +36,10 @@ _WRONG, _RIGHT, _BETTER = 0.4, 0.15, 0.25  # shares of the change the gyros leav
 
 # By what power of ten the numbers are too large, and what makes them so.
 _SHIFTS: dict[int, tuple[Severity, str, str]] = {
-    9: ("error", "The numbers are probably in nT", "multiply by 1e-9 for tesla"),
-    7: ("error", "The numbers are probably in milligauss", "multiply by 1e-7 for tesla"),
-    6: ("error", "The numbers are probably in uT", "multiply by 1e-6 for tesla"),
-    4: ("error", "The numbers are probably in gauss", "multiply by 1e-4 for tesla"),
+    **{
+        shift: ("error", f"The numbers are probably in {unit}", f"{fix} for tesla")
+        for shift, (unit, fix) in FIELD_UNITS.items()
+    },
     3: ("error", "They are probably in nT where uT is said, or uT where mT", "divide by 1000"),
     2: ("error", "They are probably in uT where gauss is said", "divide by 100"),
     1: ("warning", "They may be in mG where uT is said, or a magnet is near", "divide by 10"),
@@ -113,11 +113,11 @@ def _dead(mag: MagTable, axes: list[str], field: np.ndarray) -> Finding:
 def _unit(mag: MagTable, size: float) -> Iterator[Finding]:
     shown = f"the magnetic field is {size * 1e6:.4g} uT strong where the Earth's is 20 to 70"
     for shift, (severity, cause, mend) in _SHIFTS.items():
-        if EARTH_T[0] <= size / 10.0**shift <= EARTH_T[1]:
+        if EARTH_FIELD_T[0] <= size / 10.0**shift <= EARTH_FIELD_T[1]:
             yield finding(severity, mag, "field_unit", size)(f"{shown}. {cause}: {mend}.")
             return
     # Iron in the casing of a cheap sensor is often stronger than the Earth's field.
-    if not EARTH_T[0] / 2 <= size <= 10 * EARTH_T[1]:
+    if not EARTH_FIELD_T[0] / 2 <= size <= 10 * EARTH_FIELD_T[1]:
         yield error(mag, "field_unit", size)(
             f"{shown}, and no usual unit makes it that. These are counts of a converter, or other "
             "columns."

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from robins.dataset import GnssTable, ImuTable, Trajectory
 from robins.ins.frames import to_ned_frd
+from robins.ins.plausible import FORCE_UNITS, G
 from robins.logs.checks_gnss import check_velocity
-from robins.logs.checks_imu import UNITS, G
 from robins.logs.checks_motion import SCALES, words_of
 from robins.logs.findings import Finding
 from robins.logs.motion import signed_permutations
@@ -234,7 +234,7 @@ def _force(imu: ImuTable, master: Trajectory, shared: Shared | None) -> Iterator
     if as_is < _WRONG:
         return
     maps = signed_permutations()
-    units = [(G / value, "gravity_unit", *words) for value, words in UNITS.items()]
+    units = [(G / value, "gravity_unit", *words) for value, words in FORCE_UNITS.items()]
     step_s = usual_step_s(imu.time_ns)
     if imu.kind == "increment":  # before cm/s^2, which look the same at 100 Hz
         mend = (step_s, "rates_as_increments", "rates", "name a format of rates")

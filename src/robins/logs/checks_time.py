@@ -1,4 +1,4 @@
-"""The doctor on time stamps: unit, order, duplicates, jumps, gaps, jitter.
+"""The doctor on time stamps: unit, batches, order, duplicates, jumps, gaps, jitter.
 
 And on whether the files of one run overlap in time, and are on one time base.
 """
@@ -11,9 +11,10 @@ import numpy as np
 
 from robins.dataset import AttitudeTable, GnssTable, ImuTable, MagTable, Trajectory
 from robins.gps_time import GPS_EPOCH_S
+from robins.logs.batches import batches_of, resolution_ns, spread
 from robins.logs.findings import Finding
 from robins.logs.ordering import increasing
-from robins.logs.quiet import error, finding, name_of, place, usual_step_s, warning
+from robins.logs.quiet import error, finding, name_of, note, place, usual_step_s, warning
 from robins.logs.tables import Table
 from robins.logs.timebase import WEEK_S
 
@@ -33,6 +34,8 @@ _STEPS = {
 }
 _GAP = 2.5  # usual steps
 _SLOWEST_IMU_S = 0.25
+_LONGEST_BATCH_S = 1.5
+_PART = 500  # rows
 _WHY_GAPS = {
     GnssTable: "The receiver had no solution there; the run goes on by inertia alone",
     MagTable: "The logger lost data; heading is held by the gyros meanwhile",
@@ -56,6 +59,11 @@ def check_time(table: Table, unit_known: bool = False) -> Iterator[Finding]:
     if not np.isfinite(usual):
         yield error(table, "time_stands", 0.0)(_STANDS)
         return
+    if (first := batches_of(table)) is not None:
+        even = spread(table)
+        usual = usual_step_s(even.time_ns)
+        yield _shared(table, float(np.median(np.diff(first, append=len(table)))), usual)
+        table = even
     yield from _slow(table, usual) if unit_known else _unit(table, usual)
     keep = increasing(table.time_ns)
     yield from _duplicates(table)
@@ -82,7 +90,10 @@ def _limits_s(table: Table) -> tuple[float, float]:
     """The longest and the shortest step that such a sensor makes."""
     if isinstance(table, ImuTable):
         return _SLOWEST_IMU_S, 2e-5
-    return (2.0, 2e-5) if isinstance(table, MagTable | AttitudeTable) else (45.0, 5e-3)
+    if isinstance(table, GnssTable):
+        return 45.0, 5e-3
+    # A path may be as fast as the cameras of motion capture.
+    return (45.0, 2e-4) if isinstance(table, Trajectory) else (2.0, 2e-5)
 
 
 def _unit(table: Table, usual: float) -> Iterator[Finding]:
@@ -100,6 +111,30 @@ def _unit(table: Table, usual: float) -> Iterator[Finding]:
             f"samples are {usual:g} s apart, which no such sensor does. The time column is in "
             "another unit than seconds, or is another column; check it."
         )
+
+
+def _shared(table: Table, size: float, step_s: float) -> Finding:
+    """Batches of samples of a usual size with one stamp, or stamped in a burst."""
+    many_s = size * step_s
+    again = np.diff(table.time_ns) == 0
+    how = (
+        f"{size:g} samples share each stamp (median; {again.mean():.0%} repeat the one before)"
+        if again.mean() > 0.01
+        else f"samples are stamped in bursts of {size:g}, one burst every {many_s:.4g} s"
+    )
+    mend = (
+        "A batch lasts so long that nothing can be timed in it; log the time with all its digits"
+        if many_s > _LONGEST_BATCH_S
+        else f"`clean` spreads each batch evenly, {step_s * 1e3:.4g} ms apart; all may be early or "
+        f"late by up to {many_s * 1e3:.4g} ms, so log the sensor's own counter, or all digits"
+    )
+    return finding(
+        "error" if many_s > _LONGEST_BATCH_S else "warning",
+        table,
+        "stamps_shared",
+        size,
+        int(np.argmax(again)) + 1 if again.any() else None,
+    )(f"{how}. A buffer was read at once and stamped on arrival, or stamps were rounded. {mend}.")
 
 
 def _duplicates(table: Table) -> Iterator[Finding]:
@@ -158,28 +193,33 @@ def _named(size: float, usual: float, names: dict[float, str]) -> str:
         multiple = max(round(size / known), 1)
         if (known in (1.0, 18.0) and multiple != 1) or multiple > 24:
             continue
-        if abs(size - multiple * known) < 1.6 * usual + 1e-6 * known:
-            return f"This is {cause}"
+        if abs(size - multiple * known) < min(1.6 * usual, 0.5) + 1e-6 * known:
+            return f"It fits {cause}"
     return ""
 
 
 def _gaps(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
+    """Missing samples. Steps of a clock look alike, so those of usual sizes are named as such.
+
+    Receivers lose fixes for any time, and other sensors hardly matter, so there a gap is a gap.
+    """
     rows = np.flatnonzero(keep).tolist()
     step = (np.diff(table.time_ns[rows]) * 1e-9).tolist()
-    long = [k for k, s in enumerate(step) if s > _GAP * usual]
-    jumps = [k for k in long if _jump(step[k] - usual, usual)]
+    gaps = [k for k, s in enumerate(step) if s > _GAP * usual]
+    harmless = not isinstance(table, ImuTable | Trajectory)
+    jumps = [] if harmless else [k for k in gaps if _jump(step[k] - usual, usual)]
     for k in jumps:
         size = step[k] - usual
-        yield finding("error" if size > 1.5 else "warning", table, "time_jump", size, rows[k + 1])(
-            f"time jumps ahead by {size:.6g} s. {_jump(size, usual)}, unless exactly that much was "
-            "lost. If the motion goes on without a break, take the step off all later stamps."
+        yield warning(table, "time_jump", size, rows[k + 1])(
+            f"no sample for {step[k]:.6g} s before this one: a gap, or a clock set ahead by "
+            f"{size:.6g} s. {_jump(size, usual)}; if the motion goes on without a break, take the "
+            "step off all later stamps."
         )
-    gaps = [k for k in long if k not in jumps]
+    gaps = [k for k in gaps if k not in jumps]
     if not gaps:
         return
     worst = max(gaps, key=lambda k: step[k])
     total = sum(step[k] for k in gaps)
-    harmless = not isinstance(table, ImuTable | Trajectory)
     cause = (
         _WHY_GAPS.get(type(table))
         or "The logger lost data (buffer, card or cable too slow); a run must bridge it blindly, "
@@ -203,12 +243,20 @@ def _jump(size: float, usual: float) -> str:
 
 
 def _jitter(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
-    step = np.diff(table.time_ns[keep]) * 1e-9
+    stamps = table.time_ns[keep]
+    step = np.diff(stamps) * 1e-9
     step = step[step < _GAP * usual]
     if len(step) < 10 or isinstance(table, GnssTable):
         return
     scatter = float(step.std()) / usual
-    if scatter > 0.1:
+    rounded = resolution_ns(stamps) * 1e-9
+    if scatter > 0.1 and rounded > 0.5 * usual and _strays(stamps) < 1.5 * rounded:
+        yield note(table, "stamps_rounded", rounded)(
+            f"stamps are whole multiples of {rounded:.4g} s, for samples {step.mean():.4g} s apart "
+            f"({1 / step.mean():.4g} Hz). Their digits were lost in writing; log them all, or a "
+            f"time is wrong by up to {rounded / 2:.2g} s."
+        )
+    elif scatter > 0.1:
         low, high = np.percentile(step, [0.5, 99.5])
         yield finding("warning" if scatter > 0.5 else "note", table, "time_jitter", scatter)(
             f"steps of time scatter from {low * 1e3:.3g} to {high * 1e3:.3g} ms (mean "
@@ -216,6 +264,18 @@ def _jitter(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
             "arrival or rounded, not by the sensor's clock; harmless for slow motion, but use the "
             "sensor's own counter if it was logged."
         )
+
+
+def _strays(stamps: np.ndarray) -> float:
+    """Range of the stamps about a constant rate [s], in the median of parts of the table.
+
+    Rounding leaves that of the last digit; where rows are missing here and there it is more.
+    """
+    n = min(_PART, len(stamps))
+    parts = (stamps[: len(stamps) // n * n] - stamps[0]).reshape(-1, n) * 1e-9
+    x = np.arange(n) - 0.5 * (n - 1)
+    rest = parts - (parts @ x / (x @ x))[:, None] * x
+    return float(np.median(np.ptp(rest, axis=1)))
 
 
 def check_span(imu: ImuTable, others: Sequence[Table]) -> Iterator[Finding]:

@@ -1,7 +1,8 @@
 """Cleans a log for a run: bad samples are refused, counted and removed.
 
-What is refused here leaves the tables exactly as if its rows had never been recorded; nothing is
-repaired, interpolated or smoothed. Time is put in order by refusing the fewest samples, see
+What is refused here leaves the tables exactly as if its rows had never been recorded; no value is
+repaired, interpolated or smoothed. Samples that were stamped in batches are spread evenly, see
+`robins.logs.batches`; then time is put in order by refusing the fewest samples, see
 `robins.logs.ordering`. Gaps are declared, not filled: the system decides whether to bridge them.
 Denormal numbers and huge but possible ones pass; outliers are the business of filters.
 
@@ -20,12 +21,12 @@ import numpy as np
 
 from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.errors import require_kind
+from robins.ins.plausible import ACCEL_LIMIT, GYRO_LIMIT
+from robins.logs.batches import spread, spread_counts, spread_like
 from robins.logs.findings import LogError, refused
 from robins.logs.limits import (
-    ACCEL_LIMIT,
     ALT_LIMIT_M,
     FIELD_LIMIT_T,
-    GYRO_LIMIT,
     LAT_LIMIT,
     LON_LIMIT,
     QUATERNION_LIMIT,
@@ -45,7 +46,8 @@ def clean(dataset: Dataset) -> Dataset:
     Counts, in samples, begin with the table's name: ``imu_nan``, ``imu_inf``, ``imu_absurd`` (a
     magnitude no vehicle has), ``imu_duplicate``, ``imu_backward`` and ``imu_ahead`` (time stamps
     out of order); ``gnss_...`` likewise and ``gnss_sigma`` (zero or negative); ``truth_...``,
-    ``master_...``, ``mag_...``, ``attitude_...``.
+    ``master_...``, ``mag_...``, ``attitude_...``. Rows that were given a time of their own within a
+    batch are kept and counted as ``imu_spread``, where there are any.
     Counts already in the dataset are added to.
 
     A fix that lacks a component keeps the others: the component becomes NaN, its sigma, if that was
@@ -62,22 +64,29 @@ def clean(dataset: Dataset) -> Dataset:
     require_kind(dataset, Dataset, "clean", "make one of the table: Dataset(name, imu=table)")
     imu, counts, gaps = clean_imu(dataset.imu)
     tables: dict[str, Any] = {"imu": imu}
+    read = checked(dataset.imu)
+    even = spread(read)
     for kind, cleaner in _CLEANERS.items():
         if (table := getattr(dataset, kind)) is not None:
-            tables[kind], more = cleaner(table)
-            counts |= more
+            table = checked(table)
+            like = spread_like(table, read, even)
+            tables[kind], more = cleaner(like)
+            counts |= more | spread_counts(kind, table, like)
     total = {k: dataset.counts.get(k, 0) + counts.get(k, 0) for k in dataset.counts | counts}
     return dataclasses.replace(dataset, **tables, counts=total, imu_gaps=gaps)
 
 
 def clean_imu(imu: ImuTable) -> tuple[ImuTable, dict[str, int], list[tuple[int, int]]]:
     """Clean one IMU table: the table, counts by reason, gaps (start_ns, end_ns). See `clean`."""
-    imu = checked(imu)
+    read = checked(imu)
+    imu = spread(read)
     limit = np.repeat([GYRO_LIMIT, ACCEL_LIMIT], 3)
     have, bad = _whole_rows(np.hstack([imu.gyro, imu.accel]), limit)
     keep, counts = refusals("imu", imu.time_ns, have, bad)
+    counts |= spread_counts("imu", read, imu)
     if np.count_nonzero(keep) < 2:
-        told = ", ".join(f"{n} {k.removeprefix('imu_')}" for k, n in counts.items() if n) or "none"
+        reasons = {k.removeprefix("imu_"): n for k, n in counts.items() if n and k != "imu_spread"}
+        told = ", ".join(f"{n} {reason}" for reason, n in reasons.items()) or "none"
         raise LogError(
             imu.source or "ImuTable",
             f"fewer than two of {len(imu)} samples can be used (refused: {told})",
@@ -208,12 +217,14 @@ def clean_mag(mag: MagTable) -> tuple[MagTable, dict[str, int]]:
     Raises:
         LogError: arrays that are no table.
     """
-    mag = checked(mag)
+    read = checked(mag)
+    mag = spread(read)
     nan, inf = np.isnan(mag.field_t), np.isinf(mag.field_t)
     absurd = (np.abs(mag.field_t) > FIELD_LIMIT_T) & ~inf
     field_t = np.where(inf | absurd, np.nan, mag.field_t)
     bad = {"nan": nan.any(axis=1), "inf": inf.any(axis=1), "absurd": absurd.any(axis=1)}
     keep, counts = refusals("mag", mag.time_ns, np.ones(len(mag), bool), bad)
+    counts |= spread_counts("mag", read, mag)
     return rows_where(dataclasses.replace(mag, field_t=field_t), keep), counts
 
 

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
+from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
 from robins.errors import require_kind
+from robins.logs.batches import spread, spread_like
 from robins.logs.checks_attitude import check_attitude
 from robins.logs.checks_gnss import check_gnss, check_velocity
 from robins.logs.checks_imu import check_columns, check_imu
@@ -102,12 +103,14 @@ ALONE = (
         Code("time_stands", "error", "a time column that is constant, or another one"),
         Code("time_unit", "error", "the rate tells that time is in ms, us or ns"),
         Code("time_slow", "warning", "inertial samples too far apart to navigate by"),
+        Code("stamps_shared", "error or warning", "stamps of batches; `clean` spreads the samples"),
         Code("time_duplicate", "warning", "samples that repeat a time; `clean` refuses them"),
         Code("clock_set_back", "error", "a counter ran over, a time zone, a restart"),
         Code("time_backward", "warning", "samples that step back; `clean` refuses them"),
-        Code("time_jump", "error or warning", "a leap second, a time zone, a counter"),
+        Code("time_jump", "warning", "a gap, or a clock set by a leap second, a time zone"),
         Code("gap_short", "warning or note", "samples are missing, for less than a second"),
         Code("gap_long", "warning or note", "samples are missing, for a second or more"),
+        Code("stamps_rounded", "note", "digits of stamps were lost"),
         Code("time_jitter", "warning or note", "stamps taken on arrival, not by the sensor"),
     ),
     _check("In the numbers of any table", check_limits, "table")(
@@ -271,19 +274,24 @@ REFUSALS = {
     "duplicate": "the time of the sample before",
     "backward": "time that steps back; as few samples as possible are refused",
     "ahead": "time far ahead of what follows, likewise",
+    "spread": "not refused: stamped with others at once, its time is spread evenly",
     "sigma": "a sigma of a GNSS fix that is zero or negative",
 }
 
 
 Subject = Dataset | Table | Sequence[Table | Dataset]
+Use = Literal["any", "attitude"]
 
 
-def examine(subject: Subject) -> list[Finding]:
+def examine(subject: Subject, use: Use = "any") -> list[Finding]:
     """Judge a dataset, or tables by themselves.
 
     Args:
         subject: as it was read, before `clean`, so that everything is seen. Of a dataset count too
             the findings of its readers, its ``time_unit_known`` and its ``master_delay_s``.
+        use: "attitude" where the attitude of the sensor is all that is wanted, so that it may lie
+            any way. By default that is so where nothing but the sensor was recorded: neither fixes
+            nor a path of a vehicle.
 
     Returns:
         Errors first, then warnings, then notes; empty for a log without a flaw.
@@ -300,13 +308,21 @@ def examine(subject: Subject) -> list[Finding]:
     unit_known = {file for dataset in datasets for file in dataset.time_unit_known}
     with np.errstate(all="ignore"):  # nonsense is looked at on purpose here
         tables = [checked(table) for part in parts for table in _tables(part)]
-        all_of_them: dict[str, Any] = {"others": [t for t in tables if not isinstance(t, ImuTable)]}
+        in_vehicle = use != "attitude" and _in_vehicle(tables)
+        evens: list[Table] = []
+        imu: ImuTable | None = None
+        all_of_them: dict[str, Any] = {"others": evens}
         for table in tables:
-            things = {kind_of(table): table, "table": table, "in_vehicle": _in_vehicle(tables)}
-            if not _stamped_as(table, all_of_them.get("imu")):  # said once is enough
+            even = spread(table) if imu is None else spread_like(table, imu, all_of_them["imu"])
+            things = {kind_of(table): even, "table": even, "in_vehicle": in_vehicle}
+            if not _stamped_as(table, imu):  # once is enough
                 things |= {"stamps": table, "unit_known": table.source in unit_known}
             findings += _asked(ALONE, things, [])
-            all_of_them[kind_of(table)] = table
+            all_of_them[kind_of(table)] = even
+            if isinstance(table, ImuTable):
+                imu = table
+            else:
+                evens.append(even)
         if isinstance(subject, Dataset) and subject.master is not None:
             master, delay_s = checked(subject.master), subject.master_delay_s
             all_of_them |= {"master": master, "delay_s": delay_s}
@@ -331,9 +347,8 @@ def _tables(part: Table | Dataset) -> list[Table]:
 
 
 def _in_vehicle(tables: list[Table]) -> bool:
-    """What shall tell only how the sensor itself is turned may lie any way."""
-    kinds = {type(table) for table in tables}
-    return not kinds & {MagTable, AttitudeTable} or bool(kinds & {GnssTable, Trajectory})
+    """True where there is a vehicle, which has a top; a sensor by itself may lie any way."""
+    return any(isinstance(table, GnssTable | Trajectory) for table in tables)
 
 
 def _stamped_as(table: Table, imu: ImuTable | None) -> bool:

@@ -7,12 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from robins.dataset import AttitudeTable, GnssTable, ImuTable, MagTable, Trajectory
+from robins.ins.plausible import ACCEL_LIMIT, GYRO_LIMIT
 from robins.logs.findings import Finding
 from robins.logs.quiet import warning
 from robins.logs.tables import Table
 
-GYRO_LIMIT = 1e4  # rad/s, 95 000 turns a minute, or rad for increments
-ACCEL_LIMIT = 1e6  # m/s^2, or m/s for increments
 LAT_LIMIT, LON_LIMIT = np.pi / 2, 2 * np.pi
 ALT_LIMIT_M = 1e9
 SPEED_LIMIT = 1e5  # m/s

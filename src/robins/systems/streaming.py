@@ -21,14 +21,22 @@ import numpy as np
 
 from robins.errors import RobinsError
 from robins.filters import Belief, Filter, FilterState, Model, OnlineFilter
+from robins.ins.plausible import (
+    ACCEL_LIMIT,
+    FASTEST,
+    GYRO_LIMIT,
+    REST_RATE,
+    STRONGEST_T,
+    field_unit,
+    force_unit,
+    rate_across,
+)
 from robins.program.evaluated import evaluated
 from robins.results import ResultError, snapshot
 from robins.scenario import Parameters
 from robins.scenario.text import mapping_of, text_of
 
-_GYRO_LIMIT, _ACCEL_LIMIT = 1e4, 1e6  # rad/s, m/s^2: absurd, as `robins.logs.clean` has it
-_SPIN = 100.0  # rad/s, faster than any gyro that is not given in deg/s
-_ONE_G = (0.9, 1.1)  # size of gravity in g
+_STILL = 0.01  # of the specific force: how little it may scatter at rest
 
 
 class LiveError(RobinsError, ValueError):
@@ -81,7 +89,7 @@ class Door:
         """
         if not np.all(np.isfinite(values)):
             return "nan" if np.any(np.isnan(values)) else "inf"
-        if np.max(np.abs(values[:3])) > _GYRO_LIMIT or np.max(np.abs(values[3:])) > _ACCEL_LIMIT:
+        if np.max(np.abs(values[:3])) > GYRO_LIMIT or np.max(np.abs(values[3:])) > ACCEL_LIMIT:
             return "absurd"
         ahead = 1 if self.last_ns is None else time_ns - self.last_ns
         if 0 < ahead <= self._gap_ns:
@@ -125,19 +133,39 @@ def numbers(name: str, values: Any, size: int) -> np.ndarray:
 
 
 def refuse_units(gyro: np.ndarray, accel: np.ndarray) -> None:
-    """Refuse samples (K, 3) whose sizes are those of another unit.
+    """Refuse samples (K, 3) whose sizes are those of another unit, as the doctor of logs would.
 
     Raises:
-        LiveError: rates that no gyro reads, or a mean specific force of one.
+        LiveError: rates that no gyro reads, also where the specific force stands still; or a mean
+            specific force that is gravity in another unit.
     """
     spin = float(np.max(np.linalg.norm(gyro, axis=1), initial=0.0))
-    if spin > _SPIN:
-        what = f"reads up to {spin:.0f}, which is no rate in rad/s"
-        raise LiveError(what, "gyro", "if it is in deg/s, give np.radians of it")
-    size = float(np.linalg.norm(np.mean(accel, axis=0)))
-    if _ONE_G[0] < size < _ONE_G[1]:
-        what = f"the mean reads {size:.2f}, which is gravity in g, not in m/s^2"
-        raise LiveError(what, "accel", "multiply it by 9.80665")
+    fix = "if it is in deg/s, give np.radians of it"
+    if spin > FASTEST:
+        raise LiveError(f"reads up to {spin:.0f}, which is no rate in rad/s", "gyro", fix)
+    force = np.mean(accel, axis=0)
+    size = float(np.linalg.norm(force))
+    # An acceleration may have the size of gravity in ft/s^2; of all other units it is far off.
+    if (unit := force_unit(size)) and unit[0] != "ft/s^2":
+        what = f"the mean reads {size:.4g}, which is gravity in {unit[0]}, not in m/s^2"
+        raise LiveError(what, "accel", unit[1])
+    if float(np.linalg.norm(np.std(accel, axis=0))) < _STILL * size:
+        across = rate_across(np.mean(gyro, axis=0), force)
+        if across > REST_RATE:
+            what = f"reads {across:.2g} across gravity, which stands still: no bias in rad/s"
+            raise LiveError(what, "gyro", fix)
+
+
+def refuse_field_unit(strength: float) -> None:
+    """Refuse a magnetic field whose usual strength is beyond that of any sensor in tesla.
+
+    Raises:
+        LiveError: it is.
+    """
+    if strength > STRONGEST_T:
+        unit, fix = field_unit(strength) or ("another unit", "take it from the data sheet")
+        what = f"reads {strength:.4g}, which is no field in tesla, but one in {unit}"
+        raise LiveError(what, "field", fix)
 
 
 Part = Any  # an object with attributes

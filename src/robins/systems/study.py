@@ -301,6 +301,8 @@ class System(NamedTuple):
     # `replaying.Recorded`; a system without it cannot be tuned on logs
     recorded: Callable[..., Any] | None = None
     reads: Literal["dataset", "ranges"] = "dataset"  # what its logs are: `Dataset` or `RangeLog`
+    # what a log is examined for: "attitude" where the sensor may lie any way in its vehicle
+    use: Literal["any", "attitude"] = "any"
     # roles of arrays that a replay finds, of which exports are made
     replay_finds: tuple[str, ...] = ("attitude", "track")
     # roll, pitch, yaw [rad] of the body axes as seen from the sensor's, from replay parameters

@@ -12,6 +12,7 @@ import numpy as np
 
 from robins import logs, scenario, systems
 from robins.ins.frames import to_ned_frd
+from robins.logs.batches import spread
 from robins.logs.findings import by_severity
 from robins.logs.mounting import turned
 from robins.logs.quiet import usual_step_s
@@ -93,7 +94,7 @@ def unit_file(
             "a configuration is written from the log alone", configuration, "omit this file."
         )
     dataset = logs.load_dataset(files, formats=logs.formats_of(files, columns))
-    found = find_unit(to_ned_frd(dataset.imu), dataset.gnss)
+    found = find_unit(to_ned_frd(spread(dataset.imu)), dataset.gnss)
     if not any(value is not None for value in found):
         raise InputError(
             "the log tells nothing of its unit: there is too little motion, and no rest",
@@ -104,7 +105,7 @@ def unit_file(
 
 
 def _described(table: Any) -> dict[str, Any]:
-    step_s = usual_step_s(table.time_ns)
+    step_s = usual_step_s(spread(table).time_ns)
     return {
         "kind": kind_of(table),
         "file": table.source,

@@ -27,6 +27,10 @@ _AXES = ("x", "y", "z")
 _UT = 1e6  # of a tesla
 _WIDE = np.deg2rad(60.0)  # a gap of directions that is worth a word
 _MANY = 0.02  # outliers, likewise
+_WAYS = {
+    False: "the sensor so that each of its axes points up and down once",
+    True: "the vehicle by a whole circle",
+}
 
 
 class Turned(NamedTuple):
@@ -81,12 +85,22 @@ def samples(
 def advice(found: Calibration) -> list[str]:
     """Advice on the next step, in sentences."""
     notes = []
+    if found.level:
+        notes.append(
+            "The horizontal axes alone were calibrated: the vertical one stays as it reads. "
+            "Headings are right while the vehicle is level, and err with its tilt."
+        )
     if not found.soft_iron:
         notes.append(
             "The directions in this log tell the offset only, not the soft iron: the matrix is the "
-            "identity. Turn the sensor so that each of its axes points up and down once."
+            f"identity. Turn {_WAYS[found.level]}."
         )
-    if found.gap_rad > _WIDE:
+    if found.level and found.gap_rad > _WIDE:
+        notes.append(
+            f"A sector of {2.0 * np.degrees(found.gap_rad):.0f} deg of headings has no sample: "
+            f"there the calibration is a guess. Turn {_WAYS[True]}."
+        )
+    elif found.gap_rad > _WIDE:
         way = int(np.argmax(np.abs(found.gap)))
         sign = "+" if found.gap[way] > 0.0 else "-"
         notes.append(
@@ -163,16 +177,18 @@ def calibrate(
     field: str | None = None,
     begin: str | None = None,
     end: str | None = None,
+    horizontal: bool = False,
     columns: Sequence[str | os.PathLike[str]] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Hard and soft iron of a magnetometer from a log in which it is turned about all its axes.
+    """Hard and soft iron of a magnetometer from a log in which it is turned about.
 
     Args:
         log: its files; one that ends in .toml gives the mounting of the sensor.
         field: its size at the place, "48.5 uT"; by default the mean scale of the sensor is kept.
         begin: use samples from "20 s" after the first one on.
         end: use samples up to "80 s" after the first one.
+        horizontal: the vehicle turned about the vertical only; its z axis is not calibrated.
         columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
         progress: called with the share done and what is being done.
 
@@ -189,7 +205,7 @@ def calibrate(
     given = samples(log, begin_s, end_s, columns)
     progress(0.5, "fitting the ellipsoid")
     with refusing(first):
-        found = fitted(given.field_t, strength)
+        found = fitted(given.field_t, strength, level=horizontal)
     return Outcome(
         solution_of(given, found),
         metrics_of(found),

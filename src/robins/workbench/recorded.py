@@ -13,6 +13,7 @@ from robins import _float64, logs, scenario, systems
 from robins.dataset import Dataset
 from robins.ins.frames import to_ned_frd
 from robins.logs import Finding
+from robins.logs.doctor import Use
 from robins.results import Outcome, Progress, silent
 from robins.systems.finding import find_system
 from robins.workbench.errors import InputError, refusing
@@ -101,7 +102,7 @@ class OpenLog(NamedTuple):
         angles = np.degrees(self.system.orientation(self.parameters))
         formats = logs.formats_of(self.files, self.columns)
         dataset = logs.load_dataset(self.files, mounting=logs.Mounting(*angles), formats=formats)
-        _examine(dataset, findings)
+        _examine(dataset, findings, self.system.use)
         return logs.clean(dataset)
 
 
@@ -175,13 +176,13 @@ def align(
     return replace(found, **told, **asked(text, settings))
 
 
-def _examine(dataset: Dataset, findings: Findings) -> None:
-    """Examine a dataset by the doctor.
+def _examine(dataset: Dataset, findings: Findings, use: Use = "any") -> None:
+    """Examine a dataset by the doctor, for the use of a system.
 
     Raises:
         InputError: there are errors; the message has all of them.
     """
-    found = logs.examine(dataset)
+    found = logs.examine(dataset, use)
     findings(found)
     errors = [f for f in found if f.severity == "error"]
     if errors:

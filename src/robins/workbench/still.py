@@ -12,7 +12,8 @@ import xarray as xr
 
 from robins import units
 from robins.dataset import Dataset, ImuTable
-from robins.ins.allan import Allan, AllanFit, deviation, fit, in_field_units
+from robins.ins.allan import Allan, AllanFit, deviation, fit, in_field_units, stretches
+from robins.ins.increments import own_intervals
 from robins.logs import formats_of, open_log
 from robins.logs.clean import clean_imu
 from robins.results import Outcome, Progress, array, silent, variable
@@ -31,7 +32,7 @@ _TURNING = np.deg2rad(2.0)  # rad/s of mean rate over a second; sensors at rest 
 
 
 class Still(NamedTuple):
-    """Rates of the longest stretch of a log without gaps."""
+    """Rates of a resting IMU."""
 
     rates: dict[str, np.ndarray]  # "gyro" [rad/s], "accel" [m/s^2]: (N, 3)
     time_ns: np.ndarray  # (N,)
@@ -54,18 +55,24 @@ def still(path: Path, columns: Sequence[str | os.PathLike[str]] = ()) -> Still:
         raise InputError("holds no inertial samples", path, "give the log of an IMU.")
     cleaned, counts, _ = clean_imu(table)
     notes = [str(finding) for finding in findings]
-    begin, end = longest_stretch(cleaned.time_ns)
-    time_ns = cleaned.time_ns[begin:end]
-    if end - begin < len(cleaned):
-        span = (time_ns[-1] - time_ns[0]) * 1e-9
+    time_ns = cleaned.time_ns
+    bounds = stretches(time_ns)
+    if len(bounds) > 2:
+        rows = np.diff(bounds)
+        longest = int(np.argmax(rows))
+        span = (time_ns[bounds[longest + 1] - 1] - time_ns[bounds[longest]]) * 1e-9
         notes.append(
-            f"The log has gaps: only its longest stretch without one is used, {span:.6g} s from "
-            f"{(time_ns[0] - cleaned.time_ns[0]) * 1e-9:.6g} s after its first sample."
+            f"The log has {len(rows) - 1} gap(s): the Allan deviation is the mean over its "
+            f"{len(rows)} stretches, of which the longest has {span:.6g} s."
         )
-    rates = {"gyro": cleaned.gyro[begin:end], "accel": cleaned.accel[begin:end]}
+    rates = {"gyro": cleaned.gyro, "accel": cleaned.accel}
     if cleaned.kind == "increment":
-        dt_s = float(np.median(np.diff(time_ns))) * 1e-9
-        rates = {sensor: values / dt_s for sensor, values in rates.items()}
+        dt_s = np.diff(time_ns) * 1e-9
+        own = np.full((len(cleaned), 1), np.median(dt_s))
+        # The first increment after a gap may be that of the whole gap.
+        rows = bounds[1:-1]
+        own[rows, 0] = own_intervals(dt_s, cleaned.gyro, cleaned.accel)[rows]
+        rates = {sensor: values / own for sensor, values in rates.items()}
     if _moved(rates["gyro"], time_ns):
         notes.append("The sensor turned during the log: what follows is motion, not noise.")
     return Still(rates, time_ns, {k: n for k, n in counts.items() if n}, notes, cleaned.body)
@@ -78,15 +85,6 @@ def _moved(gyro: np.ndarray, time_ns: np.ndarray) -> bool:
     count = np.diff(np.append(starts, len(second)))[:, None]
     means = np.add.reduceat(gyro, starts, axis=0) / count
     return bool(np.abs(means - np.median(means, axis=0)).max() > _TURNING)
-
-
-def longest_stretch(time_ns: np.ndarray) -> tuple[int, int]:
-    """First and last-plus-one sample of the longest part without a gap of 1.5 intervals."""
-    step = np.diff(time_ns)
-    edges = np.flatnonzero(step > 1.5 * np.median(step)) + 1
-    bounds = np.concatenate([[0], edges, [len(time_ns)]])
-    longest = int(np.argmax(np.diff(bounds)))
-    return int(bounds[longest]), int(bounds[longest + 1])
 
 
 def expected(fitted: AllanFit, tau_s: np.ndarray) -> dict[str, np.ndarray]:

@@ -22,6 +22,7 @@ SYSTEM = System(
     replay_default=Path(__file__).parent / "scenarios" / "replay.toml",
     replay=replay,
     recorded=recorded,
+    use="attitude",
     replay_finds=("attitude",),
     orientation=lambda parameters: parameters.orientation,
     aboard=aboard,

@@ -49,6 +49,7 @@ from robins.systems.streaming import (
     as_before,
     numbers,
     online,
+    refuse_field_unit,
     refuse_units,
     stamp,
 )
@@ -56,6 +57,7 @@ from robins.systems.tables import Update
 
 _STEPS = 2  # of the filter in a sample, where it has to catch up
 _LONGEST_GAP_S, _PATIENCE_S = 10.0, 0.1
+_FAR = 10  # implausible fields in a row whose unit is looked at
 _MONITORED_S = 60.0  # of looks, that the monitor is shown
 
 
@@ -110,8 +112,8 @@ class LiveMarg(Live):
 
     _parameters: ClassVar[type[Replay]] = Replay
     _kept: ClassVar[tuple[str, ...]] = (
-        "_field", "_pending", "_looks", "_since", "_q", "_sigma", "_bias", "_gain", "_marks",
-        "_starting", "_open",
+        "_field", "_far", "_pending", "_looks", "_since", "_q", "_sigma", "_bias", "_gain",
+        "_marks", "_starting", "_open",
     )  # fmt: skip
     _parts: ClassVar[tuple[str, ...]] = ("_door", "_path")
 
@@ -153,6 +155,7 @@ class LiveMarg(Live):
     def _begin_anew(self) -> None:
         """Forget all but the counts and the stamps."""
         self._field = np.full(3, np.nan)  # of a sample that was refused
+        self._far: list[float] = []  # sizes of implausible readings in a row
         self._pending: list[Any] = []  # leaves of steps that wait, and whether the unit lies still
         self._looks = np.zeros((0, 8))  # what the monitor is shown
         self._since: list[Any] = []  # (dt, turn) of the samples after the last step
@@ -228,9 +231,13 @@ class LiveMarg(Live):
             return
         field = (raw - np.array(m.offset)) @ np.array(m.matrix).T
         if m.least <= float(np.linalg.norm(field)) <= m.most:
-            self._field = field
-        else:
-            self.counts["field_implausible"] += 1
+            self._field, self._far = field, []
+            return
+        self.counts["field_implausible"] += 1
+        self._far.append(float(np.linalg.norm(raw)))
+        if len(self._far) == _FAR:
+            strength, self._far = float(np.median(self._far)), []
+            refuse_field_unit(strength)
 
     def _saturated(self, gyro: np.ndarray, accel: np.ndarray, before: int) -> Flag:
         """Flag of a sample at the end of a range; so many samples waited for a block before it."""
