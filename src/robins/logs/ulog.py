@@ -25,7 +25,8 @@ import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.foreign import decoding
-from robins.logs.findings import Finding, LogError, refused, report, telling
+from robins.logs.findings import Finding, LogError, damaged, refused, report, telling
+from robins.logs.fix_kinds import MAVLINK
 from robins.logs.opening import whole
 from robins.logs.text import Head
 from robins.logs.timebase import LIMIT_NS
@@ -40,7 +41,6 @@ _LARGEST = 1 << 30  # bytes of a file
 _IMU, _MAG = ("sensor_combined",), ("vehicle_magnetometer", "sensor_mag")
 _GNSS = ("vehicle_gps_position", "sensor_gps")
 _NO_FIX, _FLAT_FIX = 2, 3  # below these there is no fix, or none of the height
-_QUALITY = {6: 1, 5: 2, 4: 4, 3: 5, 2: 5}  # PX4's fix_type -> RTKLIB's Q
 
 
 _EARLY = (
@@ -141,12 +141,12 @@ def _check_formats(file: str, data: bytes) -> None:
         if name not in formats:
             return 1
         if name in above or len(above) > _DEEPEST:
-            raise _damaged(file, f"the definition of {name} contains itself")
+            raise damaged(file)(f"the definition of {name} contains itself")
         if name not in sizes:
             parts = (count * size_of(of, (*above, name)) for of, count in formats[name])
             sizes[name] = sum(parts)
             if sizes[name] > _MOST:
-                raise _damaged(file, f"the definition of {name} has {sizes[name]} numbers")
+                raise damaged(file)(f"the definition of {name} has {sizes[name]} numbers")
         return sizes[name]
 
     for name in formats:
@@ -164,16 +164,11 @@ def _decode(file: str, data: bytes) -> Any:
         ) from error
     told = io.StringIO()
     # it prints what it doubts
-    with decoding(lambda why: _damaged(file, why)), contextlib.redirect_stdout(told):
+    with decoding(damaged(file)), contextlib.redirect_stdout(told):
         log = ULog(io.BytesIO(data), [*_IMU, *_MAG, *_GNSS], disable_str_exceptions=False)
     if log.file_corruption:
-        raise _damaged(file, " ".join(told.getvalue().split()) or "messages contradict each other")
+        raise damaged(file)(" ".join(told.getvalue().split()) or "messages contradict each other")
     return log
-
-
-def _damaged(file: str, why: str) -> LogError:
-    mend = "fetch it again; nothing of it was used, for no number in it can be trusted"
-    return LogError(file, f"is damaged ({why})", mend)
 
 
 def _first(
@@ -250,6 +245,6 @@ def _fixes(file: str, topic: Topic) -> GnssTable:
         sigma_m=np.stack([eph, eph, epv], axis=-1),
         v_n=v_n,
         sigma_v=np.repeat(speed[:, None], 3, axis=1),
-        quality=np.array([_QUALITY.get(int(k), 0) for k in fix], np.int64),
+        quality=np.array([MAVLINK.get(int(k), 0) for k in fix], np.int64),
         source=file,
     )
