@@ -228,10 +228,11 @@ def mapped(path: str | os.PathLike[str]) -> tuple[bytes | mmap.mmap, bool]:
     Raises:
         LogError: as `Source`; or more than 1 GiB would have to be unpacked.
     """
-    if beginning(path, 6).startswith((_XZ, _GZIP)):
-        return whole(path, _LARGEST)
-    with Source(path, binary=True).path.open("rb") as file:
-        if not os.fstat(file.fileno()).st_size:
+    beginning(path, 1)  # the error, if it cannot be read
+    with Path(path).open("rb") as file:
+        if file.read(6).startswith((_XZ, _GZIP)):
+            return whole(path, _LARGEST)
+        if not file.tell():
             return b"", False
         return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), False
 

@@ -17,36 +17,27 @@ import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
-from robins.gps_time import GPS_EPOCH_S, gps_of
+from robins.gps_time import dated, gps_of
 from robins.logs.findings import Finding, LogError, above_geoid, breaks_off, left_out, telling
 from robins.logs.fix_kinds import MAVLINK, fixes
 from robins.logs.merging import gps_clock
 from robins.logs.opening import mapped
 from robins.logs.text import Head
+from robins.logs.ulog import Topic, column, stamps, triad
 from robins.units import to_si
 
 _STAMP = struct.Struct(">Q")  # microseconds of UTC at which the ground station received it
 _EARLIEST, _LATEST = (int(year * 31_556_952e6) for year in (30, 130))
 _ONE, _TWO = 0xFE, 0xFD  # first byte of a frame of MAVLink 1 and 2
-_HIGHRES, _SCALED, _RAW, _GPS = 105, 26, 27, 24
-_NAMES = {_HIGHRES: "HIGHRES_IMU", _SCALED: "SCALED_IMU", _RAW: "RAW_IMU", _GPS: "GPS_RAW_INT"}
-_GYRO, _ACCEL, _MAG = ([axis + what for axis in "xyz"] for what in ("gyro", "acc", "mag"))
-_UNITS = {_HIGHRES: ("rad/s", "m/s^2", "G")}
-_SCALED_UNITS = ("mrad/s", "mg", "mG")
+_INERTIAL = {105: "HIGHRES_IMU", 26: "SCALED_IMU", 27: "RAW_IMU"}
+_GPS = 24
+_SENSORS = [axis + what for what in ("gyro", "acc", "mag") for axis in "xyz"]
 _FIX = ("fix_type", "lat", "lon", "alt", "alt_ellipsoid", "h_acc", "v_acc", "vel_acc", "vel", "cog")
-
-
-class _Rows(NamedTuple):
-    """Messages of one kind of one vehicle."""
-
-    at: np.ndarray  # place in the file
-    time_ns: np.ndarray
-    values: np.ndarray
 
 
 def is_tlog(head: Head) -> bool:
@@ -67,40 +58,29 @@ def read_tlog(path: str | os.PathLike[str], findings: list[Finding] | None = Non
         LogError: pymavlink is not installed, or there are no inertial samples.
     """
     file = str(path)
-    data, _ = mapped(path)
-    found, vehicles = _messages(file, data, findings)
-    kind = next((k for k in (_HIGHRES, _SCALED, _RAW) if k in found), None)
-    if kind is None:
-        held = ", ".join(_NAMES[k] for k in found) or "nothing that robins reads"
-        cause = f"has no messages HIGHRES_IMU, SCALED_IMU or RAW_IMU; it holds {held}"
+    topics = _topics(file, mapped(path)[0], findings)
+    number = next((k for k in _INERTIAL if k in topics), None)
+    if number is None:
+        cause = f"has no messages {', '.join(_INERTIAL.values())}"
         raise LogError(file, cause, "request them at 50 Hz or more, or use the log on board")
-    if vehicles > 1:
-        telling(findings, "note", "several_instances", file, value=vehicles)(
-            f"{vehicles} vehicles or components sent samples or fixes; the first is read."
-        )
-    imu = found[kind]
-    gyro_unit, accel_unit, mag_unit = _UNITS.get(kind, _SCALED_UNITS)
-    gyro, accel = to_si(imu.values[:, :3], gyro_unit), to_si(imu.values[:, 3:6], accel_unit)
-    field = imu.values[:, 6:9]
-    time_ns = imu.time_ns
-    gnss = None
-    if _GPS in found and (found[_GPS].values[:, 0] >= 2).any():
-        gnss = _fixes(file, found[_GPS], findings)
-        if _dated(gnss.time_ns[0]) and not _dated(time_ns[0]):
-            row = np.searchsorted(imu.at, found[_GPS].at) - 1
-            known = row >= 0
-            clock = gps_clock(file, time_ns[row[known]], gnss.time_ns[known], findings)
-            time_ns = clock(time_ns)
-    has_field = np.any(field != 0.0, axis=1)  # zeros: there is no magnetometer
-    return Dataset(
-        name=Path(file).name.split(".")[0],
-        imu=ImuTable(time_ns, gyro, accel, "rate", source=file),
-        mag=MagTable(time_ns[has_field], to_si(field[has_field], mag_unit), source=file)
-        if has_field.any()
-        else None,
-        gnss=gnss,
-        time_unit_known=(file,),
+    imu, gps, gnss = topics[number], topics.get(_GPS), None
+    units = ("rad/s", "m/s^2", "G") if number == 105 else ("mrad/s", "mg", "mG")
+    gyro, accel, field = (
+        to_si(triad(file, imu, "{}" + what, "xyz"), unit)
+        for what, unit in zip(("gyro", "acc", "mag"), units, strict=True)
     )
+    time_ns = _stamps(file, imu)
+    if gps is not None and (column(file, gps, "fix_type") >= 2).any():
+        gnss = _fixes(file, gps, findings)
+        arrived = np.searchsorted(imu.fields["at"], gps.fields["at"]) - 1
+        known = (arrived >= 0) & np.isfinite(gnss.lat_rad)
+        if _dated(gnss.time_ns) and not _dated(time_ns) and known.any():
+            clock = gps_clock(file, time_ns[arrived[known]], gnss.time_ns[known], findings)
+            time_ns = clock(time_ns)
+    there = field.any(axis=1)  # zeros: there is no magnetometer
+    mag = MagTable(time_ns[there], field[there], source=file) if there.any() else None
+    samples = ImuTable(time_ns, gyro, accel, "rate", source=file)
+    return Dataset(Path(file).name.split(".")[0], samples, gnss, mag=mag, time_unit_known=(file,))
 
 
 def _frames(
@@ -108,36 +88,25 @@ def _frames(
 ) -> Iterator[tuple[int, int, bytes]]:
     """Place, number and bytes of the frames that are read."""
     at, end, stray = 0, len(data), 0
-
-    def size_at(place: int) -> int:
-        """Size of stamp and frame there, 0 where there is none."""
-        if place + 14 > end or not _EARLIEST < _STAMP.unpack_from(data, place)[0] < _LATEST:
-            return 0
-        first, length = data[place + 8], data[place + 9]
-        if first == _ONE:
-            return 8 + 8 + length
-        return 8 + 12 + length + 13 * (data[place + 10] & 1) if first == _TWO else 0
-
     while at < end:
-        size = size_at(at)
-        if not size:
+        stamp, first, length, flags = struct.unpack(">QBBB", data[at : at + 11].ljust(11, b"\0"))
+        size = {_ONE: 16, _TWO: 20 + 13 * (flags & 1)}.get(first, 0) + length
+        if size <= length or not _EARLIEST < stamp < _LATEST:
             stray, at = stray + 1, at + 1
             continue
         if at + size > end:
             breaks_off(findings, file, at)
             break
         frame = data[at + 8 : at + size]
-        number = frame[5] if frame[0] == _ONE else int.from_bytes(frame[7:10], "little")
-        if number in _NAMES:
+        number = frame[5] if first == _ONE else int.from_bytes(frame[7:10], "little")
+        if number == _GPS or number in _INERTIAL:
             yield at, number, frame
         at += size
     left_out(findings, file, stray, "bytes belong to no message")
 
 
-def _messages(
-    file: str, data: bytes | mmap.mmap, findings: list[Finding] | None
-) -> tuple[dict[int, _Rows], int]:
-    """Messages of the first vehicle by their number, and the count of vehicles.
+def _topics(file: str, data: bytes | mmap.mmap, findings: list[Finding] | None) -> dict[int, Topic]:
+    """Messages of the first vehicle with inertial samples, by their number.
 
     Raises:
         LogError: pymavlink is not installed.
@@ -148,37 +117,46 @@ def _messages(
         cause = "is telemetry of MAVLink, and the package that reads it is not installed"
         raise LogError(file, cause, "install it with: pip install 'robins[logs]'") from error
     decoder, wrong = common.MAVLink(None), 0
-    senders: dict[tuple[int, int], dict[int, list[tuple[int, int, list[float]]]]] = {}
+    senders: dict[tuple[int, int], dict[int, list[list[float]]]] = {}
     for at, number, frame in _frames(file, data, findings):
         try:
             one: Any = decoder.decode(bytearray(frame))
         except common.MAVError:
             wrong += 1
             continue
-        names = _FIX if number == _GPS else (*_GYRO, *_ACCEL, *_MAG)
-        stamp = 1_000_000 * one.time_boot_ms if number == _SCALED else 1000 * one.time_usec
-        row = [float(getattr(one, name)) for name in names]
+        names = _FIX if number == _GPS else _SENSORS
+        stamp = 1000 * one.time_boot_ms if number == 26 else one.time_usec
         sender = senders.setdefault((one.get_srcSystem(), one.get_srcComponent()), {})
-        sender.setdefault(number, []).append((at, stamp, row))
+        sender.setdefault(number, []).append([at, stamp, *(getattr(one, x) for x in names)])
     left_out(findings, file, wrong, "messages have a wrong checksum")
-    inertial = (s for s in senders.values() if s.keys() - {_GPS})
-    first = next(inertial, next(iter(senders.values()), {}))
-    found: dict[int, _Rows] = {}
+    if len(senders) > 1:
+        telling(findings, "note", "several_instances", file, value=len(senders))(
+            f"{len(senders)} vehicles or components sent samples or fixes; the first is read."
+        )
+    first = next((s for s in senders.values() if s.keys() - {_GPS}), {})
+    topics: dict[int, Topic] = {}
     for number, rows in first.items():
-        at, stamps, values = zip(*rows, strict=True)
-        time_ns = np.array([s if 0 <= s < 1 << 62 else 0 for s in stamps], np.int64)
-        if _dated(time_ns[0]):
-            time_ns = gps_of(time_ns)
-        found[number] = _Rows(np.array(at, np.int64), time_ns, np.array(values))
-    return found, len(senders)
+        names = ("at", "timestamp", *(_FIX if number == _GPS else _SENSORS))
+        fields = {name: np.array([row[k] for row in rows]) for k, name in enumerate(names)}
+        fields["timestamp"] = fields["timestamp"].astype(np.uint64)
+        topics[number] = Topic(_INERTIAL.get(number, "GPS_RAW_INT"), fields)
+    return topics
 
 
-def _dated(time_ns: int) -> bool:
-    return time_ns >= GPS_EPOCH_S * 1_000_000_000
+def _dated(time_ns: np.ndarray) -> bool:
+    return dated(int(time_ns[-1]))
 
 
-def _fixes(file: str, gps: _Rows, findings: list[Finding] | None) -> GnssTable:
-    fix, lat, lon, msl, ellipsoid, h_acc, v_acc, vel_acc, vel, cog = gps.values.T
+def _stamps(file: str, topic: Topic) -> np.ndarray:
+    """GPS time where the vehicle knows UTC, else time since power-up [ns]."""
+    time_ns = stamps(file, topic)
+    return gps_of(time_ns) if _dated(time_ns) else time_ns
+
+
+def _fixes(file: str, gps: Topic, findings: list[Finding] | None) -> GnssTable:
+    fix, lat, lon, msl, ellipsoid, h_acc, v_acc, vel_acc, vel, cog = (
+        column(file, gps, name) for name in _FIX
+    )
     if not ellipsoid.any():  # MAVLink 1 does not have it
         above_geoid(findings, file, "Set the telemetry to MAVLink 2.")
         ellipsoid = msl
@@ -186,7 +164,7 @@ def _fixes(file: str, gps: _Rows, findings: list[Finding] | None) -> GnssTable:
     north, east = speed * np.cos(np.deg2rad(course)), speed * np.sin(np.deg2rad(course))
     return fixes(
         file,
-        gps.time_ns,
+        _stamps(file, gps),
         (lat * 1e-7, lon * 1e-7, ellipsoid * 1e-3),
         (h_acc * 1e-3, h_acc * 1e-3, v_acc * 1e-3),
         np.stack([north, east, np.full_like(north, np.nan)], axis=-1),

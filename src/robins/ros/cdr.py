@@ -119,7 +119,8 @@ def numbers(name: str, data: bytes, ros1: bool = False) -> tuple[int, str, list[
     time_ns, frame_id, fields = _fields(name, NUMBERS[name], data, ros1)
     flat: list[float] = []
     for one in fields:
-        flat += one if isinstance(one, tuple) else () if isinstance(one, str) else (one,)
+        if not isinstance(one, str):
+            flat += one if isinstance(one, tuple) else (float(one),)
     return time_ns, frame_id, flat
 
 
