@@ -328,7 +328,7 @@ def test_a_log_of_ardupilot_that_is_damaged(tmp_path):
         (
             b"QBffffffIIfBBHH",
             b"QBfffffdIIfBBHH",
-            "the definition of 'IMU' at byte .* states 54 bytes",
+            "in dataflash the definition of 'IMU' states 54 bytes",
         ),
         (b"AccX", b"AccW", "has no field AccX; it has "),
     ):

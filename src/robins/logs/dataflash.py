@@ -13,7 +13,6 @@ Source: ArduPilot, libraries/AP_Logger/README.md.
 
 from __future__ import annotations
 
-import mmap
 import os
 import struct
 from pathlib import Path
@@ -33,25 +32,20 @@ from robins.logs.findings import (
 )
 from robins.logs.fix_kinds import MAVLINK, fixes
 from robins.logs.merging import gps_clock
-from robins.logs.opening import mapped
-from robins.logs.text import Head
+from robins.logs.opening import Bytes, mapped
 from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS
 from robins.logs.ulog import Topic, column, stamps, triad
 from robins.units import to_si
 
 _MARK, _FMT = b"\xa3\x95", 0x80
+MAGIC = _MARK + bytes([_FMT])
 _FORMAT = struct.Struct("<BB4s16s64s")
 _WANTED = ("IMU", "MAG", "GPS", "GPA")
 _CODES = "b=i1 B=u1 h=i2 H=u2 i=i4 I=u4 f=f4 d=f8 q=i8 Q=u8 g=f2 M=u1 a=V64 n=V4 N=V16 Z=V64 "
 _CODES += "c=i2 C=u2 e=i4 E=u4 L=i4"
-_TYPES = dict(pair.split("=") for pair in _CODES.split())  # of fields, as NumPy names them
+_TYPES = {pair[0]: pair[2:] for pair in _CODES.split()}  # of fields, as NumPy names them
 _FACTORS = {**dict.fromkeys("cCeE", 0.01), "L": 1e-7}
 _LAST_WEEK = 6000  # in 2095
-
-
-def is_dataflash(head: Head) -> bool:
-    """Begins with the definition of a message."""
-    return head.start.startswith(_MARK + bytes([_FMT]))
 
 
 def read_dataflash(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
@@ -89,7 +83,7 @@ def read_dataflash(path: str | os.PathLike[str], findings: list[Finding] | None 
     )
 
 
-def _topics(file: str, data: bytes | mmap.mmap, findings: list[Finding] | None) -> dict[str, Topic]:
+def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[str, Topic]:
     """The wanted messages; bytes that belong to none are counted.
 
     Raises:
@@ -124,7 +118,7 @@ def _topics(file: str, data: bytes | mmap.mmap, findings: list[Finding] | None) 
         if kind == _FMT:
             number, size_of, *layout = _definition(file, data, at)
             if sizes[number] not in (0, size_of):
-                raise damaged(file)(f"message {number} is defined again at byte {at}")
+                raise damaged(file)(f"in dataflash message {number} is defined again at byte {at}")
             sizes[number] = size_of
             if layout[0] in _WANTED:
                 kinds[number] = layout
@@ -143,9 +137,7 @@ def _topics(file: str, data: bytes | mmap.mmap, findings: list[Finding] | None) 
     return topics
 
 
-def _definition(
-    file: str, data: bytes | mmap.mmap, at: int
-) -> tuple[int, int, str, np.dtype, list[float]]:
+def _definition(file: str, data: Bytes, at: int) -> tuple[int, int, str, np.dtype, list[float]]:
     """Number, size, name and layout of a message, and what its fields are multiplied by.
 
     Raises:
@@ -157,10 +149,10 @@ def _definition(
     if number == _FMT:
         size, codes = 3 + _FORMAT.size, "BBnNZ"
     if len(names) != len(codes) or len(set(names)) != len(names) or set(codes) - _TYPES.keys():
-        raise damaged(file)(f"the definition of {name!r} at byte {at} has no layout")
+        raise damaged(file)(f"in dataflash the definition of {name!r} at byte {at} has no layout")
     kind = np.dtype([(n, f"<{_TYPES[c]}") for n, c in zip(names, codes, strict=True)])
     if kind.itemsize + 3 != size:
-        raise damaged(file)(f"the definition of {name!r} at byte {at} states {size} bytes")
+        raise damaged(file)(f"in dataflash the definition of {name!r} states {size} bytes")
     return number, size, name, kind, [_FACTORS.get(c, 1.0) for c in codes]
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import datetime
 import math
-import mmap
 import os
 import re
 from functools import reduce
@@ -25,7 +24,7 @@ from robins.dataset import GnssTable
 from robins.gps_time import gps_of
 from robins.logs.findings import Finding, LogError, breaks_off, left_out, telling
 from robins.logs.fix_kinds import fixes
-from robins.logs.opening import mapped
+from robins.logs.opening import Bytes, mapped
 from robins.logs.text import Head
 from robins.units import to_si
 
@@ -83,9 +82,7 @@ def read_nmea(path: str | os.PathLike[str], findings: list[Finding] | None = Non
     )
 
 
-def _epochs(
-    file: str, data: bytes | mmap.mmap, findings: list[Finding] | None
-) -> list[dict[str, float]]:
+def _epochs(file: str, data: Bytes, findings: list[Finding] | None) -> list[dict[str, float]]:
     """Numbers of the sentences of each time of day; those without a time belong to the last."""
     epochs: list[dict[str, float]] = []
     talkers = {one[1] for one in _SENTENCE.finditer(data) if one[4]}

@@ -18,11 +18,12 @@ import zlib
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from robins.foreign import FREE, decoding, within
 from robins.logs.findings import LogError
 
+Bytes: TypeAlias = bytes | mmap.mmap
 _BLOCK, _ABOUT, _LARGEST = 1 << 20, 1 << 22, 1 << 30
 _PART = re.compile(r".+\.(mcap|db3|bag)(\.(xz|gz|zstd))?")
 _LISTED = re.compile(r"^\s*-\s+(\S+\.(?:mcap|db3)(?:\.zstd)?)\s*$", re.MULTILINE)
@@ -220,7 +221,7 @@ def beginning(path: str | os.PathLike[str], size: int = 256) -> bytes:
     return start[:size]
 
 
-def mapped(path: str | os.PathLike[str]) -> tuple[bytes | mmap.mmap, bool]:
+def mapped(path: str | os.PathLike[str]) -> tuple[Bytes, bool]:
     """All bytes of a file, and whether a compressed stream ended early.
 
     A plain file is mapped, so that it may be larger than memory; a compressed one is unpacked.

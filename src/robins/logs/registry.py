@@ -56,6 +56,10 @@ def _of_text(row: TextFormat) -> Format:
     return Format(row.name, row.kinds, row.about, row.recognise, partial(read_text, row), text=row)
 
 
+def _begins(magic: bytes) -> Callable[[Head], bool]:
+    return lambda head: head.start.startswith(magic)
+
+
 FORMATS: tuple[Format, ...] = (
     *map(_of_text, TEXT_FORMATS),
     Format(
@@ -84,7 +88,7 @@ FORMATS: tuple[Format, ...] = (
         "px4-ulog",
         ("imu", "mag", "gnss"),
         "PX4: .ulg; needs the extra, pip install 'robins[logs]'",
-        ulog.is_ulog,
+        _begins(ulog.MAGIC),
         ulog.read_ulog,
         binary=True,
     ),
@@ -92,7 +96,7 @@ FORMATS: tuple[Format, ...] = (
         "ros-mcap",
         ("imu", "mag", "gnss"),
         "ROS 2: .mcap with Imu, MagneticField, NavSatFix; needs the extra 'robins[logs]'",
-        ros_files.is_mcap,
+        _begins(ros_files.MCAP),
         rosbag.read_rosbag,
         binary=True,
         write=write_rosbag,
@@ -101,7 +105,7 @@ FORMATS: tuple[Format, ...] = (
         "ros-db3",
         ("imu", "mag", "gnss"),
         "ROS 2: .db3 with Imu, MagneticField, NavSatFix, or the folder of a recording",
-        ros_files.is_db3,
+        _begins(ros_files.SQLITE),
         rosbag.read_rosbag,
         binary=True,
     ),
@@ -109,7 +113,7 @@ FORMATS: tuple[Format, ...] = (
         "ros-bag",
         ("imu", "mag", "gnss"),
         "ROS 1: .bag with Imu, MagneticField, NavSatFix; needs the extra 'robins[logs]'",
-        ros_files.is_bag,
+        _begins(ros_files.BAG),
         rosbag.read_rosbag,
         binary=True,
     ),
@@ -133,7 +137,7 @@ FORMATS: tuple[Format, ...] = (
         "ardupilot-bin",
         ("imu", "mag", "gnss"),
         "ArduPilot: dataflash .BIN with IMU, MAG, GPS, GPA",
-        dataflash.is_dataflash,
+        _begins(dataflash.MAGIC),
         dataflash.read_dataflash,
         binary=True,
     ),

@@ -10,19 +10,17 @@ from __future__ import annotations
 import bz2
 import contextlib
 import io
-import mmap
 import sqlite3
 import struct
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, cast
 
 from robins.foreign import decoding, largest, unpacked, within
 from robins.logs.findings import Finding, LogError, damaged, telling
-from robins.logs.opening import mapped
-from robins.logs.text import Head
+from robins.logs.opening import Bytes, mapped
 
 if TYPE_CHECKING:
     from mcap.records import McapRecord
@@ -35,34 +33,14 @@ NO_PACKAGE = "is an MCAP file, and the package for these is not installed"
 INSTALL = "install it with: pip install 'robins[logs]'"
 
 
-class Raw(NamedTuple):
-    """A message as it was recorded."""
-
-    name: str  # of its type, as ROS 2 spells it; "" where it is not read
-    topic: str
-    data: bytes
-    ros1: bool = False
-
-
-def is_mcap(head: Head) -> bool:
-    """Begins as MCAP files do."""
-    return head.start.startswith(MCAP)
-
-
-def is_db3(head: Head) -> bool:
-    """Begins as databases of SQLite do."""
-    return head.start.startswith(SQLITE)
-
-
-def is_bag(head: Head) -> bool:
-    """Begins as recordings of ROS 1 do."""
-    return head.start.startswith(BAG)
+Raw: TypeAlias = tuple[str, str, bytes, bool]
+"""Type of a message as ROS 2 spells it, topic, bytes, and whether ROS 1 serialised it."""
 
 
 def raw_messages(
     path: Path, wanted: Collection[str], findings: list[Finding] | None
 ) -> Iterator[Raw]:
-    """Messages of the wanted types, and one without data of each other topic.
+    """Messages of the wanted types.
 
     Args:
         path: a file, plain or compressed.
@@ -101,11 +79,7 @@ def _plain(data: bytes, refuse: Callable[[str], LogError]) -> bytes:
 
 
 def _from_mcap(
-    path: Path,
-    data: bytes | mmap.mmap,
-    cut: bool,
-    wanted: Collection[str],
-    findings: list[Finding] | None,
+    path: Path, data: Bytes, cut: bool, wanted: Collection[str], findings: list[Finding] | None
 ) -> Iterator[Raw]:
     file, refuse = str(path), damaged(str(path))
     sound, closed = _sound(data)
@@ -127,7 +101,7 @@ def _from_mcap(
                 raise refuse(f"a message of channel {one.channel_id}, which is not there")
             name, topic = channels[one.channel_id]
             if name:
-                yield Raw(name, topic, _plain(one.data, refuse))
+                yield name, topic, _plain(one.data, refuse), False
     if cut or not closed:
         why = "its compressed stream has no end" if cut else f"after {len(data)} bytes"
         place = f"byte {len(data)}"
@@ -136,7 +110,7 @@ def _from_mcap(
         )
 
 
-def _sound(data: bytes | mmap.mmap) -> tuple[int, bool]:
+def _sound(data: Bytes) -> tuple[int, bool]:
     """Up to which byte records follow each other without a break, and whether the last closes."""
     at = len(MCAP)
     while at + _RECORD.size <= len(data):
@@ -150,7 +124,7 @@ def _sound(data: bytes | mmap.mmap) -> tuple[int, bool]:
 
 
 def _records(
-    file: str, data: bytes | mmap.mmap, sound: int, refuse: Callable[[str], LogError]
+    file: str, data: Bytes, sound: int, refuse: Callable[[str], LogError]
 ) -> Iterator[McapRecord]:
     """All records of a file, those of its chunks among them; the package decodes each.
 
@@ -198,11 +172,7 @@ def _records(
 
 
 def _from_db3(
-    path: Path,
-    data: bytes | mmap.mmap,
-    cut: bool,
-    wanted: Collection[str],
-    findings: list[Finding] | None,
+    path: Path, data: Bytes, cut: bool, wanted: Collection[str], findings: list[Finding] | None
 ) -> Iterator[Raw]:
     file, refuse = str(path), damaged(str(path))
     waiting = path.with_name(path.name + "-wal")
@@ -236,12 +206,10 @@ def _from_db3(
                 return
             if not isinstance(row[1], bytes):
                 raise refuse(f"a message of {named[row[0]][1]} is no bytes")
-            yield Raw(*named[row[0]], _plain(row[1], refuse))
+            yield *named[row[0]], _plain(row[1], refuse), False
 
 
-def _database(
-    path: Path, data: bytes | mmap.mmap, refuse: Callable[[str], LogError]
-) -> sqlite3.Connection:
+def _database(path: Path, data: Bytes, refuse: Callable[[str], LogError]) -> sqlite3.Connection:
     """The database, which cannot be changed, and nothing of whose schema is trusted."""
     with decoding(refuse):
         if isinstance(data, bytes):
@@ -259,11 +227,7 @@ def _database(
 
 
 def _from_bag(
-    path: Path,
-    data: bytes | mmap.mmap,
-    cut: bool,
-    wanted: Collection[str],
-    findings: list[Finding] | None,
+    path: Path, data: Bytes, cut: bool, wanted: Collection[str], findings: list[Finding] | None
 ) -> Iterator[Raw]:
     file = str(path)
     try:
@@ -282,28 +246,17 @@ def _from_bag(
         place.open = lambda mode: io.BytesIO(data)
     with decoding(refuse), Reader(cast("RPath", place)) as reader:
         for at, chunk in reader.chunks.items():
-            reader.chunks[at] = chunk._replace(decompressor=_bounded(chunk.decompressor, refuse))
+            reader.chunks[at] = chunk._replace(decompressor=_bounded)
         chosen = [c for c in reader.connections if c.msgtype in wanted]
         for one, _, message in reader.messages(chosen) if chosen else ():
-            yield Raw(one.msgtype, one.topic, message, ros1=True)
+            yield one.msgtype, one.topic, message, True
 
 
-def _bounded(
-    unpack: Callable[[bytes], bytes], refuse: Callable[[str], LogError]
-) -> Callable[[bytes], bytes]:
-    """The same decompressor, which stops where a chunk unpacks to more than measurements do."""
+def _bounded(packed: bytes) -> bytes:
+    """Content of a chunk, as far as measurements unpack."""
+    from lz4.frame import LZ4FrameDecompressor
 
-    def unpacked_chunk(packed: bytes) -> bytes:
-        most = largest(len(packed))
-        if packed[:3] == b"BZh":
-            plain = bz2.BZ2Decompressor().decompress(packed, most + 1)
-        elif packed[:4] == b"\x04\x22\x4d\x18":
-            import lz4.frame
-
-            plain = lz4.frame.LZ4FrameDecompressor().decompress(packed, most + 1)
-        else:
-            plain = unpack(packed)
-        within(len(plain), len(packed), "a chunk", refuse)
-        return plain
-
-    return unpacked_chunk
+    kinds = {b"BZ": bz2.BZ2Decompressor, b"\x04\x22": LZ4FrameDecompressor}
+    if kind := kinds.get(packed[:2]):
+        return kind().decompress(packed, largest(len(packed)))
+    return packed

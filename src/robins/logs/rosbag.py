@@ -102,12 +102,12 @@ def _topics(
     frames: dict[tuple[str, str], str] = {}
     wanted = (_IMU, _MAG, _FIX, *_TWISTS)
     for part in parts_of(path):
-        for one in raw_messages(part, wanted, findings):
+        for name, topic, data, ros1 in raw_messages(part, wanted, findings):
             try:
-                time_ns, frame_id, numbers = ros.numbers(one.name, one.data, one.ros1)
+                time_ns, frame_id, numbers = ros.numbers(name, data, ros1)
             except ros.RosError as error:
                 raise damaged(str(part))(f"RosError: {error}") from error
-            key = one.name, one.topic
+            key = name, topic
             frames.setdefault(key, frame_id)
             stamps[key].append(time_ns)
             values[key].extend(numbers)

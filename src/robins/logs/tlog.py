@@ -12,7 +12,6 @@ not, these are put on it by the order of arrival. Source: mavlink.io, common.xml
 
 from __future__ import annotations
 
-import mmap
 import os
 import struct
 from collections.abc import Iterator
@@ -26,7 +25,7 @@ from robins.gps_time import dated, gps_of
 from robins.logs.findings import Finding, LogError, above_geoid, breaks_off, left_out, telling
 from robins.logs.fix_kinds import MAVLINK, fixes
 from robins.logs.merging import gps_clock
-from robins.logs.opening import mapped
+from robins.logs.opening import Bytes, mapped
 from robins.logs.text import Head
 from robins.logs.ulog import Topic, column, stamps, triad
 from robins.units import to_si
@@ -84,7 +83,7 @@ def read_tlog(path: str | os.PathLike[str], findings: list[Finding] | None = Non
 
 
 def _frames(
-    file: str, data: bytes | mmap.mmap, findings: list[Finding] | None
+    file: str, data: Bytes, findings: list[Finding] | None
 ) -> Iterator[tuple[int, int, bytes]]:
     """Place, number and bytes of the frames that are read."""
     at, end, stray = 0, len(data), 0
@@ -105,7 +104,7 @@ def _frames(
     left_out(findings, file, stray, "bytes belong to no message")
 
 
-def _topics(file: str, data: bytes | mmap.mmap, findings: list[Finding] | None) -> dict[int, Topic]:
+def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[int, Topic]:
     """Messages of the first vehicle with inertial samples, by their number.
 
     Raises:

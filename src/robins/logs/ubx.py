@@ -10,7 +10,6 @@ east, as for PX4. Source: u-blox F9 HPG 1.32 interface description, UBX-22008968
 
 from __future__ import annotations
 
-import mmap
 import os
 import re
 import struct
@@ -24,7 +23,7 @@ from robins.gps_time import gps_of
 from robins.logs.findings import Finding, LogError, breaks_off, left_out, telling, undated
 from robins.logs.fix_kinds import fixes
 from robins.logs.merging import gps_clock, merged
-from robins.logs.opening import mapped
+from robins.logs.opening import Bytes, mapped
 from robins.logs.tables import Table
 from robins.logs.text import Head
 from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS
@@ -93,7 +92,7 @@ def read_ubx(
 
 
 def _frames(
-    file: str, data: bytes | mmap.mmap, findings: list[Finding] | None
+    file: str, data: Bytes, findings: list[Finding] | None
 ) -> dict[int, list[tuple[int, int]]]:
     """Place and length of the content of each message with a right checksum, by its kind."""
     found: dict[int, list[tuple[int, int]]] = {k: [] for k in (_PVT, _HIGH, _MEAS, _RAW)}
@@ -125,7 +124,7 @@ def _checksum(content: bytes) -> bytes:
 
 
 def _rows(
-    data: bytes | mmap.mmap, frames: list[tuple[int, int]], kind: np.dtype
+    data: Bytes, frames: list[tuple[int, int]], kind: np.dtype
 ) -> tuple[np.ndarray, np.ndarray]:
     """Messages of a fixed layout, and where each lies."""
     whole = [at for at, size in frames if size >= kind.itemsize]
@@ -135,7 +134,7 @@ def _rows(
 
 def _fixes(
     file: str,
-    data: bytes | mmap.mmap,
+    data: Bytes,
     frames: dict[int, list[tuple[int, int]]],
     findings: list[Finding] | None,
 ) -> tuple[GnssTable, np.ndarray]:
@@ -177,13 +176,13 @@ def _fixes(
     return table, at
 
 
-def _tag(data: bytes | mmap.mmap, at: int) -> int:
+def _tag(data: Bytes, at: int) -> int:
     return struct.unpack_from("<I", data, at)[0]
 
 
 def _inertial(
     file: str,
-    data: bytes | mmap.mmap,
+    data: Bytes,
     frames: list[tuple[int, int]],
     findings: list[Finding] | None,
 ) -> ImuTable | None:

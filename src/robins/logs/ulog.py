@@ -28,7 +28,6 @@ from robins.foreign import decoding
 from robins.logs.findings import Finding, LogError, damaged, refused, report, telling
 from robins.logs.fix_kinds import MAVLINK
 from robins.logs.opening import whole
-from robins.logs.text import Head
 from robins.logs.timebase import LIMIT_NS
 from robins.units import to_si
 
@@ -54,11 +53,6 @@ class Topic(NamedTuple):
 
     name: str
     fields: dict[str, np.ndarray]
-
-
-def is_ulog(head: Head) -> bool:
-    """Whether a file begins as ULogs do."""
-    return head.start.startswith(MAGIC)
 
 
 def read_ulog(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
