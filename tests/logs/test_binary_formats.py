@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from made_binary import GPS_NS, MADE, NS
 
+from robins import foreign
 from robins.dataset import GnssTable, ImuTable
 from robins.logs import LogError, load_dataset, open_log
 from robins.logs.merging import gps_clock, merged
@@ -68,6 +69,14 @@ def test_a_drive_of_ros_is_read_from_any_container(tmp_path, make):
     assert (data.name, data.time_unit_known) == ("drive", (str(path),))
     assert [f.code for f in findings] == ["velocity_taken"]
     assert load_dataset([path]).imu.time_ns.tolist() == data.imu.time_ns.tolist()
+
+
+def test_a_chunk_that_unpacks_to_no_measurements_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(foreign, "FREE", 1000)
+    monkeypatch.setattr(foreign, "RATIO", 0)
+    for packed in ("BZ2", "LZ4"):
+        with pytest.raises(LogError, match=r"is damaged or was not closed"):
+            open_log(made.bag(tmp_path / packed, packed), findings=[])
 
 
 def test_rates_and_forces_on_topics_of_their_own_are_merged(tmp_path):

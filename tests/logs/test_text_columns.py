@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from robins import foreign
 from robins.logs import open_log
 from robins.logs.findings import LogError, LogWarning
+from robins.logs.opening import _FOREIGN
 from robins.logs.text import Layout, peek, read_columns
 
 LAYOUT = Layout(("time", "x", "y"), ",")
@@ -122,6 +123,18 @@ def test_refusals_name_line_field_value_and_mend(write, data, message):
     path = write(data)
     with pytest.raises(LogError, match=message):
         read_columns(path, LAYOUT, [])
+
+
+@pytest.mark.parametrize("row", _FOREIGN, ids=[what for _, _, what, _ in _FOREIGN])
+def test_a_file_of_another_kind_is_refused_by_name_with_the_way_in(tmp_path, row):
+    place, magic, what, way = row
+    path = tmp_path / "log.bin"
+    path.write_bytes(bytes(place) + magic + bytes(99))
+    if magic in (b"\x1f\x8b", b"\xfd7zXZ\x00"):
+        path.write_bytes(gzip.compress(magic))
+    with pytest.raises(LogError) as caught:
+        peek(path)
+    assert str(caught.value) == f"{path}: is {what}, not a text log; {way}"
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ def read_dataflash(path: str | os.PathLike[str], findings: list[Finding] | None 
         LogError: a definition is damaged, or there are no inertial samples.
     """
     file = str(path)
-    topics = _topics(file, mapped(path)[0], findings)
+    topics = _topics(file, mapped(path, findings), findings)
     imu, mag, gps, gpa = map(topics.get, _WANTED)
     if imu is None:
         held = ", ".join(sorted(topics)) or "nothing that robins reads"

@@ -54,7 +54,7 @@ def read_nmea(path: str | os.PathLike[str], findings: list[Finding] | None = Non
         LogError: there is no sentence GGA or RMC with a right checksum.
     """
     file = str(path)
-    epochs = _epochs(file, mapped(path)[0], findings)
+    epochs = _epochs(file, mapped(path, findings), findings)
     days = _days(file, epochs, findings)
     end = "1" if any("lat1" in epoch for epoch in epochs) else "2"
     kept = [k for k, epoch in enumerate(epochs) if f"lat{end}" in epoch]

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from robins.foreign import FREE, decoding, within
-from robins.logs.findings import LogError
+from robins.logs.findings import Finding, LogError, telling
 
 Bytes: TypeAlias = bytes | mmap.mmap
 _BLOCK, _ABOUT, _LARGEST = 1 << 20, 1 << 22, 1 << 30
@@ -221,8 +221,8 @@ def beginning(path: str | os.PathLike[str], size: int = 256) -> bytes:
     return start[:size]
 
 
-def mapped(path: str | os.PathLike[str]) -> tuple[Bytes, bool]:
-    """All bytes of a file, and whether a compressed stream ended early.
+def mapped(path: str | os.PathLike[str], findings: list[Finding] | None) -> Bytes:
+    """All bytes of a file; a compressed stream that ended early is reported.
 
     A plain file is mapped, so that it may be larger than memory; a compressed one is unpacked.
 
@@ -232,10 +232,14 @@ def mapped(path: str | os.PathLike[str]) -> tuple[Bytes, bool]:
     beginning(path, 1)  # the error, if it cannot be read
     with Path(path).open("rb") as file:
         if file.read(6).startswith((_XZ, _GZIP)):
-            return whole(path, _LARGEST)
-        if not file.tell():
-            return b"", False
-        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), False
+            data, cut = whole(path, _LARGEST)
+            if cut:
+                telling(findings, "warning", "ends_early", str(path), value=len(data))(
+                    "its compressed stream has no end: the copy was interrupted. All before it was "
+                    "read."
+                )
+            return data
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if file.tell() else b""
 
 
 def whole(path: str | os.PathLike[str], limit: int) -> tuple[bytes, bool]:

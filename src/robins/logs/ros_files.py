@@ -19,7 +19,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, cast
 
 from robins.foreign import decoding, largest, unpacked, within
-from robins.logs.findings import Finding, LogError, damaged, telling
+from robins.logs.findings import Finding, LogError, breaks_off, damaged, telling
 from robins.logs.opening import Bytes, mapped
 
 if TYPE_CHECKING:
@@ -50,13 +50,11 @@ def raw_messages(
     Raises:
         LogError: a package is not installed; the file is damaged or of no kind that ROS records.
     """
-    data, cut = mapped(path)
+    data = mapped(path, findings)
     read = {MCAP: _from_mcap, SQLITE: _from_db3, BAG: _from_bag}
     for magic, found in read.items():
         if data[: len(magic)] == magic:
-            if cut and magic != MCAP:
-                raise damaged(str(path))("its compressed stream has no end")
-            yield from found(path, data, cut, wanted, findings)
+            yield from found(path, data, wanted, findings)
             return
     raise LogError(str(path), "is no recording of ROS", "leave the format to be recognised")
 
@@ -79,7 +77,7 @@ def _plain(data: bytes, refuse: Callable[[str], LogError]) -> bytes:
 
 
 def _from_mcap(
-    path: Path, data: Bytes, cut: bool, wanted: Collection[str], findings: list[Finding] | None
+    path: Path, data: Bytes, wanted: Collection[str], findings: list[Finding] | None
 ) -> Iterator[Raw]:
     file, refuse = str(path), damaged(str(path))
     sound, closed = _sound(data)
@@ -102,12 +100,8 @@ def _from_mcap(
             name, topic = channels[one.channel_id]
             if name:
                 yield name, topic, _plain(one.data, refuse), False
-    if cut or not closed:
-        why = "its compressed stream has no end" if cut else f"after {len(data)} bytes"
-        place = f"byte {len(data)}"
-        telling(findings, "warning", "ends_early", file, place, len(data))(
-            f"breaks off ({why}): the recording or the copy was interrupted. All before it is read."
-        )
+    if not closed:
+        breaks_off(findings, file, len(data))
 
 
 def _sound(data: Bytes) -> tuple[int, bool]:
@@ -172,7 +166,7 @@ def _records(
 
 
 def _from_db3(
-    path: Path, data: Bytes, cut: bool, wanted: Collection[str], findings: list[Finding] | None
+    path: Path, data: Bytes, wanted: Collection[str], findings: list[Finding] | None
 ) -> Iterator[Raw]:
     file, refuse = str(path), damaged(str(path))
     waiting = path.with_name(path.name + "-wal")
@@ -227,7 +221,7 @@ def _database(path: Path, data: Bytes, refuse: Callable[[str], LogError]) -> sql
 
 
 def _from_bag(
-    path: Path, data: Bytes, cut: bool, wanted: Collection[str], findings: list[Finding] | None
+    path: Path, data: Bytes, wanted: Collection[str], findings: list[Finding] | None
 ) -> Iterator[Raw]:
     file = str(path)
     try:
@@ -241,9 +235,8 @@ def _from_bag(
         return LogError(file, f"is damaged or was not closed ({why})", mend)
 
     # the reader takes whatever opens: a map gives no more bytes than there are
-    place = SimpleNamespace(exists=lambda: True, open=lambda mode: mapped(path)[0])
-    if isinstance(data, bytes):
-        place.open = lambda mode: io.BytesIO(data)
+    stream = io.BytesIO(data) if isinstance(data, bytes) else data
+    place = SimpleNamespace(exists=lambda: True, open=lambda mode: stream)
     with decoding(refuse), Reader(cast("RPath", place)) as reader:
         for at, chunk in reader.chunks.items():
             reader.chunks[at] = chunk._replace(decompressor=_bounded)

@@ -57,7 +57,7 @@ def read_tlog(path: str | os.PathLike[str], findings: list[Finding] | None = Non
         LogError: pymavlink is not installed, or there are no inertial samples.
     """
     file = str(path)
-    topics = _topics(file, mapped(path)[0], findings)
+    topics = _topics(file, mapped(path, findings), findings)
     number = next((k for k in _INERTIAL if k in topics), None)
     if number is None:
         cause = f"has no messages {', '.join(_INERTIAL.values())}"

@@ -66,7 +66,7 @@ def read_ubx(
         LogError: the file holds no ``NAV-PVT``.
     """
     file = str(path)
-    data, _ = mapped(path)
+    data = mapped(path, findings)
     frames = _frames(file, data, findings)
     if not frames[_PVT]:
         held = f"{len(frames[_MEAS])} of ESF-MEAS" if frames[_MEAS] else "none that robins reads"
