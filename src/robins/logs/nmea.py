@@ -39,8 +39,8 @@ _SLOW = 0.05  # m/s, below which receivers leave out the course
 
 
 def is_nmea(head: Head) -> bool:
-    """Has a line with a sentence among the first bytes."""
-    return _BEGINS.search(head.start) is not None
+    """Has a line with a sentence among the first bytes, and no message of UBX."""
+    return _BEGINS.search(head.start) is not None and b"\xb5\x62" not in head.start
 
 
 def read_nmea(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> GnssTable:

@@ -1,6 +1,7 @@
 """Recordings of u-blox receivers (UBX), also between sentences of NMEA and corrections.
 
 - ``NAV-PVT``: fixes with velocity and sigmas; ``NAV-HPPOSLLH`` adds the digits behind 1e-7 deg.
+- the sentences of NMEA where there is no ``NAV-PVT``: see `robins.logs.nmea`;
 - ``ESF-MEAS``: rates and specific forces of a receiver with inertial sensors, along its own axes.
 
 GPS time is the time of week of a fix, in the week of its date. Inertial stamps count milliseconds
@@ -23,6 +24,7 @@ from robins.gps_time import gps_of
 from robins.logs.findings import Finding, LogError, breaks_off, left_out, telling, undated
 from robins.logs.fix_kinds import fixes
 from robins.logs.merging import gps_clock, merged
+from robins.logs.nmea import read_nmea
 from robins.logs.opening import Bytes, mapped
 from robins.logs.tables import Table
 from robins.logs.text import Head
@@ -45,9 +47,9 @@ _GYRO_DEG_S, _ACCEL_M_S2 = 2.0**-12, 2.0**-10
 
 
 def is_ubx(head: Head) -> bool:
-    """Begins with a message of UBX, perhaps behind sentences of NMEA."""
-    at = head.start.find(_SYNC)
-    return at == 0 or (at > 0 and re.match(rb"\$[A-Z]{5}|\xd3\x00", head.start) is not None)
+    """Begins with a message of UBX, or has one behind a sentence of NMEA or a correction."""
+    begins = head.start.lstrip(b"\r\n").startswith((_SYNC, b"$", b"\xd3\x00"))
+    return begins and _SYNC in head.start
 
 
 def read_ubx(
@@ -68,6 +70,8 @@ def read_ubx(
     file = str(path)
     data = mapped(path, findings)
     frames = _frames(file, data, findings)
+    if not frames[_PVT] and re.search(rb"\$..(GGA|RMC),", data):
+        return read_nmea(path, findings)
     if not frames[_PVT]:
         held = f"{len(frames[_MEAS])} of ESF-MEAS" if frames[_MEAS] else "none that robins reads"
         raise LogError(file, f"has no messages NAV-PVT, {held}", "switch on UBX-NAV-PVT")
