@@ -38,8 +38,8 @@ def merged(gyro: ImuTable, accel: ImuTable, findings: list[Finding] | None) -> I
     now, since = gyro.time_ns[inside], at[0]
     force = np.stack([np.interp(now - since, at - since, forces[:, k]) for k in range(3)], axis=-1)
     before = np.clip(np.searchsorted(at, now, side="right") - 1, 0, max(len(at) - 2, 0))
-    wide = np.diff(at, append=at[-1])[before]
-    force[(wide > _LONG * np.median(np.diff(at))) & (now != at[before])] = np.nan
+    apart = np.diff(at, append=at[-1])
+    force[(apart[before] > _LONG * np.median(apart)) & (now != at[before])] = np.nan
     telling(findings, "note", "sensors_merged", gyro.source, value=int((~inside).sum()))(
         "rates and specific forces were recorded apart; the forces are interpolated to the times "
         f"of the rates, and {(~inside).sum()} samples without both are left out."

@@ -33,6 +33,7 @@ from robins.units import to_si
 
 _SYNC = b"\xb5\x62"
 _HEAD = struct.Struct("<2sBBH")
+_TAG = struct.Struct("<IHH")  # of ESF-MEAS: time [ms], flags, provider
 _PVT, _HIGH, _MEAS, _RAW = 0x0107, 0x0114, 0x1002, 0x1003  # class and number
 _NAV_PVT = np.dtype(  # the oldest version; place: longitude, latitude [1e-7 deg]
     "<u4, <u2, u1, u1, 3u1, u1, V8, u1, u1, V2, 2<i4, <i4, V4, 2<u4, 3<i4, V8, <u4, V12"
@@ -70,9 +71,9 @@ def read_ubx(
     file = str(path)
     data = mapped(path, findings)
     frames = _frames(file, data, findings)
-    if not frames[_PVT] and re.search(rb"\$..(GGA|RMC),", data):
-        return read_nmea(path, findings)
     if not frames[_PVT]:
+        if re.search(rb"\$..(GGA|RMC),", data):
+            return read_nmea(path, findings)
         held = f"{len(frames[_MEAS])} of ESF-MEAS" if frames[_MEAS] else "none that robins reads"
         raise LogError(file, f"has no messages NAV-PVT, {held}", "switch on UBX-NAV-PVT")
     if frames[_RAW]:
@@ -80,18 +81,15 @@ def read_ubx(
             f"{len(frames[_RAW])} messages ESF-RAW are left out; switch on ESF-MEAS for samples."
         )
     gnss, arrived = _fixes(file, data, frames, findings)
-    imu = _inertial(file, data, frames[_MEAS], findings)
+    measured = [place for place in frames[_MEAS] if place[1] >= _TAG.size]
+    tags = np.array([_TAG.unpack_from(data, at)[0] for at, _ in measured], np.int64) * 1_000_000
+    imu = _inertial(file, data, measured, findings)
     if imu is None:
         return gnss
-    if len(gnss):
-        # what was measured last when a fix arrived
-        tags = [_tag(data, at) for at, _ in frames[_MEAS]]
-        before = np.searchsorted([at for at, _ in frames[_MEAS]], arrived) - 1
-        known = before >= 0
-        local_ns = np.array(tags, np.int64)[before[known]] * 1_000_000
-        if known.any():
-            clock = gps_clock(file, local_ns, gnss.time_ns[known], findings)
-            imu = replace(imu, time_ns=clock(imu.time_ns))
+    before = np.searchsorted([at for at, _ in measured], arrived) - 1  # as a fix arrived
+    if (known := before >= 0).any():
+        clock = gps_clock(file, tags[before[known]], gnss.time_ns[known], findings)
+        imu = replace(imu, time_ns=clock(imu.time_ns))
     return Dataset(Path(file).name.split(".")[0], imu, gnss, time_unit_known=(file,))
 
 
@@ -180,24 +178,15 @@ def _fixes(
     return table, at
 
 
-def _tag(data: Bytes, at: int) -> int:
-    return struct.unpack_from("<I", data, at)[0]
-
-
 def _inertial(
-    file: str,
-    data: Bytes,
-    frames: list[tuple[int, int]],
-    findings: list[Finding] | None,
+    file: str, data: Bytes, frames: list[tuple[int, int]], findings: list[Finding] | None
 ) -> ImuTable | None:
     """Samples on the clock of the receiver."""
     halves: dict[tuple[int, ...], dict[int, list[int]]] = {_GYRO: {}, _ACCEL: {}}
     for at, size in frames:
-        if size < 8:
-            continue
-        tag, flags, _ = struct.unpack_from("<IHH", data, at)
-        count = min(flags >> 11, (size - 8) // 4)
-        words = struct.unpack_from(f"<{count}I", data, at + 8)
+        tag, flags, _ = _TAG.unpack_from(data, at)
+        count = min(flags >> 11, (size - _TAG.size) // 4)
+        words = struct.unpack_from(f"<{count}I", data, at + _TAG.size)
         read = {word >> 24 & 63: (word & 0xFFFFFF ^ 0x800000) - 0x800000 for word in words}
         for axes, rows in halves.items():
             if all(axis in read for axis in axes):
