@@ -40,7 +40,7 @@ Raw: TypeAlias = tuple[str, str, bytes, bool]
 def raw_messages(
     path: Path, wanted: Collection[str], findings: list[Finding] | None
 ) -> Iterator[Raw]:
-    """Messages of the wanted types.
+    """Messages of the wanted types, and one without bytes for each topic of any type.
 
     Args:
         path: a file, plain or compressed.
@@ -82,24 +82,25 @@ def _from_mcap(
     file, refuse = str(path), damaged(str(path))
     sound, closed = _sound(data)
     schemas: dict[int, str] = {}
-    channels: dict[int, tuple[str, str]] = {}  # schema and topic of those whose messages are read
+    channels: dict[int, tuple[str, str]] = {}  # type and topic
     one: Any
     for one in _records(file, data, sound, refuse):
-        kind = type(one).__name__  # the package is not imported here
-        if kind == "Schema":
+        record = type(one).__name__  # the package is not imported here
+        if record == "Schema":
             schemas[one.id] = one.name
-        elif kind == "Channel":
+        elif record == "Channel":
             name = schemas.get(one.schema_id, "")
             if one.schema_id and not name:
                 raise refuse(f"topic {one.topic} has schema {one.schema_id}, which is not there")
-            read = name if name in wanted and one.message_encoding == "cdr" else ""
-            channels[one.id] = (read, one.topic)
-        elif kind == "Message":
+            kind = name if one.message_encoding == "cdr" else f"{name} in {one.message_encoding}"
+            channels[one.id] = (kind, one.topic)
+            yield kind, one.topic, b"", False
+        elif record == "Message":
             if one.channel_id not in channels:
                 raise refuse(f"a message of channel {one.channel_id}, which is not there")
-            name, topic = channels[one.channel_id]
-            if name:
-                yield name, topic, _plain(one.data, refuse), False
+            kind, topic = channels[one.channel_id]
+            if kind in wanted:
+                yield kind, topic, _plain(one.data, refuse), False
     if not closed:
         breaks_off(findings, file, len(data))
 
@@ -183,16 +184,17 @@ def _from_db3(
                 raise LogError(file, cause, "export its columns to CSV")
             topics = base.execute("SELECT id, name, type, serialization_format FROM topics")
             named = {
-                key: (kind if kind in wanted and form == "cdr" else "", str(topic))
+                key: (kind if form == "cdr" else f"{kind} in {form}", str(topic))
                 for key, topic, kind, form in topics
             }
-            read = [key for key, (kind, _) in named.items() if kind]
+            read = [key for key, (kind, _) in named.items() if kind in wanted]
             marks = ",".join("?" * len(read))
             rows = base.execute(
                 f"SELECT topic_id, data FROM messages WHERE topic_id IN ({marks}) "
                 "ORDER BY timestamp, id",
                 read,
             )
+        yield from ((str(kind), topic, b"", False) for kind, topic in named.values())
         while True:
             with decoding(refuse):
                 row = next(rows, None)
@@ -240,6 +242,7 @@ def _from_bag(
     with decoding(refuse), Reader(cast("RPath", place)) as reader:
         for at, chunk in reader.chunks.items():
             reader.chunks[at] = chunk._replace(decompressor=_bounded)
+        yield from ((c.msgtype, c.topic, b"", True) for c in reader.connections)
         chosen = [c for c in reader.connections if c.msgtype in wanted]
         for one, _, message in reader.messages(chosen) if chosen else ():
             yield one.msgtype, one.topic, message, True

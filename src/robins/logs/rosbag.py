@@ -72,7 +72,7 @@ def read_rosbag(
             holds no samples.
     """
     file = str(path)
-    topics = _topics(path, findings)
+    topics, kinds = _topics(path, findings)
     imu = _inertial(file, topics, findings)
     mag, fixes = (_first(file, topics, kind, findings) for kind in (_MAG, _FIX))
     field = mag and MagTable(mag.time_ns, mag.values[:, :3] * _FLU, source=file)
@@ -82,7 +82,7 @@ def read_rosbag(
         return Dataset(name=name, imu=imu, mag=field, gnss=gnss, time_unit_known=(file,))
     alone = field if gnss is None else gnss
     if alone is None or (field is not None and gnss is not None):
-        held = ", ".join(sorted({name for name, _ in topics})) or "no messages that robins reads"
+        held = ", ".join(sorted(kinds)) or "no messages"
         raise LogError(
             file, f"has no messages {_IMU}; it holds {held}", "record that topic as well"
         )
@@ -91,8 +91,8 @@ def read_rosbag(
 
 def _topics(
     path: str | os.PathLike[str], findings: list[Finding] | None
-) -> dict[tuple[str, str], _Found]:
-    """All messages that are read, by type and topic.
+) -> tuple[dict[tuple[str, str], _Found], set[str]]:
+    """All messages that are read, by type and topic, and the types of all that are there.
 
     Raises:
         LogError: as `read_rosbag`.
@@ -100,9 +100,12 @@ def _topics(
     stamps: dict[tuple[str, str], array[int]] = defaultdict(lambda: array("q"))
     values: dict[tuple[str, str], array[float]] = defaultdict(lambda: array("d"))
     frames: dict[tuple[str, str], str] = {}
-    wanted = (_IMU, _MAG, _FIX, *_TWISTS)
+    kinds, wanted = set[str](), (_IMU, _MAG, _FIX, *_TWISTS)
     for part in parts_of(path):
         for name, topic, data, ros1 in raw_messages(part, wanted, findings):
+            kinds.add(name)
+            if not data:
+                continue
             try:
                 time_ns, frame_id, numbers = ros.numbers(name, data, ros1)
             except ros.RosError as error:
@@ -117,7 +120,7 @@ def _topics(
         dated = time_ns >= GPS_EPOCH_S * 1_000_000_000
         rows = np.array(values.pop(key)).reshape(len(time_ns), -1)
         found[key] = _Found(key[1], frame_id, np.where(dated, gps_of(time_ns), time_ns), rows)
-    return found
+    return found, kinds
 
 
 def _first(
