@@ -196,8 +196,10 @@ def test_kinds_of_fixes_of_a_receiver(tmp_path, changes, quality, lost):
 
 
 def test_a_receiver_without_a_date_and_with_more_digits(tmp_path):
-    with pytest.raises(LogError, match="has no messages NAV-PVT"):
-        read(tmp_path, made.ubx().split(b"\xb5\x62\x01\x07")[0])
+    with pytest.raises(LogError, match="has no messages NAV-PVT or ESF-MEAS; switch on UBX"):
+        read(tmp_path, made.ubx(inertial=False).replace(b"\x01\x07", b"\x01\x06"))
+    imu, found = read(tmp_path, made.ubx().split(b"\xb5\x62\x01\x07")[0])
+    assert (len(imu), imu.time_ns[0], found) == (10, 90 * NS, {})  # on the clock of the receiver
     gnss, found = read(tmp_path, made.ubx(inertial=False, validDate=0))
     assert (len(gnss), found["undated"].value) == (0, 4)
     more = struct.pack("<B3xIiiiibbbbII", 0, made.TOW_MS, 112 * 10**6, 481 * 10**6, 500_000, 0,

@@ -28,7 +28,7 @@ from robins.logs.opening import Bytes, mapped
 from robins.logs.text import Head
 from robins.units import to_si
 
-_BEGINS = re.compile(rb"(^|[\r\n])[^$\r\n]{0,60}\$[A-Z]{2}(GGA|RMC|VTG|GST|ZDA|GLL|GS[AV]|TXT),")
+_BEGINS = re.compile(rb"(^|[\r\n])[^$\r\n]{0,60}\$[A-Z]{4,6}\d*,[^*$\r\n]*\*[0-9A-Fa-f]{2}")
 _SENTENCE = re.compile(
     rb"\$([A-Z]{2})(GGA|RMC|VTG|GST|ZDA),([^*$\r\n]{0,200})(?:\*([0-9A-Fa-f]{2}))?"
 )
@@ -39,7 +39,7 @@ _SLOW = 0.05  # m/s, below which receivers leave out the course
 
 
 def is_nmea(head: Head) -> bool:
-    """Has a line with a sentence among the first bytes, and no message of UBX."""
+    """Has a line with any sentence among the first bytes, and no message of UBX."""
     return _BEGINS.search(head.start) is not None and b"\xb5\x62" not in head.start
 
 

@@ -63,29 +63,30 @@ def read_ubx(
         findings: receives what was left out; without it that is issued as `LogWarning`.
 
     Returns:
-        A `GnssTable`, or a dataset where there are inertial samples.
+        A dataset, or a table where there are only fixes or only samples.
 
     Raises:
-        LogError: the file holds no ``NAV-PVT``.
+        LogError: the file holds neither.
     """
     file = str(path)
     data = mapped(path, findings)
     frames = _frames(file, data, findings)
-    if not frames[_PVT]:
-        if re.search(rb"\$..(GGA|RMC),", data):
-            return read_nmea(path, findings)
-        held = f"{len(frames[_MEAS])} of ESF-MEAS" if frames[_MEAS] else "none that robins reads"
-        raise LogError(file, f"has no messages NAV-PVT, {held}", "switch on UBX-NAV-PVT")
     if frames[_RAW]:
         telling(findings, "note", "other_kinds", file, value=len(frames[_RAW]))(
             f"{len(frames[_RAW])} messages ESF-RAW are left out; switch on ESF-MEAS for samples."
         )
-    gnss, arrived = _fixes(file, data, frames, findings)
+    if not frames[_PVT] and re.search(rb"\$..(GGA|RMC),", data):
+        return read_nmea(path, findings)
     measured = [place for place in frames[_MEAS] if place[1] >= _TAG.size]
-    tags = np.array([_TAG.unpack_from(data, at)[0] for at, _ in measured], np.int64) * 1_000_000
     imu = _inertial(file, data, measured, findings)
+    if not frames[_PVT]:
+        if imu is not None:
+            return imu
+        raise LogError(file, "has no messages NAV-PVT or ESF-MEAS", "switch on UBX-NAV-PVT")
+    gnss, arrived = _fixes(file, data, frames, findings)
     if imu is None:
         return gnss
+    tags = np.array([_TAG.unpack_from(data, at)[0] for at, _ in measured], np.int64) * 1_000_000
     before = np.searchsorted([at for at, _ in measured], arrived) - 1  # as a fix arrived
     if (known := before >= 0).any():
         clock = gps_clock(file, tags[before[known]], gnss.time_ns[known], findings)

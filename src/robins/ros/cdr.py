@@ -155,6 +155,7 @@ def _fields(name: str, layout: tuple[str, ...], data: bytes, ros1: bool) -> tupl
     return sec * 1_000_000_000 + nanosec, frame_id, fields
 
 
+@cache
 def _size(code: str) -> int:
     """Bytes of one number of a code."""
     return struct.calcsize(f"<{code.lstrip('0123456789')[0]}")
