@@ -91,6 +91,22 @@ def test_rates_and_forces_on_topics_of_their_own_are_merged(tmp_path):
     np.testing.assert_allclose(data.imu.accel, means, rtol=0, atol=1e-12)
 
 
+def test_rates_and_forces_in_files_of_their_own_are_merged(tmp_path):
+    whole = open_log(made.folder(tmp_path / "drive", apart=True), findings=[])
+    paths = []
+    for name, kept in (("accel", "/gyro/sample"), ("gyro", "/accel/sample")):
+        paths.append(tmp_path / f"{name}.db3")
+        shutil.copy(tmp_path / "drive" / "drive.db3", paths[-1])
+        with sqlite3.connect(paths[-1]) as db:
+            db.execute("DELETE FROM topics WHERE name IN (?, '/mag', '/fix', '/vel')", [kept])
+        db.close()
+    both = load_dataset(paths)
+    np.testing.assert_array_equal(both.imu.time_ns, whole.imu.time_ns)
+    np.testing.assert_array_equal(both.imu.gyro, whole.imu.gyro)
+    np.testing.assert_array_equal(both.imu.accel, whole.imu.accel)
+    assert [f.code for f in both.findings] == ["sensors_merged"]
+
+
 def test_across_a_gap_no_force_is_interpolated():
     time_ns = np.arange(30) * NS // 10
     gone = np.zeros((30, 3))

@@ -15,11 +15,18 @@ _DRIFT, _STRAY_S = 2e-4, 1.0  # of a clock; a stamp that is further from the oth
 _TREND_S = 60.0  # a drift is found from stamps over at least this time
 
 
+def are_halves(one: ImuTable, other: ImuTable) -> bool:
+    """True if one has only rates and the other only specific forces; the rest is zero or NaN."""
+    has = [[np.nan_to_num(v).any() for v in (t.gyro, t.accel)] for t in (one, other)]
+    return sorted(has) == [[False, True], [True, False]]
+
+
 def merged(gyro: ImuTable, accel: ImuTable, findings: list[Finding] | None) -> ImuTable:
     """Rates of one table with the specific forces of another, on the clock of the rates.
 
-    Specific forces are interpolated linearly. Samples outside of their time are left out; across a
-    gap of more than five of their intervals the specific force is missing (NaN).
+    They may be given in either order. Specific forces are interpolated linearly. Samples outside of
+    their time are left out; across a gap of more than five of their intervals the specific force is
+    missing (NaN).
 
     Args:
         gyro: rates; its specific forces are not used.
@@ -29,6 +36,8 @@ def merged(gyro: ImuTable, accel: ImuTable, findings: list[Finding] | None) -> I
     Raises:
         LogError: the two share no time.
     """
+    if not np.nan_to_num(gyro.gyro).any():
+        gyro, accel = accel, gyro
     order = np.argsort(accel.time_ns, kind="stable")
     at, forces = accel.time_ns[order], accel.accel[order]
     inside = (gyro.time_ns >= at[0]) & (gyro.time_ns <= at[-1])

@@ -29,7 +29,7 @@ from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.gps_time import GPS_EPOCH_S, gps_of
 from robins.logs.findings import Finding, LogError, damaged, telling
 from robins.logs.fix_kinds import with_usual_sigmas
-from robins.logs.merging import merged
+from robins.logs.merging import are_halves, merged
 from robins.logs.opening import parts_of
 from robins.logs.ros_files import raw_messages
 from robins.logs.tables import Table
@@ -158,14 +158,10 @@ def _inertial(
     ]  # fmt: skip
     if not tables:
         return None
-    has = [tuple(np.nan_to_num(v).any() for v in (t.gyro, t.accel)) for _, t in tables]
-    pair = {(True, False), (False, True)}
-    other = next((k for k in range(len(has)) if {has[0], has[k]} == pair), None)
-    _first(file, topics, _IMU, findings, "" if other is None else tables[other][0])
-    if other is None:
-        return tables[0][1]
-    gyro, accel = (0, other) if has[0][0] else (other, 0)
-    return merged(tables[gyro][1], tables[accel][1], findings)
+    first = tables[0][1]
+    other = next(((k, t) for k, t in tables[1:] if are_halves(first, t)), None)
+    _first(file, topics, _IMU, findings, other[0] if other else "")
+    return merged(first, other[1], findings) if other else first
 
 
 def _fixes(
