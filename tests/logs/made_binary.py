@@ -195,7 +195,7 @@ def nmea(utc=UTC, gst=True, talkers=("GN",), date=True):
 # ----------------------------------------------------------------------------------------- MAVLink
 
 
-def tlog(kind="HIGHRES_IMU", version=2, boot_ms=100_000):
+def tlog(kind="HIGHRES_IMU", version=2, boot_ms=100_000, units=1):
     """Telemetry as a ground station keeps it; the vehicle counts from power-up."""
     common, out = {1: mavlink1, 2: mavlink2}[version], []
     sender = common.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -209,7 +209,9 @@ def tlog(kind="HIGHRES_IMU", version=2, boot_ms=100_000):
         boot_us = boot_ms * 1000 + int(t // 1000)
         if kind == "HIGHRES_IMU":
             values = (*a, *g, *(m * 1e4), 0.0, 0.0, 0.0, 0.0, 63)
-            send(t, common.MAVLink_highres_imu_message(boot_us, *map(float, values[:13]), 63))
+            for unit in range(units):
+                values = [float(x) + unit for x in values[:13]]
+                send(t, common.MAVLink_highres_imu_message(boot_us, *values, 63, unit))
         else:
             counts = [*np.rint(a / 9.80665e-3), *np.rint(g * 1e3), *np.rint(m * 1e7)]
             send(t, common.MAVLink_scaled_imu_message(boot_us // 1000, *map(int, counts)))

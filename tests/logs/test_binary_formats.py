@@ -293,6 +293,12 @@ def test_telemetry_of_a_vehicle(tmp_path, kind, version):
     assert_fixes(data.gnss, 100 * NS, down=False, atol=5.1e-8)
 
 
+def test_of_several_units_and_vehicles_the_first_is_read(tmp_path):
+    data, found = read(tmp_path, made.tlog(units=2))
+    np.testing.assert_allclose(data.imu.gyro, MADE.gyro, rtol=0, atol=1e-6)
+    assert (len(data.gnss), found["several_instances"].value) == (4, 2)
+
+
 def test_telemetry_that_is_damaged(tmp_path, monkeypatch):
     content = made.tlog()
     at = content.index(b"\xfd", 2000)

@@ -116,7 +116,7 @@ def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[int,
         cause = "is telemetry of MAVLink, and the package that reads it is not installed"
         raise LogError(file, cause, "install it with: pip install 'robins[logs]'") from error
     decoder, wrong = common.MAVLink(None), 0
-    senders: dict[tuple[int, int], dict[int, list[list[float]]]] = {}
+    senders: dict[tuple[int, int, int], dict[int, list[list[float]]]] = {}
     for at, number, frame in _frames(file, data, findings):
         try:
             one: Any = decoder.decode(bytearray(frame))
@@ -125,12 +125,13 @@ def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[int,
             continue
         names = _FIX if number == _GPS else _SENSORS
         stamp = 1000 * one.time_boot_ms if number == 26 else one.time_usec
-        sender = senders.setdefault((one.get_srcSystem(), one.get_srcComponent()), {})
+        unit = one.id if number == 105 else 0  # of several on one vehicle
+        sender = senders.setdefault((one.get_srcSystem(), one.get_srcComponent(), unit), {})
         sender.setdefault(number, []).append([at, stamp, *(getattr(one, x) for x in names)])
     left_out(findings, file, wrong, "messages have a wrong checksum")
     if len(senders) > 1:
         telling(findings, "note", "several_instances", file, value=len(senders))(
-            f"{len(senders)} vehicles or components sent samples or fixes; the first is read."
+            f"{len(senders)} vehicles, components or units sent samples; the first is read."
         )
     first = next((s for s in senders.values() if s.keys() - {_GPS}), {})
     topics: dict[int, Topic] = {}
