@@ -30,6 +30,7 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "logs"))
 
 from log_samples import SAMPLES
+from made_binary import bag, content
 from made_rosbag import drive, rosbag
 from mcap.writer import CompressionType
 
@@ -66,6 +67,8 @@ def kinds() -> list[Kind]:
     samples = {k: _longer(v) if isinstance(v, str) else v for k, v in SAMPLES.items()}
     for one in CompressionType:
         samples[f"ros-mcap {one.name}"] = rosbag(drive(), one)
+    for one in ("LZ4", "BZ2"):
+        samples[f"ros-bag {one}"] = content(bag, "drive.bag", compression=one)
     samples["gz"] = gzip.compress(samples["named-imu"], mtime=0)
     samples["xz"] = lzma.compress(samples["rtklib-pos"])
     paths = {f.name for f in FORMATS if set(f.holds) & {"trajectory", "attitude"}} - {"broad-npz"}

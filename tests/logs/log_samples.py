@@ -1,5 +1,6 @@
 """The beginning of a file of every format, by its name."""
 
+import made_binary
 from made_nine_axis import broad_bytes
 from made_rosbag import drive, rosbag
 from made_ulog import flight
@@ -71,4 +72,10 @@ SAMPLES = {
     "broad-npz": broad_bytes(),
     "px4-ulog": flight(0.1)[0],
     "ros-mcap": rosbag(drive()),
+    "ros-db3": made_binary.content(made_binary.folder, "drive"),
+    "ros-bag": made_binary.content(made_binary.bag, "drive.bag"),
+    "ubx": made_binary.ubx(),
+    "nmea": made_binary.nmea(),
+    "ardupilot-bin": made_binary.dataflash(),
+    "mavlink-tlog": made_binary.tlog(),
 }

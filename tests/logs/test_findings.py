@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import made_binary
 import pytest
 from finding_tables import findings as documented
 from log_samples import EUROC_TRUTH, KFGINS_IMU, RTKLIB
@@ -90,6 +91,28 @@ FILES = (
         "other_kinds",
         "note: lines of other kinds were left out: 1 of 'imu3'",
         "point3 0 3785108 899901 5037234\nimu3 1 2 3\n",
+    ),
+    (
+        "damaged_frames",
+        "warning: 1 messages have a wrong length or checksum; they are left out",
+        made_binary.ubx(inertial=False).replace(b"\x1c\x11", b"\x1c\x12", 1),
+    ),
+    (
+        "undated",
+        "note: 4 messages NAV-PVT have no date yet",
+        made_binary.ubx(inertial=False, validDate=0),
+    ),
+    ("sigma_assumed", "note: 4 of 4 fixes state no sigma", made_binary.nmea()),
+    ("clock_aligned", "note: stamps of the samples are put on GPS time", made_binary.ubx()),
+    (
+        "sensors_merged",
+        "note: rates and specific forces were recorded apart",
+        made_binary.content(made_binary.folder, "drive", apart=True, velocity="base"),
+    ),
+    (
+        "velocity_taken",
+        "note: velocities of 4 of 4 fixes are those of /vel",
+        made_binary.content(made_binary.folder, "drive"),
     ),
 )
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from robins import foreign
 from robins.logs import open_log
 from robins.logs.findings import LogError, LogWarning
+from robins.logs.opening import _FOREIGN
 from robins.logs.text import Layout, peek, read_columns
 
 LAYOUT = Layout(("time", "x", "y"), ",")
@@ -124,12 +125,24 @@ def test_refusals_name_line_field_value_and_mend(write, data, message):
         read_columns(path, LAYOUT, [])
 
 
+@pytest.mark.parametrize("row", _FOREIGN, ids=[what for _, _, what, _ in _FOREIGN])
+def test_a_file_of_another_kind_is_refused_by_name_with_the_way_in(tmp_path, row):
+    place, magic, what, way = row
+    path = tmp_path / "log.bin"
+    path.write_bytes(bytes(place) + magic + bytes(99))
+    if magic in (b"\x1f\x8b", b"\xfd7zXZ\x00"):
+        path.write_bytes(gzip.compress(magic))
+    with pytest.raises(LogError) as caught:
+        peek(path)
+    assert str(caught.value) == f"{path}: is {what}, not a text log; {way}"
+
+
 @pytest.mark.parametrize(
     ("data", "message"),
     [
         (b"PK\x03\x04....", r"log.csv: is a zip archive, not a text log; unpack it first"),
         (b"ULog\x01\x12\x35", r"log.csv: is a PX4 ULog, not a text log; leave the format"),
-        (b"#ROSBAG V2.0\n", r"log.csv: is a ROS bag, not a text log; export"),
+        (b"#ROSBAG V2.0\n", r"log.csv: is a ROS bag, not a text log; leave"),
     ],
 )
 def test_other_kinds_of_file_are_named(tmp_path, data, message):
@@ -307,9 +320,15 @@ def test_memory_is_bounded_by_the_numbers_not_by_the_text(tmp_path):
     assert peak < 2 * held + 40e6
 
 
-@pytest.mark.parametrize("name", ["missing.csv", "."])
-def test_what_cannot_be_opened(tmp_path, name):
-    with pytest.raises(LogError, match=r"cannot be read: .+; check path and permissions"):
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("missing.csv", "cannot be read: .+; check path and permissions"),
+        (".", "is a folder with 0 recordings of ROS, not one; give a file of it"),
+    ],
+)
+def test_what_cannot_be_opened(tmp_path, name, words):
+    with pytest.raises(LogError, match=words):
         peek(tmp_path / name)
 
 

@@ -85,6 +85,12 @@ OF_READERS = (
     Code("angle_range", "warning", "single angles that cannot be; they are taken as missing"),
     Code("quaternion_length", "warning", "single quaternions of another length; likewise"),
     Code("other_kinds", "note", "a file holds lines of kinds that are not read"),
+    Code("damaged_frames", "warning", "messages without a right checksum, or bytes of none"),
+    Code("undated", "note", "fixes from before the receiver knew the date"),
+    Code("sigma_assumed", "note", "a receiver states no sigmas; those of its kind of fix are used"),
+    Code("sensors_merged", "note", "gyros and accelerometers were recorded apart"),
+    Code("clock_aligned", "note", "samples are put on GPS time by the arrival of the fixes"),
+    Code("velocity_taken", "note", "velocities of fixes come from a topic of their own"),
 )
 
 _OF_VELOCITY = (

@@ -81,6 +81,42 @@ def telling(
     return lambda sentence: report(findings, make(sentence))
 
 
+def damaged(file: str) -> Callable[[str], LogError]:
+    """Makes the error about a damaged file of the reason."""
+    mend = "fetch it again; nothing of it was used, for no number in it can be trusted"
+    return lambda why: LogError(file, f"is damaged ({why})", mend)
+
+
+def left_out(findings: list[Finding] | None, file: str, count: int, what: str) -> None:
+    """Report what was not read because it is damaged, if there is any."""
+    if count:
+        make = telling(findings, "warning", "damaged_frames", file, value=count)
+        make(f"{count} {what}; they are left out.")
+
+
+def undated(findings: list[Finding] | None, file: str, count: int, what: str) -> None:
+    """Report fixes from before a receiver knew the date, if there are any."""
+    if count:
+        make = telling(findings, "note", "undated", file, value=count)
+        make(f"{count} {what} have no date yet; they are left out.")
+
+
+def breaks_off(findings: list[Finding] | None, file: str, at: int) -> None:
+    """Report a last message that is not whole."""
+    telling(findings, "warning", "ends_early", file, f"byte {at}", at)(
+        "the last message is not whole: the recording or the copy was interrupted. All before it "
+        "was read."
+    )
+
+
+def above_geoid(findings: list[Finding] | None, file: str, mend: str) -> None:
+    """Report heights that are not above the ellipsoid."""
+    telling(findings, "warning", "height_above_geoid", file, value="geoid")(
+        "heights are above the geoid, and robins takes them as above the WGS-84 ellipsoid. "
+        f"Differences of height stay right; gravity errs by 3e-6 m/s^2 per metre. {mend}"
+    )
+
+
 def by_severity(findings: list[Finding]) -> list[Finding]:
     """Errors first, then warnings, then notes; otherwise in the order they were made."""
     return sorted(findings, key=lambda f: SEVERITIES.index(f.severity))

@@ -9,6 +9,7 @@ from typing import Any
 
 from robins.dataset import Dataset, ImuTable, Trajectory
 from robins.logs.findings import Finding, LogError
+from robins.logs.merging import are_halves, merged
 from robins.logs.mounting import Mounting, turned
 from robins.logs.registry import fitting, open_log
 from robins.logs.tables import Table, kind_of, tables_of
@@ -27,8 +28,9 @@ def load_dataset(
     """Read IMU, and whatever else there is, as it is in the files; see `clean`.
 
     Args:
-        paths: one, or several in any order; one IMU table in all, and at most one of each other
-            kind. A path in a file of its own is the truth.
+        paths: one, or several in any order; one IMU table in all, or one with rates and one with
+            specific forces, and at most one of each other kind. A path in a file of its own is the
+            truth.
         name: of the dataset; by default the name of the file with the IMU.
         mounting: turns the sensor's axes to forward-right-down and says where the antenna is.
         formats: path -> its format, for files that are not recognised by content.
@@ -53,6 +55,8 @@ def load_dataset(
             known += opened.time_unit_known
         for table in tables_of(opened):
             kind = kind_of(table)
+            if isinstance(table, ImuTable) and kind in held and are_halves(held[kind], table):
+                table = merged(held.pop(kind), table, findings)
             if kind in held:
                 cause = f"is a second file of the kind of {held[kind].source} ({kind})"
                 raise LogError(path, cause, "give one of the two")

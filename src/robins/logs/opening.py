@@ -10,30 +10,68 @@ from __future__ import annotations
 
 import gzip
 import lzma
+import mmap
 import os
+import re
 import tempfile
 import zlib
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from robins.foreign import FREE, decoding, within
-from robins.logs.findings import LogError
+from robins.logs.findings import Finding, LogError, telling
 
-_BLOCK = 1 << 20
+Bytes: TypeAlias = bytes | mmap.mmap
+_BLOCK, _ABOUT, _LARGEST = 1 << 20, 1 << 22, 1 << 30
+_PART = re.compile(r".+\.(mcap|db3|bag)(\.(xz|gz|zstd))?")
+_LISTED = re.compile(r"^\s*-\s+(\S+\.(?:mcap|db3)(?:\.zstd)?)\s*$", re.MULTILINE)
+_NUMBER = re.compile(r"_(\d+)\.(?:mcap|db3|bag)")
 _XZ, _GZIP = b"\xfd7zXZ\x00", b"\x1f\x8b"
-_FOREIGN = {
-    b"PK\x03\x04": ("a zip archive", "unpack it first"),
-    b"BZh": ("a bzip2 file", "unpack it first"),
-    b"\x28\xb5\x2f\xfd": ("a zstd file", "unpack it first"),
-    b"ULog": ("a PX4 ULog", "leave the format to be recognised"),
-    b"#ROSBAG": ("a ROS bag", "export the IMU and GNSS topics to CSV"),
-    b"SQLite": ("an SQLite file (a ROS 2 bag?)", "convert it to MCAP: ros2 bag convert"),
-    b"\x89MCAP": ("an MCAP file", "leave the format to be recognised"),
-    b"\x89HDF": ("an HDF5 or MATLAB v7.3 file", "export the columns to CSV"),
-    b"MATLAB": ("a MATLAB file", "export the columns to CSV"),
-}
+_NATIVE = "leave the format to be recognised"
+_CSV, _UNPACK = "export the columns to CSV", "unpack it first"
+_RTKLIB = "solve its positions with RTKLIB (convbin, rnx2rtkp) and give the .pos"
+_FOREIGN: tuple[tuple[int, bytes, str, str], ...] = (  # place, bytes there, kind, the way in
+    (0, b"PK\x03\x04", "a zip archive", _UNPACK),
+    (0, _GZIP, "a gzip file in another compressed file", _UNPACK),
+    (0, _XZ, "an xz file in another compressed file", _UNPACK),
+    (0, b"BZh", "a bzip2 file", _UNPACK),
+    (0, b"\x28\xb5\x2f\xfd", "a zstd file", _UNPACK),
+    (0, b"7z\xbc\xaf\x27\x1c", "a 7z archive", _UNPACK),
+    (0, b"Rar!", "a RAR archive", _UNPACK),
+    (257, b"ustar", "a tar archive", _UNPACK),
+    (0, b"ULog", "a PX4 ULog", _NATIVE),
+    (0, b"#ROSBAG V2.0", "a ROS bag", _NATIVE),
+    (0, b"#ROSBAG", "a ROS bag of an old version", "convert it with rosbag fix"),
+    (0, b"SQLite", "an SQLite file (a ROS 2 bag?)", _NATIVE),
+    (0, b"\x89MCAP", "an MCAP file", _NATIVE),
+    (0, b"\xb5\x62", "a UBX file of u-blox", _NATIVE),
+    (0, b"\xa3\x95", "an ArduPilot dataflash log", _NATIVE),
+    (0, b"\x89HDF", "an HDF5 or MATLAB v7.3 file", _CSV),
+    (0, b"MATLAB", "a MATLAB file", _CSV),
+    (0, b"CDF\x01", "a NetCDF file", _CSV),
+    (0, b"PAR1", "a Parquet file", "export it: pandas.read_parquet(FILE).to_csv(...)"),
+    (0, b"ARROW1", "an Arrow or Feather file", "export it: pandas.read_feather(FILE).to_csv(...)"),
+    (0, b"TDSm", "a TDMS file of LabVIEW", "export the channels to CSV, e.g. by npTDMS"),
+    (0, b"MDF ", "an MDF file of measurements (MF4)", "export the signals to CSV, e.g. by asammdf"),
+    (0, b"\xd4\xc3\xb2\xa1", "a pcap of network packets", "extract its stream with Wireshark"),
+    (0, b"\x0a\x0d\x0d\x0a", "a pcapng of network packets", "extract its stream with Wireshark"),
+    (0, b"$@", "Septentrio SBF", "convert it with bin2asc or sbf2rin of RxTools"),
+    (0, b"\xaa\x44\x12", "a NovAtel OEM4/6 log", "convert it to ASCII with NovAtel Convert"),
+    (0, b"\xaa\x44\xb5", "a NovAtel OEM7 log", "convert it to ASCII with NovAtel Convert"),
+    (60, b"RINEX VERSION", "RINEX observations", _RTKLIB),
+    (0, b"\xd3\x00", "RTCM 3 corrections", _RTKLIB),
+    (0, b"\xfa\xff", "an Xsens MTB log", "export it to text with MT Manager"),
+    (0, b"\xfa", "VectorNav binary output", "export it to CSV with VectorNav Control Center"),
+    (16, b"BUILD", "a DJI .DAT log", "convert it to CSV with DatCon"),
+    (242, b"DJI_LOG_V3", "a DJI .DAT log", "convert it to CSV with DatCon"),
+    (4, b"ftyp", "an MP4 film", "extract its telemetry (GoPro: gopro2json) to CSV"),
+    (0, b"\xff\xd8\xff", "a JPEG picture", "give the log"),
+    (0, b"\x89PNG", "a PNG picture", "give the log"),
+    (0, b"%PDF", "a PDF document", "give the log"),
+    (0, b"\x7fELF", "a program (ELF)", "give the log"),
+)
 
 
 class _Gunzip:
@@ -61,6 +99,35 @@ class _Gunzip:
         return self._inner.unused_data
 
 
+def parts_of(path: str | os.PathLike[str]) -> list[Path]:
+    """Files of a recording in their order: the file itself, or those of a folder of ROS.
+
+    A folder names them in its ``metadata.yaml``, or holds one file, or files numbered _0, _1, ...
+
+    Raises:
+        LogError: a folder without such files, or that lacks one of them.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        return [folder]
+    there = {p.name for p in folder.iterdir() if _PART.fullmatch(p.name) and p.is_file()}
+    try:
+        about = (folder / "metadata.yaml").read_bytes()[:_ABOUT].decode("utf-8", "replace")
+    except OSError:
+        about = ""
+    names = [Path(name).name for name in _LISTED.findall(about)]
+    if lacking := [name for name in names if name not in there]:
+        cause = f"lacks {', '.join(lacking)}, which its metadata.yaml names"
+        raise LogError(str(folder), cause, "copy the whole folder again")
+    if not names:
+        numbers = {name: int((_NUMBER.search(name) or [0, -1])[1]) for name in there}
+        names = sorted(there, key=lambda name: numbers[name])
+        if not names or (len(names) > 1 and [*map(numbers.get, names)] != [*range(len(names))]):
+            cause = f"is a folder with {len(names)} recordings of ROS, not one"
+            raise LogError(str(folder), cause, "give a file of it, or the folder of one recording")
+    return [folder / name for name in names]
+
+
 class Source:
     """The bytes of a file, decompressed if it is .xz or .gz by content, in blocks.
 
@@ -72,7 +139,7 @@ class Source:
     """
 
     def __init__(self, path: str | os.PathLike[str], binary: bool = False):
-        self.path = Path(path)
+        self.path = parts_of(path)[0]
         self.binary = binary
         self.cut = False
 
@@ -81,19 +148,26 @@ class Source:
             with self.path.open("rb") as file:
                 head = file.read(8)
                 file.seek(0)
-                for magic, (what, mend) in _FOREIGN.items():
-                    if head.startswith(magic) and not self.binary:
-                        raise LogError(str(self.path), f"is {what}, not a text log", mend)
-                if head.startswith((_XZ, _GZIP)):
-                    yield from self._expand(file, head.startswith(_XZ))
-                else:
-                    while block := file.read(_BLOCK):
-                        yield block
+                packed = head.startswith((_XZ, _GZIP))
+                blocks = self._expand(file, head.startswith(_XZ)) if packed else self._plain(file)
+                for count, block in enumerate(blocks):
+                    if not (count or self.binary):
+                        self._refuse_foreign(block)
+                    yield block
         except OSError as error:
             why = error.strerror or str(error)
             raise LogError(
                 str(self.path), f"cannot be read: {why}", "check path and permissions"
             ) from error
+
+    def _plain(self, file) -> Iterator[bytes]:
+        while block := file.read(_BLOCK):
+            yield block
+
+    def _refuse_foreign(self, start: bytes) -> None:
+        for at, magic, what, mend in _FOREIGN:
+            if start.startswith(magic, at):
+                raise LogError(str(self.path), f"is {what}, not a text log", mend)
 
     def _expand(self, file, xz: bool) -> Iterator[bytes]:
         new = partial(lzma.LZMADecompressor, memlimit=2 * FREE) if xz else _Gunzip
@@ -145,6 +219,27 @@ def beginning(path: str | os.PathLike[str], size: int = 256) -> bytes:
         if len(start) >= size:
             break
     return start[:size]
+
+
+def mapped(path: str | os.PathLike[str], findings: list[Finding] | None) -> Bytes:
+    """All bytes of a file; a compressed stream that ended early is reported.
+
+    A plain file is mapped, so that it may be larger than memory; a compressed one is unpacked.
+
+    Raises:
+        LogError: as `Source`; or more than 1 GiB would have to be unpacked.
+    """
+    beginning(path, 1)  # the error, if it cannot be read
+    with Path(path).open("rb") as file:
+        if file.read(6).startswith((_XZ, _GZIP)):
+            data, cut = whole(path, _LARGEST)
+            if cut:
+                telling(findings, "warning", "ends_early", str(path), value=len(data))(
+                    "its compressed stream has no end: the copy was interrupted. All before it was "
+                    "read."
+                )
+            return data
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if file.tell() else b""
 
 
 def whole(path: str | os.PathLike[str], limit: int) -> tuple[bytes, bool]:

@@ -14,7 +14,18 @@ from typing import NamedTuple
 
 from robins.dataset import Dataset
 from robins.errors import require_kind
-from robins.logs import broad, phone, rosbag, rtklib, ulog
+from robins.logs import (
+    broad,
+    dataflash,
+    nmea,
+    phone,
+    ros_files,
+    rosbag,
+    rtklib,
+    tlog,
+    ubx,
+    ulog,
+)
 from robins.logs.findings import Finding, LogError, refused
 from robins.logs.mounting import Origin
 from robins.logs.opening import beginning
@@ -45,6 +56,10 @@ def _of_text(row: TextFormat) -> Format:
     return Format(row.name, row.kinds, row.about, row.recognise, partial(read_text, row), text=row)
 
 
+def _begins(magic: bytes) -> Callable[[Head], bool]:
+    return lambda head: head.start.startswith(magic)
+
+
 FORMATS: tuple[Format, ...] = (
     *map(_of_text, TEXT_FORMATS),
     Format(
@@ -73,7 +88,7 @@ FORMATS: tuple[Format, ...] = (
         "px4-ulog",
         ("imu", "mag", "gnss"),
         "PX4: .ulg; needs the extra, pip install 'robins[logs]'",
-        ulog.is_ulog,
+        _begins(ulog.MAGIC),
         ulog.read_ulog,
         binary=True,
     ),
@@ -81,10 +96,58 @@ FORMATS: tuple[Format, ...] = (
         "ros-mcap",
         ("imu", "mag", "gnss"),
         "ROS 2: .mcap with Imu, MagneticField, NavSatFix; needs the extra 'robins[logs]'",
-        rosbag.is_mcap,
+        _begins(ros_files.MCAP),
         rosbag.read_rosbag,
         binary=True,
         write=write_rosbag,
+    ),
+    Format(
+        "ros-db3",
+        ("imu", "mag", "gnss"),
+        "ROS 2: .db3 with Imu, MagneticField, NavSatFix, or the folder of a recording",
+        _begins(ros_files.SQLITE),
+        rosbag.read_rosbag,
+        binary=True,
+    ),
+    Format(
+        "ros-bag",
+        ("imu", "mag", "gnss"),
+        "ROS 1: .bag with Imu, MagneticField, NavSatFix; needs the extra 'robins[logs]'",
+        _begins(ros_files.BAG),
+        rosbag.read_rosbag,
+        binary=True,
+    ),
+    Format(
+        "ubx",
+        ("imu", "gnss"),
+        "u-blox: .ubx with NAV-PVT, and ESF-MEAS of receivers with inertial sensors",
+        ubx.is_ubx,
+        ubx.read_ubx,
+        binary=True,
+    ),
+    Format(
+        "nmea",
+        ("gnss",),
+        "NMEA 0183: sentences GGA, RMC, VTG, GST, ZDA of any receiver",
+        nmea.is_nmea,
+        nmea.read_nmea,
+        binary=True,
+    ),
+    Format(
+        "ardupilot-bin",
+        ("imu", "mag", "gnss"),
+        "ArduPilot: dataflash .BIN with IMU, MAG, GPS, GPA",
+        _begins(dataflash.MAGIC),
+        dataflash.read_dataflash,
+        binary=True,
+    ),
+    Format(
+        "mavlink-tlog",
+        ("imu", "mag", "gnss"),
+        "MAVLink: .tlog of a ground station; needs the extra 'robins[logs]'",
+        tlog.is_tlog,
+        tlog.read_tlog,
+        binary=True,
     ),
 )
 """All of them."""

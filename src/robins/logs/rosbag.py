@@ -1,11 +1,13 @@
-"""Recordings of ROS 2 in MCAP files: the messages of `robins.ros`, as tables.
+"""Recordings of ROS 1 and 2: the messages of `robins.ros` and velocities of receivers, as tables.
 
 Of each type the first topic that has messages counts:
 
-- ``sensor_msgs/msg/Imu``: rates [rad/s] and specific force [m/s^2]. The orientation is the estimate
-  of whoever wrote it, no truth, and is left alone.
-- ``sensor_msgs/msg/MagneticField``: magnetic field [T].
-- ``sensor_msgs/msg/NavSatFix``: fixes; sigmas are missing where the covariance is not known.
+- ``sensor_msgs/Imu``: rates [rad/s] and specific force [m/s^2]; where one topic has only rates and
+  another only specific forces, both. The orientation is an estimate, no truth, and is left alone.
+- ``sensor_msgs/MagneticField``: magnetic field [T].
+- ``sensor_msgs/NavSatFix``: fixes; sigmas are missing where the covariance is not known.
+- ``geometry_msgs/TwistStamped``, ``TwistWithCovarianceStamped``: east-north-up velocity of a fix of
+  the same frame_id and stamp, as drivers of receivers write it; any other is left alone.
 
 Axes of sensors are forward-left-up (REP-103) and become those of a table. The stamp is that of the
 header: UTC since 1970, which becomes GPS time, or else a count from a start of its own, which stays
@@ -14,62 +16,43 @@ header: UTC since 1970, which becomes GPS time, or else a count from a start of 
 
 from __future__ import annotations
 
-import io
 import os
-import struct
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from array import array
+from collections import defaultdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from robins import ros
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
-from robins.foreign import decoding, unpacked, within
 from robins.gps_time import GPS_EPOCH_S, gps_of
-from robins.logs.findings import Finding, LogError, report, telling
-from robins.logs.opening import whole
+from robins.logs.findings import Finding, LogError, damaged, telling
+from robins.logs.fix_kinds import with_usual_sigmas
+from robins.logs.merging import are_halves, merged
+from robins.logs.opening import parts_of
+from robins.logs.ros_files import raw_messages
 from robins.logs.tables import Table
-from robins.logs.text import Head
 
-if TYPE_CHECKING:
-    from mcap.records import McapRecord
-
-MAGIC = b"\x89MCAP0\r\n"
-_LARGEST = 1 << 30  # bytes of a file
-_RECORD, _FOOTER = struct.Struct("<BQ"), 2  # opcode and length of a record; the last one's opcode
 _FLU = np.array([1.0, -1.0, -1.0])  # forward-left-up <-> forward-right-down
 _NED = [1, 0, 2]  # of east, north, up: variances have no sign
+_ENU = np.array([1.0, 1.0, -1.0])  # signs of a velocity in the order of `_NED`
 _QUALITY = {0: 5, 1: 3, 2: 4}  # status of a NavSatFix -> RTKLIB's Q
-_KINDS: tuple[type[ros.Message], ...] = (ros.Imu, ros.MagneticField, ros.NavSatFix)
-_EARLY = (
-    "{name} breaks off ({why}): the recording or the copy was interrupted. All before it was read."
-)
-NO_PACKAGE = "is an MCAP file, and the package for these is not installed"
-INSTALL = "install it with: pip install 'robins[logs]'"
+_IMU, _MAG, _FIX = (ros.name_of(kind) for kind in (ros.Imu, ros.MagneticField, ros.NavSatFix))
+_TWISTS = tuple(f"geometry_msgs/msg/Twist{kind}Stamped" for kind in ("", "WithCovariance"))
+# where a quantity lies among the numbers of its message
+_TURN, _TURN_KNOWN, _FORCE, _FORCE_KNOWN = slice(13, 16), 16, slice(25, 28), 28
+_STATUS, _PLACE, _VARIANCE, _KIND = 0, slice(2, 5), [5, 9, 13], 14
+_TWIST_VARIANCE = [6, 13, 20]
 
 
 class _Found(NamedTuple):
     """The messages of a topic."""
 
     topic: str
+    frame_id: str  # of the first
     time_ns: np.ndarray
-    messages: list[Any]
-
-    def column(self, name: str) -> np.ndarray:
-        """A field of all messages."""
-        return np.array([getattr(one, name) for one in self.messages], np.float64)
-
-    def known(self, name: str) -> np.ndarray:
-        """A quantity of an Imu, along forward-right-down; NaN where it says that it has none."""
-        values, first = self.column(name) * _FLU, self.column(f"{name}_covariance")[:, 0]
-        return np.where((first == -1.0)[:, None], np.nan, values)
-
-
-def is_mcap(head: Head) -> bool:
-    """Whether a file begins as MCAP files do."""
-    return head.start.startswith(MAGIC)
+    values: np.ndarray  # (n, numbers of a message)
 
 
 def read_rosbag(
@@ -78,176 +61,162 @@ def read_rosbag(
     """Read inertial samples, magnetic field and fixes.
 
     Args:
-        path: the file, plain or compressed.
+        path: a file (.mcap, .db3, .bag), plain or compressed, or the folder of a recording.
         findings: receives what was left out; without it that is issued as `LogWarning`.
 
     Returns:
         A dataset; a table where there are no inertial samples but magnetic field or fixes.
 
     Raises:
-        LogError: the package `mcap` is not installed; the file is damaged, or holds no samples.
+        LogError: a package of the extra `logs` is not installed; a file is damaged or missing, or
+            holds no samples.
     """
     file = str(path)
-    topics = _messages(file, path, findings)
-    imu, mag, gnss = (_first(file, topics, kind, findings) for kind in _KINDS)
-    field = mag and MagTable(mag.time_ns, mag.column("magnetic_field") * _FLU, source=file)
-    fixes = gnss and _fixes(file, gnss)
+    topics, kinds = _topics(path, findings)
+    imu = _inertial(file, topics, findings)
+    mag, fixes = (_first(file, topics, kind, findings) for kind in (_MAG, _FIX))
+    field = mag and MagTable(mag.time_ns, mag.values[:, :3] * _FLU, source=file)
+    gnss = fixes and _fixes(file, fixes, topics, findings)
     if imu is not None:
-        rates, accel = imu.known("angular_velocity"), imu.known("linear_acceleration")
-        return Dataset(
-            name=Path(file).name.split(".")[0],
-            imu=ImuTable(imu.time_ns, rates, accel, "rate", source=file),
-            mag=field,
-            gnss=fixes,
-            time_unit_known=(file,),
+        name = Path(file).name.split(".")[0]
+        return Dataset(name=name, imu=imu, mag=field, gnss=gnss, time_unit_known=(file,))
+    alone = field if gnss is None else gnss
+    if alone is None or (field is not None and gnss is not None):
+        held = ", ".join(sorted(kinds)) or "no messages"
+        raise LogError(
+            file, f"has no messages {_IMU}; it holds {held}", "record that topic as well"
         )
-    alone = field if fixes is None else fixes
-    if alone is None or (field is not None and fixes is not None):
-        held = ", ".join(sorted({name for name, _ in topics})) or "no messages that robins reads"
-        cause = f"has no messages {ros.name_of(ros.Imu)}; it holds {held}"
-        raise LogError(file, cause, "record that topic as well")
     return alone
 
 
-def _messages(
-    file: str, path: str | os.PathLike[str], findings: list[Finding] | None
-) -> dict[tuple[str, str], list[ros.Stamped]]:
-    """All messages of these types, by type and topic.
+def _topics(
+    path: str | os.PathLike[str], findings: list[Finding] | None
+) -> tuple[dict[tuple[str, str], _Found], set[str]]:
+    """All messages that are read, by type and topic, and the types of all that are there.
 
     Raises:
         LogError: as `read_rosbag`.
     """
-    data, cut = whole(path, _LARGEST)
-    sound, closed = _sound(data)
-
-    def damaged(why: str) -> LogError:
-        mend = "fetch it again; nothing of it was used, for no number in it can be trusted"
-        return LogError(file, f"is damaged ({why})", mend)
-
-    found: dict[tuple[str, str], list[ros.Stamped]] = {}
-    names = {ros.name_of(kind): kind for kind in _KINDS}
-    schemas: dict[int, str] = {}
-    channels: dict[int, tuple[str, str]] = {}  # schema and topic of those whose messages are read
-    one: Any
-    for one in _records(file, data[:sound], damaged):
-        kind = type(one).__name__  # the package is not imported here
-        if kind == "Schema":
-            schemas[one.id] = one.name
-        elif kind == "Channel":
-            name = schemas.get(one.schema_id, "")
-            if one.schema_id and not name:
-                raise damaged(f"topic {one.topic} has schema {one.schema_id}, which is not there")
-            if name in names and one.message_encoding == "cdr":
-                channels[one.id] = (name, one.topic)
-            else:
-                channels[one.id] = ("", one.topic)
-        elif kind == "Message":
-            if one.channel_id not in channels:
-                raise damaged(f"a message of channel {one.channel_id}, which is not there")
-            name, topic = channels[one.channel_id]
-            if name:
-                try:
-                    stamped = ros.decode(names[name], one.data)
-                except ros.RosError as error:
-                    raise damaged(f"RosError: {error}") from error
-                found.setdefault((name, topic), []).append(stamped)
-    if cut or not closed:
-        why = "its compressed stream has no end" if cut else f"after {len(data)} bytes"
-        sentence = _EARLY.format(name=Path(file).name, why=why)
-        place = f"byte {len(data)}"
-        report(findings, Finding("warning", "ends_early", file, place, len(data), sentence))
-    return found
-
-
-def _sound(data: bytes) -> tuple[int, bool]:
-    """Up to which byte records follow each other without a break, and whether the last closes."""
-    at = len(MAGIC)
-    while at + _RECORD.size <= len(data):
-        opcode, size = _RECORD.unpack_from(data, at)
-        if opcode == 0 or at + _RECORD.size + size > len(data):
-            break
-        at += _RECORD.size + size
-        if opcode == _FOOTER:
-            return at + len(MAGIC), data[at : at + len(MAGIC)] == MAGIC
-    return min(at, len(data)), False
-
-
-def _records(file: str, data: bytes, damaged: Callable[[str], LogError]) -> Iterator[McapRecord]:
-    """All records of a file, those of its chunks among them; the package decodes each.
-
-    Raises:
-        LogError: the package is not installed, or a record is damaged.
-    """
-    try:
-        from mcap.exceptions import EndOfFile
-        from mcap.records import Chunk
-        from mcap.stream_reader import StreamReader, breakup_chunk
-    except ImportError as error:
-        raise LogError(file, NO_PACKAGE, INSTALL) from error
-    plain, stream = 0, io.BytesIO(data)
-    records = StreamReader(stream, emit_chunks=True, validate_crcs=True).records
-    while True:
-        try:
-            with decoding(damaged):
-                one = next(records, None)
-        except LogError as error:
-            if isinstance(error.__cause__, EndOfFile) and stream.tell() == len(data):
-                return  # behind the last whole record: the file is not closed
-            raise
-        if one is None:
-            return
-        if not isinstance(one, Chunk):
-            yield one
-            continue
-        plain += one.uncompressed_size
-        within(plain, len(data), "its chunks", damaged)
-        content = unpacked(one.data, one.compression, one.uncompressed_size, damaged)
-        with decoding(damaged):
-            inner = breakup_chunk(replace(one, data=content, compression=""), validate_crc=True)
-        yield from inner
+    stamps: dict[tuple[str, str], array[int]] = defaultdict(lambda: array("q"))
+    values: dict[tuple[str, str], array[float]] = defaultdict(lambda: array("d"))
+    frames: dict[tuple[str, str], str] = {}
+    kinds, wanted = set[str](), (_IMU, _MAG, _FIX, *_TWISTS)
+    for part in parts_of(path):
+        for name, topic, data, ros1 in raw_messages(part, wanted, findings):
+            kinds.add(name)
+            if not data:
+                continue
+            try:
+                time_ns, frame_id, numbers = ros.numbers(name, data, ros1)
+            except ros.RosError as error:
+                raise damaged(str(part))(f"RosError: {error}") from error
+            key = name, topic
+            frames.setdefault(key, frame_id)
+            stamps[key].append(time_ns)
+            values[key].extend(numbers)
+    found: dict[tuple[str, str], _Found] = {}
+    for key, frame_id in frames.items():
+        time_ns = np.array(stamps.pop(key), np.int64)
+        dated = time_ns >= GPS_EPOCH_S * 1_000_000_000
+        rows = np.array(values.pop(key)).reshape(len(time_ns), -1)
+        found[key] = _Found(key[1], frame_id, np.where(dated, gps_of(time_ns), time_ns), rows)
+    return found, kinds
 
 
 def _first(
     file: str,
-    topics: dict[tuple[str, str], list[ros.Stamped]],
-    kind: type[ros.Message],
+    topics: dict[tuple[str, str], _Found],
+    name: str,
     findings: list[Finding] | None,
+    beside: str = "",
 ) -> _Found | None:
-    """The first topic of a type."""
-    name = ros.name_of(kind)
-    found = [topic for of, topic in topics if of == name]
-    if not found:
-        return None
-    if len(found) > 1:
+    """The first topic of a type, and a note of the others but that `beside` it."""
+    found = [one for (of, _), one in topics.items() if of == name]
+    left = [one.topic for one in found[1:] if one.topic != beside]
+    if left:
         telling(findings, "note", "several_instances", file, value=len(found))(
-            f"{name} was recorded on {len(found)} topics; the first, {found[0]}, is read and the "
-            f"others are left alone: {', '.join(found[1:])}."
+            f"{name} was recorded on {len(found)} topics; the first, {found[0].topic}, is read and "
+            f"the others are left alone: {', '.join(left)}."
         )
-    stamped = topics[name, found[0]]
-    time_ns = np.array([one.time_ns for one in stamped], np.int64)
-    dated = time_ns >= GPS_EPOCH_S * 1_000_000_000
-    return _Found(
-        found[0], np.where(dated, gps_of(time_ns), time_ns), [one.message for one in stamped]
-    )
+    return found[0] if found else None
 
 
-def _fixes(file: str, gnss: _Found) -> GnssTable:
-    status = gnss.column("status")
+def _inertial(
+    file: str, topics: dict[tuple[str, str], _Found], findings: list[Finding] | None
+) -> ImuTable | None:
+    """Samples of the first topic, with those of another where it has one half of them only."""
+
+    def known(one: _Found, place: slice, at: int) -> np.ndarray:
+        """A quantity, forward-right-down; NaN where its covariance states that it is not known."""
+        return np.where(one.values[:, at : at + 1] == -1.0, np.nan, one.values[:, place] * _FLU)
+
+    tables = [
+        (one.topic, ImuTable(one.time_ns, known(one, _TURN, _TURN_KNOWN),
+                             known(one, _FORCE, _FORCE_KNOWN), "rate", source=file))
+        for (name, _), one in topics.items()
+        if name == _IMU
+    ]  # fmt: skip
+    if not tables:
+        return None
+    first = tables[0][1]
+    other = next(((k, t) for k, t in tables[1:] if are_halves(first, t)), None)
+    _first(file, topics, _IMU, findings, other[0] if other else "")
+    return merged(first, other[1], findings) if other else first
+
+
+def _fixes(
+    file: str,
+    gnss: _Found,
+    topics: dict[tuple[str, str], _Found],
+    findings: list[Finding] | None,
+) -> GnssTable:
+    status = gnss.values[:, _STATUS]
     lost = status < 0
-    variance = gnss.column("position_covariance")[:, [0, 4, 8]][:, _NED]
-    unknown = gnss.column("position_covariance_type") == 0
+    variance = gnss.values[:, _VARIANCE][:, _NED]
+    unknown = gnss.values[:, _KIND] == 0
     with np.errstate(invalid="ignore"):  # a negative variance is none
         sigma_m = np.where(unknown[:, None], np.nan, np.sqrt(variance))
-
-    def known(name: str) -> np.ndarray:
-        return np.where(lost, np.nan, gnss.column(name))
-
-    return GnssTable(
+    lat_deg, lon_deg, alt_m = np.where(lost[:, None], np.nan, gnss.values[:, _PLACE]).T.copy()
+    v_n, sigma_v = _velocities(file, gnss, topics, findings)
+    table = GnssTable(
         time_ns=gnss.time_ns,
-        lat_rad=np.deg2rad(known("latitude")),
-        lon_rad=np.deg2rad(known("longitude")),
-        alt_m=known("altitude"),
+        lat_rad=np.deg2rad(lat_deg),
+        lon_rad=np.deg2rad(lon_deg),
+        alt_m=alt_m,
         sigma_m=sigma_m,
+        v_n=v_n,
+        sigma_v=sigma_v,
         quality=np.array([_QUALITY.get(int(k), 0) for k in status], np.int64),
         source=file,
     )
+    return with_usual_sigmas(table, findings, places=False)
+
+
+def _velocities(
+    file: str,
+    gnss: _Found,
+    topics: dict[tuple[str, str], _Found],
+    findings: list[Finding] | None,
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Velocities of the fixes and their sigmas, where the receiver's driver wrote them."""
+    for (name, topic), one in topics.items():
+        if name not in _TWISTS or one.frame_id != gnss.frame_id:
+            continue
+        order = np.argsort(one.time_ns, kind="stable")
+        at = np.minimum(np.searchsorted(one.time_ns, gnss.time_ns, sorter=order), len(order) - 1)
+        row = order[at]
+        same = (one.time_ns[row] == gnss.time_ns)[:, None]
+        if 2 * same.sum() <= len(same):
+            continue
+        v_n = np.where(same, one.values[row, :3][:, _NED] * _ENU, np.nan)
+        sigma_v = np.full_like(v_n, np.nan)
+        if name == _TWISTS[1]:
+            variance = one.values[row][:, _TWIST_VARIANCE][:, _NED]
+            with np.errstate(invalid="ignore"):
+                sigma_v = np.where(same & (variance > 0.0), np.sqrt(variance), np.nan)
+        telling(findings, "note", "velocity_taken", file, value=topic)(
+            f"velocities of {int(same.sum())} of {len(same)} fixes are those of {topic}, taken as "
+            f"east, north, up: it has the frame_id and the stamps of {gnss.topic}."
+        )
+        return v_n, sigma_v
+    return None, None

@@ -25,9 +25,9 @@ import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.foreign import decoding
-from robins.logs.findings import Finding, LogError, refused, report, telling
+from robins.logs.findings import Finding, LogError, damaged, refused, report, telling
+from robins.logs.fix_kinds import MAVLINK
 from robins.logs.opening import whole
-from robins.logs.text import Head
 from robins.logs.timebase import LIMIT_NS
 from robins.units import to_si
 
@@ -40,7 +40,6 @@ _LARGEST = 1 << 30  # bytes of a file
 _IMU, _MAG = ("sensor_combined",), ("vehicle_magnetometer", "sensor_mag")
 _GNSS = ("vehicle_gps_position", "sensor_gps")
 _NO_FIX, _FLAT_FIX = 2, 3  # below these there is no fix, or none of the height
-_QUALITY = {6: 1, 5: 2, 4: 4, 3: 5, 2: 5}  # PX4's fix_type -> RTKLIB's Q
 
 
 _EARLY = (
@@ -54,11 +53,6 @@ class Topic(NamedTuple):
 
     name: str
     fields: dict[str, np.ndarray]
-
-
-def is_ulog(head: Head) -> bool:
-    """Whether a file begins as ULogs do."""
-    return head.start.startswith(MAGIC)
 
 
 def read_ulog(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
@@ -86,14 +80,14 @@ def read_ulog(path: str | os.PathLike[str], findings: list[Finding] | None = Non
         held = ", ".join(sorted({item.name for item in log.data_list})) or "nothing"
         cause = f"has no samples of {_IMU[0]}; it holds {held}"
         raise LogError(file, cause, "log that topic and fly again")
-    time_ns = _stamps(file, imu)
+    time_ns = stamps(file, imu)
     mag, gnss = (_first(file, log, topics, findings) for topics in (_MAG, _GNSS))
     return Dataset(
         name=Path(file).name.split(".")[0],
         imu=ImuTable(
             time_ns,
-            _triad(file, imu, "gyro_rad[{}]", "012"),
-            _triad(file, imu, "accelerometer_m_s2[{}]", "012"),
+            triad(file, imu, "gyro_rad[{}]", "012"),
+            triad(file, imu, "accelerometer_m_s2[{}]", "012"),
             "rate",
             source=file,
         ),
@@ -141,12 +135,12 @@ def _check_formats(file: str, data: bytes) -> None:
         if name not in formats:
             return 1
         if name in above or len(above) > _DEEPEST:
-            raise _damaged(file, f"the definition of {name} contains itself")
+            raise damaged(file)(f"the definition of {name} contains itself")
         if name not in sizes:
             parts = (count * size_of(of, (*above, name)) for of, count in formats[name])
             sizes[name] = sum(parts)
             if sizes[name] > _MOST:
-                raise _damaged(file, f"the definition of {name} has {sizes[name]} numbers")
+                raise damaged(file)(f"the definition of {name} has {sizes[name]} numbers")
         return sizes[name]
 
     for name in formats:
@@ -164,16 +158,11 @@ def _decode(file: str, data: bytes) -> Any:
         ) from error
     told = io.StringIO()
     # it prints what it doubts
-    with decoding(lambda why: _damaged(file, why)), contextlib.redirect_stdout(told):
+    with decoding(damaged(file)), contextlib.redirect_stdout(told):
         log = ULog(io.BytesIO(data), [*_IMU, *_MAG, *_GNSS], disable_str_exceptions=False)
     if log.file_corruption:
-        raise _damaged(file, " ".join(told.getvalue().split()) or "messages contradict each other")
+        raise damaged(file)(" ".join(told.getvalue().split()) or "messages contradict each other")
     return log
-
-
-def _damaged(file: str, why: str) -> LogError:
-    mend = "fetch it again; nothing of it was used, for no number in it can be trusted"
-    return LogError(file, f"is damaged ({why})", mend)
 
 
 def _first(
@@ -192,21 +181,27 @@ def _first(
     return None
 
 
-def _column(file: str, topic: Topic, name: str) -> np.ndarray:
+def column(file: str, topic: Topic, name: str) -> np.ndarray:
+    """Numbers of a field.
+
+    Raises:
+        LogError: there is none of this name.
+    """
     if name in topic.fields:
         with np.errstate(invalid="ignore"):  # a NaN that signals stays a NaN
             return np.asarray(topic.fields[name], np.float64)
     raise refused(file, field=topic.name)(
         f"has no field {name}; it has {', '.join(sorted(topic.fields))}",
-        "this version of PX4 is not known; export the topic to CSV",
+        "this version of the autopilot is not known; export the topic to CSV",
     )
 
 
-def _triad(file: str, topic: Topic, pattern: str, parts: str) -> np.ndarray:
-    return np.stack([_column(file, topic, pattern.format(part)) for part in parts], axis=-1)
+def triad(file: str, topic: Topic, pattern: str, parts: str) -> np.ndarray:
+    """Three fields, (n, 3)."""
+    return np.stack([column(file, topic, pattern.format(part)) for part in parts], axis=-1)
 
 
-def _stamps(file: str, topic: Topic) -> np.ndarray:
+def stamps(file: str, topic: Topic) -> np.ndarray:
     """When it was measured, or else logged [ns]."""
     sample = topic.fields.get("timestamp_sample")
     stamps = topic.fields.get("timestamp") if sample is None or not np.all(sample) else sample
@@ -219,37 +214,35 @@ def _stamps(file: str, topic: Topic) -> np.ndarray:
 
 def _field(file: str, topic: Topic) -> MagTable:
     pattern, parts = ("{}", "xyz") if topic.name == "sensor_mag" else ("magnetometer_ga[{}]", "012")
-    field_t = to_si(_triad(file, topic, pattern, parts), "G")
-    return MagTable(_stamps(file, topic), field_t, source=file)
+    field_t = to_si(triad(file, topic, pattern, parts), "G")
+    return MagTable(stamps(file, topic), field_t, source=file)
 
 
 def _fixes(file: str, topic: Topic) -> GnssTable:
     """Older versions log integers of 1e-7 deg and mm, newer ones degrees and metres."""
 
     def either(new: str, old: str, scale: float) -> np.ndarray:
-        return (
-            _column(file, topic, new) if new in topic.fields else _column(file, topic, old) * scale
-        )
+        return column(file, topic, new) if new in topic.fields else column(file, topic, old) * scale
 
-    fix = _column(file, topic, "fix_type")
+    fix = column(file, topic, "fix_type")
     lat_deg = either("latitude_deg", "lat", 1e-7)
     lon_deg = either("longitude_deg", "lon", 1e-7)
     alt_m = either("altitude_ellipsoid_m", "alt_ellipsoid", 1e-3)
-    eph, epv, speed = (_column(file, topic, name) for name in ("eph", "epv", "s_variance_m_s"))
-    v_n = _triad(file, topic, "vel_{}_m_s", "ned")
-    v_n[(fix < _FLAT_FIX) | (_column(file, topic, "vel_ned_valid") == 0)] = np.nan
+    eph, epv, speed = (column(file, topic, name) for name in ("eph", "epv", "s_variance_m_s"))
+    v_n = triad(file, topic, "vel_{}_m_s", "ned")
+    v_n[(fix < _FLAT_FIX) | (column(file, topic, "vel_ned_valid") == 0)] = np.nan
 
     def known(values: np.ndarray, least: int) -> np.ndarray:
         return np.where(fix >= least, values, np.nan)
 
     return GnssTable(
-        time_ns=_stamps(file, topic),
+        time_ns=stamps(file, topic),
         lat_rad=np.deg2rad(known(lat_deg, _NO_FIX)),
         lon_rad=np.deg2rad(known(lon_deg, _NO_FIX)),
         alt_m=known(alt_m, _FLAT_FIX),
         sigma_m=np.stack([eph, eph, epv], axis=-1),
         v_n=v_n,
         sigma_v=np.repeat(speed[:, None], 3, axis=1),
-        quality=np.array([_QUALITY.get(int(k), 0) for k in fix], np.int64),
+        quality=np.array([MAVLINK.get(int(k), 0) for k in fix], np.int64),
         source=file,
     )

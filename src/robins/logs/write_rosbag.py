@@ -21,7 +21,7 @@ from robins.gps_time import GPS_EPOCH_S, utc_of
 from robins.logs.findings import LogError, LogWarning
 from robins.logs.opening import write_lines
 from robins.logs.quantities import words_of
-from robins.logs.rosbag import INSTALL, NO_PACKAGE
+from robins.logs.ros_files import INSTALL, NO_PACKAGE
 from robins.logs.tables import Table, kind_in_text, tables_of
 
 _LATEST_NS = (1 << 31) * 1_000_000_000

@@ -5,7 +5,7 @@
 - `cdr`: the bytes of a message.
 """
 
-from robins.ros.cdr import RosError, Stamped, decode, encode
+from robins.ros.cdr import NUMBERS, RosError, Stamped, decode, encode, numbers
 from robins.ros.convert import imu, magnetic_field, nav_sat_fix, odometry
 from robins.ros.messages import (
     TYPES,
@@ -19,6 +19,7 @@ from robins.ros.messages import (
 )
 
 __all__ = [
+    "NUMBERS",
     "TYPES",
     "Imu",
     "MagneticField",
@@ -34,5 +35,6 @@ __all__ = [
     "magnetic_field",
     "name_of",
     "nav_sat_fix",
+    "numbers",
     "odometry",
 ]

@@ -30,6 +30,12 @@ _LAYOUTS: dict[type[Message], tuple[str, ...]] = {  # codes of `struct`, one a f
         Odometry: "s 3d 4d 36d 3d 3d 36d",
     }.items()
 }
+NUMBERS: dict[str, tuple[str, ...]] = {
+    **{name_of(kind): layout for kind, layout in _LAYOUTS.items()},
+    "geometry_msgs/msg/TwistStamped": (*_HEADER.split(), "3d", "3d"),
+    "geometry_msgs/msg/TwistWithCovarianceStamped": (*_HEADER.split(), "3d", "3d", "36d"),
+}
+"""Layouts of the types that `numbers` decodes, by name."""
 
 
 class RosError(RobinsError, ValueError):
@@ -95,16 +101,42 @@ def decode(kind: type[Message], data: bytes) -> Stamped:
     Raises:
         RosError: there are too few bytes, or they are not in XCDR1.
     """
-    order = _ORDERS.get(bytes(data[:2]))
+    time_ns, frame_id, fields = _fields(name_of(kind), _LAYOUTS[kind], data, False)
+    return Stamped(time_ns, frame_id, kind(*fields))
+
+
+def numbers(name: str, data: bytes, ros1: bool = False) -> tuple[int, str, list[float]]:
+    """Stamp [ns], frame and numbers of a message, its texts left out.
+
+    Args:
+        name: a type of `NUMBERS`.
+        data: its bytes.
+        ros1: serialised by ROS 1: packed, little endian, with a sequence number before the stamp.
+
+    Raises:
+        RosError: there are too few bytes, or (but for ROS 1) they are not in XCDR1.
+    """
+    time_ns, frame_id, fields = _fields(name, NUMBERS[name], data, ros1)
+    flat: list[float] = []
+    for one in fields:
+        if not isinstance(one, str):
+            flat += one if isinstance(one, tuple) else (float(one),)
+    return time_ns, frame_id, flat
+
+
+def _fields(name: str, layout: tuple[str, ...], data: bytes, ros1: bool) -> tuple[int, str, list]:
+    """Stamp [ns], frame and the fields behind the header."""
+    order = "<" if ros1 else _ORDERS.get(bytes(data[:2]))
     if order is None:
         raise RosError(
-            f"{name_of(kind)} is encoded in another way ({bytes(data[:4]).hex()})",
+            f"{name} is encoded in another way ({bytes(data[:4]).hex()})",
             fix="write it in CDR, as ROS 2 does",
         )
+    # four bytes that name the encoding, or the sequence number
     body, at, values = memoryview(data)[4:], 0, []
     try:
-        for code in _LAYOUTS[kind]:
-            at += -at % _size("I" if code == "s" else code)
+        for code in layout:
+            at += 0 if ros1 else -at % _size("I" if code == "s" else code)
             if code == "s":
                 (length,) = struct.unpack_from(f"{order}I", body, at)
                 code, at = f"{length}s", at + 4
@@ -116,13 +148,14 @@ def decode(kind: type[Message], data: bytes) -> Stamped:
                 values.append(found if code[:-1] else found[0])
     except (struct.error, UnicodeDecodeError) as error:
         raise RosError(
-            f"{name_of(kind)} of {len(data)} bytes cannot be decoded ({error})",
+            f"{name} of {len(data)} bytes cannot be decoded ({error})",
             fix="is it of another version of ROS?",
         ) from None
     sec, nanosec, frame_id, *fields = values
-    return Stamped(sec * 1_000_000_000 + nanosec, frame_id, kind(*fields))
+    return sec * 1_000_000_000 + nanosec, frame_id, fields
 
 
+@cache
 def _size(code: str) -> int:
     """Bytes of one number of a code."""
     return struct.calcsize(f"<{code.lstrip('0123456789')[0]}")

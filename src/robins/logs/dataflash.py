@@ -1,0 +1,211 @@
+"""Flight logs of ArduPilot (dataflash, ``.BIN``), which describe their own messages.
+
+Read are, of the lowest instance of each:
+
+- ``IMU``: rates [rad/s] and specific force [m/s^2], forward-right-down;
+- ``MAG``: magnetic field [mG], less the offsets that the autopilot believes;
+- ``GPS``, with the accuracies and the geoid of ``GPA``: fixes at their GPS week and time of week.
+
+All else counts microseconds since power-up and is put on GPS time by the fixes. There are no
+checksums: messages must follow each other without a break, but an altered number is not noticed.
+Source: ArduPilot, libraries/AP_Logger/README.md.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
+from robins.logs.findings import (
+    Finding,
+    LogError,
+    above_geoid,
+    breaks_off,
+    damaged,
+    left_out,
+    telling,
+    undated,
+)
+from robins.logs.fix_kinds import MAVLINK, fixes
+from robins.logs.merging import gps_clock
+from robins.logs.opening import Bytes, mapped
+from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS
+from robins.logs.ulog import Topic, column, stamps, triad
+from robins.units import to_si
+
+_MARK, _FMT = b"\xa3\x95", 0x80
+MAGIC = _MARK + bytes([_FMT])
+_FORMAT = struct.Struct("<BB4s16s64s")
+_WANTED = ("IMU", "MAG", "GPS", "GPA")
+_CODES = "b=i1 B=u1 h=i2 H=u2 i=i4 I=u4 f=f4 d=f8 q=i8 Q=u8 g=f2 M=u1 a=V64 n=V4 N=V16 Z=V64 "
+_CODES += "c=i2 C=u2 e=i4 E=u4 L=i4"
+_TYPES = {pair[0]: pair[2:] for pair in _CODES.split()}  # of fields, as NumPy names them
+_FACTORS = {**dict.fromkeys("cCeE", 0.01), "L": 1e-7}
+_LAST_WEEK = 6000  # in 2095
+
+
+def read_dataflash(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
+    """Read inertial samples, and field and fixes where they were logged.
+
+    Args:
+        path: the file, plain or compressed.
+        findings: receives what was left out or assumed; without it that is issued as `LogWarning`.
+
+    Raises:
+        LogError: a definition is damaged, or there are no inertial samples.
+    """
+    file = str(path)
+    topics = _topics(file, mapped(path, findings), findings)
+    imu, mag, gps, gpa = map(topics.get, _WANTED)
+    if imu is None:
+        held = ", ".join(sorted(topics)) or "nothing that robins reads"
+        raise LogError(file, f"has no samples IMU; it holds {held}", "set LOG_BITMASK to log them")
+    imu_ns, mag_ns, gnss = stamps(file, imu), mag and stamps(file, mag), None
+    if gps is not None:
+        gnss, arrived = _fixes(file, gps, gpa, findings)
+        if (known := np.isfinite(gnss.lat_rad)).any():
+            clock = gps_clock(file, arrived[known], gnss.time_ns[known], findings)
+            imu_ns, mag_ns = clock(imu_ns), mag_ns if mag_ns is None else clock(mag_ns)
+        else:
+            gnss = None
+    gyro, accel = triad(file, imu, "Gyr{}", "XYZ"), triad(file, imu, "Acc{}", "XYZ")
+    field = mag and to_si(triad(file, mag, "Mag{}", "XYZ"), "mG")
+    return Dataset(
+        name=Path(file).name.split(".")[0],
+        imu=ImuTable(imu_ns, gyro, accel, "rate", source=file),
+        mag=None if mag_ns is None or field is None else MagTable(mag_ns, field, source=file),
+        gnss=gnss,
+        time_unit_known=(file,),
+    )
+
+
+def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[str, Topic]:
+    """The wanted messages; bytes that belong to none are counted.
+
+    Raises:
+        LogError: a definition contradicts itself or an earlier one.
+    """
+    sizes = [0] * 256
+    sizes[_FMT] = 3 + _FORMAT.size
+    kinds: dict[int, list] = {}
+    found: dict[int, list[bytes]] = {}
+    at, stray, end = 0, 0, len(data)
+
+    def fits(place: int) -> int:
+        """Size of the message there, 0 where there is none."""
+        if data[place : place + 2] != _MARK or place + 3 > end:
+            return 0
+        size = sizes[data[place + 2]]
+        return size if place + size <= end else 0
+
+    while at < end:
+        size = fits(at)
+        if not size:  # the next place where two messages follow each other
+            begin, at = at, data.find(_MARK, at + 1)
+            while at >= 0 and not ((size := fits(at)) and (at + size == end or fits(at + size))):
+                at = data.find(_MARK, at + 1)
+            at = end if at < 0 else at
+            if at == end and end - begin < 256 and data[begin : begin + 2] == _MARK:
+                breaks_off(findings, file, begin)
+            elif set(data[begin:at]) - {0, 255}:  # with which blocks of a chip are filled up
+                stray += at - begin
+            continue
+        kind = data[at + 2]
+        if kind == _FMT:
+            number, size_of, *layout = _definition(file, data, at)
+            if sizes[number] not in (0, size_of):
+                raise damaged(file)(f"in dataflash message {number} is defined again at byte {at}")
+            sizes[number] = size_of
+            if layout[0] in _WANTED:
+                kinds[number] = layout
+                found.setdefault(number, [])
+        elif kind in found:
+            found[kind].append(data[at + 3 : at + size])
+        at += size
+    left_out(findings, file, stray, "bytes belong to no message")
+    topics: dict[str, Topic] = {}
+    for number, (name, layout, factors) in kinds.items():
+        if found[number]:
+            rows = np.frombuffer(b"".join(found[number]), layout)
+            fields = zip(layout.names or (), factors, strict=True)
+            topic = Topic(name, {n: rows[n] * f if f != 1 else rows[n] for n, f in fields})
+            topics[name] = _lowest(file, topic, findings)
+    return topics
+
+
+def _definition(file: str, data: Bytes, at: int) -> tuple[int, int, str, np.dtype, list[float]]:
+    """Number, size, name and layout of a message, and what its fields are multiplied by.
+
+    Raises:
+        LogError: it contradicts itself.
+    """
+    number, size, *texts = _FORMAT.unpack_from(data, at + 3)
+    name, codes, columns = (text.rstrip(b"\0").decode("ascii", "replace") for text in texts)
+    names = [x.replace("TimeUS", "timestamp") for x in columns.split(",") if x]
+    if number == _FMT:
+        size, codes = 3 + _FORMAT.size, "BBnNZ"
+    if len(names) != len(codes) or len(set(names)) != len(names) or set(codes) - _TYPES.keys():
+        raise damaged(file)(f"in dataflash the definition of {name!r} at byte {at} has no layout")
+    kind = np.dtype([(n, f"<{_TYPES[c]}") for n, c in zip(names, codes, strict=True)])
+    if kind.itemsize + 3 != size:
+        raise damaged(file)(f"in dataflash the definition of {name!r} states {size} bytes")
+    return number, size, name, kind, [_FACTORS.get(c, 1.0) for c in codes]
+
+
+def _lowest(file: str, topic: Topic, findings: list[Finding] | None) -> Topic:
+    """The rows of the lowest instance."""
+    if "I" not in topic.fields:
+        return topic
+    numbers = np.unique(topic.fields["I"])
+    if len(numbers) > 1 and topic.name != "GPA":
+        telling(findings, "note", "several_instances", file, value=len(numbers))(
+            f"{topic.name} was logged of {len(numbers)} sensors; number {numbers[0]} is read and "
+            "the others are left alone."
+        )
+    mine = topic.fields["I"] == numbers[0]
+    return Topic(topic.name, {name: values[mine] for name, values in topic.fields.items()})
+
+
+def _fixes(
+    file: str, gps: Topic, gpa: Topic | None, findings: list[Finding] | None
+) -> tuple[GnssTable, np.ndarray]:
+    """Fixes that have a GPS time, and when each was logged."""
+    week, ms = column(file, gps, "GWk"), column(file, gps, "GMS")
+    dated = (week > 0) & (week < _LAST_WEEK) & (ms < WEEK_NS // 1_000_000)
+    undated(findings, file, int((~dated).sum()), "messages GPS")
+    gps = Topic(gps.name, {name: values[dated] for name, values in gps.fields.items()})
+    arrived, status = stamps(file, gps), column(file, gps, "Status")
+    time_ns = week[dated].astype(np.int64) * WEEK_NS + ms[dated].astype(np.int64) * 1_000_000
+
+    def beside(name: str) -> np.ndarray:
+        """A column of GPA at the stamps of the fixes; NaN where there is none."""
+        if gpa is None or name not in gpa.fields or not len(arrived):
+            return np.full(len(arrived), np.nan)
+        _, mine, row = np.intersect1d(arrived, stamps(file, gpa), return_indices=True)
+        out = np.full(len(arrived), np.nan)
+        out[mine] = column(file, gpa, name)[row]
+        return out
+
+    # the autopilot counts the geoid's height with the other sign
+    separation = beside("Und")
+    if np.isnan(separation).any():
+        above_geoid(findings, file, "A newer version of ArduPilot logs the geoid.")
+        separation = np.zeros_like(separation)
+    speed, course = column(file, gps, "Spd"), np.deg2rad(column(file, gps, "GCrs"))
+    down = np.where(beside("VV") == 0.0, np.nan, column(file, gps, "VZ"))
+    table = fixes(
+        file,
+        GPS_EPOCH_NS + time_ns,
+        (column(file, gps, "Lat"), column(file, gps, "Lng"), column(file, gps, "Alt") - separation),
+        (beside("HAcc"), beside("HAcc"), beside("VAcc")),
+        np.stack([speed * np.cos(course), speed * np.sin(course), down], axis=-1),
+        beside("SAcc"),
+        np.array([MAVLINK.get(int(k), 0) for k in status]),
+        status == 2,
+        findings,
+    )
+    return table, arrived

@@ -1,0 +1,87 @@
+"""Kinds of fixes as RTKLIB counts them, and sigmas where a receiver states none.
+
+1 is a fixed solution, 2 float, 3 with augmentation by satellite, 4 differential, 5 single, 6 a
+precise point position; 0 is none of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from robins.dataset import GnssTable
+from robins.logs.findings import Finding, telling
+
+MAVLINK = {6: 1, 5: 2, 4: 4, 3: 5, 2: 5}
+"""GPS_FIX_TYPE of MAVLink, PX4 and ArduPilot -> kind; less is no fix, and 2 has no height."""
+
+_USUAL = {1: (0.02, 0.05), 2: (0.3, 0.1), 3: (1.0, 0.2), 4: (1.0, 0.2), 5: (3.0, 0.3)}
+_USUAL[6] = (0.1, 0.1)
+"""Usual sigma of a horizontal place [m] and of a velocity [m/s] of each kind, in the open."""
+
+
+def fixes(
+    file: str,
+    time_ns: np.ndarray,
+    place: tuple[np.ndarray, np.ndarray, np.ndarray],
+    sigma_m: tuple[np.ndarray, np.ndarray, np.ndarray],
+    v_n: np.ndarray,
+    sigma_v: np.ndarray,
+    kind: np.ndarray,
+    flat: np.ndarray,
+    findings: list[Finding] | None,
+) -> GnssTable:
+    """Fixes of a receiver: NaN where it had none, and the usual sigmas where it stated none.
+
+    Args:
+        file: source of the table.
+        time_ns: (n,) stamps.
+        place: latitude, longitude [deg], height [m], (n,) each.
+        sigma_m: along north, east, down; zero or NaN where it is not stated.
+        v_n: (n, 3) velocity.
+        sigma_v: (n,) of each component of the velocity; likewise.
+        kind: (n,) of the fix; 0 where there is none.
+        flat: (n,) bool; such a fix has neither height nor velocity.
+        findings: receives a note where sigmas are assumed.
+    """
+    there, solid = kind > 0, (kind > 0) & ~flat
+    lat, lon = (np.deg2rad(np.where(there, value, np.nan)) for value in place[:2])
+    sigma = np.stack(sigma_m, axis=-1)
+    table = GnssTable(
+        time_ns=time_ns,
+        lat_rad=lat,
+        lon_rad=lon,
+        alt_m=np.where(solid, place[2], np.nan),
+        sigma_m=np.where(sigma > 0.0, sigma, np.nan),
+        v_n=np.where(solid[:, None], v_n, np.nan),
+        sigma_v=np.repeat(np.where(sigma_v > 0.0, sigma_v, np.nan)[:, None], 3, axis=1),
+        quality=kind.astype(np.int64),
+        source=file,
+    )
+    return with_usual_sigmas(table, findings)
+
+
+def with_usual_sigmas(
+    table: GnssTable, findings: list[Finding] | None, places: bool = True
+) -> GnssTable:
+    """The same fixes, with the usual sigmas of their kind where none is stated, and a note.
+
+    Vertical sigmas are twice the horizontal ones. What is missing itself gets no sigma.
+    """
+    kinds = np.zeros(len(table), np.int64) if table.quality is None else table.quality
+    usual = np.array([_USUAL.get(int(k), _USUAL[5]) for k in kinds]).reshape(-1, 2)
+    shape = np.array([1.0, 1.0, 2.0])
+    lacking = np.isnan(table.sigma_m) & np.isfinite(table.lat_rad)[:, None] & places
+    sigma_m = np.where(lacking, usual[:, :1] * shape, table.sigma_m)
+    sigma_v, count = table.sigma_v, lacking.any(axis=1)
+    if table.v_n is not None and sigma_v is not None:
+        unstated = np.isnan(sigma_v) & np.isfinite(table.v_n)
+        sigma_v = np.where(unstated, usual[:, 1:] * shape, sigma_v)
+        count = count | unstated.any(axis=1)
+    if count.any():
+        telling(findings, "note", "sigma_assumed", table.source, value=int(count.sum()))(
+            f"{count.sum()} of {len(table)} fixes state no sigma of place or velocity; that of the "
+            "kind is assumed: 0.02 m for fixed, 0.3 m for float, 3 m for single ones."
+        )
+    return dataclasses.replace(table, sigma_m=sigma_m, sigma_v=sigma_v)

@@ -1,0 +1,99 @@
+"""Samples of two sensors on one clock, and two clocks made one."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from robins.dataset import ImuTable
+from robins.logs.findings import Finding, LogError, telling
+
+_LONG = 5.0  # typical intervals; across a longer one no specific force is interpolated
+_DRIFT, _STRAY_S = 2e-4, 1.0  # of a clock; a stamp that is further from the others is not used
+_TREND_S = 60.0  # a drift is found from stamps over at least this time
+
+
+def are_halves(one: ImuTable, other: ImuTable) -> bool:
+    """True if one has only rates and the other only specific forces; the rest is zero or NaN."""
+    has = [[np.nan_to_num(v).any() for v in (t.gyro, t.accel)] for t in (one, other)]
+    return sorted(has) == [[False, True], [True, False]]
+
+
+def merged(gyro: ImuTable, accel: ImuTable, findings: list[Finding] | None) -> ImuTable:
+    """Rates of one table with the specific forces of another, on the clock of the rates.
+
+    They may be given in either order. Specific forces are interpolated linearly. Samples outside of
+    their time are left out; across a gap of more than five of their intervals the specific force is
+    missing (NaN).
+
+    Args:
+        gyro: rates; its specific forces are not used.
+        accel: specific forces; its rates are not used.
+        findings: receives a note.
+
+    Raises:
+        LogError: the two share no time.
+    """
+    if not np.nan_to_num(gyro.gyro).any():
+        gyro, accel = accel, gyro
+    order = np.argsort(accel.time_ns, kind="stable")
+    at, forces = accel.time_ns[order], accel.accel[order]
+    inside = (gyro.time_ns >= at[0]) & (gyro.time_ns <= at[-1])
+    if not inside.any():
+        cause = "rates and specific forces were recorded apart and share no time"
+        raise LogError(gyro.source, cause, "are they of one recording?")
+    now, since = gyro.time_ns[inside], at[0]
+    force = np.stack([np.interp(now - since, at - since, forces[:, k]) for k in range(3)], axis=-1)
+    before = np.clip(np.searchsorted(at, now, side="right") - 1, 0, max(len(at) - 2, 0))
+    apart = np.diff(at, append=at[-1])
+    force[(apart[before] > _LONG * np.median(apart)) & (now != at[before])] = np.nan
+    telling(findings, "note", "sensors_merged", gyro.source, value=int((~inside).sum()))(
+        "rates and specific forces were recorded apart; the forces are interpolated to the times "
+        f"of the rates, and {(~inside).sum()} samples without both are left out."
+    )
+    rows = None if gyro.rows is None else gyro.rows[inside]
+    return dataclasses.replace(gyro, time_ns=now, gyro=gyro.gyro[inside], accel=force, rows=rows)
+
+
+def gps_clock(
+    file: str, local_ns: np.ndarray, gps_ns: np.ndarray, findings: list[Finding] | None
+) -> Callable[[np.ndarray], np.ndarray]:
+    """GPS time of a local clock that stamps fixes when they arrive.
+
+    The clock may drift linearly. The fix that arrived fastest is taken to have arrived at once: the
+    true delay of a receiver cannot be found from stamps, and remains as a latency of the fixes.
+
+    Args:
+        file: for messages.
+        local_ns: (n,) arrival of each fix, local time.
+        gps_ns: (n,) GPS time of each fix.
+        findings: receives a note with the spread of the delays.
+
+    Returns:
+        A function from local to GPS time [ns].
+
+    Raises:
+        LogError: the two clocks do not run at one rate.
+    """
+    begin, apart = int(local_ns[0]), int(local_ns[0]) - int(gps_ns[0])
+    x, late = (local_ns - begin) * 1e-9, (local_ns - gps_ns - apart) * 1e-9
+    span = float(x.max() - x.min())
+    near = np.abs(late - np.median(late)) < _STRAY_S + _DRIFT * span
+    if 2 * near.sum() <= len(near):
+        cause = "the stamps of its fixes and their GPS times do not run at one rate"
+        raise LogError(file, cause, "was the clock set during the recording? cut it there")
+    slope = float(np.polyfit(x[near], late[near], 1)[0]) if span > _TREND_S else 0.0
+    slope = float(np.clip(slope, -_DRIFT, _DRIFT))
+    rest = late[near] - slope * x[near]
+    telling(findings, "note", "clock_aligned", file, value=float(np.ptp(rest)))(
+        "stamps of the samples are put on GPS time by the arrival of the fixes, whose delays vary "
+        f"by {np.ptp(rest):.3f} s; a constant delay of the receiver remains as a latency."
+    )
+
+    def to_gps(time_ns: np.ndarray) -> np.ndarray:
+        late_ns = (slope * (time_ns - begin) * 1e-9 + float(rest.min())) * 1e9
+        return time_ns - apart - np.rint(late_ns).astype(np.int64)
+
+    return to_gps

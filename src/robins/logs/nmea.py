@@ -1,0 +1,182 @@
+"""Sentences of NMEA 0183 that a receiver wrote, whatever else stands between them.
+
+- ``GGA``: fixes; the height above the ellipsoid is the altitude plus the separation of the geoid.
+- ``RMC``, else ``VTG``: velocity over ground; there is none down. Without GGA also the place.
+- ``GST``: sigmas of the place. Others are the usual ones of the kind of a fix, see `fix_kinds`.
+- ``RMC`` and ``ZDA``: the date. Stamps are UTC and become GPS time.
+
+Sentences without a right checksum are left out and counted. Of several talkers GN counts, or the
+first. Source: NMEA 0183 4.11; u-blox F9 HPG 1.32 interface description, UBX-22008968.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import os
+import re
+from functools import reduce
+from operator import xor
+
+import numpy as np
+
+from robins.dataset import GnssTable
+from robins.gps_time import gps_of
+from robins.logs.findings import Finding, LogError, breaks_off, left_out, telling
+from robins.logs.fix_kinds import fixes
+from robins.logs.opening import Bytes, mapped
+from robins.logs.text import Head
+from robins.units import to_si
+
+_BEGINS = re.compile(rb"(^|[\r\n])[^$\r\n]{0,60}\$[A-Z]{4,6}\d*,[^*$\r\n]*\*[0-9A-Fa-f]{2}")
+_SENTENCE = re.compile(
+    rb"\$([A-Z]{2})(GGA|RMC|VTG|GST|ZDA),([^*$\r\n]{0,200})(?:\*([0-9A-Fa-f]{2}))?"
+)
+_CLOCK = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d(?:\.\d*)?|60(?:\.\d*)?)", re.ASCII)
+_DAY_NS, _EPOCH = 86_400_000_000_000, datetime.date(1970, 1, 1).toordinal()
+_KIND = {"1": 5.0, "2": 4.0, "3": 5.0, "4": 1.0, "5": 2.0}  # of GGA -> RTKLIB's Q
+_SLOW = 0.05  # m/s, below which receivers leave out the course
+
+
+def is_nmea(head: Head) -> bool:
+    """Has a line with any sentence among the first bytes, and no message of UBX."""
+    return _BEGINS.search(head.start) is not None and b"\xb5\x62" not in head.start
+
+
+def read_nmea(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> GnssTable:
+    """Read fixes.
+
+    Args:
+        path: the file, plain or compressed.
+        findings: receives what was left out or assumed; without it that is issued as `LogWarning`.
+
+    Raises:
+        LogError: there is no sentence GGA or RMC with a right checksum.
+    """
+    file = str(path)
+    epochs = _epochs(file, mapped(path, findings), findings)
+    days = _days(file, epochs, findings)
+    end = "1" if any("lat1" in epoch for epoch in epochs) else "2"
+    kept = [k for k, epoch in enumerate(epochs) if f"lat{end}" in epoch]
+    if not kept:
+        cause = "has no sentence GGA or RMC with a right checksum"
+        raise LogError(file, cause, "switch on GGA, RMC and GST in the receiver")
+
+    def column(name: str) -> np.ndarray:
+        return np.array([epochs[k].get(name, math.nan) for k in kept])
+
+    utc_ns = np.array([days[k] * _DAY_NS + int(epochs[k]["time"]) for k in kept], np.int64)
+    speed, course = to_si(column("speed"), "kn"), np.deg2rad(column("course"))
+    course = np.where(np.isnan(course) & (speed < _SLOW), 0.0, course)
+    nothing = np.full(len(kept), np.nan)
+    return fixes(
+        file,
+        gps_of(utc_ns) if days[0] >= 0 else utc_ns + _DAY_NS,
+        (column(f"lat{end}"), column(f"lon{end}"), column("height")),
+        (column("north"), column("east"), column("up")),
+        np.stack([speed * np.cos(course), speed * np.sin(course), nothing], axis=-1),
+        nothing,
+        column(f"kind{end}"),
+        np.zeros(len(kept), bool),
+        findings,
+    )
+
+
+def _epochs(file: str, data: Bytes, findings: list[Finding] | None) -> list[dict[str, float]]:
+    """Numbers of the sentences of each time of day; those without a time belong to the last."""
+    epochs: list[dict[str, float]] = []
+    talkers = {one[1] for one in _SENTENCE.finditer(data) if one[4]}
+    wrong, left = 0, set[bytes]()
+    for one in _SENTENCE.finditer(data):
+        talker, kind, body, given = one.groups()
+        if given is None and one.end() == len(data):
+            breaks_off(findings, file, one.start())
+            continue
+        try:
+            if given is None or int(given, 16) != reduce(xor, talker + kind + b"," + body):
+                raise ValueError
+            found = _numbers(kind.decode(), body.decode("ascii").split(","))
+        except (ValueError, IndexError):
+            wrong += 1
+            continue
+        near = (epoch for epoch in epochs[:-4:-1] if epoch["time"] == found.get("time"))
+        epoch = epochs[-1] if kind == b"VTG" and epochs else next(near, None)
+        if epoch is None and "time" in found:
+            epochs.append(epoch := {})
+        if epoch is not None:
+            if epoch.keys() >= found.keys():
+                left.add(talker)
+            better = talker == b"GN" and len(talkers) > 1
+            epoch |= found if better else {k: x for k, x in found.items() if k not in epoch}
+    left_out(findings, file, wrong, "sentences lack a right checksum or a field")
+    if len(left) and len(talkers) > 1:
+        telling(findings, "note", "several_instances", file, value=len(talkers))(
+            f"several talkers ({', '.join(sorted(t.decode() for t in talkers))}) state the same; "
+            "GN is read where it is among them, else the first."
+        )
+    return epochs
+
+
+def _numbers(kind: str, fields: list[str]) -> dict[str, float]:
+    """What a sentence states.
+
+    Raises:
+        ValueError: a field is no number, time or date.
+        IndexError: there are too few fields.
+    """
+
+    def number(k: int) -> float:
+        return float(fields[k]) if fields[k] else math.nan
+
+    def degrees(k: int) -> float:
+        whole = number(k) // 100.0  # ddmm.mmm
+        value = whole + (number(k) - 100.0 * whole) / 60.0
+        return -value if fields[k + 1] in ("S", "W") else value
+
+    if kind == "VTG":
+        return {"speed": number(4), "course": number(0)}
+    if not fields[0]:
+        return {}  # the receiver does not know the time yet
+    if (clock := _CLOCK.fullmatch(fields[0])) is None:
+        raise ValueError
+    minutes = 60 * int(clock[1]) + int(clock[2])
+    found: dict[str, float] = {"time": 6e10 * minutes + round(float(clock[3]) * 1e9)}
+    if kind == "GGA":
+        found |= {"kind1": _KIND.get(fields[5], 0.0), "height": number(8) + number(10)}
+        return found | {"lat1": degrees(1), "lon1": degrees(3)}
+    if kind == "GST":
+        return found | {"north": number(5), "east": number(6), "up": number(7)}
+    if kind == "RMC":
+        valid, date = fields[1] == "A", fields[8]
+        found |= {"lat2": degrees(2), "lon2": degrees(4), "kind2": 5.0 if valid else 0.0}
+        found |= {"speed": number(6), "course": number(7)} if valid else {}
+        century = "19" if date[4:5] > "7" else "20"
+        day = [date[:2], date[2:4], century + date[4:]] if date else [""]
+    else:
+        day = fields[1:4]
+    if all(day):
+        there = datetime.date(*(int(x) for x in day[::-1]))
+        found["day"] = float(there.toordinal() - _EPOCH)
+    return found
+
+
+def _days(file: str, epochs: list[dict[str, float]], findings: list[Finding] | None) -> list[int]:
+    """Day of each epoch: that it states, else that of its neighbour, with midnights between.
+
+    Days count from 1970, or from -1 where no sentence states the date.
+    """
+    midnights = [0] * len(epochs)
+    for k in range(1, len(epochs)):
+        back = epochs[k]["time"] < epochs[k - 1]["time"] - _DAY_NS // 2
+        midnights[k] = midnights[k - 1] + back
+    stated = [int(e["day"]) - n for e, n in zip(epochs, midnights, strict=True) if "day" in e]
+    if epochs and not stated:
+        telling(findings, "note", "undated", file, value=len(epochs))(
+            "no sentence states the date (RMC, ZDA); stamps count from the midnight before the "
+            "first."
+        )
+    day, days = stated[0] if stated else -1, []
+    for epoch, count in zip(epochs, midnights, strict=True):
+        day = int(epoch["day"]) - count if "day" in epoch else day
+        days.append(day + count)
+    return days

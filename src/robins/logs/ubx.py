@@ -1,0 +1,206 @@
+"""Recordings of u-blox receivers (UBX), also between sentences of NMEA and corrections.
+
+- ``NAV-PVT``: fixes with velocity and sigmas; ``NAV-HPPOSLLH`` adds the digits behind 1e-7 deg.
+- the sentences of NMEA where there is no ``NAV-PVT``: see `robins.logs.nmea`;
+- ``ESF-MEAS``: rates and specific forces of a receiver with inertial sensors, along its own axes.
+
+GPS time is the time of week of a fix, in the week of its date. Inertial stamps count milliseconds
+of the receiver and are put on GPS time by the order of arrival. ``hAcc`` is taken for north and for
+east, as for PX4. Source: u-blox F9 HPG 1.32 interface description, UBX-22008968.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from robins.dataset import Dataset, GnssTable, ImuTable
+from robins.gps_time import gps_of
+from robins.logs.findings import Finding, LogError, breaks_off, left_out, telling, undated
+from robins.logs.fix_kinds import fixes
+from robins.logs.merging import gps_clock, merged
+from robins.logs.nmea import read_nmea
+from robins.logs.opening import Bytes, mapped
+from robins.logs.tables import Table
+from robins.logs.text import Head
+from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS
+from robins.units import to_si
+
+_SYNC = b"\xb5\x62"
+_HEAD = struct.Struct("<2sBBH")
+_TAG = struct.Struct("<IHH")  # of ESF-MEAS: time [ms], flags, provider
+_PVT, _HIGH, _MEAS, _RAW = 0x0107, 0x0114, 0x1002, 0x1003  # class and number
+_NAV_PVT = np.dtype(  # the oldest version; place: longitude, latitude [1e-7 deg]
+    "<u4, <u2, u1, u1, 3u1, u1, V8, u1, u1, V2, 2<i4, <i4, V4, 2<u4, 3<i4, V8, <u4, V12"
+)
+_NAMES = "tow year month day clock valid _1 fix flags _2 place h_m _3 acc v _4 s_acc _5"
+_NAV_PVT.names = tuple(_NAMES.split())
+_NAV_HIGH = np.dtype("V3, u1, <u4, 2<i4, <i4, V4, 4i1, 2<u4")
+_NAV_HIGH.names = ("_1", "invalid", "tow", "place", "h_m", "_2", "more", "acc")
+_DATED = 3  # bits of valid: date, time
+_GYRO, _ACCEL = (14, 13, 5), (16, 17, 18)  # types of x, y, z in ESF-MEAS
+_GYRO_DEG_S, _ACCEL_M_S2 = 2.0**-12, 2.0**-10
+
+
+def is_ubx(head: Head) -> bool:
+    """Begins with a message of UBX, or has one behind a sentence of NMEA or a correction."""
+    begins = head.start.lstrip(b"\r\n").startswith((_SYNC, b"$", b"\xd3\x00"))
+    return begins and _SYNC in head.start
+
+
+def read_ubx(
+    path: str | os.PathLike[str], findings: list[Finding] | None = None
+) -> Table | Dataset:
+    """Read fixes, and inertial samples where they were recorded.
+
+    Args:
+        path: the file, plain or compressed.
+        findings: receives what was left out; without it that is issued as `LogWarning`.
+
+    Returns:
+        A dataset, or a table where there are only fixes or only samples.
+
+    Raises:
+        LogError: the file holds neither.
+    """
+    file = str(path)
+    data = mapped(path, findings)
+    frames = _frames(file, data, findings)
+    if frames[_RAW]:
+        telling(findings, "note", "other_kinds", file, value=len(frames[_RAW]))(
+            f"{len(frames[_RAW])} messages ESF-RAW are left out; switch on ESF-MEAS for samples."
+        )
+    if not frames[_PVT] and re.search(rb"\$..(GGA|RMC),", data):
+        return read_nmea(path, findings)
+    measured = [place for place in frames[_MEAS] if place[1] >= _TAG.size]
+    imu = _inertial(file, data, measured, findings)
+    if not frames[_PVT]:
+        if imu is not None:
+            return imu
+        raise LogError(file, "has no messages NAV-PVT or ESF-MEAS", "switch on UBX-NAV-PVT")
+    gnss, arrived = _fixes(file, data, frames, findings)
+    if imu is None:
+        return gnss
+    tags = np.array([_TAG.unpack_from(data, at)[0] for at, _ in measured], np.int64) * 1_000_000
+    before = np.searchsorted([at for at, _ in measured], arrived) - 1  # as a fix arrived
+    if (known := before >= 0).any():
+        clock = gps_clock(file, tags[before[known]], gnss.time_ns[known], findings)
+        imu = replace(imu, time_ns=clock(imu.time_ns))
+    return Dataset(Path(file).name.split(".")[0], imu, gnss, time_unit_known=(file,))
+
+
+def _frames(
+    file: str, data: Bytes, findings: list[Finding] | None
+) -> dict[int, list[tuple[int, int]]]:
+    """Place and length of the content of each message with a right checksum, by its kind."""
+    found: dict[int, list[tuple[int, int]]] = {k: [] for k in (_PVT, _HIGH, _MEAS, _RAW)}
+    at, wrong, open_at = data.find(_SYNC), 0, -1
+    while at >= 0:
+        head = data[at : at + _HEAD.size].ljust(_HEAD.size, b"\xff")
+        _, group, number, size = _HEAD.unpack(head)
+        end = at + _HEAD.size + size
+        if end + 2 > len(data):
+            open_at = at if open_at < 0 else open_at
+        elif _checksum(data[at + 2 : end]) == data[end : end + 2]:
+            found.get(group << 8 | number, []).append((at + 6, size))
+            wrong, open_at = wrong + (open_at >= 0), -1
+            at = data.find(_SYNC, end + 2)
+            continue
+        else:
+            wrong += 1
+        at = data.find(_SYNC, at + 2)
+    left_out(findings, file, wrong, "messages have a wrong length or checksum")
+    if open_at >= 0:
+        breaks_off(findings, file, open_at)
+    return found
+
+
+def _checksum(content: bytes) -> bytes:
+    """Fletcher's of 8 bits."""
+    values = np.frombuffer(content, np.uint8).astype(np.int64)
+    return bytes([values.sum() & 255, (values @ np.arange(len(values), 0, -1)) & 255])
+
+
+def _rows(
+    data: Bytes, frames: list[tuple[int, int]], kind: np.dtype
+) -> tuple[np.ndarray, np.ndarray]:
+    """Messages of a fixed layout, and where each lies."""
+    whole = [at for at, size in frames if size >= kind.itemsize]
+    content = b"".join(data[at : at + kind.itemsize] for at in whole)
+    return np.frombuffer(content, kind), np.array(whole, np.int64)
+
+
+def _fixes(
+    file: str,
+    data: Bytes,
+    frames: dict[int, list[tuple[int, int]]],
+    findings: list[Finding] | None,
+) -> tuple[GnssTable, np.ndarray]:
+    """Fixes that have a date, and the place of each in the file."""
+    pvt, at = _rows(data, frames[_PVT], _NAV_PVT)
+    dated = ((pvt["valid"] & _DATED) == _DATED) & (pvt["tow"] < WEEK_NS // 1_000_000)
+    dated &= (pvt["year"] >= 1980) & (pvt["year"] < 2100) & (pvt["month"] - 1 < 12)
+    undated(findings, file, int((~dated).sum()), "messages NAV-PVT")
+    pvt, at = pvt[dated], at[dated]
+    day = [f"{y:04d}-{m:02d}" for y, m in zip(pvt["year"], pvt["month"], strict=True)]
+    days = np.array(day, "datetime64[M]").astype("datetime64[D]").astype(np.int64) + pvt["day"] - 1
+    utc_ns = (days * 86400 + pvt["clock"] @ np.array([3600, 60, 1])) * 1_000_000_000
+    tow_ns = pvt["tow"].astype(np.int64) * 1_000_000
+    week = np.rint((gps_of(utc_ns) - GPS_EPOCH_NS - tow_ns) / WEEK_NS).astype(np.int64)
+    carrier = pvt["flags"] >> 6
+    kind = np.select([carrier == 2, carrier == 1, pvt["flags"] & 2 > 0], [1, 2, 4], 5)
+    there = (pvt["flags"] & 1 > 0) & (pvt["fix"] >= 2) & (pvt["fix"] <= 4)
+    lon, lat, height_m = *(pvt["place"] * 1e-7).T, pvt["h_m"] * 1e-3
+    horizontal, vertical = pvt["acc"].T * 1e-3
+    high, _ = _rows(data, frames[_HIGH], _NAV_HIGH)
+    _, mine, more = np.intersect1d(pvt["tow"], high["tow"], return_indices=True)
+    if len(more) and len(np.unique(pvt["tow"])) == len(pvt):
+        mine, more = (x[(high["invalid"][more] & 1) == 0] for x in (mine, more))
+        place, digits = high["place"][more], high["more"][more]
+        lon[mine], lat[mine] = (place * 1e-7 + digits[:, :2] * 1e-9).T
+        height_m[mine] = high["h_m"][more] * 1e-3 + digits[:, 2] * 1e-4
+        horizontal[mine], vertical[mine] = high["acc"][more].T * 1e-4
+    table = fixes(
+        file,
+        GPS_EPOCH_NS + week * WEEK_NS + tow_ns,
+        (lat, lon, height_m),
+        (horizontal, horizontal, vertical),
+        pvt["v"] * 1e-3,
+        pvt["s_acc"] * 1e-3,
+        np.where(there, kind, 0),
+        pvt["fix"] == 2,
+        findings,
+    )
+    return table, at
+
+
+def _inertial(
+    file: str, data: Bytes, frames: list[tuple[int, int]], findings: list[Finding] | None
+) -> ImuTable | None:
+    """Samples on the clock of the receiver."""
+    halves: dict[tuple[int, ...], dict[int, list[int]]] = {_GYRO: {}, _ACCEL: {}}
+    for at, size in frames:
+        tag, flags, _ = _TAG.unpack_from(data, at)
+        count = min(flags >> 11, (size - _TAG.size) // 4)
+        words = struct.unpack_from(f"<{count}I", data, at + _TAG.size)
+        read = {word >> 24 & 63: (word & 0xFFFFFF ^ 0x800000) - 0x800000 for word in words}
+        for axes, rows in halves.items():
+            if all(axis in read for axis in axes):
+                rows[tag] = [read[axis] for axis in axes]
+    gyro, accel = (
+        (np.array(list(rows), np.int64) * 1_000_000, np.array(list(rows.values()), np.float64))
+        for rows in halves.values()
+    )
+    if not (len(gyro[0]) and len(accel[0])):
+        return None
+    rates, forces = to_si(gyro[1] * _GYRO_DEG_S, "deg/s"), accel[1] * _ACCEL_M_S2
+    turns = ImuTable(gyro[0], rates, np.full_like(rates, np.nan), "rate", source=file)
+    if np.array_equal(gyro[0], accel[0]):
+        return ImuTable(gyro[0], rates, forces, "rate", source=file)
+    other = ImuTable(accel[0], np.full_like(forces, np.nan), forces, "rate", source=file)
+    return merged(turns, other, findings)
