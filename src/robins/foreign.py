@@ -133,7 +133,7 @@ def arrays_of(
         within(declared, len(content), f"up to {name!r} it", refuse)
         if name in arrays or member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise refuse(f"{name!r} is there twice, or packed as NumPy does not pack")
-        arrays[name] = _array(_member(archive, member, refuse), name, refuse)
+        arrays[name] = array_of(_member(archive, member, refuse), name, refuse)
     return arrays
 
 
@@ -146,8 +146,12 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, refuse: Refuse) -
         return file.read(member.file_size)
 
 
-def _array(raw: bytes, name: str, refuse: Refuse) -> np.ndarray:
-    """Array of the bytes of a ``.npy`` file."""
+def array_of(raw: bytes, name: str, refuse: Refuse) -> np.ndarray:
+    """Array of the bytes of a ``.npy`` file.
+
+    Raises:
+        RobinsError: as `refuse` makes it: it is cut or damaged, or holds objects.
+    """
     file = io.BytesIO(raw)
     with (
         decoding(lambda why: refuse(f"{name!r} is no array of NumPy: {why}")),

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from robins.cli.frame import Status, only_json
+from robins.cli.options import typed
 from robins.cli.tell import say
 
 _COLOURS = {"error": "red", "warning": "yellow", "note": "cyan"}
@@ -63,9 +64,8 @@ def _text(found: Any, log: Sequence[Path], columns: Sequence[Path]) -> str:
         return "\n".join(
             [*lines, "Next:   mend the errors; a run on this log would be wrong or meaningless"]
         )
-    # Without fixes there is no position, but with a magnetic field an attitude.
+    # Without fixes there is no position, but an attitude.
     kinds = {table["kind"] for table in found.tables}
-    system = " --system marg" if "mag" in kinds and "gnss" not in kinds else ""
-    declared = [word for path in columns for word in ("--columns", path)]
-    words = shlex.join(map(str, [*log, *declared]))
+    system = "" if "gnss" in kinds else " --system marg"
+    words = shlex.join(map(str, [*log, *typed(columns)]))
     return "\n".join([*lines, f"Next:   robins replay {words}{system}"])

@@ -26,14 +26,19 @@ def _columns(names: str, holds: str, *units: str) -> tuple[Column, ...]:
     return tuple(Column(quantity, name, units) for name, quantity in pairs)
 
 
-def _format(name: str, about: str, looks: Looks | None = None, **how: Any):
-    """A row: what `TextFormat` takes, then groups of columns; with `looks` by their order."""
+def _format(
+    name: str, about: str, looks: Looks | None = None, rows: Looks | None = None, **how: Any
+):
+    """A row: what `TextFormat` takes, then groups of columns; with `looks` by their order.
+
+    `rows` tells by rows of numbers where a header, by whose names columns are found, is missing.
+    """
 
     def of(*groups: Iterable[Column]) -> TextFormat:
         columns = itertools.chain.from_iterable(groups)
         if looks is not None:
             columns = (column._replace(place=k) for k, column in enumerate(columns, start=1))
-        return TextFormat(name, about, tuple(columns), looks=looks, **how)
+        return TextFormat(name, about, tuple(columns), looks=looks or rows, **how)
 
     return of
 
@@ -76,6 +81,19 @@ def _kfgins_nav(rows: Rows) -> bool:
     )
 
 
+def _poses(first: int, stamps: tuple[float, float], width: int) -> Looks:
+    """Stamps within these, and from place `first` on a unit quaternion, which turns."""
+
+    def looks(rows: Rows) -> bool:
+        return len(rows[0]) >= width and all(
+            stamps[0] <= row[0] < stamps[1]
+            and abs(sum(q * q for q in row[first : first + 4]) - 1.0) < 5e-3
+            for row in rows
+        )
+
+    return looks
+
+
 # ----------------------------------------------------------------------------------- the table
 
 _PLACE = (
@@ -83,6 +101,10 @@ _PLACE = (
     *_columns("height [m]", "height", "m"),
 )
 _EULER = "roll pitch heading"
+_POSE = (
+    _columns("tx, ty, tz", "east north up", "m"),
+    _columns("qx, qy, qz, qw", "q_x q_y q_z q_w"),
+)
 _SECOND = _columns("time of week [s]", "time_of_week", "s")
 _NAMED = _columns("time_{unit_}", "time", *_CLOCKS)
 
@@ -155,6 +177,7 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
         "EuRoC and ASL: ground truth in local metres, taken as east, north, up",
         nav="ENU",
         commented=True,
+        choice=True,
     )(
         _columns("timestamp [ns] | timestamp", "time", "ns"),
         _columns(
@@ -172,14 +195,37 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
     ),
     _format(
         "tum",
-        "TUM, for evo: metres east, north, up of an origin, rotation with the scalar last",
+        "TUM, evo, ORB-SLAM, ov_eval: metres east, north, up of an origin, the scalar last",
         separator=" ",
         nav="ENU",
         commented=True,
+        rows=_poses(4, (-1e9, 1e11), 8),
     )(
-        _columns("timestamp", "time", "s"),
-        _columns("tx, ty, tz", "east north up", "m"),
-        _columns("qx, qy, qz, qw", "q_x q_y q_z q_w"),
+        _columns("timestamp | timestamp(s)", "time", "s"),
+        *_POSE,
+    ),
+    _format(
+        "orbslam-euroc",
+        "ORB-SLAM3 SaveTrajectoryEuRoC, Basalt: as tum, in nanoseconds and without a header",
+        separator=" ",
+        nav="ENU",
+        looks=_poses(4, (1e14, 1e19), 8),
+    )(
+        _columns("timestamp [ns]", "time", "ns"),
+        *_POSE,
+    ),
+    _format(
+        "openvins-state",
+        "OpenVINS save_total_state: time, rotation with the scalar last, place, velocity",
+        separator=" ",
+        nav="ENU",
+        looks=_poses(1, (-1e9, 1e11), 17),
+    )(
+        _columns("timestamp(s)", "time", "s"),
+        _columns("q_x, q_y, q_z, q_w", "q_x q_y q_z q_w"),
+        _columns("p_x [m], p_y [m], p_z [m]", "east north up", "m"),
+        _columns("v_x [m/s], v_y [m/s]", "v_east v_north", "m/s"),
+        (Column("v_down", "v_z [m/s]", ("m/s",), scale=-1.0),),
     ),
     _format(
         "named-imu",
