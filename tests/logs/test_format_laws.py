@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from log_samples import SAMPLES
 from made_pair import attitudes
+from made_wild import KITTI_TIMES
 
 from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.ins.frames import to_enu_rfu
@@ -119,6 +120,7 @@ def test_a_sample_is_recognised_by_content_alone_and_by_no_other_format(tmp_path
         pytest.importorskip("pyulog", reason="the extra `logs` is not installed")
     path = tmp_path / "no_telling_name"
     sample = SAMPLES[format.name]
+    (tmp_path / "times.txt").write_text(KITTI_TIMES)
     path.write_bytes(pack(sample.encode() if isinstance(sample, str) else sample))
     assert recognise(path).name == format.name
     held = tables_of(open_log(path, findings=[]))

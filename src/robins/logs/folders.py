@@ -78,9 +78,8 @@ def _table(path: Path, clock: str, names: Sequence[str], findings: Findings) -> 
         return next(found, -1)
 
     places = [place(name) for name in names]
-    wanted = dict(zip(names[:1], places[:1], strict=True)) | (
-        {clock: place(clock)} if clock else {}
-    )
+    wanted = dict(zip(names[:1], places[:1], strict=True))
+    wanted |= {clock: place(clock)} if clock else {}
     if lacking := [name for name, at in wanted.items() if at < 0]:
         raise refused(str(path), f"line {line}")(
             f"no column fits {lacking[0]}; there are {', '.join(held)}", "export it again"

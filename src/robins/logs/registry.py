@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from robins.dataset import Dataset
 from robins.errors import require_kind
-from robins.logs import broad, phone, rosbag, rtklib, ulog
+from robins.logs import broad, paths, phone, rosbag, rtklib, ulog
 from robins.logs.archives import head_of, kind_of_archive
 from robins.logs.findings import Finding, LogError, refused
 from robins.logs.folders import read_folder
@@ -57,6 +57,20 @@ FORMATS: tuple[Format, ...] = (
         rtklib.read_rtklib,
     ),
     Format(
+        "kitti-odometry",
+        ("trajectory",),
+        "KITTI odometry: 12 numbers a line, times.txt beside it",
+        paths.is_kitti,
+        paths.read_kitti,
+    ),
+    Format(
+        "novatel-inspva",
+        ("trajectory",),
+        "NovAtel: INSPVAA and INSPVASA in ASCII, each line against its checksum",
+        paths.is_inspva,
+        paths.read_inspva,
+    ),
+    Format(
         "phone-csv",
         ("imu", "mag", "gnss"),
         "phones, as strapdown-rs keeps their drives: CSV, UTC dates, Android's axes",
@@ -69,6 +83,14 @@ FORMATS: tuple[Format, ...] = (
         "BROAD, the orientation benchmark of Laidig et al. (2021): .mat, .hdf5, .npz",
         broad.is_broad,
         broad.read_broad,
+        binary=True,
+    ),
+    Format(
+        "sbet",
+        ("trajectory",),
+        "Applanix POSPac: SBET, 17 doubles a record",
+        paths.is_sbet,
+        paths.read_sbet,
         binary=True,
     ),
     Format(

@@ -26,6 +26,13 @@ def _columns(names: str, holds: str, *units: str) -> tuple[Column, ...]:
     return tuple(Column(quantity, name, units) for name, quantity in pairs)
 
 
+def _triad(names: str, holds: str, *units: str) -> tuple[Column, ...]:
+    """Three columns, with @ for X, Y, Z in the names."""
+    return tuple(
+        Column(holds.replace("@", axis), names.replace("@", axis.upper()), units) for axis in "xyz"
+    )
+
+
 def _format(
     name: str, about: str, looks: Looks | None = None, rows: Looks | None = None, **how: Any
 ):
@@ -252,6 +259,48 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
         _columns("roll_{unit_}, pitch_{unit_}, heading_{unit_}", _EULER, *_ANGLE),
         _columns("q_w, q_x, q_y, q_z", "q_w q_x q_y q_z"),
         _columns("omega_@_{unit_}", "omega_@", *_RATE),
+    ),
+    _format(
+        "xsens-mt",
+        "Xsens MT Manager: tab-separated text, ticks of 0.1 ms, axes of the sensor",
+        separator="\t",
+        others=True,
+    )(
+        (Column("time", "SampleTimeFine", ("ms",), scale=0.1),),
+        _triad("Acc_@", "accel_@", "m/s^2"),
+        _triad("Gyr_@", "gyro_@", "rad/s"),
+    ),
+    _format(
+        "xsens-dot",
+        "Xsens DOT: CSV below lines about the device, microseconds, axes of the sensor",
+        others=True,
+    )(
+        _columns("SampleTimeFine", "time", "us"),
+        _triad("Acc_@", "accel_@", "m/s^2"),
+        _triad("Gyr_@", "gyro_@", "deg/s"),
+    ),
+    _format(
+        "microstrain-csv",
+        "MicroStrain MIP Monitor: CSV below DATA_START, week and second of GPS",
+        others=True,
+        choice=True,
+    )(
+        _columns("GPS Week", "week"),
+        _columns("GPS TOW", "time_of_week", "s"),
+        _triad("@ Accel [x8004]", "accel_@", "g"),
+        _triad("@ Gyro [x8005]", "gyro_@", "rad/s"),
+        _triad("@ Mag [x8006]", "mag_@", "G"),
+    ),
+    _format(
+        "vectornav-csv",
+        "VectorNav: CSV of its uncompensated sensors, as INSTINCT writes it too",
+        others=True,
+        choice=True,
+    )(
+        _columns("TimeStartup | TimeStartup [ns]", "time", "ns"),
+        _triad("UncompAcc@ | UnCompAcc@ | UnCompAcc@ [m/s^2]", "accel_@", "m/s^2"),
+        _triad("UncompGyro@ | UnCompGyro@ | UnCompGyro@ [rad/s]", "gyro_@", "rad/s"),
+        _triad("UncompMag@ | UnCompMag@ | UnCompMag@ [Gauss]", "mag_@", "G"),
     ),
     _format(
         "xio-csv",
