@@ -19,7 +19,7 @@ OPENVINS = (
 KITTI = "".join(f"1 0 0 {k} 0 1 0 {-2 * k} 0 0 1 {3 * k}\n" for k in range(20))
 KITTI_TIMES = "".join(f"{0.1 * k:.6e}\n" for k in range(20))
 XSENS_MT = (
-    "// Start Time: Unknown\n// Sample rate: 100.0Hz\n// Scenario: 1.0\n// Firmware Version: 4.0.2\n"
+    "// Start Time: Unknown\n// Sample rate: 100.0Hz\n// Firmware Version: 4.0.2\n"
     "PacketCounter\tSampleTimeFine\tAcc_X\tAcc_Y\tAcc_Z\tGyr_X\tGyr_Y\tGyr_Z\tStatusWord\n"
 ) + "".join(f"{k:05d}\t{10000 + 100 * k}\t0.1\t0.2\t9.8\t0.01\t0.02\t0.03\t0A\n" for k in range(9))
 XSENS_DOT = (

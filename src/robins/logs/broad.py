@@ -62,12 +62,13 @@ def read_broad(path: str | os.PathLike[str], findings: list[Finding] | None = No
     rate = _rate(file, arrays["sampling_rate"])
     tables = {name: _rows_of(file, name, arrays[name], width) for name, width in _COLUMNS.items()}
     n = len(tables["imu_gyr"])
-    for name, rows in (*tables.items(), ("movement", arrays["movement"])):
+    movement = arrays["movement"]
+    if movement.shape in ((n, 1), (1, n)):  # of MATLAB, which has neither vectors nor, here, bool
+        movement = movement.reshape(n)
+        movement = movement.astype(bool) if np.isin(movement, (0, 1)).all() else movement
+    for name, rows in (*tables.items(), ("movement", movement)):
         if rows.shape[:1] != (n,):
             raise _misfit(file, name, rows, f"({n}, ...) as imu_gyr has")
-    movement = arrays["movement"]
-    if movement.shape == (n, 1) and np.isin(movement, (0, 1)).all():  # of MATLAB
-        movement = movement[:, 0].astype(bool)
     if movement.ndim != 1 or movement.dtype.kind != "b":
         raise _misfit(file, "movement", movement, f"({n},) of bool")
     time_ns = np.round(np.arange(n) * (1e9 / rate)).astype(np.int64)

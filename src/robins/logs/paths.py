@@ -17,6 +17,7 @@ import os
 import zlib
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
 from robins import rotation
@@ -69,7 +70,7 @@ def read_kitti(path: str | os.PathLike[str], findings: Findings = None) -> Traje
     time_ns = stamps_to_ns(str(times), "time", clock.texts[:, 0], clock.rows)
     matrix = poses.values.reshape(-1, 3, 4)
     try:
-        q_lb = np.asarray(rotation.from_dcm(_TO_ENU @ matrix[:, :, :3] @ _CAMERA))
+        q_lb = np.asarray(rotation.from_dcm(jnp.asarray(_TO_ENU @ matrix[:, :, :3] @ _CAMERA)))
     except ValueError as error:
         raise LogError(str(path), f"holds no rotation: {error}", "copy it again") from error
     r_l = matrix[:, :, 3] @ _TO_ENU.T
@@ -89,7 +90,8 @@ def is_sbet(head: Head) -> bool:
     with np.errstate(all="ignore"):
         step = then[0] - first[0]
     limits = (1e-6 < abs(x) < limit for x, limit in zip(first[:2], (7e5, np.pi / 2), strict=True))
-    return all(limits) and abs(first[2]) <= 7.0 and abs(first[3]) < 1e5 and 1e-4 < step < 10.0
+    near = abs(first[2]) <= 7.0 and abs(first[3]) < 1e5 and 1e-4 < step < 10.0
+    return all(limits) and bool(near)
 
 
 def read_sbet(path: str | os.PathLike[str], findings: Findings = None) -> Trajectory:
