@@ -68,17 +68,18 @@ def names_in(path: str, changed_ns: int) -> frozenset[str]:
         LogError: as `arrays_in`.
     """
     if kind_of_archive(beginning(path)) == "npz":
-        members = archive_of(whole(path, _LARGEST)[0], partial(_damaged, path)).namelist()
+        data, _ = whole(path, _LARGEST)
+        members = archive_of(data, partial(_damaged, path, len(data))).namelist()
         return frozenset(name.removesuffix(".npy") for name in members)
     return frozenset(arrays_in(path))
 
 
-def _damaged(path: str, why: str) -> LogError:
+def _damaged(path: str, size: int, why: str) -> LogError:
     mend = (
         "fetch it again, or save it as plain numbers; nothing of it was used, for no number in it "
         "can be trusted"
     )
-    return LogError(path, f"is cut short or damaged: {why}", mend)
+    return LogError(path, f"is cut short or damaged after {size} bytes: {why}", mend)
 
 
 def arrays_in(
@@ -95,7 +96,7 @@ def arrays_in(
             from a damaged one.
     """
     data, _ = whole(path, _LARGEST)
-    damaged = partial(_damaged, os.fspath(path))
+    damaged = partial(_damaged, os.fspath(path), len(data))
     kind = kind_of_archive(data[:256])
     if kind == "npz":
         return arrays_of(data, damaged, names)
@@ -177,7 +178,7 @@ def _hdf5(data: bytes, refuse: Refuse) -> dict[str, np.ndarray]:
             return
         declared += item.nbytes
         within(declared, len(data), f"up to {name!r} it", refuse)
-        out[name] = item[()]
+        out[name] = np.asarray(item[()])
 
     with decoding(refuse), h5py.File(io.BytesIO(data), "r") as file:
         file.visititems(keep)

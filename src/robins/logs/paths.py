@@ -132,7 +132,8 @@ def read_inspva(path: str | os.PathLike[str], findings: Findings = None) -> Traj
     """
     file, rows, numbers, clocks = str(path), list[int](), list[list[float]](), list[list[bytes]]()
     damaged = idle = 0
-    for k, raw in enumerate(whole(path, _LARGEST)[0].split(b"\n"), start=1):
+    data = whole(path, _LARGEST)[0].removeprefix(b"\xef\xbb\xbf")
+    for k, raw in enumerate(data.split(b"\n"), start=1):
         if not raw.startswith(tuple(one.encode() for one in _INSPVA)):
             continue
         body, _, check = raw.strip()[1:].partition(b"*")

@@ -226,7 +226,7 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
         "OpenVINS save_total_state: time, rotation with the scalar last, place, velocity",
         separator=" ",
         nav="ENU",
-        looks=_poses(1, (-1e9, 1e11), 17),
+        looks=_poses(1, (-1e9, 1e11), 11),
     )(
         _columns("timestamp(s)", "time", "s"),
         _columns("q_x, q_y, q_z, q_w", "q_x q_y q_z q_w"),
