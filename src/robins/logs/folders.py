@@ -187,7 +187,7 @@ def _phone(folder: Path, findings: Findings) -> Dataset:
         for k in range(3, 9):
             v[v[:, k] < 0.0, k] = np.nan  # what is not known
         gnss = fixes_of(str(path), fix_ns, v[:, :5], v[:, 5:], fix_rows)
-        if np.isnan(gnss.sigma_v).all():
+        if gnss.sigma_v is None or np.isnan(gnss.sigma_v).all():
             gnss = replace(gnss, v_n=None, sigma_v=None)
     name = folder.resolve().name
     return Dataset(name, imu, gnss, mag=mag, time_unit_known=(str(gyro_file),))
@@ -249,7 +249,8 @@ def _simulated(folder: Path, findings: Findings) -> Dataset:
         euler = of("ref_att_euler", *(rf"ref_{n} \(.*\)" for n in ("Roll", "Pitch", "Yaw")))
         q_nb = np.asarray(rotation.from_euler(*np.deg2rad(euler).T))
         place[:2] = np.deg2rad(place[:2])
-        truth = Trajectory(time_ns, *place, v_n, q_nb, source=str(folder / "ref_pos.csv"))
+        lat, lon, alt = place
+        truth = Trajectory(time_ns, lat, lon, alt, v_n, q_nb, source=str(folder / "ref_pos.csv"))
     return Dataset(folder.resolve().name, imu, gnss, truth, time_unit_known=(file,))
 
 

@@ -115,8 +115,9 @@ def read_sbet(path: str | os.PathLike[str], findings: Findings = None) -> Trajec
         q_nb = np.asarray(rotation.from_euler(*euler))
     time_ns = unrolled(np.round(v[:, 0] * 1e9).astype(np.int64))
     missing = np.full((count, 3), np.nan)
-    place = (v[:, k].astype(np.float64) for k in (1, 2, 3))
-    return Trajectory(time_ns, *place, missing, q_nb, source=file, rows=np.arange(1, count + 1))
+    lat, lon, alt = (v[:, k].astype(np.float64) for k in (1, 2, 3))
+    rows = np.arange(1, count + 1)
+    return Trajectory(time_ns, lat, lon, alt, missing, q_nb, source=file, rows=rows)
 
 
 def is_inspva(head: Head) -> bool:

@@ -127,11 +127,7 @@ def read_text(
             q: _si(f.column, f.unit, table.values[:, layout.number(f.place)])
             for q, f in numbers.items()
         }
-        | {
-            c.holds: _si(c, c.unit, np.full(len(table.rows), c.value))
-            for c in format.columns
-            if c.value is not None
-        },
+        | {c.holds: _si(c, c.unit, np.full(len(table.rows), c.value)) for c in format.stated},
         _times(file, texts, stamps, table.rows, format.rate_hz),
         table.rows,
         nav,
@@ -150,8 +146,9 @@ def read_text(
 
 def _si(column: Column, symbol: str, values: np.ndarray) -> np.ndarray:
     exact = column.scale == 1.0 and column.offset == 0.0
-    scaled = values if exact else values * column.scale + column.offset + 0.0  # no minus zero
-    return to_si(scaled, unit(symbol, QUANTITIES[column.holds])).copy()
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite: for `clean` to count
+        scaled = values if exact else values * column.scale + column.offset + 0.0  # no minus zero
+        return to_si(scaled, unit(symbol, QUANTITIES[column.holds])).copy()
 
 
 def _times(
@@ -218,7 +215,7 @@ def _tables(format: TextFormat, read: Read, origin: Origin | None, known: bool) 
     made = []
     for kind in format.kinds:
         own = {q for need in TABLES[kind].needs for q in parts(need)} & set(read.values)
-        own -= format.constants
+        own -= {column.holds for column in format.stated}
         if not own:
             continue
         part = read

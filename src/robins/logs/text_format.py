@@ -174,10 +174,10 @@ class TextFormat:
         """Whether columns are found by their names."""
         return not any(column.place for column in self.columns)
 
-    @cached_property
-    def constants(self) -> set[str]:
-        """Quantities that are stated here and in no column."""
-        return {column.holds for column in self.columns if column.value is not None}
+    @property
+    def stated(self) -> list[Column]:
+        """Constants, which are stated here and in no column of a file."""
+        return [column for column in self.columns if column.value is not None]
 
     @property
     def local(self) -> bool:
@@ -339,7 +339,7 @@ def columns_of(format: TextFormat, file: str, header: Header) -> dict[str, Found
         if (other := out.get(f.column.holds)) is not None:
             raise at()(f"{other.name} and {f.name} are the same thing", "keep one")
         out[f.column.holds] = f
-    used, lacking = sort_out(format, set(out) | format.constants)
+    used, lacking = sort_out(format, set(out) | {c.holds for c in format.stated})
     clocks = {"time", "time_of_week"} & format.quantities
     lacking |= clocks if not clocks & set(out) else set()
     if lacking:
@@ -368,34 +368,40 @@ def _dated(column: Column) -> bool:
     return column.holds == "time" and column.unit in DATES
 
 
+def _check_column(column: Column, source: str) -> None:
+    """Raise if a column cannot be one."""
+    at = partial(refused, source)
+    quantity, where = column.holds, f"columns.{column.holds}"
+    clock = quantity in ("time", "time_of_week")
+    if quantity not in QUANTITIES:
+        raise at(where)("is no quantity that a column can hold", one_of(quantity, QUANTITIES))
+    for symbol in () if _dated(column) else column.units:
+        try:
+            plain = symbol if symbol == ANY else unit(symbol, QUANTITIES[quantity]).symbol
+        except UnitError as error:
+            raise at(where, "unit", symbol)(str(error), "state one of these") from error
+        if clock and plain not in CLOCKS:
+            mend = f"record it in one of {', '.join(CLOCKS)}"
+            raise at(where, "unit", symbol)("is no unit of time stamps", mend)
+    numbers = (column.offset, 0.0 if column.value is None else column.value)
+    if not all(map(math.isfinite, numbers)):
+        raise at(where)("has an offset or value that is not finite", "give a number")
+    if column.value is not None and (clock or quantity == "week"):
+        raise at(where, "value", column.value)("is not for time", "state rate, such as 100 Hz")
+    if not (math.isfinite(column.scale) and column.scale):
+        mend = "give a number other than 0, such as -1"
+        raise at(where, "scale", column.scale)("cannot scale anything", mend)
+    if quantity == "week" and (column.scale, column.offset) != (1.0, 0.0):
+        raise at(where)("is scaled or offset", "state weeks since 1980 as they are")
+    if clock and column.scale < 0.0:
+        raise at(where, "scale", column.scale)("turns time back", "give a positive number")
+
+
 def _check(format: TextFormat) -> None:
     """Raise if a row cannot be one."""
     at = partial(refused, format.source or f"format {format.name}")
     for column in format.columns:
-        quantity, where = column.holds, f"columns.{column.holds}"
-        clock = quantity in ("time", "time_of_week")
-        if quantity not in QUANTITIES:
-            raise at(where)("is no quantity that a column can hold", one_of(quantity, QUANTITIES))
-        for symbol in () if _dated(column) else column.units:
-            try:
-                plain = symbol if symbol == ANY else unit(symbol, QUANTITIES[quantity]).symbol
-            except UnitError as error:
-                raise at(where, "unit", symbol)(str(error), "state one of these") from error
-            if clock and plain not in CLOCKS:
-                mend = f"record it in one of {', '.join(CLOCKS)}"
-                raise at(where, "unit", symbol)("is no unit of time stamps", mend)
-        numbers = (column.offset, 0.0 if column.value is None else column.value)
-        if not all(map(math.isfinite, numbers)):
-            raise at(where)("has an offset or value that is not finite", "give a number")
-        if column.value is not None and (clock or quantity == "week"):
-            raise at(where, "value", column.value)("is not for time", "state rate, such as 100 Hz")
-        if not (math.isfinite(column.scale) and column.scale):
-            mend = "give a number other than 0, such as -1"
-            raise at(where, "scale", column.scale)("cannot scale anything", mend)
-        if quantity == "week" and (column.scale, column.offset) != (1.0, 0.0):
-            raise at(where)("is scaled or offset", "state weeks since 1980 as they are")
-        if clock and column.scale < 0.0:
-            raise at(where, "scale", column.scale)("turns time back", "give a positive number")
+        _check_column(column, format.source or f"format {format.name}")
     held = [column.holds for column in format.columns]
     if twice := [q for q in held if held.count(q) > 1]:
         raise at(f"columns.{twice[0]}")("is held by two columns", "keep one")

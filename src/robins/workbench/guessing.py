@@ -14,7 +14,6 @@ import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from robins.dataset import ImuTable
 from robins.logs.archives import head_of
 from robins.logs.declared import format_of
 from robins.logs.quantities import GROUPS, QUANTITIES, parts
-from robins.logs.tables import tables_of
+from robins.logs.tables import Table, tables_of
 from robins.logs.text import Head
 from robins.units import KINDS, to_si
 from robins.workbench.errors import InputError
@@ -158,7 +157,7 @@ def _sheet(head: Head) -> tuple[list[str], str, str, list[list[str]]]:
 
 
 def _known(names: Sequence[str]) -> tuple[Columns, dict[str, str]]:
-    """What the names hold, and why others are left aside."""
+    """Quantities that the names hold, and the reasons to leave others aside."""
     found: Columns = {}
     aside: dict[str, str] = {}
     for name in names:
@@ -343,7 +342,7 @@ def _turned_by_gravity(imu: ImuTable) -> tuple[float, bool]:
     return float(a @ b) / energy, alike > 0.9
 
 
-def _objects(imu: ImuTable, others: list[Any], scale: float) -> bool:
+def _objects(imu: ImuTable, others: list[Table], scale: float) -> bool:
     """True if the doctor objects to the unit of the rates, times this."""
     found = logs.examine([replace(imu, gyro=imu.gyro * scale), *others])
     return any(finding.code == "gyro_unit" for finding in found)
