@@ -121,7 +121,7 @@ def run(
     out: Path | None,
     master: Path | None,
     slave: Path | None,
-    columns: tuple[Path, ...],
+    columns: tuple[Path | str, ...],
     **options: Any,
 ) -> None:
     """Simulate SCENARIO with several filters.
@@ -228,7 +228,7 @@ def replay(log: tuple[Path, ...], runs: int | None, out: Path | None, **options:
 @COLUMNS
 @answers
 def doctor(
-    log: tuple[Path, ...], write: Path | None, columns: tuple[Path, ...], as_json: bool
+    log: tuple[Path, ...], write: Path | None, columns: tuple[Path | str, ...], as_json: bool
 ) -> int:
     """Examine a log as an engineer would: units, axes, gravity, rates, gaps, time, sigmas.
 

@@ -31,7 +31,7 @@ def warn(findings: Sequence[Any]) -> None:
 
 
 def judge(
-    log: Sequence[Path], columns: Sequence[Path], as_json: bool, write: Path | None = None
+    log: Sequence[Path], columns: Sequence[Path | str], as_json: bool, write: Path | None = None
 ) -> Status:
     """Print what there is and the findings; bad input if a run on this log would be wrong.
 
@@ -49,7 +49,7 @@ def judge(
     return Status.BAD_INPUT if found.counts["error"] else Status.DONE
 
 
-def _text(found: Any, log: Sequence[Path], columns: Sequence[Path]) -> str:
+def _text(found: Any, log: Sequence[Path], columns: Sequence[Path | str]) -> str:
     lines = []
     for table in found.tables:
         rate = f" at {table['rate_hz']:.4g} Hz" if table["rate_hz"] else ""

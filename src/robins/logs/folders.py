@@ -58,9 +58,9 @@ def read_folder(path: str | os.PathLike[str], findings: Findings = None) -> Data
         for place in (folder, folder / "mav0", folder / "oxts"):
             if (place / mark).exists():
                 return read(place, findings)
-    held = ", ".join(sorted(p.name for p in folder.iterdir())[:20]) or "nothing"
-    known = "imu0/data.csv (EuRoC), timestamps.txt (KITTI oxts), Gyroscope.csv (phones)"
-    raise LogError(str(path), f"is a folder with {held}", f"give its files, or one with {known}")
+    held = ", ".join(sorted(p.name for p in folder.iterdir())[:5]) or "nothing"
+    marks = ", ".join(_FOLDERS)
+    raise LogError(str(path), f"is a folder with {held}", f"give files, or one with {marks}")
 
 
 def _table(path: Path, clock: str, names: Sequence[str], findings: Findings) -> Columns:

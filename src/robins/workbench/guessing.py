@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -338,7 +339,7 @@ def _turned_by_gravity(imu: ImuTable) -> tuple[float, bool]:
     energy = float(b @ b)
     if not energy:
         return 0.0, False
-    alike = float(a @ b) / np.sqrt(energy * max(float(a @ a), 1e-300))
+    alike = float(a @ b) / math.sqrt(energy * max(float(a @ a), 1e-300))
     return float(a @ b) / energy, alike > 0.9
 
 
