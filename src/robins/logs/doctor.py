@@ -84,6 +84,8 @@ OF_READERS = (
     Code("angle_range", "warning", "single angles that cannot be; they are taken as missing"),
     Code("quaternion_length", "warning", "single quaternions of another length; likewise"),
     Code("other_kinds", "note", "a file holds lines of kinds that are not read"),
+    Code("lines_left_out", "warning", "lines that fail their checksum, or of an idle receiver"),
+    Code("fixes_of_truth", "note", "fixes and path are one solution, of the same receiver"),
 )
 
 _OF_VELOCITY = (

@@ -22,7 +22,7 @@ import numpy as np
 
 from robins import rotation
 from robins.dataset import Trajectory
-from robins.logs.findings import Finding, LogError, refused, report, telling
+from robins.logs.findings import Finding, LogError, refused, telling
 from robins.logs.mounting import LocalPath, from_local
 from robins.logs.opening import whole
 from robins.logs.read_text import NOWHERE
@@ -153,8 +153,9 @@ def read_inspva(path: str | os.PathLike[str], findings: Findings = None) -> Traj
         clocks.append(fields[:2])
     for count, what in ((damaged, "are cut or fail their checksum"), (idle, "are not aligned")):
         if count:
-            sentence = f"{Path(file).name}: {count} INSPVA lines {what} and are left out."
-            report(findings, Finding("warning", "lines_left_out", file, "", count, sentence))
+            telling(findings, "warning", "lines_left_out", file, value=count)(
+                f"{count} INSPVA lines {what} and are left out."
+            )
     if not rows:
         raise LogError(file, "holds no whole INSPVA line of an aligned unit", "record it again")
     v, at, clock = np.array(numbers), np.array(rows), np.array(clocks, "S40")
