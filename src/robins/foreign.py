@@ -191,7 +191,9 @@ def array_of(raw: bytes, name: str, refuse: Refuse) -> np.ndarray:
 
 
 def arrays_of_hdf5(content: bytes, refuse: Refuse) -> dict[str, np.ndarray]:
-    """Arrays of numbers of an HDF5 file by path; links to other files lead nowhere.
+    """Arrays of numbers of an HDF5 file by path, and numbers among its own attributes.
+
+    Links to other files lead nowhere.
 
     Raises:
         RobinsError: as `refuse` makes it: it is damaged, or declares more than it holds.
@@ -213,7 +215,8 @@ def arrays_of_hdf5(content: bytes, refuse: Refuse) -> dict[str, np.ndarray]:
 
     with decoding(refuse), h5py.File(io.BytesIO(content), "r") as file:
         file.visititems(keep)
-    return out
+        stated = {name: np.asarray(file.attrs[name]) for name in file.attrs}
+    return {name: one for name, one in stated.items() if one.dtype.kind in "biuf"} | out
 
 
 def columns_of_parquet(content: bytes, refuse: Refuse) -> dict[str, np.ndarray]:

@@ -204,6 +204,8 @@ def test_broad_in_all_its_archives(tmp_path):
     with h5py.File(tmp_path / "trial.hdf5", "w") as file:
         for name, array in arrays.items():
             file[name] = array
+        file.attrs["sampling_rate"] = file["sampling_rate"][()]  # as in those published
+        del file["sampling_rate"]
     np.savez(tmp_path / "trial.npz", **arrays)
     trials = [open_log(tmp_path / f"trial.{end}") for end in ("npz", "mat", "hdf5")]
     for trial in trials:

@@ -64,8 +64,8 @@ def _text(found: Any, log: Sequence[Path], columns: Sequence[Path | str]) -> str
         return "\n".join(
             [*lines, "Next:   mend the errors; a run on this log would be wrong or meaningless"]
         )
-    # Without fixes there is no position, but an attitude.
+    # Without fixes there is no position, but with a magnetic field an attitude.
     kinds = {table["kind"] for table in found.tables}
-    system = "" if "gnss" in kinds else " --system marg"
+    system = " --system marg" if "mag" in kinds and "gnss" not in kinds else ""
     words = shlex.join(map(str, [*log, *typed(columns)]))
     return "\n".join([*lines, f"Next:   robins replay {words}{system}"])
