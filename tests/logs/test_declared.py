@@ -261,6 +261,7 @@ def test_the_name_of_a_format_is_for_files_that_are_not_recognised(tmp_path):
         (('name = "t"', "value = 3"), "columns.time: value = 3.0: is not for time; state rate"),
         (('name = "wx"', 'name = "a", value = 3'), "gyro_x: has both name and value; state"),
         (("body", 'rate = "100"\nbody'), "own.toml: rate: '100' has no unit; .*; give it like"),
+        (("body", 'rate = "1 MHz"\nbody'), "rate = 1000000.0: is not between 0.1 and 100000 Hz"),
         (("body", 'rate = "100 Hz"\nbody'), "columns: there is no time, or there are two; state"),
         (("body", 'decimal = ";"\nbody'), 'own.toml: decimal = \';\': cannot be the sign of dec'),
         (('name = "wx"', 'nam = "wx"'), r"gyro_x.nam: is not a known key; did you mean name\?"),

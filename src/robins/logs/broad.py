@@ -24,11 +24,11 @@ from robins.logs.archives import arrays_in, kind_of_archive, names_in
 from robins.logs.findings import Finding, LogError, refused
 from robins.logs.tables import unit_quaternions
 from robins.logs.text import Head
+from robins.logs.text_format import RATES_HZ
 from robins.units import to_si
 
 _COLUMNS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4}
 _NAMES = (*_COLUMNS, "movement", "sampling_rate")
-_RATES_HZ = (0.1, 1e5)
 
 
 def is_broad(head: Head) -> bool:
@@ -90,9 +90,9 @@ def _rate(file: str, value: np.ndarray) -> float:
     if value.size != 1 or value.dtype.kind not in "fiu":
         raise _misfit(file, "sampling_rate", value, "() of a real number")
     rate = float(value.reshape(()))
-    if not _RATES_HZ[0] <= rate <= _RATES_HZ[1]:
+    if not RATES_HZ[0] <= rate <= RATES_HZ[1]:
         raise refused(file, field="sampling_rate", value=rate)(
-            f"is not between {_RATES_HZ[0]:g} and {_RATES_HZ[1]:g} Hz, and time is made from it",
+            f"is not between {RATES_HZ[0]:g} and {RATES_HZ[1]:g} Hz, and time is made from it",
             "give samples a second",
         )
     return rate

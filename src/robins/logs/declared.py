@@ -163,7 +163,8 @@ def formats_of(files: Paths, columns: Paths) -> dict[str, str | TextFormat]:
             raise LogError(row.source, "its columns fit none of the files", mend)
     for name in names:
         called(name, "--format")
-        open_ones = [f for f in (os.fspath(file) for file in files) if f not in out]
+        plain = (os.fspath(file) for file in files if not os.path.isdir(file))
+        open_ones = [file for file in plain if file not in out]
         meant = [f for f in open_ones if len(open_ones) == 1 or len(fitting(f)[1]) != 1]
         if not meant:
             raise LogError(f"--format {name}", "all files are recognised", "omit the name")

@@ -39,7 +39,14 @@ from robins.logs.text_format import (
     header_of,
     tick_of,
 )
-from robins.logs.timebase import WEEK_NS, dates_to_ns, stamps_to_ns, unrolled, weeks_of
+from robins.logs.timebase import (
+    LIMIT_NS,
+    WEEK_NS,
+    dates_to_ns,
+    stamps_to_ns,
+    unrolled,
+    weeks_of,
+)
 from robins.units import from_si, to_si, unit
 
 NOWHERE = Origin(0.0, 0.0, 0.0)
@@ -167,7 +174,12 @@ def _times(
     else:
         exponent = CLOCKS[unit(symbol).symbol]
         time_ns = stamps_to_ns(file, name, stamps[clock], rows, *tick_of(column, symbol))
-    time_ns = time_ns + round(Decimal(repr(column.offset)).scaleb(exponent))
+    shift = round(Decimal(repr(column.offset)).scaleb(exponent))
+    if abs(shift) >= LIMIT_NS:
+        raise refused(file, field=name, value=column.offset)(
+            "is an offset of 146 years or more", "give it in the unit of the column"
+        )
+    time_ns = time_ns + shift
     if clock == "time":
         return time_ns
     if "week" in stamps:

@@ -72,6 +72,9 @@ class Axes(NamedTuple):
         return v[:, self.component] * self.sign
 
 
+RATES_HZ = (0.1, 1e5)
+"""Rates of which a recording is believed, where its time is made from it."""
+
 _ABOVE = 40  # lines among which a header is looked for
 _LETTER = re.compile("[A-Za-z]")
 
@@ -407,11 +410,12 @@ def _check(format: TextFormat) -> None:
         raise at(f"columns.{twice[0]}")("is held by two columns", "keep one")
     if len({column.place > 0 for column in format.columns if column.value is None}) > 1:
         raise at("columns")("some have names and some have places", "give all the same way")
+    if format.rate_hz and not RATES_HZ[0] <= format.rate_hz <= RATES_HZ[1]:
+        between = f"is not between {RATES_HZ[0]:g} and {RATES_HZ[1]:g} Hz"
+        raise at("", "rate", format.rate_hz)(between, "give rows a second, such as 100 Hz")
     if len({"time", "time_of_week"} & format.quantities) != (0 if format.rate_hz else 1):
         mend = "state one column as time, or a rate of the rows"
         raise at("columns")("there is no time, or there are two", mend)
-    if not (math.isfinite(format.rate_hz) and format.rate_hz >= 0.0):
-        raise at("", "rate", format.rate_hz)("is no rate of rows", "give one, such as 100 Hz")
     if "week" in format.quantities and "time" in format.quantities:
         raise at("columns.week")("needs the second of that week", "state time_of_week")
     kinds = format.kinds
