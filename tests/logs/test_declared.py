@@ -266,6 +266,7 @@ def test_the_name_of_a_format_is_for_files_that_are_not_recognised(tmp_path):
         (("body", 'decimal = ";"\nbody'), 'own.toml: decimal = \';\': cannot be the sign of dec'),
         (('name = "wx"', 'nam = "wx"'), r"gyro_x.nam: is not a known key; did you mean name\?"),
         (('name = "wx"', "place = 0"), "columns.gyro_x: place = 0: is less than 1; count"),
+        (('name = "wx"', f"place = {10**19}"), "gyro_x: place = 10*: is beyond 10000; count"),
         (('name = "wx"', "place = 3"), "columns: some have names and some have places"),
         (('name = "wx"', 'name = "a", place = 3'), "columns.gyro_x: has both name and place"),
         (('name = "wx", ', ""), "columns.gyro_x: has neither name nor place"),

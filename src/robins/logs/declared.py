@@ -45,6 +45,7 @@ _KEYS: Types = {"columns": (dict,), "separator": (str,), "skip": (int,)}
 _KEYS |= {"body": (str,), "nav": (str,), "rate": (str,), "decimal": (str,)}
 _COLUMN: Types = {"name": (str,), "place": (int,), "unit": (str,), "scale": (int, float)}
 _COLUMN |= {"offset": (int, float), "value": (int, float)}
+_WIDEST = 10_000  # columns
 _MANY = re.compile(r"([-+]?\d+\.?\d*(?:[eE][-+]?\d+)?) (.+)")
 _WORDS = {dict: "a table", str: "text", int: "a whole number", float: "a number"}
 
@@ -102,8 +103,9 @@ def _column(file: str, quantity: str, stated: Any) -> Column:
         mend = "state the name in the header, or the place from 1 where there is none"
         both = f"both {' and '.join(ways)}" if ways else "neither name nor place"
         raise refused(file, key)(f"has {both}", mend)
-    if stated.get("place", 1) < 1:
-        raise refused(file, key, "place", stated["place"])("is less than 1", "count from 1")
+    if not 1 <= (place := stated.get("place", 1)) <= _WIDEST:
+        wrong = "is less than 1" if place < 1 else f"is beyond {_WIDEST}"
+        raise refused(file, key, "place", place)(wrong, "count from 1")
     kind = QUANTITIES.get(quantity, "ratio")
     if kind != "ratio" and "unit" not in stated:
         mend = f"state one of {', '.join(KINDS[kind])}"
