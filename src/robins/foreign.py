@@ -14,16 +14,28 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+import struct
 import warnings
 import zipfile
+import zlib
 from collections.abc import Callable, Collection, Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robins.errors import RobinsError
 
+if TYPE_CHECKING:
+    import h5py
+
 FREE = 64 << 20  # bytes
 RATIO = 200
+_MAT_START = 128  # bytes of the header of MATLAB v5
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
+_NUMBERS |= {12: "i8", 13: "u8"}  # types of its elements
+_MATRIX, _COMPRESSED = 14, 15
+_STRUCT, _NUMERIC = 2, range(6, 16)  # classes of matrices
+_COMPLEX, _DEEPEST = 0x800, 8
 
 Refuse = Callable[[str], RobinsError]
 """Makes the error of a room from the reason."""
@@ -133,7 +145,7 @@ def arrays_of(
         within(declared, len(content), f"up to {name!r} it", refuse)
         if name in arrays or member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise refuse(f"{name!r} is there twice, or packed as NumPy does not pack")
-        arrays[name] = _array(_member(archive, member, refuse), name, refuse)
+        arrays[name] = array_of(_member(archive, member, refuse), name, refuse)
     return arrays
 
 
@@ -146,8 +158,12 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, refuse: Refuse) -
         return file.read(member.file_size)
 
 
-def _array(raw: bytes, name: str, refuse: Refuse) -> np.ndarray:
-    """Array of the bytes of a ``.npy`` file."""
+def array_of(raw: bytes, name: str, refuse: Refuse) -> np.ndarray:
+    """Array of the bytes of a ``.npy`` file.
+
+    Raises:
+        RobinsError: as `refuse` makes it: it is cut or damaged, or holds objects.
+    """
     file = io.BytesIO(raw)
     with (
         decoding(lambda why: refuse(f"{name!r} is no array of NumPy: {why}")),
@@ -172,3 +188,128 @@ def _array(raw: bytes, name: str, refuse: Refuse) -> np.ndarray:
     with decoding(lambda why: refuse(f"{name!r} is no array of NumPy: {why}")):
         flat = np.frombuffer(raw, dtype, offset=file.tell())
         return flat.reshape(shape, order="F" if fortran else "C").copy(order="K")
+
+
+def arrays_of_hdf5(content: bytes, refuse: Refuse) -> dict[str, np.ndarray]:
+    """Arrays of numbers of an HDF5 file by path, and numbers among its own attributes.
+
+    Links to other files lead nowhere.
+
+    Raises:
+        RobinsError: as `refuse` makes it: it is damaged, or declares more than it holds.
+    """
+    import h5py
+
+    out: dict[str, np.ndarray] = {}
+    declared = 0
+
+    def keep(name: str, item: h5py.Dataset | h5py.Group) -> None:
+        nonlocal declared
+        if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "biuf":
+            return
+        if item.is_virtual or item.external:
+            return
+        declared += item.nbytes
+        within(declared, len(content), f"up to {name!r} it", refuse)
+        out[name] = np.asarray(item[()])
+
+    with decoding(refuse), h5py.File(io.BytesIO(content), "r") as file:
+        file.visititems(keep)
+        stated = {name: np.asarray(file.attrs[name]) for name in file.attrs}
+    return {name: one for name, one in stated.items() if one.dtype.kind in "biuf"} | out
+
+
+def columns_of_parquet(content: bytes, refuse: Refuse) -> dict[str, np.ndarray]:
+    """Columns of numbers and dates of a Parquet file.
+
+    Raises:
+        RobinsError: as `refuse` makes it: it is damaged, declares more than it holds, or the
+            package `pyarrow` is not installed.
+    """
+    try:
+        from pyarrow import parquet, types
+    except ImportError as error:
+        raise refuse("no package for Parquet is there: pip install 'robins[parquet]'") from error
+    with decoding(refuse):
+        opened = parquet.ParquetFile(io.BytesIO(content))
+        meta, schema = opened.metadata, opened.schema_arrow
+        tests = (types.is_integer, types.is_floating, types.is_timestamp, types.is_boolean)
+        plain = [f.name for f in schema if any(test(f.type) for test in tests)]
+        within(8 * meta.num_rows * max(len(plain), 1), len(content), "it", refuse)
+        table = opened.read(columns=plain)
+        return {name: table.column(name).to_numpy() for name in plain}
+
+
+def arrays_of_matlab(content: bytes, refuse: Refuse) -> dict[str, np.ndarray]:
+    """Real arrays of a MATLAB v5 file, those of structs as ``outer/name``.
+
+    Elements are those of MathWorks' "MAT-File Level 5 File Format". SciPy is not used: it takes
+    the memory that a damaged cell array declares, and follows structs as deep as the stack allows.
+
+    Raises:
+        RobinsError: as `refuse` makes it: it is damaged, or unpacks to more than measurements do.
+    """
+    order = {b"IM": "<", b"MI": ">"}.get(content[126:128], "")
+    if not order:
+        raise refuse("its header has no mark of the order of bytes")
+    out: dict[str, np.ndarray] = {}
+    room = largest(len(content))
+    for kind, body in _elements(content[_MAT_START:], order, refuse):
+        if kind == _COMPRESSED:
+            with decoding(refuse):
+                plain = zlib.decompressobj().decompress(body, room + 1)
+            room -= len(plain)
+            if room < 0:
+                raise refuse(f"it unpacks to more than {largest(len(content))} bytes")
+            kind, body = next(_elements(plain, order, refuse), (0, b""))
+        if kind == _MATRIX:
+            _matrix(body, order, refuse, out)
+    return out
+
+
+def _elements(data: bytes, order: str, refuse: Refuse) -> Iterator[tuple[int, bytes]]:
+    """Type and content of the data elements of a body, short ones too."""
+    at = 0
+    while at + 8 <= len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, at)
+        short = kind >> 16
+        if short:
+            kind, size, start, step = kind & 0xFFFF, short, at + 4, 8
+        else:
+            start, step = at + 8, 8 + size + (-size % 8 if kind != _COMPRESSED else 0)
+        if start + size > len(data) or (short and size > 4):
+            raise refuse(f"an element declares {size} bytes, and {len(data) - start} are there")
+        yield kind, data[start : start + size]
+        at += step
+
+
+def _matrix(
+    body: bytes,
+    order: str,
+    refuse: Refuse,
+    out: dict[str, np.ndarray],
+    outer: str = "",
+    given: str = "",
+    depth: int = 0,
+) -> None:
+    """Put the real arrays of a matrix or struct under their names; pass other classes over."""
+    parts = list(_elements(body, order, refuse))
+    if len(parts) < 4 or len(parts[0][1]) < 4:
+        return
+    flags = int.from_bytes(parts[0][1][:4], "little" if order == "<" else "big")
+    sizes = np.frombuffer(parts[1][1][: len(parts[1][1]) // 4 * 4], f"{order}i4").tolist()
+    name = outer + (parts[2][1].decode("latin1") or given)
+    kind, raw = parts[3]
+    if flags & 0xFF in _NUMERIC and not flags & _COMPLEX:
+        if kind not in _NUMBERS or len(raw) != math.prod(sizes) * int(_NUMBERS[kind][1]):
+            raise refuse(f"{name!r} holds {len(raw)} bytes where {sizes} numbers are declared")
+        values = np.frombuffer(raw, order + _NUMBERS[kind])
+        if name in out or min(sizes) < 0:
+            raise refuse(f"{name!r} is there twice, or of a negative size")
+        out[name] = values.reshape(sizes, order="F")
+    elif flags & 0xFF == _STRUCT and sizes == [1, 1] and depth < _DEEPEST and len(parts) > 4:
+        width = max(int.from_bytes(raw, "little" if order == "<" else "big"), 1)
+        keys = [parts[4][1][k : k + width] for k in range(0, len(parts[4][1]), width)]
+        for key, (_, inner) in zip(keys, parts[5:], strict=False):
+            field = key.split(b"\0")[0].decode("latin1")
+            _matrix(inner, order, refuse, out, f"{name}/", field, depth + 1)

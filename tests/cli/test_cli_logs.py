@@ -374,3 +374,30 @@ def test_declared_columns_are_read_by_the_commands_and_refused_with_their_key(ro
         assert answer.status == Status.BAD_INPUT
         assert f"{declared} columns.gyro_w: is no quantity" in answer.err.replace("\n", " ")
         assert "did you mean gyro_" in answer.err
+
+
+def test_a_table_is_guessed_declared_and_examined_and_a_path_named(robins, tmp_path):
+    log, table = tmp_path / "my own.csv", a_still_imu(20.0)
+    columns = [table.time_ns / 1e9, table.accel / 9.80665, table.gyro]
+    rows = np.column_stack(columns).tolist()
+    lines = [";".join(map(repr, row)) for row in rows]
+    log.write_text("\n".join(["t;ax;ay;az;wx (rad/s);wy (rad/s);wz (rad/s)", *lines]) + "\n")
+    answer = robins("guess", log)
+    assert answer.status == Status.DONE, answer.err
+    assert 'unit = "g" }   # proved by gravity: median size 1' in answer.out
+    assert f"robins doctor '{log}' --columns columns.toml" in answer.err
+    (tmp_path / "columns.toml").write_text(answer.out)
+    answer = robins("doctor", log, "--columns", "columns.toml")
+    assert answer.status == Status.DONE, answer.out
+    assert json.loads(robins("guess", log, "--json").out)["toml"].startswith("# my own.csv")
+    path = tmp_path / "path.txt"
+    path.write_text(
+        "".join(f"{k}00000000,0,0,{k},0,0,0,1,9\n" for k in range(30)).replace(",", " ")
+    )
+    answer = robins("doctor", path, "--format", "orbslam-euroc")
+    assert answer.status == Status.DONE, answer.err
+    assert "30 rows" in answer.out
+    assert f"robins replay {path} --format orbslam-euroc" in answer.out
+    answer = robins("doctor", path, "--format", "orbslam")
+    assert answer.status == Status.BAD_INPUT
+    assert "no format is called 'orbslam'; choose one of gnss-imu" in answer.err.replace("\n", " ")

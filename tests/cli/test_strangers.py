@@ -103,6 +103,7 @@ HARMLESS = (
     "replay log.csv study.toml --out o",
     "replay log.csv --columns columns.toml --out o",
     "doctor log.csv --columns columns.toml",
+    "guess log.csv",
     "allan log.csv --columns columns.toml --out o",
     "calibrate log.csv --columns columns.toml --out o",
     "design study.toml --out o",

@@ -1,6 +1,8 @@
 """The beginning of a file of every format, by its name."""
 
 import made_binary
+import made_wild as wild
+import numpy as np
 from made_nine_axis import broad_bytes
 from made_rosbag import drive, rosbag
 from made_ulog import flight
@@ -68,6 +70,16 @@ SAMPLES = {
     "named-imu": NAMED_IMU,
     "named-path": NAMED_PATH,
     "xio-csv": XIO,
+    "orbslam-euroc": wild.ORBSLAM,
+    "openvins-state": wild.OPENVINS,
+    "kitti-odometry": wild.KITTI,
+    "novatel-inspva": wild.INSPVA,
+    "xsens-mt": wild.XSENS_MT,
+    "xsens-dot": wild.XSENS_DOT,
+    "microstrain-csv": wild.MICROSTRAIN,
+    "vectornav-csv": wild.VECTORNAV,
+    "sbet": wild.SBET,
+    "arrays": wild.bytes_of(np.savez, **wild.named()),
     "phone-csv": PHONE,
     "broad-npz": broad_bytes(),
     "px4-ulog": flight(0.1)[0],

@@ -164,6 +164,77 @@ def test_columns_decide_which_table_it_is(tmp_path, columns, kind):
             np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-9)
 
 
+def test_dates_counts_constants_rates_offsets_and_decimal_commas(own):
+    """What loggers do to time and numbers, each by hand."""
+
+    def read(toml, rows):
+        declared, log = own(toml, LOG.splitlines()[0] + "\n" + rows)
+        row = columns_from(declared)
+        with pytest.raises(LogError, match="such a format is only read"):
+            write_log(log.parent / "x.csv", open_log(log, row), row)
+        return open_log(log, row)
+
+    cells = ";1;m;2;3;0;0;2000\n"
+    dated = TOML.replace('"ms"', '"iso"')
+    times = read(
+        dated, f"2025-06-11T22:34:27.5+02:00{cells}2025-06-11 16:04:29-0430{cells}"
+    ).time_ns
+    assert (times - 1_749_674_085 * 10**9).tolist() == [500_000_000, 2_000_000_000]
+    for unit, leap in (("iso UTC", 18), ("iso GPS", 0)):
+        (time,) = read(dated.replace('"iso"', f'"{unit}"'), f"2025-06-11 20:34:27{cells}").time_ns
+        assert time == (1_749_674_067 + leap) * 10**9
+    declared, log = own(dated, LOG.splitlines()[0] + f"\n2025-06-11 20:34:27{cells}")
+    with pytest.raises(LogError, match=r"t = '2025.*': is not a date and time with its"):
+        open_log(log, columns_from(declared))
+    rate = 'rate = "50 Hz"\n' + TOML.replace('time = { name = "t", unit = "ms" }\n', "")
+    rate = rate.replace('{ name = "wy", unit', "{ value = 7, unit")
+    imu = read(rate, cells[1:].join(["t;"] * 3) + cells[1:])
+    assert imu.time_ns.tolist() == [0, 20_000_000, 40_000_000]
+    np.testing.assert_allclose(np.rad2deg(imu.gyro[:, 1]), -7.0)
+    comma = 'decimal = ","\n' + TOML.replace("scale = 0.5", "scale = 0.5, offset = -100")
+    comma = comma.replace('unit = "ms"', 'unit = "ms", offset = 0.25')
+    imu = read(comma, "1,5;0,5;a,b;2;3;0,25;0;2000,5\n")
+    assert imu.time_ns.tolist() == [1_750_000]
+    np.testing.assert_allclose(np.rad2deg(imu.gyro[0, 0]), 0.5)
+    np.testing.assert_allclose(imu.accel[0, 2] / 9.80665e-3, -(2000.5 * 0.5 - 100))
+
+
+@pytest.mark.parametrize(("unit", "stamp", "ns"), [
+    ("0.1 ms", "12345", 1_234_500_000), ("39.0625 us", "3", 117_188), ("39.0625 us", "1.6", 62_500),
+    ("10 ns", "7.5", 75), ("1e-3 ms", "2", 2_000), ("2 s", "1756402240.5", 3_512_804_481 * 10**9),
+])  # fmt: skip
+def test_a_stamp_counts_so_many_of_a_unit_exactly(own, unit, stamp, ns):
+    declared, log = own(TOML.replace('"ms"', f'"{unit}"'))
+    log.write_text(LOG.splitlines()[0] + f"\n{stamp};1;m;2;3;0;0;2000\n")
+    row = columns_from(declared)
+    imu = open_log(log, row)
+    assert imu.time_ns.tolist() == [ns]
+    write_log(log, imu, row)
+    assert open_log(log, row).time_ns.tolist() == [ns]
+
+
+def test_lines_above_a_header_are_passed_over(own):
+    above = "Logger 3.1\nserial;0042\nrange;16 g\n\n"
+    declared, log = own(log=above + LOG)
+    imu = load_dataset([log], formats=formats_of([log], [declared])).imu
+    assert imu.rows.tolist() == [6, 7, 8, 9, 10]
+
+
+def test_the_name_of_a_format_is_for_files_that_are_not_recognised(tmp_path):
+    known = tmp_path / "imu.csv"
+    known.write_text(
+        "time_s,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,accel_x_g,accel_y_g,accel_z_g\n0,0,0,0,0,0,-1\n"
+    )
+    rows = tmp_path / "path"
+    rows.write_text("1 2 3\n")
+    assert formats_of([known, rows], ["format:tum"]) == {str(rows): "tum"}
+    assert formats_of([known], ["format:tum"]) == {str(known): "tum"}
+    with pytest.raises(LogError, match="no format is called 'tmu'; choose one of"):
+        formats_of([rows], ["format:tmu"])
+    with pytest.raises(LogError, match="--format tum: all files are recognised; omit the name"):
+        formats_of([known, known], ["format:tum"])
+
+
 # ------------------------------------------------------------------------------------- refusals
 
 
@@ -185,9 +256,17 @@ def test_columns_decide_which_table_it_is(tmp_path, columns, kind):
         ((', unit = "g" }', " }"), "columns.accel_x: has no unit; state one of m/s"),
         (("scale = 0.5", "scale = 0"), "columns.accel_z: scale = 0.0: cannot scale anything"),
         (("scale = 0.5", "scale = true"), "columns.accel_z.scale = True: is not a number"),
-        (("scale = 0.5", "offset = 2"), "accel_z.offset: is not a known key; choose one of name"),
+        (("scale = 0.5", "bias = 2"), "accel_z.bias: is not a known key; choose one of name"),
+        (("scale = 0.5", "offset = nan"), "columns.accel_z: has an offset or value that is not"),
+        (('name = "t"', "value = 3"), "columns.time: value = 3.0: is not for time; state rate"),
+        (('name = "wx"', 'name = "a", value = 3'), "gyro_x: has both name and value; state"),
+        (("body", 'rate = "100"\nbody'), "own.toml: rate: '100' has no unit; .*; give it like"),
+        (("body", 'rate = "1 MHz"\nbody'), "rate = 1000000.0: is not between 0.1 and 100000 Hz"),
+        (("body", 'rate = "100 Hz"\nbody'), "columns: there is no time, or there are two; state"),
+        (("body", 'decimal = ";"\nbody'), 'own.toml: decimal = \';\': cannot be the sign of dec'),
         (('name = "wx"', 'nam = "wx"'), r"gyro_x.nam: is not a known key; did you mean name\?"),
         (('name = "wx"', "place = 0"), "columns.gyro_x: place = 0: is less than 1; count"),
+        (('name = "wx"', f"place = {10**19}"), "gyro_x: place = 10*: is beyond 10000; count"),
         (('name = "wx"', "place = 3"), "columns: some have names and some have places"),
         (('name = "wx"', 'name = "a", place = 3'), "columns.gyro_x: has both name and place"),
         (('name = "wx", ', ""), "columns.gyro_x: has neither name nor place"),

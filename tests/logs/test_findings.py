@@ -12,6 +12,7 @@ from finding_tables import findings as documented
 from log_samples import EUROC_TRUTH, KFGINS_IMU, RTKLIB
 from made_spoilt import tumble
 from made_ulog import flight
+from made_wild import INSPVA, OXTS
 from spoilt import HEALTHY, SPOILT
 
 import robins.logs
@@ -114,6 +115,16 @@ FILES = (
         "note: velocities of 4 of 4 fixes are those of /vel",
         made_binary.content(made_binary.folder, "drive"),
     ),
+    (
+        "lines_left_out",
+        "warning: 1 INSPVA lines are cut or fail their checksum and are left out",
+        INSPVA + INSPVA.replace("108", "109"),
+    ),
+    (
+        "fixes_of_truth",
+        "note: fixes and path are both the solution of the OXTS unit",
+        {"data/0.txt": OXTS, "timestamps.txt": "2011-09-26 13:02:25.964389445\n"},
+    ),
 )
 
 
@@ -166,7 +177,9 @@ def test_what_a_reader_leaves_out_is_found(tmp_path, code, says, content):
     if code == "several_instances":
         pytest.importorskip("pyulog", reason="the extra `logs` is not installed")
     path = tmp_path / "log.txt"
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    for name, text in content.items() if isinstance(content, dict) else [("", content)]:
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        (path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
     found = []
     (read_librsf if code == "other_kinds" else open_log)(path, findings=found)
     (f,) = found

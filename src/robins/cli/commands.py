@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from robins.cli.options import (
     folder_name,
     log_name,
     publishes,
+    typed,
 )
 from robins.cli.sensitivity import sensitivity
 from robins.cli.tell import carry_out, say
@@ -48,6 +50,7 @@ Examples:
   robins sensitivity my.toml --vary "gnss.sigma=1 m to 5 m" --vary "start.tilt=1 deg to 5 deg"
   robins bound ins-gnss/drive                    how accurate can these sensors be at best?
   robins doctor imu.csv gnss.pos                 can my log be navigated?
+  robins guess my.csv > columns.toml             declare the columns of any other table
   robins replay imu.csv gnss.pos --out walk      navigate it
   robins allan still.csv                         noise parameters of my IMU
   robins calibrate turned.csv                    hard and soft iron of my magnetometer
@@ -118,7 +121,7 @@ def run(
     out: Path | None,
     master: Path | None,
     slave: Path | None,
-    columns: tuple[Path, ...],
+    columns: tuple[Path | str, ...],
     **options: Any,
 ) -> None:
     """Simulate SCENARIO with several filters.
@@ -131,7 +134,7 @@ def run(
     """
     if master is None and slave is None:
         if columns:
-            where = f"--columns {columns[0]}"
+            where = " ".join(typed(columns[:1]))
             raise InputError("the option is for logs", where, "give --master and --slave too.")
         carry_out("run", scenario, out=out or RESULTS / folder_name(scenario), **options)
         return
@@ -225,7 +228,7 @@ def replay(log: tuple[Path, ...], runs: int | None, out: Path | None, **options:
 @COLUMNS
 @answers
 def doctor(
-    log: tuple[Path, ...], write: Path | None, columns: tuple[Path, ...], as_json: bool
+    log: tuple[Path, ...], write: Path | None, columns: tuple[Path | str, ...], as_json: bool
 ) -> int:
     """Examine a log as an engineer would: units, axes, gravity, rates, gaps, time, sigmas.
 
@@ -236,6 +239,25 @@ def doctor(
     velocities, noise at rest) becomes a configuration for `robins replay`.
     """
     return judge(log, columns, as_json, write)
+
+
+@app.command(
+    short_help="Guess the columns of a table that is in no known format.",
+    epilog=examples("robins guess my.csv > columns.toml"),
+)
+@click.argument("log", type=LOGS)
+@answers
+def guess(log: Path, as_json: bool) -> None:
+    """Print TOML that declares the columns of LOG, for the option --columns of other commands.
+
+    Headings tell what columns hold. Units that they do not state are proved by gravity, by the
+    field of the Earth and by the doctor; what is only likely is marked GUESSED in a comment, and
+    what is not known is left out.
+    """
+    text = importlib.import_module("robins.workbench").guess(log)
+    say({"toml": text}, text.rstrip("\n"), as_json)
+    words = shlex.join(["robins", "doctor", str(log), "--columns", "columns.toml"])
+    click.echo(f"Next:   save it as columns.toml, check what is GUESSED, then {words}", err=True)
 
 
 @app.command(

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from robins.cli.frame import Status, only_json
+from robins.cli.options import typed
 from robins.cli.tell import say
 
 _COLOURS = {"error": "red", "warning": "yellow", "note": "cyan"}
@@ -30,7 +31,7 @@ def warn(findings: Sequence[Any]) -> None:
 
 
 def judge(
-    log: Sequence[Path], columns: Sequence[Path], as_json: bool, write: Path | None = None
+    log: Sequence[Path], columns: Sequence[Path | str], as_json: bool, write: Path | None = None
 ) -> Status:
     """Print what there is and the findings; bad input if a run on this log would be wrong.
 
@@ -48,7 +49,7 @@ def judge(
     return Status.BAD_INPUT if found.counts["error"] else Status.DONE
 
 
-def _text(found: Any, log: Sequence[Path], columns: Sequence[Path]) -> str:
+def _text(found: Any, log: Sequence[Path], columns: Sequence[Path | str]) -> str:
     lines = []
     for table in found.tables:
         rate = f" at {table['rate_hz']:.4g} Hz" if table["rate_hz"] else ""
@@ -66,6 +67,5 @@ def _text(found: Any, log: Sequence[Path], columns: Sequence[Path]) -> str:
     # Without fixes there is no position, but an attitude.
     kinds = {table["kind"] for table in found.tables}
     system = "" if "gnss" in kinds else " --system marg"
-    declared = [word for path in columns for word in ("--columns", path)]
-    words = shlex.join(map(str, [*log, *declared]))
+    words = shlex.join(map(str, [*log, *typed(columns)]))
     return "\n".join([*lines, f"Next:   robins replay {words}{system}"])

@@ -22,13 +22,54 @@ JSON = option(
     "--json", "as_json", is_flag=True, help="Print one JSON object, nothing else, to stdout."
 )
 OUT = option("--out", type=LOGS, metavar="DIR", help="Result folder. [default: results/<name>]")
-COLUMNS = option(
-    "--columns",
-    type=LOGS,
-    multiple=True,
-    metavar="TOML",
-    help="Declares the columns of a log that is in no known format; may be repeated.",
-)
+_FORMATS = "robins.formats"  # key of the names while a command line is read
+
+
+def _name_formats(
+    context: click.Context, _given: click.Parameter, names: tuple[str, ...]
+) -> tuple[str, ...]:
+    context.meta[_FORMATS] = tuple(f"format:{name}" for name in names)
+    return names
+
+
+def _with_formats(
+    context: click.Context, _given: click.Parameter, files: tuple[Path, ...]
+) -> tuple[Path | str, ...]:
+    return *files, *context.meta.get(_FORMATS, ())
+
+
+def COLUMNS(command: Callable) -> Callable:
+    """Options by which the columns of a log are found that is in no known format."""
+    for one in (
+        option(
+            "--columns",
+            type=LOGS,
+            multiple=True,
+            callback=_with_formats,
+            metavar="TOML",
+            help="Declares the columns of a log that is in no known format; may be repeated.",
+        ),
+        option(
+            "--format",
+            multiple=True,
+            is_eager=True,
+            expose_value=False,
+            callback=_name_formats,
+            metavar="NAME",
+            help="Format of a log that is not recognised, such as tum; may be repeated.",
+        ),
+    ):
+        command = one(command)
+    return command
+
+
+def typed(columns: Sequence[Path | str]) -> list[str]:
+    """Words of a command line that give these declarations and names again."""
+    words: list[str] = []
+    for one in columns:
+        named = isinstance(one, str)
+        words += ("--format", one.removeprefix("format:")) if named else ("--columns", str(one))
+    return words
 
 
 def _confirm(

@@ -1,6 +1,7 @@
-"""Trials of BROAD, the orientation benchmark of Laidig et al. (2021): NumPy archives (``.npz``).
+"""Trials of BROAD, the orientation benchmark of Laidig et al. (2021): .mat, .hdf5 and .npz.
 
-Each holds a nine-axis IMU and the attitude that cameras saw:
+Each archive, of the repository github.com/dlaidig/broad or made of one by NumPy, holds a nine-axis
+IMU and the attitude that cameras saw:
 
 - ``imu_gyr`` (n, 3) rad/s, ``imu_acc`` (n, 3) specific force in m/s^2, ``imu_mag`` (n, 3) uT;
 - ``opt_quat`` (n, 4), scalar first, sensor to east-north-up, NaN where the cameras lost it;
@@ -19,25 +20,26 @@ from pathlib import Path
 import numpy as np
 
 from robins.dataset import AttitudeTable, Dataset, ImuTable, MagTable
-from robins.foreign import archive_of, arrays_of
+from robins.logs.archives import arrays_in, kind_of_archive, names_in
 from robins.logs.findings import Finding, LogError, refused
-from robins.logs.opening import whole
 from robins.logs.tables import unit_quaternions
 from robins.logs.text import Head
+from robins.logs.text_format import RATES_HZ
 from robins.units import to_si
 
 _COLUMNS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4}
 _NAMES = (*_COLUMNS, "movement", "sampling_rate")
-_LARGEST = 1 << 30  # bytes of a file, 18 hours at 500 Hz
-_RATES_HZ = (0.1, 1e5)
-_HEADER = 30  # bytes before the name of an archive's first member
 
 
-def is_archive(head: Head) -> bool:
-    """Whether a file begins as NumPy archives do, whole or cut."""
-    length = int.from_bytes(head.start[26:28], "little")
-    name = head.start[_HEADER : _HEADER + length]
-    return head.start.startswith(b"PK\x03\x04") and name.endswith(b".npy")
+def is_broad(head: Head) -> bool:
+    """True if a file is an archive with some of these arrays.
+
+    Raises:
+        LogError: it is a damaged archive.
+    """
+    if not kind_of_archive(head.start):
+        return False
+    return bool(names_in(head.file, os.stat(head.file).st_mtime_ns) & set(_COLUMNS))
 
 
 def read_broad(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
@@ -52,14 +54,21 @@ def read_broad(path: str | os.PathLike[str], findings: list[Finding] | None = No
             Nothing is read from a damaged one: its index comes last.
     """
     file = str(path)
-    arrays = _members(file)
+    arrays = arrays_in(path, _NAMES)
+    if lacking := [name for name in _NAMES if name not in arrays]:
+        held = sorted(names_in(file, os.stat(file).st_mtime_ns))
+        what = f"has no array {', '.join(lacking)}; it has {', '.join(held)}"
+        raise LogError(file, what, "name the arrays as BROAD does")
     rate = _rate(file, arrays["sampling_rate"])
     tables = {name: _rows_of(file, name, arrays[name], width) for name, width in _COLUMNS.items()}
     n = len(tables["imu_gyr"])
-    for name, rows in (*tables.items(), ("movement", arrays["movement"])):
+    movement = arrays["movement"]
+    if movement.shape in ((n, 1), (1, n)):  # of MATLAB, which has neither vectors nor, here, bool
+        movement = movement.reshape(n)
+        movement = movement.astype(bool) if np.isin(movement, (0, 1)).all() else movement
+    for name, rows in (*tables.items(), ("movement", movement)):
         if rows.shape[:1] != (n,):
             raise _misfit(file, name, rows, f"({n}, ...) as imu_gyr has")
-    movement = arrays["movement"]
     if movement.ndim != 1 or movement.dtype.kind != "b":
         raise _misfit(file, "movement", movement, f"({n},) of bool")
     time_ns = np.round(np.arange(n) * (1e9 / rate)).astype(np.int64)
@@ -77,32 +86,13 @@ def read_broad(path: str | os.PathLike[str], findings: list[Finding] | None = No
     )
 
 
-def _members(file: str) -> dict[str, np.ndarray]:
-    """The arrays by name, each checked against its checksum before it is looked at."""
-    data, _ = whole(file, _LARGEST)
-
-    def damaged(why: str) -> LogError:
-        mend = (
-            "fetch it again, or save it as plain numbers; nothing of it was used, for no number in "
-            "it can be trusted"
-        )
-        return LogError(file, f"is cut short or damaged after {len(data)} bytes: {why}", mend)
-
-    arrays = arrays_of(data, damaged, _NAMES)
-    if lacking := [name for name in _NAMES if name not in arrays]:
-        held = sorted(name.removesuffix(".npy") for name in archive_of(data, damaged).namelist())
-        what = f"has no array {', '.join(lacking)}; it has {', '.join(held)}"
-        raise LogError(file, what, "name the arrays as BROAD does")
-    return arrays
-
-
 def _rate(file: str, value: np.ndarray) -> float:
-    if value.shape not in ((), (1,)) or value.dtype.kind not in "fiu":
+    if value.size != 1 or value.dtype.kind not in "fiu":
         raise _misfit(file, "sampling_rate", value, "() of a real number")
     rate = float(value.reshape(()))
-    if not _RATES_HZ[0] <= rate <= _RATES_HZ[1]:
+    if not RATES_HZ[0] <= rate <= RATES_HZ[1]:
         raise refused(file, field="sampling_rate", value=rate)(
-            f"is not between {_RATES_HZ[0]:g} and {_RATES_HZ[1]:g} Hz, and time is made from it",
+            f"is not between {RATES_HZ[0]:g} and {RATES_HZ[1]:g} Hz, and time is made from it",
             "give samples a second",
         )
     return rate

@@ -8,14 +8,19 @@
     gyro_x = { name = "wx", unit = "deg/s" }     # the name in the header
     accel_x = { place = 5, unit = "g" }          # or the place from 1, where there is no header
     mag_x = { name = "mx", unit = "uT", scale = 0.15 }    # counts of 0.15 uT; -1 reverses an axis
+    sigma_north = { value = 0.5, unit = "m" }    # a constant, which no column holds
 
-Units are those of `robins.units`, quantities those of `robins.logs.quantities`. Columns that are
-not stated may hold anything. `skip` lines come before the header, or before the rows without one.
+Units are those of `robins.units`, or so many of them (``"0.1 ms"``); for dates of ISO 8601 ``iso``,
+which states its offset from UTC, ``iso UTC`` or ``iso GPS``. ``offset`` is added in the unit, after
+``scale``. ``rate = "100 Hz"`` stands for a column of time, ``decimal = ","`` for decimal commas.
+Quantities are those of `robins.logs.quantities`. Columns that are not stated may hold anything.
+`skip` lines come before the header, or before the rows without one.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from collections.abc import Iterable
 from dataclasses import replace
@@ -23,17 +28,25 @@ from pathlib import Path
 from typing import Any
 
 from robins.foreign import decoding
+from robins.logs.archives import head_of
 from robins.logs.findings import LogError, refused
 from robins.logs.quantities import QUANTITIES
-from robins.logs.text import Head, peek
+from robins.logs.registry import called, fitting
+from robins.logs.text import Head
 from robins.logs.text_format import Column, TextFormat, columns_of, header_of, one_of
-from robins.units import KINDS
+from robins.units import KINDS, UnitError, parse
+
+NAMED = "format:"
+"""What the name of a format begins with where files with declarations are given."""
 
 Paths = Iterable[str | os.PathLike[str]]
 Types = dict[str, tuple[type, ...]]
 _KEYS: Types = {"columns": (dict,), "separator": (str,), "skip": (int,)}
-_KEYS |= {"body": (str,), "nav": (str,)}
+_KEYS |= {"body": (str,), "nav": (str,), "rate": (str,), "decimal": (str,)}
 _COLUMN: Types = {"name": (str,), "place": (int,), "unit": (str,), "scale": (int, float)}
+_COLUMN |= {"offset": (int, float), "value": (int, float)}
+_WIDEST = 10_000  # columns
+_MANY = re.compile(r"([-+]?\d+\.?\d*(?:[eE][-+]?\d+)?) (.+)")
 _WORDS = {dict: "a table", str: "text", int: "a whole number", float: "a number"}
 
 
@@ -52,6 +65,11 @@ def columns_from(path: str | os.PathLike[str]) -> TextFormat:
         raise LogError(file, f"cannot be read: {why}", "check path and permissions") from error
     except UnicodeDecodeError as error:
         raise LogError(file, f"is no TOML: {error}", "repair it") from error
+    return format_of(text, file)
+
+
+def format_of(text: str, file: str) -> TextFormat:
+    """Read a format from TOML of a file, as `columns_from`."""
     with decoding(lambda why: LogError(file, f"is no TOML: {why}", "repair it")):
         content = tomllib.loads(text)
     _checked(file, "", content, _KEYS)
@@ -62,7 +80,13 @@ def columns_from(path: str | os.PathLike[str]) -> TextFormat:
     if content.get("skip", 0) < 0:
         at = refused(file, field="skip", value=content["skip"])
         raise at("is less than 0", "count lines from 0")
-    name = Path(path).name.split(".")[0]
+    if "rate" in content:
+        try:
+            content["rate_hz"] = parse(content["rate"], "frequency")
+        except UnitError as error:
+            raise refused(file, field="rate")(str(error), "give it like 100 Hz") from error
+        del content["rate"]
+    name = Path(file).name.split(".")[0]
     row = TextFormat(name, f"declared in {file}", columns, others=True, source=file, **content)
     # a file of several sensors has gaps where one is slower
     return replace(row, sparse=len(row.kinds) > 1)
@@ -74,22 +98,29 @@ def _column(file: str, quantity: str, stated: Any) -> Column:
         mend = 'write it like { name = "t", unit = "ms" }'
         raise refused(file, field=key, value=stated)("is not a table of name and unit", mend)
     _checked(file, f"{key}.", stated, _COLUMN)
-    if ("name" in stated) == ("place" in stated):
+    ways = [way for way in ("name", "place", "value") if way in stated]
+    if len(ways) != 1:
         mend = "state the name in the header, or the place from 1 where there is none"
-        both = "both name and place" if "name" in stated else "neither name nor place"
+        both = f"both {' and '.join(ways)}" if ways else "neither name nor place"
         raise refused(file, key)(f"has {both}", mend)
-    if stated.get("place", 1) < 1:
-        raise refused(file, key, "place", stated["place"])("is less than 1", "count from 1")
+    if not 1 <= (place := stated.get("place", 1)) <= _WIDEST:
+        wrong = "is less than 1" if place < 1 else f"is beyond {_WIDEST}"
+        raise refused(file, key, "place", place)(wrong, "count from 1")
     kind = QUANTITIES.get(quantity, "ratio")
     if kind != "ratio" and "unit" not in stated:
         mend = f"state one of {', '.join(KINDS[kind])}"
         raise refused(file, key)("has no unit", mend)
+    count, symbol = 1.0, stated.get("unit")
+    if symbol is not None and (many := _MANY.fullmatch(symbol)):
+        count, symbol = float(many[1]), many[2]
     return Column(
         quantity,
         stated.get("name", f"column {stated.get('place')}"),
-        (stated["unit"],) if "unit" in stated else (),
-        float(stated.get("scale", 1.0)),
+        () if symbol is None else (symbol,),
+        float(stated.get("scale", 1.0)) * count,
         stated.get("place", 0),
+        float(stated.get("offset", 0.0)) * count,
+        float(stated["value"]) if "value" in stated else None,
     )
 
 
@@ -103,37 +134,49 @@ def _checked(file: str, at: str, table: dict[str, Any], allowed: Types):
             raise refused(file, field=f"{at}{key}", value=value)(f"is not {words}", f"give {words}")
 
 
-def formats_of(files: Paths, columns: Paths) -> dict[str, TextFormat]:
-    """Which of the files are in formats declared in TOML files: path -> its row.
+def formats_of(files: Paths, columns: Paths) -> dict[str, str | TextFormat]:
+    """Formats that are declared or named for files: path -> its row or its name.
 
     Args:
         files: of a log.
-        columns: TOML files, see `columns_from`; each must fit one of the files.
+        columns: TOML files, see `columns_from`, each of which must fit one of the files; or text
+            ``format:NAME`` for the only file, or for those that no one format is recognised for.
 
     Raises:
-        LogError: as `columns_from`; a declaration fits none of the files, or two fit one.
+        LogError: as `columns_from`; a declaration fits none of the files, or two fit one; a name is
+            no format, or all files are recognised without it.
     """
-    columns = list(columns)
-    heads = list(filter(None, map(_head, dict.fromkeys(files)))) if columns else []
-    out: dict[str, TextFormat] = {}
-    for row in map(columns_from, columns):
-        fitting = [head for head in heads if row.recognise(head)]
-        for head in fitting:
-            if head.file in out:
-                both = f"fits both {out[head.file].source} and {row.source}"
+    files, columns = list(files), list(columns)
+    names = [c.removeprefix(NAMED) for c in columns if isinstance(c, str) and c.startswith(NAMED)]
+    declared = [c for c in columns if not (isinstance(c, str) and c.startswith(NAMED))]
+    heads = list(filter(None, map(_head, dict.fromkeys(files)))) if declared else []
+    out: dict[str, str | TextFormat] = {}
+    for row in map(columns_from, declared):
+        fits = [head for head in heads if row.recognise(head)]
+        for head in fits:
+            if isinstance(earlier := out.get(head.file), TextFormat):
+                both = f"fits both {earlier.source} and {row.source}"
                 raise LogError(head.file, both, "give the columns of each file once")
             out[head.file] = row
-        if not fitting and heads:
+        if not fits and heads:
             columns_of(row, heads[0].file, header_of(row, heads[0]))
-        if not fitting:
+        if not fits:
             mend = "check separator, skip and places"
             raise LogError(row.source, "its columns fit none of the files", mend)
+    for name in names:
+        called(name, "--format")
+        plain = (os.fspath(file) for file in files if not os.path.isdir(file))
+        open_ones = [file for file in plain if file not in out]
+        meant = [f for f in open_ones if len(open_ones) == 1 or len(fitting(f)[1]) != 1]
+        if not meant:
+            raise LogError(f"--format {name}", "all files are recognised", "omit the name")
+        out |= dict.fromkeys(meant, name)
     return out
 
 
 def _head(path: str | os.PathLike[str]) -> Head | None:
     """How a text file begins; one of another kind cannot be in a declared format."""
     try:
-        return peek(path)
+        return head_of(path)
     except LogError:
         return None

@@ -91,6 +91,8 @@ OF_READERS = (
     Code("sensors_merged", "note", "gyros and accelerometers were recorded apart"),
     Code("clock_aligned", "note", "samples are put on GPS time by the arrival of the fixes"),
     Code("velocity_taken", "note", "velocities of fixes come from a topic of their own"),
+    Code("lines_left_out", "warning", "lines that fail their checksum, or of an idle receiver"),
+    Code("fixes_of_truth", "note", "fixes and path are one solution, of the same receiver"),
 )
 
 _OF_VELOCITY = (

@@ -118,7 +118,7 @@ def _open_as(
 ) -> Table | Dataset | None:
     """A file that holds several kinds of columns is read for the kind that is wanted."""
     format = (formats or {}).get(os.fspath(path))
-    if format is None:
+    if format is None and not os.path.isdir(path):
         names = [f.name for f in fitting(path)[1] if f.holds == (kind,)]
         format = names[0] if len(names) == 1 else None
     opened = open_log(path, format, findings)

@@ -38,23 +38,39 @@ def merged(gyro: ImuTable, accel: ImuTable, findings: list[Finding] | None) -> I
     """
     if not np.nan_to_num(gyro.gyro).any():
         gyro, accel = accel, gyro
-    order = np.argsort(accel.time_ns, kind="stable")
-    at, forces = accel.time_ns[order], accel.accel[order]
-    inside = (gyro.time_ns >= at[0]) & (gyro.time_ns <= at[-1])
+    force = interpolated(gyro.time_ns, accel.time_ns, accel.accel)
+    ends = accel.time_ns.min(), accel.time_ns.max()
+    inside = (gyro.time_ns >= ends[0]) & (gyro.time_ns <= ends[1])
     if not inside.any():
         cause = "rates and specific forces were recorded apart and share no time"
         raise LogError(gyro.source, cause, "are they of one recording?")
-    now, since = gyro.time_ns[inside], at[0]
-    force = np.stack([np.interp(now - since, at - since, forces[:, k]) for k in range(3)], axis=-1)
-    before = np.clip(np.searchsorted(at, now, side="right") - 1, 0, max(len(at) - 2, 0))
-    apart = np.diff(at, append=at[-1])
-    force[(apart[before] > _LONG * np.median(apart)) & (now != at[before])] = np.nan
     telling(findings, "note", "sensors_merged", gyro.source, value=int((~inside).sum()))(
         "rates and specific forces were recorded apart; the forces are interpolated to the times "
         f"of the rates, and {(~inside).sum()} samples without both are left out."
     )
     rows = None if gyro.rows is None else gyro.rows[inside]
-    return dataclasses.replace(gyro, time_ns=now, gyro=gyro.gyro[inside], accel=force, rows=rows)
+    now, turns = gyro.time_ns[inside], gyro.gyro[inside]
+    return dataclasses.replace(gyro, time_ns=now, gyro=turns, accel=force[inside], rows=rows)
+
+
+def interpolated(now_ns: np.ndarray, at_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (m, 3) at other times (n,), linearly; (n, 3).
+
+    NaN outside of their time, and across a gap of more than five of their intervals.
+
+    Args:
+        now_ns: (n,) wanted times.
+        at_ns: (m,) times of the values, in any order.
+        values: (m, 3).
+    """
+    order = np.argsort(at_ns, kind="stable")
+    at_ns, values = at_ns[order], values[order]
+    now, at = (t - at_ns[0] for t in (now_ns, at_ns))
+    columns = [np.interp(now, at, column, left=np.nan, right=np.nan) for column in values.T]
+    found, apart = np.stack(columns, axis=-1), np.diff(at, append=at[-1])
+    before = np.clip(np.searchsorted(at, now, side="right") - 1, 0, max(len(at) - 2, 0))
+    found[(apart[before] > _LONG * np.median(apart)) & (now != at[before])] = np.nan
+    return found
 
 
 def gps_clock(

@@ -17,24 +17,20 @@ make give it above the sea.
 from __future__ import annotations
 
 import os
-import re
 from pathlib import Path
 
 import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.logs.findings import Finding, LogError, refused
-from robins.logs.text import Columns, Head, Layout, peek, read_columns
-from robins.logs.timebase import calendar_to_ns
+from robins.logs.text import Head, Layout, peek, read_columns
+from robins.logs.timebase import dates_to_ns
 from robins.units import to_si
 
 _GYRO, _ACCEL, _MAG = (tuple(f"{s}_{axis}" for axis in "xyz") for s in ("gyro", "acc", "mag"))
 _PLACE = ("latitude", "longitude", "altitude", "horizontalAccuracy", "verticalAccuracy")
 _VELOCITY = ("speed", "bearing", "speedAccuracy", "bearingAccuracy")
 _NEEDED = ("time", *_GYRO, *_ACCEL, *_MAG, *_PLACE, *_VELOCITY)
-_STAMP = re.compile(
-    r"(\d{4})-(\d\d)-(\d\d)[ T](\d\d:\d\d:\d\d(?:\.\d{1,9})?)(?:Z|([+-])(\d\d):?(\d\d))", re.ASCII
-)
 _RADIUS_68 = float(np.sqrt(-2.0 * np.log(1.0 - 0.68)))  # in sigmas of one axis
 _SINGLE = 5  # RTKLIB's Q of a fix without corrections
 
@@ -79,7 +75,7 @@ def read_phone(path: str | os.PathLike[str], findings: list[Finding] | None = No
     def stack(*wanted: str) -> np.ndarray:
         return columns.values[:, [place[name] for name in wanted]]
 
-    time_ns = _stamps(file, columns)
+    time_ns = dates_to_ns(file, "time", columns.texts[:, 0], columns.rows)
     have = {
         "inertial samples": np.isfinite(stack(*_GYRO, *_ACCEL)).any(axis=1),
         "magnetic field": np.isfinite(stack(*_MAG)).any(axis=1),
@@ -95,14 +91,25 @@ def read_phone(path: str | os.PathLike[str], findings: list[Finding] | None = No
             time_ns[imu], stack(*_GYRO)[imu], stack(*_ACCEL)[imu], "rate", "RFU", file, rows[imu]
         ),
         mag=MagTable(time_ns[mag], to_si(stack(*_MAG)[mag], "uT"), "RFU", file, rows[mag]),
-        gnss=_fixes(file, time_ns[gnss], stack(*_PLACE)[gnss], stack(*_VELOCITY)[gnss], rows[gnss]),
+        gnss=fixes_of(
+            file, time_ns[gnss], stack(*_PLACE)[gnss], stack(*_VELOCITY)[gnss], rows[gnss]
+        ),
         time_unit_known=(file,),
     )
 
 
-def _fixes(
+def fixes_of(
     file: str, time_ns: np.ndarray, place: np.ndarray, velocity: np.ndarray, rows: np.ndarray
 ) -> GnssTable:
+    """Fixes of Android's numbers.
+
+    Args:
+        file: for messages.
+        time_ns: (n,) stamps.
+        place: (n, 5) latitude, longitude [deg], altitude, radius of 68 %, sigma of altitude [m].
+        velocity: (n, 4) speed [m/s], bearing [deg] and their sigmas.
+        rows: (n,) line numbers.
+    """
     lat_deg, lon_deg, alt_m, radius_m, sigma_alt_m = place.T
     speed, bearing_deg, sigma_speed, sigma_bearing_deg = velocity.T
     bearing = np.deg2rad(bearing_deg)
@@ -123,24 +130,3 @@ def _fixes(
         source=file,
         rows=rows,
     )
-
-
-def _stamps(file: str, columns: Columns) -> np.ndarray:
-    """Dates with their offset from UTC as nanoseconds since 1970 in GPS time."""
-    out = np.zeros(len(columns.rows), np.int64)
-    for k, raw in enumerate(columns.texts[:, 0]):
-        text = raw.decode("utf-8", "replace").strip().strip('"')
-        match = _STAMP.fullmatch(text)
-        try:
-            if match is None:
-                raise ValueError("not of that form")
-            year, month, day, clock, sign, hours, minutes = match.groups()
-            utc_ns = calendar_to_ns(f"{year}/{month}/{day}", clock, utc=True)
-        except ValueError as error:
-            raise refused(file, f"line {columns.rows[k]}", "time", text)(
-                f"is not a date and time with its offset from UTC ({error})",
-                "write it like 2025-06-11 20:34:27+00:00",
-            ) from error
-        ahead_s = (3600 * int(hours) + 60 * int(minutes)) if sign else 0
-        out[k] = utc_ns - (-ahead_s if sign == "-" else ahead_s) * 1_000_000_000
-    return out

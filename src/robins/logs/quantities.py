@@ -79,6 +79,9 @@ QUANTITIES: dict[str, str] = {q: kind for g in GROUPS.values() for q, kind in g.
 CLOCKS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 """Units of time stamps, and how many decimals of them a nanosecond is."""
 
+DATES = ("iso", "iso UTC", "iso GPS")
+"""In place of a unit: ISO 8601 with its offset from UTC, or without one in UTC or GPS time."""
+
 _GROUP_OF = {q: name for name, g in GROUPS.items() for q in g.kinds}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from dataclasses import replace
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,21 +23,30 @@ from robins.dataset import (
     Trajectory,
 )
 from robins.ins.frames import swap, swap_q
+from robins.logs.archives import head_of, rows_of
 from robins.logs.findings import Finding, LogError, refused, telling
 from robins.logs.mounting import LocalPath, Origin, from_local
-from robins.logs.quantities import QUANTITIES, TABLES, parts, words_of
+from robins.logs.quantities import CLOCKS, DATES, QUANTITIES, TABLES, parts, words_of
 from robins.logs.tables import Table, kind_of, unit_quaternions
-from robins.logs.text import COMMENTS, Head, Layout, peek, read_columns
+from robins.logs.text import COMMENTS, Head, Layout, read_columns
 from robins.logs.text_format import (
     PAIRS,
     Axes,
+    Column,
     Found,
     TextFormat,
     columns_of,
-    decimals_of,
     header_of,
+    tick_of,
 )
-from robins.logs.timebase import WEEK_NS, stamps_to_ns, unrolled, weeks_of
+from robins.logs.timebase import (
+    LIMIT_NS,
+    WEEK_NS,
+    dates_to_ns,
+    stamps_to_ns,
+    unrolled,
+    weeks_of,
+)
 from robins.units import from_si, to_si, unit
 
 NOWHERE = Origin(0.0, 0.0, 0.0)
@@ -89,7 +99,7 @@ def read_text(
 
     Args:
         format: what its columns hold.
-        path: the file, plain or compressed.
+        path: the file, plain or compressed; an archive of arrays likewise.
         findings: receives what was left out or is doubted; without it that is issued as
             `LogWarning`.
         origin: where local metres are put on the Earth, by default where a comment says.
@@ -100,7 +110,7 @@ def read_text(
     Raises:
         LogError: columns are missing, named twice, of another unit, or not numbers.
     """
-    file, head = str(path), peek(path)
+    file, head = str(path), head_of(path)
     header = header_of(format, head)
     columns = columns_of(format, file, header)
     texts = {q: f for q, f in columns.items() if q in _TEXTS}
@@ -112,15 +122,20 @@ def read_text(
         numbers=tuple(sorted({f.place for f in numbers.values()})) if format.others else None,
         skip=header.line,
         all_named=header.all_named,
+        decimal=format.decimal,
     )
-    table = read_columns(path, layout, findings)
+    table = rows_of(head, layout) if head.names else read_columns(path, layout, findings)
     stamps = {q: table.texts[:, layout.texts.index(f.place)] for q, f in texts.items()}
     nav, body = _frames(format, head)
     read = Read(
         file,
         numbers,
-        {q: _si(f, table.values[:, layout.number(f.place)]) for q, f in numbers.items()},
-        _times(file, texts, stamps, table.rows),
+        {
+            q: _si(f.column, f.unit, table.values[:, layout.number(f.place)])
+            for q, f in numbers.items()
+        }
+        | {c.holds: _si(c, c.unit, np.full(len(table.rows), c.value)) for c in format.stated},
+        _times(file, texts, stamps, table.rows, format.rate_hz),
         table.rows,
         nav,
         body,
@@ -136,18 +151,35 @@ def read_text(
     return _tables(format, read, origin, known=any(f.sure for f in texts.values()))
 
 
-def _si(found: Found, values: np.ndarray) -> np.ndarray:
-    scale = found.column.scale
-    scaled = values if scale == 1.0 else values * scale + 0.0  # no minus zero
-    return to_si(scaled, unit(found.unit, QUANTITIES[found.column.holds])).copy()
+def _si(column: Column, symbol: str, values: np.ndarray) -> np.ndarray:
+    exact = column.scale == 1.0 and column.offset == 0.0
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite: for `clean` to count
+        scaled = values if exact else values * column.scale + column.offset + 0.0  # no minus zero
+        return to_si(scaled, unit(symbol, QUANTITIES[column.holds])).copy()
 
 
 def _times(
-    file: str, texts: dict[str, Found], stamps: dict[str, np.ndarray], rows: np.ndarray
+    file: str,
+    texts: dict[str, Found],
+    stamps: dict[str, np.ndarray],
+    rows: np.ndarray,
+    rate_hz: float,
 ) -> np.ndarray:
+    if rate_hz:
+        return np.round(np.arange(len(rows)) * (1e9 / rate_hz)).astype(np.int64)
     clock = "time" if "time" in texts else "time_of_week"
-    found = texts[clock]
-    time_ns = stamps_to_ns(file, found.name, stamps[clock], rows, decimals_of(found))
+    column, _, name, symbol = texts[clock]
+    if symbol in DATES:
+        exponent, time_ns = 9, dates_to_ns(file, name, stamps[clock], rows, symbol[4:])
+    else:
+        exponent = CLOCKS[unit(symbol).symbol]
+        time_ns = stamps_to_ns(file, name, stamps[clock], rows, *tick_of(column, symbol))
+    shift = round(Decimal(repr(column.offset)).scaleb(exponent))
+    if abs(shift) >= LIMIT_NS:
+        raise refused(file, field=name, value=column.offset)(
+            "is an offset of 146 years or more", "give it in the unit of the column"
+        )
+    time_ns = time_ns + shift
     if clock == "time":
         return time_ns
     if "week" in stamps:
@@ -195,6 +227,7 @@ def _tables(format: TextFormat, read: Read, origin: Origin | None, known: bool) 
     made = []
     for kind in format.kinds:
         own = {q for need in TABLES[kind].needs for q in parts(need)} & set(read.values)
+        own -= {column.holds for column in format.stated}
         if not own:
             continue
         part = read

@@ -18,6 +18,7 @@ from robins.logs import (
     broad,
     dataflash,
     nmea,
+    paths,
     phone,
     ros_files,
     rosbag,
@@ -26,7 +27,9 @@ from robins.logs import (
     ubx,
     ulog,
 )
+from robins.logs.archives import head_of, kind_of_archive
 from robins.logs.findings import Finding, LogError, refused
+from robins.logs.folders import read_folder
 from robins.logs.mounting import Origin
 from robins.logs.opening import beginning
 from robins.logs.quantities import words_of
@@ -70,6 +73,20 @@ FORMATS: tuple[Format, ...] = (
         rtklib.read_rtklib,
     ),
     Format(
+        "kitti-odometry",
+        ("trajectory",),
+        "KITTI odometry: 12 numbers a line, times.txt beside it",
+        paths.is_kitti,
+        paths.read_kitti,
+    ),
+    Format(
+        "novatel-inspva",
+        ("trajectory",),
+        "NovAtel: INSPVAA and INSPVASA in ASCII, each line against its checksum",
+        paths.is_inspva,
+        paths.read_inspva,
+    ),
+    Format(
         "phone-csv",
         ("imu", "mag", "gnss"),
         "phones, as strapdown-rs keeps their drives: CSV, UTC dates, Android's axes",
@@ -79,9 +96,25 @@ FORMATS: tuple[Format, ...] = (
     Format(
         "broad-npz",
         ("imu", "mag", "attitude"),
-        "BROAD, the orientation benchmark of Laidig et al. (2021): NumPy archives",
-        broad.is_archive,
+        "BROAD, the orientation benchmark of Laidig et al. (2021): .mat, .hdf5, .npz",
+        broad.is_broad,
         broad.read_broad,
+        binary=True,
+    ),
+    Format(
+        "sbet",
+        ("trajectory",),
+        "Applanix POSPac: SBET, 17 doubles a record",
+        paths.is_sbet,
+        paths.read_sbet,
+        binary=True,
+    ),
+    Format(
+        "arrays",
+        ("imu",),
+        "npy, npz, MATLAB, HDF5, Parquet ('robins[parquet]'): arrays named as columns of text",
+        lambda head: bool(kind_of_archive(head.start)) and not broad.is_broad(head),
+        lambda path, findings=None: _of_names(path)(path, findings),
         binary=True,
     ),
     Format(
@@ -153,6 +186,23 @@ FORMATS: tuple[Format, ...] = (
 """All of them."""
 
 
+def _of_names(path: str | os.PathLike[str]) -> Callable[..., Table | Dataset]:
+    """Reader of the one text format whose names the arrays of an archive have.
+
+    Raises:
+        LogError: there is none, or several; the sentence lists the names of the arrays.
+    """
+    head = head_of(path)
+    rows = [row for row in TEXT_FORMATS if row.named and row.recognise(head)]
+    if len(rows) != 1:
+        held = ", ".join(head.names[:40])
+        cause = "no known format has" if not rows else "several formats have"
+        raise LogError(
+            head.file, f"{cause} arrays of these names: {held}", "declare your columns (--columns)"
+        )
+    return partial(read_text, rows[0])
+
+
 def fitting(path: str | os.PathLike[str]) -> tuple[Head, list[Format]]:
     """How a file begins, and the formats that its beginning fits.
 
@@ -201,7 +251,7 @@ def open_log(
     """Read a log.
 
     Args:
-        path: the file, plain or compressed (.xz, .gz).
+        path: the file, plain or compressed (.xz, .gz); or a folder that is a recording.
         format: a name in `FORMATS`, or a row of your own; by default it is recognised by content.
         findings: receives what the reader left out or doubts; without it that is issued as
             `LogWarning`.
@@ -216,8 +266,10 @@ def open_log(
     """
     if isinstance(format, TextFormat):
         known = _of_text(format)
+    elif os.path.isdir(path):
+        return read_folder(path, findings)
     else:
-        known = recognise(path) if format is None else _called(format, FORMATS, path)
+        known = recognise(path) if format is None else called(format, path)
     if origin is None:
         return known.read(path, findings)
     if known.text is None or not known.text.local:
@@ -258,7 +310,7 @@ def write_log(
         row = format
     else:
         written = [f for f in FORMATS if f.text or f.write]
-        named = _called(format or _usual(path, table), written, path)
+        named = called(format or _usual(path, table), path, written)
         if named.write is not None:
             if week is not None or origin is not None:
                 cause = f"{named.name} has neither a GPS week nor local metres"
@@ -275,7 +327,7 @@ def _usual(path: str | os.PathLike[str], table: Table | Dataset) -> str:
         return "ros-mcap"
     kinds = tuple(map(kind_in_text, tables_of(table)))
     for name in ("named-imu", "named-path"):
-        if kinds == _called(name, FORMATS, path).holds:
+        if kinds == called(name, path).holds:
             return name
     raise LogError(
         str(path),
@@ -284,7 +336,12 @@ def _usual(path: str | os.PathLike[str], table: Table | Dataset) -> str:
     )
 
 
-def _called(name: str, among: Sequence[Format], path: str | os.PathLike[str]) -> Format:
+def called(name: str, path: str | os.PathLike[str], among: Sequence[Format] = FORMATS) -> Format:
+    """Format of this name; the path is for the message.
+
+    Raises:
+        LogError: there is none.
+    """
     named = {f.name: f for f in among}
     if name not in named:
         raise LogError(

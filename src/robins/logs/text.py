@@ -48,6 +48,7 @@ class Layout(NamedTuple):
     numbers: tuple[int, ...] | None = None  # in ascending order; None: all that are not text
     skip: int = 0  # header lines
     all_named: bool = False  # no columns follow those named: more fields are decimal commas
+    decimal: str = "."
 
     def number(self, place: int) -> int:
         """Where in `Columns.values` the column at this place lies."""
@@ -70,6 +71,8 @@ class Head(NamedTuple):
     file: str
     lines: list[str]
     start: bytes = b""  # the first bytes of a binary file
+    names: tuple[str, ...] = ()  # of the columns of an archive
+    arrays: tuple[np.ndarray, ...] = ()  # they themselves
 
     def data(self, count: int = 50) -> list[tuple[int, str]]:
         """Line numbers and text of the first lines that are neither blank nor comments."""
@@ -226,6 +229,8 @@ class _Reader:
 
     def read(self, block: bytes, line: int, cut_first: tuple[int, str] | None) -> Columns:
         """Columns of a block whose first line has this number."""
+        if self.layout.decimal != ".":
+            block = block.replace(self.layout.decimal.encode(), b".")
         try:
             table = np.loadtxt(
                 io.BytesIO(block),
@@ -248,7 +253,7 @@ class _Reader:
     def _joined(self, table: np.ndarray, kind: str) -> np.ndarray:
         """The columns of one kind side by side."""
         runs = [table[str(k)] for k, own in enumerate(self.runs) if own == kind]
-        return np.hstack(runs) if runs else np.zeros((len(table), 0))
+        return np.hstack(runs) if runs else np.zeros((len(table), 0), kind)
 
     def _line_by_line(self, block: bytes, line: int, cut_first: tuple[int, str] | None) -> Columns:
         comments = tuple(c.encode() for c in COMMENTS)

@@ -9,8 +9,10 @@ has one.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from decimal import Decimal
 from difflib import get_close_matches
 from functools import cached_property, partial
 from typing import NamedTuple
@@ -19,7 +21,15 @@ import numpy as np
 
 from robins.dataset import BodyFrame, NavFrame
 from robins.logs.findings import refused
-from robins.logs.quantities import CLOCKS, QUANTITIES, TABLES, groups_of, parts, tables_of_groups
+from robins.logs.quantities import (
+    CLOCKS,
+    DATES,
+    QUANTITIES,
+    TABLES,
+    groups_of,
+    parts,
+    tables_of_groups,
+)
 from robins.logs.text import COMMENTS, Head
 from robins.units import KINDS, UnitError, unit
 
@@ -62,6 +72,12 @@ class Axes(NamedTuple):
         return v[:, self.component] * self.sign
 
 
+RATES_HZ = (0.1, 1e5)
+"""Rates of which a recording is believed, where its time is made from it."""
+
+_ABOVE = 40  # lines among which a header is looked for
+_LETTER = re.compile("[A-Za-z]")
+
 ANY = "*"
 """As the name of the time, any name of the first column; among units, any of the right kind."""
 
@@ -72,7 +88,7 @@ Looks = Callable[[list[list[float]]], bool]
 
 
 class Column(NamedTuple):
-    """One column: value = number * scale * unit.
+    """One column: value = (number * scale + offset) * unit; or a constant, which no file holds.
 
     In the name, ``{unit}`` stands for the unit, ``{unit_}`` for one that can be part of a name
     (rad/s is rad_s); names separated by `` | `` are alternatives, of which the first is written.
@@ -83,6 +99,8 @@ class Column(NamedTuple):
     units: tuple[str, ...] = ()  # it may be in, the first is written; by default that of the SI
     scale: float = 1.0
     place: int = 0  # from 1, where columns have places and no names
+    offset: float = 0.0
+    value: float | None = None  # of a constant
 
     @property
     def unit(self) -> str:
@@ -122,6 +140,8 @@ class TextFormat:
     about: str  # one line for people
     columns: tuple[Column, ...]
     separator: str = ","  # " ": any number of blanks
+    decimal: str = "."  # or ","
+    rate_hz: float = 0.0  # of the rows, where no column holds their time
     skip: int = 0  # lines before the header, or before the rows where there is none
     body: str = "FRD"  # ways of the axes x, y, z; other than FRD and RFU are turned to FRD
     nav: str = "NED"  # or ENU, to which attitudes turn
@@ -158,6 +178,11 @@ class TextFormat:
         return not any(column.place for column in self.columns)
 
     @property
+    def stated(self) -> list[Column]:
+        """Constants, which are stated here and in no column of a file."""
+        return [column for column in self.columns if column.value is not None]
+
+    @property
     def local(self) -> bool:
         """Whether places are metres from an origin."""
         return "east" in self.quantities
@@ -171,28 +196,30 @@ class TextFormat:
         """Whether a file begins like this.
 
         One column beside the time is enough, so that what lacks is told; all are needed where the
-        time may have any name.
+        time may have any name. A format whose header is a comment may lack it, where its rows tell.
         """
-        if not self.named:
+        found = {f.column.holds: f for f in header_by_name(self, head).found if self.named}
+        if not found and (not self.named or (self.commented and self.looks)):
             rows = self._rows_of_numbers(head)
             return bool(rows) and (self.looks is None or self.looks(rows))
-        found = {f.column.holds: f for f in header_by_name(self, head).found}
         clock = found.get("time") or found.get("time_of_week")
-        if clock is None or len(found) < 2:
+        if (clock is None and not self.rate_hz) or len(found) < 2:
             return False
-        return ANY not in clock.column.name.split(" | ") or not sort_out(self, set(found))[1]
+        any_name = clock is not None and ANY in clock.column.name.split(" | ")
+        return not any_name or not sort_out(self, set(found))[1]
 
     def _rows_of_numbers(self, head: Head, lines: int = 20) -> list[list[float]]:
         """The first rows that lack nothing; none if some are not numbers, or not of one width."""
         data = [text for k, text in head.data(self.skip + lines) if k > self.skip]
-        rows = [text.split(self.delimiter) for text in data]
+        rows = [text.replace(self.decimal, ".").split(self.delimiter) for text in data]
         if len({len(row) for row in rows[:2]}) == 2:  # began mid-line
             rows = rows[1:]
-        if len({len(row) for row in rows}) != 1 or len(rows[0]) < max(
-            c.place for c in self.columns
-        ):
+        least = max(c.place for c in self.columns) or len(self.columns)
+        if len({len(row) for row in rows}) != 1 or len(rows[0]) < least:
             return []
-        places = [c.place - 1 for c in self.columns] if self.others else range(len(rows[0]))
+        places = range(len(rows[0]))
+        if self.others:
+            places = [c.place - 1 for c in self.columns if c.value is None and not _dated(c)]
         try:
             numbers = [[float(row[k].strip() or "nan") for k in places] for row in rows]
         except ValueError:
@@ -224,14 +251,21 @@ class Header(NamedTuple):
 
 
 def header_by_name(format: TextFormat, head: Head) -> Header:
-    """The line that names most columns: the first that is no comment, or a comment before."""
-    data = [k for k, _ in head.data(format.skip + 1) if k > format.skip]
-    first = data[0] if data else len(head.lines)
+    """The line that names most columns: the first that is no comment, or one near the beginning.
+
+    What a program writes above its header, such as the device and its settings, is passed over.
+    """
+    if head.names:
+        return Header(0, list(head.names), _found(format, list(head.names)), all_named=True)
+    data = [(k, text) for k, text in head.data(format.skip + _ABOVE) if k > format.skip]
+    first = data[0][0] if data else len(head.lines)
+    named = {first, *(k for k, text in data if _LETTER.search(text))}
     candidates = [
-        _header(format, k, text, all_named=k == first)
-        for k, text in enumerate(head.lines[:first], start=1)
-        if k == first or text.lstrip().startswith(COMMENTS)
+        _header(format, k, text, all_named=k in named)
+        for k, text in enumerate(head.lines[: max(named)], start=1)
+        if k in named or text.lstrip().startswith(COMMENTS)
     ]
+    candidates.sort(key=lambda header: header.line != first)
     return max(candidates, key=lambda header: len(header.found))
 
 
@@ -244,6 +278,7 @@ def header_of(format: TextFormat, head: Head) -> Header:
     places = [
         Found(column, (column.place or k) - 1, column.names[0], column.unit)
         for k, column in enumerate(format.columns, start=1)
+        if column.value is None
     ]
     names = [f"column {k}" for k in range(1, 2 + max(f.place for f in places))]
     for f in places:
@@ -256,16 +291,20 @@ def _header(format: TextFormat, line: int, text: str, all_named: bool) -> Header
         text.strip().lstrip("".join(COMMENTS)) if text.lstrip().startswith(COMMENTS) else text
     )
     names = [name.strip().strip('"') for name in stripped.split(format.delimiter)]
+    return Header(line, names, _found(format, names), all_named)
+
+
+def _found(format: TextFormat, names: list[str]) -> list[Found]:
     found = []
     for place, name in enumerate(names):
         plain = name.replace("µ", "u").replace("μ", "u")
         for column in format.columns:
-            symbol = column.unit_of(plain)
+            symbol = column.unit_of(plain) if column.value is None else None
             if symbol is None and place == 0 and ANY in column.name.split(" | "):
                 symbol = column.unit
             if symbol is not None:
                 found.append(Found(column, place, name, symbol))
-    return Header(line, names, found, all_named)
+    return found
 
 
 def sort_out(format: TextFormat, found: set[str]) -> tuple[set[str], set[str]]:
@@ -303,7 +342,7 @@ def columns_of(format: TextFormat, file: str, header: Header) -> dict[str, Found
         if (other := out.get(f.column.holds)) is not None:
             raise at()(f"{other.name} and {f.name} are the same thing", "keep one")
         out[f.column.holds] = f
-    used, lacking = sort_out(format, set(out))
+    used, lacking = sort_out(format, set(out) | {c.holds for c in format.stated})
     clocks = {"time", "time_of_week"} & format.quantities
     lacking |= clocks if not clocks & set(out) else set()
     if lacking:
@@ -321,40 +360,62 @@ def columns_of(format: TextFormat, file: str, header: Header) -> dict[str, Found
     out = {q: f for q, f in out.items() if q in used}
     for quantity, f in out.items():
         try:
-            unit(f.unit, QUANTITIES[quantity])
+            None if _dated(f.column) else unit(f.unit, QUANTITIES[quantity])
         except UnitError as error:
             raise at(f.name)(str(error), "state the unit") from error
     return out
+
+
+def _dated(column: Column) -> bool:
+    """Whether a column holds times as dates."""
+    return column.holds == "time" and column.unit in DATES
+
+
+def _check_column(column: Column, source: str) -> None:
+    """Raise if a column cannot be one."""
+    at = partial(refused, source)
+    quantity, where = column.holds, f"columns.{column.holds}"
+    clock = quantity in ("time", "time_of_week")
+    if quantity not in QUANTITIES:
+        raise at(where)("is no quantity that a column can hold", one_of(quantity, QUANTITIES))
+    for symbol in () if _dated(column) else column.units:
+        try:
+            plain = symbol if symbol == ANY else unit(symbol, QUANTITIES[quantity]).symbol
+        except UnitError as error:
+            raise at(where, "unit", symbol)(str(error), "state one of these") from error
+        if clock and plain not in CLOCKS:
+            mend = f"record it in one of {', '.join(CLOCKS)}"
+            raise at(where, "unit", symbol)("is no unit of time stamps", mend)
+    numbers = (column.offset, 0.0 if column.value is None else column.value)
+    if not all(map(math.isfinite, numbers)):
+        raise at(where)("has an offset or value that is not finite", "give a number")
+    if column.value is not None and (clock or quantity == "week"):
+        raise at(where, "value", column.value)("is not for time", "state rate, such as 100 Hz")
+    if not (math.isfinite(column.scale) and column.scale):
+        mend = "give a number other than 0, such as -1"
+        raise at(where, "scale", column.scale)("cannot scale anything", mend)
+    if quantity == "week" and (column.scale, column.offset) != (1.0, 0.0):
+        raise at(where)("is scaled or offset", "state weeks since 1980 as they are")
+    if clock and column.scale < 0.0:
+        raise at(where, "scale", column.scale)("turns time back", "give a positive number")
 
 
 def _check(format: TextFormat) -> None:
     """Raise if a row cannot be one."""
     at = partial(refused, format.source or f"format {format.name}")
     for column in format.columns:
-        quantity, where = column.holds, f"columns.{column.holds}"
-        clock = quantity in ("time", "time_of_week")
-        if quantity not in QUANTITIES:
-            raise at(where)("is no quantity that a column can hold", one_of(quantity, QUANTITIES))
-        for symbol in column.units:
-            try:
-                plain = symbol if symbol == ANY else unit(symbol, QUANTITIES[quantity]).symbol
-            except UnitError as error:
-                raise at(where, "unit", symbol)(str(error), "state one of these") from error
-            if clock and plain not in CLOCKS:
-                mend = f"record it in one of {', '.join(CLOCKS)}"
-                raise at(where, "unit", symbol)("is no unit of time stamps", mend)
-        if not (math.isfinite(column.scale) and column.scale):
-            mend = "give a number other than 0, such as -1"
-            raise at(where, "scale", column.scale)("cannot scale anything", mend)
-        if column.scale != 1.0 and (clock or quantity == "week"):
-            raise at(where, "scale", column.scale)("is not for time stamps", "state their unit")
+        _check_column(column, format.source or f"format {format.name}")
     held = [column.holds for column in format.columns]
     if twice := [q for q in held if held.count(q) > 1]:
         raise at(f"columns.{twice[0]}")("is held by two columns", "keep one")
-    if len({column.place > 0 for column in format.columns}) > 1:
+    if len({column.place > 0 for column in format.columns if column.value is None}) > 1:
         raise at("columns")("some have names and some have places", "give all the same way")
-    if len({"time", "time_of_week"} & format.quantities) != 1:
-        raise at("columns")("there is no time, or there are two", "state one column as time")
+    if format.rate_hz and not RATES_HZ[0] <= format.rate_hz <= RATES_HZ[1]:
+        between = f"is not between {RATES_HZ[0]:g} and {RATES_HZ[1]:g} Hz"
+        raise at("", "rate", format.rate_hz)(between, "give rows a second, such as 100 Hz")
+    if len({"time", "time_of_week"} & format.quantities) != (0 if format.rate_hz else 1):
+        mend = "state one column as time, or a rate of the rows"
+        raise at("columns")("there is no time, or there are two", mend)
     if "week" in format.quantities and "time" in format.quantities:
         raise at("columns.week")("needs the second of that week", "state time_of_week")
     kinds = format.kinds
@@ -370,6 +431,9 @@ def _check(format: TextFormat) -> None:
     if not format.choice and (idle := format.quantities - used):
         told = ", ".join(q for q in QUANTITIES if q in idle)
         raise at("columns")(f"{told} have no use in {' and '.join(kinds)}", "leave them out")
+    if format.decimal not in (".", ",") or format.decimal == format.separator:
+        mend = 'give "," with another separator, such as ";"'
+        raise at("", "decimal", format.decimal)("cannot be the sign of decimals", mend)
     if len(format.separator) != 1 or format.separator.isalnum() or format.separator in '+-."#%':
         mend = 'give one character, such as "," ";" "\\t" or " "'
         raise at("", "separator", format.separator)("cannot separate numbers", mend)
@@ -399,6 +463,7 @@ def _needs(kind: str) -> str:
     return f"the {kind} table needs {', or '.join(sets)}"
 
 
-def decimals_of(found: Found) -> int:
-    """How many decimals of the unit of a time column a nanosecond is."""
-    return CLOCKS[unit(found.unit).symbol]
+def tick_of(column: Column, symbol: str) -> tuple[int, int]:
+    """Integers e and m of a time column, one of whose numbers is m * 10^e ns."""
+    _, digits, exponent = Decimal(repr(column.scale)).normalize().as_tuple()
+    return CLOCKS[unit(symbol).symbol] + int(exponent), int("".join(map(str, digits)))

@@ -26,14 +26,26 @@ def _columns(names: str, holds: str, *units: str) -> tuple[Column, ...]:
     return tuple(Column(quantity, name, units) for name, quantity in pairs)
 
 
-def _format(name: str, about: str, looks: Looks | None = None, **how: Any):
-    """A row: what `TextFormat` takes, then groups of columns; with `looks` by their order."""
+def _triad(names: str, holds: str, *units: str) -> tuple[Column, ...]:
+    """Three columns, with @ for X, Y, Z in the names."""
+    return tuple(
+        Column(holds.replace("@", axis), names.replace("@", axis.upper()), units) for axis in "xyz"
+    )
+
+
+def _format(
+    name: str, about: str, looks: Looks | None = None, rows: Looks | None = None, **how: Any
+):
+    """A row: what `TextFormat` takes, then groups of columns; with `looks` by their order.
+
+    `rows` tells by rows of numbers where a header, by whose names columns are found, is missing.
+    """
 
     def of(*groups: Iterable[Column]) -> TextFormat:
         columns = itertools.chain.from_iterable(groups)
         if looks is not None:
             columns = (column._replace(place=k) for k, column in enumerate(columns, start=1))
-        return TextFormat(name, about, tuple(columns), looks=looks, **how)
+        return TextFormat(name, about, tuple(columns), looks=looks or rows, **how)
 
     return of
 
@@ -76,6 +88,19 @@ def _kfgins_nav(rows: Rows) -> bool:
     )
 
 
+def _poses(first: int, stamps: tuple[float, float], width: int) -> Looks:
+    """Stamps within these, and from place `first` on a unit quaternion, which turns."""
+
+    def looks(rows: Rows) -> bool:
+        return len(rows[0]) >= width and all(
+            stamps[0] <= row[0] < stamps[1]
+            and abs(sum(q * q for q in row[first : first + 4]) - 1.0) < 5e-3
+            for row in rows
+        )
+
+    return looks
+
+
 # ----------------------------------------------------------------------------------- the table
 
 _PLACE = (
@@ -83,6 +108,10 @@ _PLACE = (
     *_columns("height [m]", "height", "m"),
 )
 _EULER = "roll pitch heading"
+_POSE = (
+    _columns("tx, ty, tz", "east north up", "m"),
+    _columns("qx, qy, qz, qw", "q_x q_y q_z q_w"),
+)
 _SECOND = _columns("time of week [s]", "time_of_week", "s")
 _NAMED = _columns("time_{unit_}", "time", *_CLOCKS)
 
@@ -155,6 +184,7 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
         "EuRoC and ASL: ground truth in local metres, taken as east, north, up",
         nav="ENU",
         commented=True,
+        choice=True,
     )(
         _columns("timestamp [ns] | timestamp", "time", "ns"),
         _columns(
@@ -172,14 +202,37 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
     ),
     _format(
         "tum",
-        "TUM, for evo: metres east, north, up of an origin, rotation with the scalar last",
+        "TUM, evo, ORB-SLAM, ov_eval: metres east, north, up of an origin, the scalar last",
         separator=" ",
         nav="ENU",
         commented=True,
+        rows=_poses(4, (-1e9, 1e11), 8),
     )(
-        _columns("timestamp", "time", "s"),
-        _columns("tx, ty, tz", "east north up", "m"),
-        _columns("qx, qy, qz, qw", "q_x q_y q_z q_w"),
+        _columns("timestamp | timestamp(s)", "time", "s"),
+        *_POSE,
+    ),
+    _format(
+        "orbslam-euroc",
+        "ORB-SLAM3 SaveTrajectoryEuRoC, Basalt: as tum, in nanoseconds and without a header",
+        separator=" ",
+        nav="ENU",
+        looks=_poses(4, (1e14, 1e19), 8),
+    )(
+        _columns("timestamp [ns]", "time", "ns"),
+        *_POSE,
+    ),
+    _format(
+        "openvins-state",
+        "OpenVINS save_total_state: time, rotation with the scalar last, place, velocity",
+        separator=" ",
+        nav="ENU",
+        looks=_poses(1, (-1e9, 1e11), 11),
+    )(
+        _columns("timestamp(s)", "time", "s"),
+        _columns("q_x, q_y, q_z, q_w", "q_x q_y q_z q_w"),
+        _columns("p_x [m], p_y [m], p_z [m]", "east north up", "m"),
+        _columns("v_x [m/s], v_y [m/s]", "v_east v_north", "m/s"),
+        (Column("v_down", "v_z [m/s]", ("m/s",), scale=-1.0),),
     ),
     _format(
         "named-imu",
@@ -206,6 +259,48 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
         _columns("roll_{unit_}, pitch_{unit_}, heading_{unit_}", _EULER, *_ANGLE),
         _columns("q_w, q_x, q_y, q_z", "q_w q_x q_y q_z"),
         _columns("omega_@_{unit_}", "omega_@", *_RATE),
+    ),
+    _format(
+        "xsens-mt",
+        "Xsens MT Manager: tab-separated text, ticks of 0.1 ms, axes of the sensor",
+        separator="\t",
+        others=True,
+    )(
+        (Column("time", "SampleTimeFine", ("ms",), scale=0.1),),
+        _triad("Acc_@", "accel_@", "m/s^2"),
+        _triad("Gyr_@", "gyro_@", "rad/s"),
+    ),
+    _format(
+        "xsens-dot",
+        "Xsens DOT: CSV below lines about the device, microseconds, axes of the sensor",
+        others=True,
+    )(
+        _columns("SampleTimeFine", "time", "us"),
+        _triad("Acc_@", "accel_@", "m/s^2"),
+        _triad("Gyr_@", "gyro_@", "deg/s"),
+    ),
+    _format(
+        "microstrain-csv",
+        "MicroStrain MIP Monitor: CSV below DATA_START, week and second of GPS",
+        others=True,
+        choice=True,
+    )(
+        _columns("GPS Week", "week"),
+        _columns("GPS TOW", "time_of_week", "s"),
+        _triad("@ Accel [x8004]", "accel_@", "g"),
+        _triad("@ Gyro [x8005]", "gyro_@", "rad/s"),
+        _triad("@ Mag [x8006]", "mag_@", "G"),
+    ),
+    _format(
+        "vectornav-csv",
+        "VectorNav: CSV of its uncompensated sensors, as INSTINCT writes it too",
+        others=True,
+        choice=True,
+    )(
+        _columns("TimeStartup | TimeStartup [ns]", "time", "ns"),
+        _triad("UncompAcc@ | UnCompAcc@ | UnCompAcc@ [m/s^2]", "accel_@", "m/s^2"),
+        _triad("UncompGyro@ | UnCompGyro@ | UnCompGyro@ [rad/s]", "gyro_@", "rad/s"),
+        _triad("UncompMag@ | UnCompMag@ | UnCompMag@ [Gauss]", "mag_@", "G"),
     ),
     _format(
         "xio-csv",

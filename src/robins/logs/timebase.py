@@ -24,6 +24,10 @@ LIMIT_NS = 2**62  # 146 years; between stamps below it, differences stay within 
 _LAST_WEEK = (LIMIT_NS - GPS_EPOCH_NS) // WEEK_NS  # in 2116
 _HOUR_NS = 3600 * _NS
 _DATE = re.compile(r"(\d{4})/(\d{1,2})/(\d{1,2})", re.ASCII)
+_STAMP = re.compile(
+    r'"?(\d{4})-(\d\d)-(\d\d)[ T](\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)(Z|([+-])(\d\d):?(\d\d))?"?',
+    re.ASCII,
+)
 _CLOCK = re.compile(r"(\d{1,2}):(\d{1,2}):(\d{1,2}(?:\.\d*)?)", re.ASCII)
 _EPOCH_DAY = datetime.date(1970, 1, 1).toordinal()
 
@@ -71,11 +75,11 @@ def _digits(columns: np.ndarray, at: int, length: int, exponent: int) -> np.ndar
     return value * 10 ** (exponent - max(length - at - 1, 0))
 
 
-def _exactly(text: bytes, exponent: int) -> int | None:
+def _exactly(text: bytes, exponent: int, count: int = 1) -> int | None:
     if b"_" in text:  # which Python would allow between digits
         return None
     try:
-        number = Decimal(text.decode("ascii").strip()).scaleb(exponent)
+        number = Decimal(text.decode("ascii").strip()).scaleb(exponent) * count
         if number.adjusted() > 18:  # do not write out 1e999999999
             return None
         whole = int((number + Decimal("0.5")).to_integral_value("ROUND_FLOOR"))
@@ -85,14 +89,19 @@ def _exactly(text: bytes, exponent: int) -> int | None:
 
 
 def stamps_to_ns(
-    file: str, field: str, text: np.ndarray, rows: np.ndarray, exponent: int = 9
+    file: str, field: str, text: np.ndarray, rows: np.ndarray, exponent: int = 9, count: int = 1
 ) -> np.ndarray:
-    """`decimals_to_ns` for a column of a file.
+    """`decimals_to_ns` for a column of a file, in units of count * 10**exponent ns.
 
     Raises:
         LogError: a stamp is no number, or too large for the unit it is read in.
     """
-    time_ns, good = decimals_to_ns(text, exponent)
+    if count == 1:
+        time_ns, good = decimals_to_ns(text, exponent)
+    else:
+        exact = [_exactly(one, exponent, count) for one in text.tolist()]
+        good = np.array([ns is not None for ns in exact])
+        time_ns = np.array([ns or 0 for ns in exact], np.int64)
     good &= (time_ns > -LIMIT_NS) & (time_ns < LIMIT_NS)
     if not good.all():
         bad = int(np.argmin(good))
@@ -141,6 +150,43 @@ def calendar_to_ns(date: str, clock: str, *, utc: bool = False) -> int:
     if abs(whole) * _NS >= LIMIT_NS - _NS:
         raise ValueError(f"the year {today.year} is not one from which anyone has a log")
     return whole * _NS + int((seconds * _NS).to_integral_value())
+
+
+def dates_to_ns(
+    file: str, field: str, text: np.ndarray, rows: np.ndarray, zone: str = ""
+) -> np.ndarray:
+    """Dates and times of ISO 8601 as nanoseconds since 1970 in GPS time.
+
+    Args:
+        file: for messages.
+        field: name of the column, for messages.
+        text: (n,) bytes, such as b"2025-06-11T20:34:27.5+02:00".
+        rows: (n,) line numbers.
+        zone: "UTC" or "GPS" of stamps without an offset from UTC; with "GPS" none may have one.
+
+    Raises:
+        LogError: a stamp is no such date.
+    """
+    out = np.zeros(len(rows), np.int64)
+    for k, raw in enumerate(text.tolist()):
+        shown = raw.decode("utf-8", "replace").strip()
+        match = _STAMP.fullmatch(shown)
+        try:
+            if match is None or (zone == "GPS" if match[5] else not zone):
+                raise ValueError("not of that form")
+            year, month, day, clock, _, sign, hours, minutes = match.groups()
+            date, clock = f"{year}/{month}/{day}", clock.replace(",", ".")
+            out[k] = calendar_to_ns(date, clock, utc=zone != "GPS")
+        except ValueError as error:
+            form = "a date and time" if zone else "a date and time with its offset from UTC"
+            raise refused(file, f"line {rows[k]}", field, shown)(
+                f"is not {form} ({error})",
+                f"write it like 2025-06-11 20:34:27{'' if zone else '+00:00'}",
+            ) from error
+        if sign:
+            ahead_s = 3600 * int(hours) + 60 * int(minutes)
+            out[k] -= (-ahead_s if sign == "-" else ahead_s) * _NS
+    return out
 
 
 def weeks_of(file: str, field: str, text: np.ndarray, rows: np.ndarray) -> np.ndarray:

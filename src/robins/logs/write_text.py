@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Iterator
+from decimal import Decimal
 from typing import Any
 
 import jax.numpy as jnp
@@ -16,12 +17,13 @@ from robins.ins.frames import swap
 from robins.logs.findings import LogError, refused
 from robins.logs.mounting import Origin, to_local
 from robins.logs.opening import write_lines
-from robins.logs.quantities import CLOCKS, parts, words_of
+from robins.logs.quantities import DATES, parts, words_of
 from robins.logs.tables import Table, kind_in_text, place_of, tables_of
-from robins.logs.text_format import ANY, PAIRS, Axes, Column, TextFormat
+from robins.logs.text_format import ANY, PAIRS, Axes, Column, TextFormat, tick_of
 from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS, ns_to_decimal
 from robins.units import from_si, unit
 
+_CLOCKS = ("time", "time_of_week")
 _ROWS = 50_000
 _STEEP = 1.5  # rad; nearer to the vertical roll and heading lose digits
 Values = dict[str, np.ndarray]  # by quantity, SI
@@ -41,6 +43,10 @@ def write_text(
     Raises:
         LogError: the format does not hold such a table, or the file cannot be written.
     """
+    dated = any(c.unit in DATES or (c.offset and c.holds in _CLOCKS) for c in format.columns)
+    if dated or format.stated or format.rate_hz or format.decimal != ".":
+        cause = f"{format.name} has a rate, a constant, dates, an offset of time or decimal commas"
+        raise LogError(str(path), cause, "such a format is only read; choose another")
     tables = tables_of(table)
     for one in tables:
         _check(format, path, one)
@@ -231,7 +237,8 @@ def _cells(
             out[place] = (stamps[column.holds], column)
         elif place not in out:
             in_units = from_si(values.get(column.holds, missing), unit(column.unit))
-            scaled = in_units if column.scale == 1.0 else in_units / column.scale + 0.0
+            exact = column.scale == 1.0 and column.offset == 0.0
+            scaled = in_units if exact else (in_units - column.offset) / column.scale + 0.0
             out[place] = (scaled, column)
     return out
 
@@ -263,6 +270,9 @@ def _blocks(
 def _texts(cells: Cells, block: slice) -> list[str]:
     values, column = cells
     numbers = values[block].tolist()
-    if column.holds in ("time", "time_of_week"):
-        return [ns_to_decimal(ns, CLOCKS[column.unit]) for ns in numbers]
+    if column.holds in _CLOCKS:
+        exponent, count = tick_of(column, column.unit)
+        if count == 1 and exponent >= 0:
+            return [ns_to_decimal(ns, exponent) for ns in numbers]
+        return [str(Decimal(ns).scaleb(-exponent) / count) for ns in numbers]
     return list(map(str if column.holds == "week" else repr, numbers))

@@ -37,6 +37,7 @@ _WHERE = {
     "examine": "examination",
     "export": "exporting",
     "export_filter": "boards",
+    "guess": "guessing",
     "inventory": "contents",
     "overview": "contents",
     "plan_campaign": "campaigns",

@@ -1,0 +1,153 @@
+"""Archives of arrays as columns with names: NumPy, MATLAB, HDF5 and Parquet.
+
+An array of n numbers is the column of its name; of one of n rows and k columns column j is
+``name[:,j]``. What lies in a struct of MATLAB or a group of HDF5 is ``outer/name``. The longer side
+is taken for the rows, since MATLAB's own HDF5 (v7.3) has its arrays transposed. By these names a
+format finds its columns as by those of a header.
+
+Nothing in a file is carried out: pickles, objects, function handles, links to other files and
+arrays that are computed are passed over (`robins.foreign` has the decoders).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Iterator
+from functools import lru_cache, partial
+
+import numpy as np
+
+from robins.foreign import (
+    archive_of,
+    array_of,
+    arrays_of,
+    arrays_of_hdf5,
+    arrays_of_matlab,
+    columns_of_parquet,
+)
+from robins.logs.findings import LogError
+from robins.logs.opening import beginning, whole
+from robins.logs.text import Columns, Head, Layout, peek
+
+_LARGEST = 1 << 30  # bytes of a file
+_TEXT = "S40"  # of time stamps, as `robins.logs.text` has them
+_WIDEST = 64  # columns of an array; images and point clouds are none
+_HEADER = 30  # bytes before the name of the first member of a zip archive
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+
+
+def kind_of_archive(start: bytes) -> str:
+    """Kind of an archive by its first bytes, "" if it is none."""
+    member = start[_HEADER : _HEADER + int.from_bytes(start[26:28], "little")]
+    kinds = {
+        "npz": start.startswith(b"PK\x03\x04") and member.endswith(b".npy"),
+        "npy": start.startswith(b"\x93NUMPY"),
+        "hdf5": start.startswith((_HDF5, b"MATLAB 7.3")),
+        "mat": start.startswith(b"MATLAB 5.0"),
+        "parquet": start.startswith(b"PAR1"),
+    }
+    return next((kind for kind, fits in kinds.items() if fits), "")
+
+
+@lru_cache(maxsize=4)
+def names_in(path: str, changed_ns: int) -> frozenset[str]:
+    """Names of the arrays of an archive, which was changed at that time.
+
+    Raises:
+        LogError: as `arrays_in`.
+    """
+    if kind_of_archive(beginning(path)) == "npz":
+        data, _ = whole(path, _LARGEST)
+        members = archive_of(data, partial(_damaged, path, len(data))).namelist()
+        return frozenset(name.removesuffix(".npy") for name in members)
+    return frozenset(arrays_in(path))
+
+
+def _damaged(path: str, size: int, why: str) -> LogError:
+    mend = (
+        "fetch it again, or save it as plain numbers; nothing of it was used, for no number in it "
+        "can be trusted"
+    )
+    return LogError(path, f"is cut short or damaged after {size} bytes: {why}", mend)
+
+
+def arrays_in(
+    path: str | os.PathLike[str], names: Collection[str] | None = None
+) -> dict[str, np.ndarray]:
+    """Arrays of numbers of an archive by name.
+
+    Args:
+        path: the file, plain or compressed.
+        names: those wanted of an archive of NumPy; None: all.
+
+    Raises:
+        LogError: it is cut or damaged, or a package to read it is not installed. Nothing is read
+            from a damaged one.
+    """
+    data, _ = whole(path, _LARGEST)
+    damaged = partial(_damaged, os.fspath(path), len(data))
+    kind = kind_of_archive(data[:256])
+    if kind == "npz":
+        return arrays_of(data, damaged, names)
+    if kind == "npy":
+        return {"": array_of(data, "it", damaged)}
+    if kind == "parquet":
+        return columns_of_parquet(data, damaged)
+    return arrays_of_hdf5(data, damaged) if kind == "hdf5" else arrays_of_matlab(data, damaged)
+
+
+def head_of(path: str | os.PathLike[str]) -> Head:
+    """Beginning of a text file, or names and columns of an archive.
+
+    Raises:
+        LogError: as `arrays_in` and `robins.logs.text.peek`; an archive holds no columns.
+    """
+    start = beginning(path)
+    if not kind_of_archive(start):
+        return peek(path)
+    columns = dict(_columns(arrays_in(path)))
+    if not columns:
+        raise LogError(os.fspath(path), "holds no arrays of numbers", "save the samples in arrays")
+    return Head(os.fspath(path), [], start, tuple(columns), tuple(columns.values()))
+
+
+def _columns(arrays: dict[str, np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
+    for name, array in arrays.items():
+        one = array.squeeze()
+        if one.dtype.kind not in "biufM" or not 0 < one.ndim < 3 or not one.size:
+            continue
+        if one.ndim == 1:
+            yield name, one
+            continue
+        rows = one if one.shape[0] >= one.shape[1] else one.T
+        for k in range(rows.shape[1] if rows.shape[1] <= _WIDEST else 0):
+            yield f"{name}[:,{k}]", rows[:, k]
+
+
+def rows_of(head: Head, layout: Layout) -> Columns:
+    """Columns of an archive as those of a text file, numbered from 1.
+
+    Raises:
+        LogError: they are of several lengths, or hold dates where numbers are needed.
+    """
+    wanted = layout.texts + (layout.numbers if layout.numbers is not None else ())
+    numbers = layout.numbers
+    if numbers is None:
+        numbers = tuple(k for k in range(len(head.names)) if k not in layout.texts)
+        wanted = layout.texts + numbers
+    sizes = {head.names[k]: len(head.arrays[k]) for k in wanted}
+    if len(set(sizes.values())) != 1:
+        told = ", ".join(f"{name} {size}" for name, size in sizes.items())
+        mend = "declare columns of one sensor, which have one length"
+        raise LogError(head.file, f"the columns differ in length: {told}", mend)
+    if dates := [head.names[k] for k in numbers if head.arrays[k].dtype.kind == "M"]:
+        raise LogError(head.file, f"{dates[0]} holds dates, not numbers", "declare it as the time")
+    rows = next(iter(sizes.values()))
+    with np.errstate(invalid="ignore"):  # a NaN that signals stays a NaN
+        values = [head.arrays[k].astype(np.float64) for k in numbers]
+    texts = [head.arrays[k].astype(_TEXT) for k in layout.texts]
+    return Columns(
+        np.stack(texts, axis=-1) if texts else np.zeros((rows, 0), _TEXT),
+        np.stack(values, axis=-1) if values else np.zeros((rows, 0)),
+        np.arange(1, rows + 1),
+    )

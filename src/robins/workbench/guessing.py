@@ -1,0 +1,383 @@
+"""The command `guess`: which columns of a table hold what, from its headings and its numbers.
+
+Names and units are those that loggers use. A unit that no heading states is proved where it can be:
+specific force by the size of gravity, a magnetic field by that of the Earth, stamps by the year,
+gyros by the doctor, who compares them with gravity and, where there are fixes, with the course.
+What is only likely is marked in a comment, and what is not known is left out.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from robins import logs
+from robins.dataset import ImuTable
+from robins.logs.archives import head_of
+from robins.logs.declared import format_of
+from robins.logs.quantities import GROUPS, QUANTITIES, parts
+from robins.logs.tables import Table, tables_of
+from robins.logs.text import Head
+from robins.units import KINDS, to_si
+from robins.workbench.errors import InputError
+
+_G = 9.80665
+_SPELLINGS = {
+    "m/s^2": "m/s^2 m/s2 m/s² m/s/s ms-2 ms^-2 mps2 m_s2 m_s^2 m/sec^2 m/sec2",
+    "g": "g gs",
+    "mg": "mg",
+    "rad/s": "rad/s rads rad/sec rps rad_s rads-1 rads^-1",
+    "deg/s": "deg/s dps °/s deg/sec degs deg_s degs^-1 degrees/s deg_per_s",
+    "mrad/s": "mrad/s",
+    "mdeg/s": "mdps mdeg/s",
+    "uT": "ut µt μt microtesla",
+    "mT": "mt",
+    "nT": "nt",
+    "G": "gauss ga",
+    "mG": "mgauss mga",
+    "s": "s sec secs second seconds",
+    "ms": "ms msec millis milliseconds",
+    "us": "us µs μs usec micros microseconds",
+    "ns": "ns nsec nanos nanoseconds",
+    "deg": "deg ° degrees degree",
+    "rad": "rad radians",
+    "m": "m metres meters",
+    "m/s": "m/s mps ms-1 m_s",
+}
+_UNIT_OF = {spelling: unit for unit, line in _SPELLINGS.items() for spelling in line.split()}
+_MILLI = {"mdeg/s": ("deg/s", 1e-3)}  # spelt by loggers, unknown to `robins.units`
+_SENSORS = {
+    "accel": {"a", "acc", "accel", "accelerometer", "acceleration", "f", "force"},
+    "gyro": {"g", "w", "gyr", "gyro", "gyroscope", "omega", "angular", "rotation", "rate"},
+    "mag": {"m", "b", "mag", "magn", "magnetometer", "magnetic"},
+}
+_NOT_RAW = {"user", "free", "gravity", "bias", "ref", "std", "sigma", "cov", "covariance"}
+_NOT_RAW |= {"filtered", "accuracy", "error", "dop", "msl"}
+_SINGLE = {
+    "time": "time timestamp t ts stamp times datetime seconds elapsed timeus timems unixtime epoch",
+    "lat": "lat latitude",
+    "lon": "lon lng long longitude",
+    "height": "alt altitude height hgt",
+    "v_north": "vn vnorth veln velnorth velocitynorth",
+    "v_east": "ve veast vele veleast velocityeast",
+    "v_down": "vd vdown veld veldown velocitydown",
+}
+_QUANTITY_OF = {word: quantity for quantity, line in _SINGLE.items() for word in line.split()}
+_ISO = re.compile(r'"?\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d[.,\d]*(Z|[-+]\d\d:?\d\d)?"?')
+_EPOCHS = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18}  # seconds of today since 1970, roughly
+_FIELD_T = (2.0e-5, 7.0e-5)
+_FASTEST = 35.0  # rad/s, 2000 deg/s: the range of most gyros
+
+Columns = dict[str, tuple[str, str, str]]  # quantity -> name, unit or "", why
+
+
+def guess(path: str | os.PathLike[str]) -> str:
+    """TOML that declares the columns of a table, with a comment on what is only likely.
+
+    Args:
+        path: text with headings, or an archive of arrays.
+
+    Raises:
+        InputError: there are no headings, or none that is known.
+        robins.logs.LogError: the file cannot be read.
+    """
+    head = head_of(path)
+    names, separator, decimal, cells = _sheet(head)
+    found, aside = _known(names)
+    used = _whole(set(found))
+    aside |= {found[q][0]: "its table is not whole" for q in set(found) - used - {"time"}}
+    columns = {q: found[q] for q in QUANTITIES if q in used | {"time"} and q in found}
+    if not used:
+        held = ", ".join(names[:30])
+        mend = 'write the columns yourself, as "A format of your own" of docs/logs.md shows.'
+        raise InputError(f"no headings of a whole table; there are {held}", os.fspath(path), mend)
+    texts = {q: [row[names.index(name)] for row in cells] for q, (name, _, _) in columns.items()}
+    numbers = {q: np.array([_number(text, decimal) for text in texts[q]]) for q in columns}
+    _fill(columns, numbers, texts.get("time", []))
+    settings, notes = _settings(separator, decimal, numbers, columns)
+    _prove_gyros(path, settings, columns, numbers)
+    taken = {name for name, _, _ in columns.values()}
+    unused = [f"  {name}: {aside.get(name, 'not known')}" for name in names if name not in taken]
+    notes += ["not used:", *unused] if unused else []
+    title = f"# {os.path.basename(path)}, by `robins guess`"
+    comments = (f"# {note}" for note in notes)
+    return "\n".join([title, *settings, *comments, "", *_lines(columns)]) + "\n"
+
+
+def _whole(found: set[str]) -> set[str]:
+    """Quantities of whole tables that may share a file."""
+    groups = {name for name in GROUPS if set(parts(name)) <= found}
+    imu = {"gyro", "accel"} <= groups
+    keep = {"gyro", "accel", "mag"} if imu else {"mag"} - ({"mag"} if "place" in groups else set())
+    keep |= {"place", "velocity"} if "place" in groups else set()
+    return {q for group in groups & keep for q in parts(group)}
+
+
+# ------------------------------------------------------------------------------------ headings
+
+
+def _sheet(head: Head) -> tuple[list[str], str, str, list[list[str]]]:
+    """Names, separator, sign of decimals and cells of the first rows.
+
+    Raises:
+        InputError: no line of names stands above rows of numbers.
+    """
+    if head.names:
+        longest = max(map(len, head.arrays))
+        columns = [
+            (name, array[:5000].astype("S40").astype(str))
+            for name, array in zip(head.names, head.arrays, strict=True)
+            if len(array) == longest
+        ]
+        rows = np.stack([column for _, column in columns], axis=-1)
+        return [name for name, _ in columns], "", ".", rows.tolist()
+    best: tuple[list[str], str, str, list[list[str]]] = ([], "", ".", [])
+    lines = [text.lstrip("#% ") for text in head.lines if text.strip()]
+    for separator in (",", ";", "\t", "|", " "):
+        rows = [text.split(None if separator == " " else separator) for text in lines]
+        for k, (names, below) in enumerate(itertools.pairwise(rows)):
+            named = sum(bool(re.search("[A-Za-z]", name)) for name in names)
+            counted = sum(bool(re.fullmatch(r"[-+\d.,eE]+", cell.strip())) for cell in below)
+            whole = len(below) == len(names) > len(best[0])
+            if whole and 2 * named > len(names) and 2 * counted > len(names):
+                comma = separator != "," and any(re.fullmatch(r"-?\d+,\d+", c) for c in below)
+                plain = [name.strip().strip('"') for name in names]
+                after = [row for row in rows[k + 1 :] if len(row) == len(names)]
+                best = (plain, separator, "," if comma else ".", after)
+    if not best[0]:
+        mend = "name the columns by place; docs/logs.md shows how."
+        raise InputError("no line of names stands above rows of numbers", head.file, mend)
+    return best
+
+
+def _known(names: Sequence[str]) -> tuple[Columns, dict[str, str]]:
+    """Quantities that the names hold, and the reasons to leave others aside."""
+    found: Columns = {}
+    aside: dict[str, str] = {}
+    for name in names:
+        quantity, unit, doubt = _named(name)
+        if not quantity:
+            aside[name] = doubt or "not known"
+        elif quantity in found:
+            aside[name] = f"{found[quantity][0]} is taken for {quantity}"
+        else:
+            found[quantity] = (name, unit, "unit by its heading" if unit else doubt)
+    return found, aside
+
+
+def _named(name: str) -> tuple[str, str, str]:
+    """Quantity and unit that a name states, "" where it states none, and a doubt."""
+    base, unit = name, ""
+    if bracketed := re.fullmatch(r"(.*?)\s*[\[(]([^\])]*)[\])]", name):
+        stated = re.sub(r"[\s*·]", "", bracketed[2].lower())
+        if not re.fullmatch(r":,\d+", stated):
+            base, unit = bracketed[1], _UNIT_OF.get(stated, "")
+    else:
+        cuts = (m.start() for m in re.finditer("_", name))
+        ends = [(name[:at], _UNIT_OF.get(name[at + 1 :].lower(), "")) for at in cuts]
+        base, unit = next(((b, u) for b, u in ends if u), (name, ""))
+    words = [w.lower() for w in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", base)]
+    if column := re.search(r"\[:,([012])\]$", name):
+        words.append("xyz"[int(column[1])])
+    joined = "".join(words)
+    if len(words) > 1 and words[-1] in ("n", "e", "d", "north", "east", "down"):
+        joined = "".join(w for w in words if w not in ("gps", "gnss"))
+    for word in (joined, *words):
+        if word in _QUANTITY_OF and not set(words) & _NOT_RAW:
+            return _QUANTITY_OF[word], unit, ""
+    axis = joined[-1:]
+    stem = {*words[:-1]} if words and words[-1] == axis else {joined[:-1]}
+    if axis not in ("x", "y", "z"):
+        return "", "", ""
+    if stem & _NOT_RAW:
+        return "", "", "no reading of the sensor itself"
+    sensors = [s for s, known in _SENSORS.items() if stem & known]
+    if len(sensors) != 1:
+        return "", "", ""
+    if sensors[0] == "mag":
+        unit = {"g": "G", "mg": "mG"}.get(unit, unit)
+    quantity = f"{sensors[0]}_{axis}"
+    return quantity, unit if unit in {*KINDS[QUANTITIES[quantity]], *_MILLI} else "", ""
+
+
+# --------------------------------------------------------------------------------------- units
+
+
+def _number(text: str, decimal: str) -> float:
+    try:
+        return float(text.strip().replace(decimal, "."))
+    except ValueError:
+        return np.nan
+
+
+def _fill(columns: Columns, numbers: dict[str, np.ndarray], stamps: Sequence[str]) -> None:
+    """State the units that numbers tell."""
+    if "time" in columns and not columns["time"][1]:
+        columns["time"] = (columns["time"][0], *_clock(numbers["time"], stamps))
+    sized: list[tuple[str, Callable[[float], Iterator[tuple[str, str]]]]] = [
+        ("accel", _gravity),
+        ("mag", _field),
+    ]
+    for sensor, candidates in sized:
+        group = parts(sensor)
+        if group[0] not in columns or columns[group[0]][1]:
+            continue
+        size = float(np.nanmedian(np.linalg.norm([numbers[q] for q in group], axis=0)))
+        unit, why = next(candidates(size), ("", f"UNIT NOT KNOWN: median size {size:.4g}"))
+        columns |= {q: (columns[q][0], unit, why) for q in group}
+    for quantity, (name, unit, _) in list(columns.items()):
+        kind = QUANTITIES[quantity]
+        if not unit and kind in ("angle", "length", "speed"):
+            guessed = {"angle": "deg", "length": "m", "speed": "m/s"}[kind]
+            columns[quantity] = (name, guessed, "GUESSED: no heading states the unit")
+
+
+def _clock(values: np.ndarray, stamps: Sequence[str]) -> tuple[str, str]:
+    if stamps and (date := _ISO.fullmatch(stamps[0].strip())):
+        return ("iso", "dates") if date[1] else ("iso UTC", "GUESSED: dates without offset, in UTC")
+    typical, step = float(np.nanmedian(values)), np.diff(values)
+    for unit, size in _EPOCHS.items():
+        if 0.2 * size < typical < 4.0 * size:
+            return unit, "counts from 1970; offset = 18 s would turn UTC into GPS time of today"
+    step_s = float(np.nanmedian(step[step > 0.0])) if (step > 0.0).any() else np.nan
+    for low, high in ((20.0, 4000.0), (0.5, 20e3)):
+        for unit in ("s", "ms", "us", "ns"):
+            rate = 1.0 / to_si(step_s, unit) if step_s > 0.0 else 0.0
+            if low <= rate <= high:
+                return unit, f"GUESSED: {rate:.4g} rows a second"
+    return "", "UNIT NOT KNOWN"
+
+
+def _gravity(size: float) -> Iterator[tuple[str, str]]:
+    for unit in ("m/s^2", "g", "mg"):
+        if 0.9 < to_si(size, unit) / _G < 1.1:
+            yield unit, f"proved by gravity: median size {size:.4g}"
+    for bits in range(8, 17):  # counts of a range of so many g
+        if 0.95 < size / 2.0**bits < 1.05:
+            yield f"{2.0**-bits!r} g", f"GUESSED: {2**bits} counts a g by gravity, {size:.6g}"
+
+
+def _field(size: float) -> Iterator[tuple[str, str]]:
+    for unit in KINDS["magnetic field"]:
+        if _FIELD_T[0] < to_si(size, unit) < _FIELD_T[1]:
+            yield unit, f"by the field of the Earth: median size {size:.4g}"
+
+
+def _prove_gyros(
+    path: str | os.PathLike[str],
+    settings: Sequence[str],
+    columns: Columns,
+    numbers: dict[str, np.ndarray],
+) -> None:
+    """State the unit of gyros to which the doctor does not object, where he does to the other."""
+    if "gyro_x" not in columns or columns["gyro_x"][1]:
+        return
+
+    def tried(unit: str, why: str) -> Columns:
+        return columns | {q: (columns[q][0], unit, why) for q in parts("gyro")}
+
+    fastest = float(np.nanmax(np.abs([numbers[q] for q in parts("gyro")])))
+    unit, why = "rad/s", f"GUESSED: it may be deg/s; largest number {fastest:.4g}"
+    if fastest > _FASTEST:
+        unit, why = "deg/s", f"GUESSED: {fastest:.4g} rad/s is beyond the range of gyros"
+    text = "\n".join([*settings, *_lines(tried("rad/s", ""))])
+    try:
+        opened = logs.open_log(path, format_of(text, os.fspath(path)), [])
+    except logs.LogError:
+        opened = None  # a unit is missing above
+    if opened is not None:
+        tables = tables_of(opened)
+        imu = next(table for table in tables if isinstance(table, ImuTable))
+        others = [table for table in tables if table is not imu]
+        scale, trust = _turned_by_gravity(imu)
+        fitting = [u for u in (*KINDS["angle rate"], *_MILLI) if abs(scale / _si(u) - 1.0) < 0.15]
+        sound = [u for u in ("rad/s", "deg/s") if not _objects(imu, others, _si(u))]
+        if trust and fitting:
+            unit, why = (
+                fitting[0],
+                f"proved by gravity, which turns {scale / _si(fitting[0]):.3f} times so",
+            )
+        elif trust:
+            unit, why = "", f"UNIT NOT KNOWN: by gravity one is {scale:.4g} rad/s"
+        elif len(sound) == 1:
+            unit, why = sound[0], "proved by the doctor: in the other unit it would be wrong"
+    columns |= tried(unit, why)
+
+
+def _si(unit: str) -> float:
+    """One of an angle rate in rad/s."""
+    symbol, scale = _MILLI.get(unit, (unit, 1.0))
+    return to_si(scale, symbol)
+
+
+def _turned_by_gravity(imu: ImuTable) -> tuple[float, bool]:
+    """Factor of the rates by which specific force turns as gravity does, and if it can be trusted.
+
+    At rest in translation f' = f x omega. Both sides are summed up over a fifth of a second; the
+    factor is that of least squares, trusted where they correlate by 0.9.
+    """
+    dt = np.diff(imu.time_ns) * 1e-9
+    size = max(int(0.2 / max(float(np.median(dt)), 1e-6)), 1)
+    f, n = imu.accel, len(imu.accel) // size
+    if n < 20:
+        return 0.0, False
+    change = np.cross(f[:-1], imu.gyro[:-1]) * dt[:, None]
+    summed = np.add.reduceat(change, np.arange(0, len(change), size))[: n - 1]
+    smooth = np.add.reduceat(f, np.arange(0, len(f), size))[:n] / size
+    # means of two neighbouring windows lie one window apart, as the middle of what turned between
+    turned = np.diff(smooth, axis=0)[: len(summed) - 1]
+    between = 0.5 * (summed[:-1] + summed[1:])[: len(turned)]
+    good = np.isfinite(turned).all(axis=1) & np.isfinite(between).all(axis=1)
+    a, b = turned[good].ravel(), between[good].ravel()
+    energy = float(b @ b)
+    if not energy:
+        return 0.0, False
+    alike = float(a @ b) / math.sqrt(energy * max(float(a @ a), 1e-300))
+    return float(a @ b) / energy, alike > 0.9
+
+
+def _objects(imu: ImuTable, others: list[Table], scale: float) -> bool:
+    """True if the doctor objects to the unit of the rates, times this."""
+    found = logs.examine([replace(imu, gyro=imu.gyro * scale), *others])
+    return any(finding.code == "gyro_unit" for finding in found)
+
+
+# ----------------------------------------------------------------------------------------- TOML
+
+
+def _settings(
+    separator: str, decimal: str, numbers: dict[str, np.ndarray], columns: Columns
+) -> tuple[list[str], list[str]]:
+    """Lines above the columns, and comments."""
+    lines = [f"separator = {json.dumps(separator)}"] if separator not in ("", ",") else []
+    lines += ['decimal = ","'] if decimal == "," else []
+    notes = []
+    if "time" not in columns:
+        notes.append('rate = "100 Hz"   NOT KNOWN: no column of time was found; state the rate')
+    if "accel_x" in columns:
+        mean = np.nanmean([numbers[q] for q in parts("accel")], axis=1)
+        up = mean / max(float(np.linalg.norm(mean)), 1e-300)
+        if up[2] > 0.8:
+            lines.append('body = "FLU"   # z points up by gravity; GUESSED: x forward, y left')
+        elif up[2] > -0.8:
+            notes.append(
+                f"gravity is along {np.round(up, 2)} of x, y, z: body may have to be stated"
+            )
+    return lines, notes
+
+
+def _lines(columns: Columns) -> Iterator[str]:
+    yield "[columns]"
+    for quantity, (name, unit, why) in columns.items():
+        symbol, scale = _MILLI.get(unit, (unit, 1.0))
+        more = "" if scale == 1.0 else f", scale = {scale!r}"
+        line = f"{quantity} = {{ name = {json.dumps(name, ensure_ascii=False)}"
+        known = f", unit = {json.dumps(symbol)}{more} }}"
+        yield f"{'' if symbol else '# '}{line}{known}{'   # ' + why if why else ''}"
