@@ -1,4 +1,4 @@
-"""Folders that are one recording: EuRoC, KITTI, phones, gnss-ins-sim.
+"""Folders that are one recording: ROS, EuRoC, KITTI, phones, gnss-ins-sim.
 
 - EuRoC and ASL: ``mav0`` or the folder above it, with ``imu0`` and ``state_groundtruth_estimate0``.
 - KITTI raw: ``oxts`` with ``data/*.txt`` and ``timestamps.txt``, of which the columns are in the
@@ -27,8 +27,11 @@ from robins.dataset import Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.gps_time import gps_of
 from robins.logs.findings import Finding, LogError, refused, telling
 from robins.logs.merging import interpolated
+from robins.logs.opening import RECORDING
 from robins.logs.phone import fixes_of
 from robins.logs.read_text import read_text
+from robins.logs.rosbag import read_rosbag
+from robins.logs.tables import Table
 from robins.logs.text import Columns, Layout, peek, read_columns
 from robins.logs.text_formats import TEXT_FORMATS
 from robins.logs.timebase import dates_to_ns, stamps_to_ns
@@ -42,7 +45,7 @@ _FLU = np.array([1.0, -1.0, -1.0])
 _SEPARATORS = (",", ";", "\t")
 
 
-def read_folder(path: str | os.PathLike[str], findings: Findings = None) -> Dataset:
+def read_folder(path: str | os.PathLike[str], findings: Findings = None) -> Table | Dataset:
     """Read a folder that is a recording.
 
     Args:
@@ -58,9 +61,16 @@ def read_folder(path: str | os.PathLike[str], findings: Findings = None) -> Data
         for place in (folder, folder / "mav0", folder / "oxts"):
             if (place / mark).exists():
                 return read(place, findings)
-    held = ", ".join(sorted(p.name for p in folder.iterdir())[:5]) or "nothing"
+    names = sorted(p.name for p in folder.iterdir())
+    if "metadata.yaml" in names or any(map(RECORDING.fullmatch, names)):
+        return read_rosbag(folder, findings)
+    held = ", ".join(names[:5]) or "nothing"
     marks = ", ".join(_FOLDERS)
-    raise LogError(str(path), f"is a folder with {held}", f"give files, or one with {marks}")
+    raise LogError(
+        str(path),
+        f"is a folder with {held}",
+        f"give files, or a folder of ROS, or one with {marks}",
+    )
 
 
 def _table(path: Path, clock: str, names: Sequence[str], findings: Findings) -> Columns:

@@ -25,7 +25,7 @@ from robins.logs.findings import Finding, LogError, telling
 
 Bytes: TypeAlias = bytes | mmap.mmap
 _BLOCK, _ABOUT, _LARGEST = 1 << 20, 1 << 22, 1 << 30
-_PART = re.compile(r".+\.(mcap|db3|bag)(\.(xz|gz|zstd))?")
+RECORDING = re.compile(r".+\.(mcap|db3|bag)(\.(xz|gz|zstd))?")
 _LISTED = re.compile(r"^\s*-\s+(\S+\.(?:mcap|db3)(?:\.zstd)?)\s*$", re.MULTILINE)
 _NUMBER = re.compile(r"_(\d+)\.(?:mcap|db3|bag)")
 _XZ, _GZIP = b"\xfd7zXZ\x00", b"\x1f\x8b"
@@ -110,7 +110,7 @@ def parts_of(path: str | os.PathLike[str]) -> list[Path]:
     folder = Path(path)
     if not folder.is_dir():
         return [folder]
-    there = {p.name for p in folder.iterdir() if _PART.fullmatch(p.name) and p.is_file()}
+    there = {p.name for p in folder.iterdir() if RECORDING.fullmatch(p.name) and p.is_file()}
     try:
         about = (folder / "metadata.yaml").read_bytes()[:_ABOUT].decode("utf-8", "replace")
     except OSError:
