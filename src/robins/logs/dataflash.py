@@ -14,6 +14,7 @@ Source: ArduPilot, libraries/AP_Logger/README.md.
 from __future__ import annotations
 
 import os
+import re
 import struct
 from pathlib import Path
 
@@ -30,7 +31,7 @@ from robins.logs.findings import (
     telling,
     undated,
 )
-from robins.logs.fix_kinds import MAVLINK, fixes
+from robins.logs.fix_kinds import MAVLINK, fixes, over_ground
 from robins.logs.merging import gps_clock
 from robins.logs.opening import Bytes, mapped
 from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS
@@ -44,6 +45,7 @@ _WANTED = ("IMU", "MAG", "GPS", "GPA")
 _CODES = "b=i1 B=u1 h=i2 H=u2 i=i4 I=u4 f=f4 d=f8 q=i8 Q=u8 g=f2 M=u1 a=V64 n=V4 N=V16 Z=V64 "
 _CODES += "c=i2 C=u2 e=i4 E=u4 L=i4"
 _TYPES = {pair[0]: pair[2:] for pair in _CODES.split()}  # of fields, as NumPy names them
+_NO_FILL = re.compile(rb"[^\x00\xff]")  # with which blocks of a chip are filled up
 _FACTORS = {**dict.fromkeys("cCeE", 0.01), "L": 1e-7}
 _LAST_WEEK = 6000  # in 2095
 
@@ -111,7 +113,7 @@ def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[str,
             at = end if at < 0 else at
             if at == end and end - begin < 256 and data[begin : begin + 2] == _MARK:
                 breaks_off(findings, file, begin)
-            elif set(data[begin:at]) - {0, 255}:  # with which blocks of a chip are filled up
+            elif _NO_FILL.search(data, begin, at):
                 stray += at - begin
             continue
         kind = data[at + 2]
@@ -195,14 +197,13 @@ def _fixes(
     if np.isnan(separation).any():
         above_geoid(findings, file, "A newer version of ArduPilot logs the geoid.")
         separation = np.zeros_like(separation)
-    speed, course = column(file, gps, "Spd"), np.deg2rad(column(file, gps, "GCrs"))
     down = np.where(beside("VV") == 0.0, np.nan, column(file, gps, "VZ"))
     table = fixes(
         file,
         GPS_EPOCH_NS + time_ns,
         (column(file, gps, "Lat"), column(file, gps, "Lng"), column(file, gps, "Alt") - separation),
         (beside("HAcc"), beside("HAcc"), beside("VAcc")),
-        np.stack([speed * np.cos(course), speed * np.sin(course), down], axis=-1),
+        over_ground(column(file, gps, "Spd"), column(file, gps, "GCrs"), down),
         beside("SAcc"),
         np.array([MAVLINK.get(int(k), 0) for k in status]),
         status == 2,

@@ -62,6 +62,16 @@ def fixes(
     return with_usual_sigmas(table, findings)
 
 
+def over_ground(
+    speed: np.ndarray, course_deg: np.ndarray, down: np.ndarray | float = np.nan
+) -> np.ndarray:
+    """Velocity north, east, down, (n, 3), of a speed over ground and its course."""
+    course = np.deg2rad(course_deg)
+    with np.errstate(invalid="ignore"):  # an infinite course has no direction
+        north, east = speed * np.cos(course), speed * np.sin(course)
+    return np.stack([north, east, np.broadcast_to(down, north.shape)], axis=-1)
+
+
 def with_usual_sigmas(
     table: GnssTable, findings: list[Finding] | None, places: bool = True
 ) -> GnssTable:

@@ -23,7 +23,7 @@ import numpy as np
 from robins.dataset import GnssTable
 from robins.gps_time import gps_of
 from robins.logs.findings import Finding, LogError, breaks_off, left_out, telling
-from robins.logs.fix_kinds import fixes
+from robins.logs.fix_kinds import fixes, over_ground
 from robins.logs.opening import Bytes, mapped
 from robins.logs.text import Head
 from robins.units import to_si
@@ -66,7 +66,7 @@ def read_nmea(path: str | os.PathLike[str], findings: list[Finding] | None = Non
         return np.array([epochs[k].get(name, math.nan) for k in kept])
 
     utc_ns = np.array([days[k] * _DAY_NS + int(epochs[k]["time"]) for k in kept], np.int64)
-    speed, course = to_si(column("speed"), "kn"), np.deg2rad(column("course"))
+    speed, course = to_si(column("speed"), "kn"), column("course")
     course = np.where(np.isnan(course) & (speed < _SLOW), 0.0, course)
     nothing = np.full(len(kept), np.nan)
     return fixes(
@@ -74,7 +74,7 @@ def read_nmea(path: str | os.PathLike[str], findings: list[Finding] | None = Non
         gps_of(utc_ns) if days[0] >= 0 else utc_ns + _DAY_NS,
         (column(f"lat{end}"), column(f"lon{end}"), column("height")),
         (column("north"), column("east"), column("up")),
-        np.stack([speed * np.cos(course), speed * np.sin(course), nothing], axis=-1),
+        over_ground(speed, course),
         nothing,
         column(f"kind{end}"),
         np.zeros(len(kept), bool),

@@ -23,6 +23,7 @@ import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.logs.findings import Finding, LogError, refused
+from robins.logs.fix_kinds import over_ground
 from robins.logs.text import Head, Layout, peek, read_columns
 from robins.logs.timebase import dates_to_ns
 from robins.units import to_si
@@ -112,7 +113,6 @@ def fixes_of(
     """
     lat_deg, lon_deg, alt_m, radius_m, sigma_alt_m = place.T
     speed, bearing_deg, sigma_speed, sigma_bearing_deg = velocity.T
-    bearing = np.deg2rad(bearing_deg)
     # A bearing that is 180 deg unsure says nothing: the error is at most twice the speed.
     across = speed * np.minimum(np.deg2rad(sigma_bearing_deg), 2.0)
     sigma = np.hypot(sigma_speed, across)
@@ -124,7 +124,7 @@ def fixes_of(
         lon_rad=np.deg2rad(lon_deg),
         alt_m=alt_m.copy(),
         sigma_m=np.stack([sigma_m, sigma_m, sigma_alt_m], axis=-1),
-        v_n=np.stack([speed * np.cos(bearing), speed * np.sin(bearing), missing], axis=-1),
+        v_n=over_ground(speed, bearing_deg),
         sigma_v=np.stack([sigma, sigma, missing], axis=-1),
         quality=np.full(len(speed), _SINGLE, np.int64),
         source=file,

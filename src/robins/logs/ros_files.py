@@ -213,7 +213,7 @@ def _database(path: Path, data: Bytes, refuse: Callable[[str], LogError]) -> sql
             base.deserialize(data)
         else:
             base = sqlite3.connect(f"{path.absolute().as_uri()}?immutable=1", uri=True)
-        base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(len(data), 1 << 16))
+        base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(max(len(data), 1 << 16), (1 << 31) - 1))
         base.execute("PRAGMA query_only = ON")
         base.execute("PRAGMA trusted_schema = OFF")
         return base

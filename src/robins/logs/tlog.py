@@ -13,6 +13,7 @@ not, these are put on it by the order of arrival. Source: mavlink.io, common.xml
 from __future__ import annotations
 
 import os
+import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,7 +24,7 @@ import numpy as np
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.gps_time import dated, gps_of
 from robins.logs.findings import Finding, LogError, above_geoid, breaks_off, left_out, telling
-from robins.logs.fix_kinds import MAVLINK, fixes
+from robins.logs.fix_kinds import MAVLINK, fixes, over_ground
 from robins.logs.merging import gps_clock
 from robins.logs.opening import Bytes, mapped
 from robins.logs.text import Head
@@ -33,6 +34,7 @@ from robins.units import to_si
 _STAMP = struct.Struct(">Q")  # microseconds of UTC at which the ground station received it
 _EARLIEST, _LATEST = (int(year * 31_556_952e6) for year in (30, 130))
 _ONE, _TWO = 0xFE, 0xFD  # first byte of a frame of MAVLink 1 and 2
+_FIRST = re.compile(rb"[\xfd\xfe]")
 _INERTIAL = {105: "HIGHRES_IMU", 26: "SCALED_IMU", 27: "RAW_IMU"}
 _GPS = 24
 _SENSORS = [axis + what for what in ("gyro", "acc", "mag") for axis in "xyz"]
@@ -91,7 +93,9 @@ def _frames(
         stamp, first, length, flags = struct.unpack(">QBBB", data[at : at + 11].ljust(11, b"\0"))
         size = {_ONE: 16, _TWO: 20 + 13 * (flags & 1)}.get(first, 0) + length
         if size <= length or not _EARLIEST < stamp < _LATEST:
-            stray, at = stray + 1, at + 1
+            later = _FIRST.search(data, at + 9)  # behind the stamp of the next frame
+            stray, at = stray - at, later.start() - 8 if later else end
+            stray += at
             continue
         if at + size > end:
             breaks_off(findings, file, at)
@@ -161,13 +165,12 @@ def _fixes(file: str, gps: Topic, findings: list[Finding] | None) -> GnssTable:
         above_geoid(findings, file, "Set the telemetry to MAVLink 2.")
         ellipsoid = msl
     speed, course = (np.where(x < 65535.0, x * 1e-2, np.nan) for x in (vel, cog))
-    north, east = speed * np.cos(np.deg2rad(course)), speed * np.sin(np.deg2rad(course))
     return fixes(
         file,
         _stamps(file, gps),
         (lat * 1e-7, lon * 1e-7, ellipsoid * 1e-3),
         (h_acc * 1e-3, h_acc * 1e-3, v_acc * 1e-3),
-        np.stack([north, east, np.full_like(north, np.nan)], axis=-1),
+        over_ground(speed, course),
         vel_acc * 1e-3,
         np.array([MAVLINK.get(int(k), 0) for k in fix]),
         fix == 2,
