@@ -217,9 +217,9 @@ def _apple(folder: Path) -> float:
         cause = "has neither TotalAcceleration.csv nor Metadata.csv, so the sign is not known"
         raise LogError(str(folder), cause, "export the recording with its metadata")
     names, values = ([c.strip('" \r') for c in text.split(",")] for text in peek(path).lines[:2])
-    told = dict(zip(names, values, strict=False))
-    apple = told.get("platform", "").lower() == "ios"
-    return -1.0 if apple and told.get("standardisation", "false").lower() != "true" else 1.0
+    stated = dict(zip(names, values, strict=False))
+    apple = stated.get("platform", "").lower() == "ios"
+    return -1.0 if apple and stated.get("standardisation", "false").lower() != "true" else 1.0
 
 
 # ------------------------------------------------------------------------------- gnss-ins-sim
