@@ -274,7 +274,7 @@ def _imu(read: Read) -> ImuTable:
         _compare_dt(read)
     rate = read.has("gyro")
     turn, force = map(read.stack, ("gyro", "accel") if rate else ("dtheta", "dv"))
-    turns, forces = (np.isfinite(v).any(axis=1) for v in (turn, force))
+    turns, forces = (np.asarray(np.isfinite(v).any(axis=1)) for v in (turn, force))
     if rate and turns.any() and forces.any() and not (turns & forces).any():
         own = read.time_ns[turns], turn[turns], read.time_ns[forces], force[forces]
         read = read.of(turns)
