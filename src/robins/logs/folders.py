@@ -139,13 +139,12 @@ def _oxts(folder: Path, findings: Findings) -> Dataset:
 
 
 def _record(path: Path) -> np.ndarray:
-    layout = Layout(tuple(f"number {k + 1}" for k in range(_OXTS)), None, texts=())
     text = path.read_bytes()[: 1 << 16]
     try:
         numbers = np.array([text.split()], np.float64)
     except ValueError as error:
         raise LogError(str(path), f"is no record: {error}", "copy it again") from error
-    if numbers.shape != (1, len(layout.names)):
+    if numbers.shape != (1, _OXTS):
         raise LogError(str(path), f"has {numbers.size} numbers, not {_OXTS}", "copy it again")
     return numbers
 
