@@ -213,6 +213,30 @@ def test_a_stamp_counts_so_many_of_a_unit_exactly(own, unit, stamp, ns):
     assert open_log(log, row).time_ns.tolist() == [ns]
 
 
+def test_rows_of_several_sensors_are_told_by_a_text(own):
+    """Android's loggers: a row a sensor; specific forces are taken to the stamps of the gyros."""
+    triads = (("gyro", "rad/s", "GYR"), ("accel", "m/s^2", "ACC"), ("mag", "uT", "MAG"))
+    toml = '[columns]\ntime = { name = "t", unit = "ms" }\n' + "".join(
+        f'{q}_{a} = {{ name = "{a}", unit = "{u}", where = {{ sensor = "{s}" }} }}\n'
+        for q, u, s in triads for a in "xyz"
+    )  # fmt: skip
+    rows = ['0,"ACC",0,0,8', "5,GYR,1,2,3", "6,BARO,1013,,", "10,MAG,20,0,-40", "15,GYR,4,5,6"]
+    log = "t,sensor,x,y,z\n" + "\n".join([*rows, "20,ACC,0,0,12", "25,GYR,7,8,9"]) + "\n"
+    declared, path = own(toml, log)
+    data = open_log(path, columns_from(declared))
+    assert data.imu.time_ns.tolist() == [5_000_000, 15_000_000, 25_000_000]
+    assert data.imu.gyro[1].tolist() == [4, 5, 6]
+    np.testing.assert_allclose(data.imu.accel[:, 2], [9.0, 11.0, np.nan])
+    np.testing.assert_allclose(data.mag.field_t, [[20e-6, 0, -40e-6]])
+    path.write_text(log.replace("sensor", "kind"))
+    with pytest.raises(LogError, match="line 1: the header lacks sensor; it has t, kind, x, y, z"):
+        open_log(path, columns_from(declared))
+    with pytest.raises(
+        LogError, match=r"gyro_x: where = .*: is not one column and its text; write"
+    ):
+        columns_from(own(toml.replace('sensor = "GYR"', "sensor = 1", 1))[0])
+
+
 def test_lines_above_a_header_are_passed_over(own):
     above = "Logger 3.1\nserial;0042\nrange;16 g\n\n"
     declared, log = own(log=above + LOG)

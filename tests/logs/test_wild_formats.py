@@ -377,7 +377,7 @@ def test_a_folder_that_is_no_recording_says_what_it_holds(tmp_path):
 # ------------------------------------------------------------------------------------- damage
 
 
-def test_damage_is_told_and_nothing_else(tmp_path):
+def test_damaged_files_are_read_or_refused(tmp_path):
     """Bits, cuts and sizes changed in every kind of file: read or refused by a `LogError`."""
     rng = np.random.default_rng(11)
     files = [path.read_bytes() for path in archives(tmp_path)]

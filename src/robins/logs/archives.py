@@ -137,9 +137,9 @@ def rows_of(head: Head, layout: Layout) -> Columns:
         wanted = layout.texts + numbers
     sizes = {head.names[k]: len(head.arrays[k]) for k in wanted}
     if len(set(sizes.values())) != 1:
-        told = ", ".join(f"{name} {size}" for name, size in sizes.items())
+        listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
         mend = "declare columns of one sensor, which have one length"
-        raise LogError(head.file, f"the columns differ in length: {told}", mend)
+        raise LogError(head.file, f"the columns differ in length: {listed}", mend)
     if dates := [head.names[k] for k in numbers if head.arrays[k].dtype.kind == "M"]:
         raise LogError(head.file, f"{dates[0]} holds dates, not numbers", "declare it as the time")
     rows = next(iter(sizes.values()))

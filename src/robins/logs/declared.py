@@ -9,6 +9,7 @@
     accel_x = { place = 5, unit = "g" }          # or the place from 1, where there is no header
     mag_x = { name = "mx", unit = "uT", scale = 0.15 }    # counts of 0.15 uT; -1 reverses an axis
     sigma_north = { value = 0.5, unit = "m" }    # a constant, which no column holds
+    mag_y = { name = "y", unit = "uT", where = { sensor = "MAG" } }    # in rows of this text only
 
 Units are those of `robins.units`, or so many of them (``"0.1 ms"``); for dates of ISO 8601 ``iso``,
 which states its offset from UTC, ``iso UTC`` or ``iso GPS``. ``offset`` is added in the unit, after
@@ -44,7 +45,7 @@ Types = dict[str, tuple[type, ...]]
 _KEYS: Types = {"columns": (dict,), "separator": (str,), "skip": (int,)}
 _KEYS |= {"body": (str,), "nav": (str,), "rate": (str,), "decimal": (str,)}
 _COLUMN: Types = {"name": (str,), "place": (int,), "unit": (str,), "scale": (int, float)}
-_COLUMN |= {"offset": (int, float), "value": (int, float)}
+_COLUMN |= {"offset": (int, float), "value": (int, float), "where": (dict,)}
 _WIDEST = 10_000  # columns
 _MANY = re.compile(r"([-+]?\d+\.?\d*(?:[eE][-+]?\d+)?) (.+)")
 _WORDS = {dict: "a table", str: "text", int: "a whole number", float: "a number"}
@@ -89,7 +90,7 @@ def format_of(text: str, file: str) -> TextFormat:
     name = Path(file).name.split(".")[0]
     row = TextFormat(name, f"declared in {file}", columns, others=True, source=file, **content)
     # a file of several sensors has gaps where one is slower
-    return replace(row, sparse=len(row.kinds) > 1)
+    return replace(row, sparse=len(row.kinds) > 1 or any(c.where[0] for c in columns))
 
 
 def _column(file: str, quantity: str, stated: Any) -> Column:
@@ -110,6 +111,10 @@ def _column(file: str, quantity: str, stated: Any) -> Column:
     if kind != "ratio" and "unit" not in stated:
         mend = f"state one of {', '.join(KINDS[kind])}"
         raise refused(file, key)("has no unit", mend)
+    where = next(iter(stated.get("where", {}).items()), ("", ""))
+    if len(stated.get("where", {"": ""})) != 1 or not isinstance(where[1], str):
+        mend = 'write it like { sensor = "GYR" }'
+        raise refused(file, key, "where", stated["where"])("is not one column and its text", mend)
     count, symbol = 1.0, stated.get("unit")
     if symbol is not None and (many := _MANY.fullmatch(symbol)):
         count, symbol = float(many[1]), many[2]
@@ -121,6 +126,7 @@ def _column(file: str, quantity: str, stated: Any) -> Column:
         stated.get("place", 0),
         float(stated.get("offset", 0.0)) * count,
         float(stated["value"]) if "value" in stated else None,
+        where,
     )
 
 

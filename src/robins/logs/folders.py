@@ -149,13 +149,12 @@ def _oxts(folder: Path, findings: Findings) -> Dataset:
 
 
 def _record(path: Path) -> np.ndarray:
-    layout = Layout(tuple(f"number {k + 1}" for k in range(_OXTS)), None, texts=())
     text = path.read_bytes()[: 1 << 16]
     try:
         numbers = np.array([text.split()], np.float64)
     except ValueError as error:
         raise LogError(str(path), f"is no record: {error}", "copy it again") from error
-    if numbers.shape != (1, len(layout.names)):
+    if numbers.shape != (1, _OXTS):
         raise LogError(str(path), f"has {numbers.size} numbers, not {_OXTS}", "copy it again")
     return numbers
 
@@ -227,9 +226,9 @@ def _apple(folder: Path) -> float:
         cause = "has neither TotalAcceleration.csv nor Metadata.csv, so the sign is not known"
         raise LogError(str(folder), cause, "export the recording with its metadata")
     names, values = ([c.strip('" \r') for c in text.split(",")] for text in peek(path).lines[:2])
-    told = dict(zip(names, values, strict=False))
-    apple = told.get("platform", "").lower() == "ios"
-    return -1.0 if apple and told.get("standardisation", "false").lower() != "true" else 1.0
+    stated = dict(zip(names, values, strict=False))
+    apple = stated.get("platform", "").lower() == "ios"
+    return -1.0 if apple and stated.get("standardisation", "false").lower() != "true" else 1.0
 
 
 # ------------------------------------------------------------------------------- gnss-ins-sim

@@ -25,15 +25,17 @@ from robins.dataset import (
 from robins.ins.frames import swap, swap_q
 from robins.logs.archives import head_of, rows_of
 from robins.logs.findings import Finding, LogError, refused, telling
+from robins.logs.merging import on_clock_of
 from robins.logs.mounting import LocalPath, Origin, from_local
 from robins.logs.quantities import CLOCKS, DATES, QUANTITIES, TABLES, parts, words_of
 from robins.logs.tables import Table, kind_of, unit_quaternions
-from robins.logs.text import COMMENTS, Head, Layout, read_columns
+from robins.logs.text import COMMENTS, Columns, Head, Layout, read_columns
 from robins.logs.text_format import (
     PAIRS,
     Axes,
     Column,
     Found,
+    Header,
     TextFormat,
     columns_of,
     header_of,
@@ -115,10 +117,11 @@ def read_text(
     columns = columns_of(format, file, header)
     texts = {q: f for q, f in columns.items() if q in _TEXTS}
     numbers = {q: f for q, f in columns.items() if q not in _TEXTS}
+    marks = _marks(file, header, columns)
     layout = Layout(
         tuple(header.names),
         format.delimiter,
-        texts=tuple(sorted({f.place for f in texts.values()})),
+        texts=tuple(sorted({*(f.place for f in texts.values()), *marks.values()})),
         numbers=tuple(sorted({f.place for f in numbers.values()})) if format.others else None,
         skip=header.line,
         all_named=header.all_named,
@@ -130,10 +133,7 @@ def read_text(
     read = Read(
         file,
         numbers,
-        {
-            q: _si(f.column, f.unit, table.values[:, layout.number(f.place)])
-            for q, f in numbers.items()
-        }
+        {q: _column(f, table, layout, marks) for q, f in numbers.items()}
         | {c.holds: _si(c, c.unit, np.full(len(table.rows), c.value)) for c in format.stated},
         _times(file, texts, stamps, table.rows, format.rate_hz),
         table.rows,
@@ -149,6 +149,30 @@ def read_text(
     if format.local:
         origin = origin or _origin(head)
     return _tables(format, read, origin, known=any(f.sure for f in texts.values()))
+
+
+def _marks(file: str, header: Header, columns: dict[str, Found]) -> dict[str, int]:
+    """Places of the columns whose text tells which rows hold a quantity.
+
+    Raises:
+        LogError: the header has no such column.
+    """
+    names = {f.column.where[0] for f in columns.values()} - {""}
+    if lacking := sorted(names - set(header.names)):
+        raise refused(file, f"line {header.line}")(
+            f"the header lacks {lacking[0]}; it has {', '.join(header.names)}", "name it as it is"
+        )
+    return {name: header.names.index(name) for name in names}
+
+
+def _column(found: Found, table: Columns, layout: Layout, marks: dict[str, int]) -> np.ndarray:
+    """Numbers of a column in SI units; NaN in rows of other sensors."""
+    values = _si(found.column, found.unit, table.values[:, layout.number(found.place)])
+    name, text = found.column.where
+    if name:
+        marked = np.char.strip(table.texts[:, layout.texts.index(marks[name])], b'" ')
+        values[marked != text.encode()] = np.nan
+    return values
 
 
 def _si(column: Column, symbol: str, values: np.ndarray) -> np.ndarray:
@@ -249,9 +273,16 @@ def _imu(read: Read) -> ImuTable:
     if read.has("dt"):
         _compare_dt(read)
     rate = read.has("gyro")
+    turn, force = map(read.stack, ("gyro", "accel") if rate else ("dtheta", "dv"))
+    turns, forces = (np.asarray(np.isfinite(v).any(axis=1)) for v in (turn, force))
+    if rate and turns.any() and forces.any() and not (turns & forces).any():
+        own = read.time_ns[turns], turn[turns], read.time_ns[forces], force[forces]
+        read = read.of(turns)
+        _, turn, force = on_clock_of(*own)
     return ImuTable(
         read.time_ns,
-        *map(read.stack, ("gyro", "accel") if rate else ("dtheta", "dv")),
+        turn,
+        force,
         kind="rate" if rate else "increment",
         body=read.body,
         **read.origin,

@@ -101,6 +101,7 @@ class Column(NamedTuple):
     place: int = 0  # from 1, where columns have places and no names
     offset: float = 0.0
     value: float | None = None  # of a constant
+    where: tuple[str, str] = ("", "")  # another column, and its text in the rows that hold this
 
     @property
     def unit(self) -> str:

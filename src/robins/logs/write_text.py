@@ -43,9 +43,11 @@ def write_text(
     Raises:
         LogError: the format does not hold such a table, or the file cannot be written.
     """
-    dated = any(c.unit in DATES or (c.offset and c.holds in _CLOCKS) for c in format.columns)
+    dated = any(
+        c.unit in DATES or (c.offset and c.holds in _CLOCKS) or c.where[0] for c in format.columns
+    )
     if dated or format.stated or format.rate_hz or format.decimal != ".":
-        cause = f"{format.name} has a rate, a constant, dates, an offset of time or decimal commas"
+        cause = f"{format.name} has a rate, constants, dates, decimal commas or rows of one sensor"
         raise LogError(str(path), cause, "such a format is only read; choose another")
     tables = tables_of(table)
     for one in tables:
