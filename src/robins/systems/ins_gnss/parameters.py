@@ -133,6 +133,9 @@ class Unit(Imu):
 class Rover(Gnss):
     """A receiver of which nothing is told."""
 
+    # of every fix, in the place of what the log states; north, east, down, or one for all
+    sigma: Annotated[q.Three, Quantity("length", above="0 m")] | None = None
+    velocity_sigma: Annotated[q.Three, Quantity("speed", above="0 m/s")] | None = None
     sigma_factor: dict[str, Positive] = pydantic.Field(default_factory=lambda: {"2": 3.0, "5": 3.0})
 
 
