@@ -87,11 +87,12 @@ def log_of(seed: int, at_rest: bool) -> tuple[Dataset, Truth]:
     def sensed(x: np.ndarray, bias: float, noise: float, shaken: float) -> np.ndarray:
         mean = np.vstack([x[:1], x[1:].reshape(-1, FINE, 3).mean(axis=1)])  # over a sample
         own = rng.normal(0.0, bias, 3) + rng.normal(0.0, noise, (count, 3))
-        return mean + own + moves * rng.normal(0.0, shaken, (count, 3))
+        shakes = np.diff(rng.normal(0.0, shaken, (count + 1, 3)), axis=0)  # to and fro
+        return mean + own + moves * shakes
 
     quiet = rng.uniform() < 0.2  # a smooth road
-    gyro = sensed(truth.omega_b, 2e-3, 1e-3, 0.0 if quiet else 0.02)
-    accel = sensed(truth.force_b, 0.05, 0.015, 0.0 if quiet else 0.4)
+    gyro = sensed(truth.omega_b, 2e-3, 1e-3, 0.0 if quiet else 0.015)
+    accel = sensed(truth.force_b, 0.05, 0.015, 0.0 if quiet else 0.3)
     stamps = np.round(truth.time_s[every] * 1e9).astype(np.int64)
     # increments: a mean over a sample is one, whatever happens within it
     imu = ImuTable(stamps, gyro / RATE_HZ, accel / RATE_HZ, "increment", source="positions_only")

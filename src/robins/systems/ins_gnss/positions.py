@@ -209,7 +209,7 @@ def _between(
     A fix stamped t is of t - latency; the state is that of the last stamp.
     """
     now_s, (dt, theta, dv) = log.gnss_s[fix], log.increments[:3]
-    last = int(np.searchsorted(log.time_s, now_s - 1e-9))
+    last = int(np.searchsorted(log.time_s, now_s))
     first_s = now_s + np.nanmin(time_s) - max(gnss.latency, 0.0)
     first = min(int(np.searchsorted(log.time_s, first_s)), last)
     rows = np.arange(last, first - 1, -1)  # backwards

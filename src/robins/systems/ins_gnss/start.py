@@ -206,7 +206,7 @@ def _levelled(
     # without a course nothing is taken from after the rest that it begins at
     end = min(int(np.searchsorted(log.time_s, until_s)), len(dt) - 1)
     enough = min(int(np.append(np.flatnonzero(still)[width : width + 1], end)[0]), end)
-    last = enough if fast is None else int(np.searchsorted(log.time_s, log.gnss_s[fast]))
+    last = enough if fast is None else _row(log, fast)
     quiet_enough = np.flatnonzero(still[: last + 1])
     if len(quiet_enough):
         at = int(quiet_enough[min(len(quiet_enough) - 1, width)])
@@ -304,4 +304,4 @@ def _by_positions(
 
 def _row(log: Log, fix: int) -> int:
     """Row of the increment that holds a fix."""
-    return int(np.searchsorted(log.time_s, log.gnss_s[fix] - 1e-9))
+    return int(np.searchsorted(log.time_s, log.gnss_s[fix]))
