@@ -127,6 +127,7 @@ def fitted(
         v = _lines(time_s, place, sigma)[1][0]
         q_nb = with_heading(q_nb, float(np.arctan2(v[1], v[0])))
     moved, arms = _between(log, fix, q_nb, gnss, bias, time_s[0])
+    time_s = time_s - gnss.latency  # at which the positions were true
     for _ in range(1 if heading_known else 4):  # of a turn the line has the course of its middle
         p, v, spread = _lines(time_s, place - (moved + arms)[None], sigma)
         heading = float(np.arctan2(v[0, 1], v[0, 0]))
