@@ -101,7 +101,7 @@ def test_errors_come_first_and_those_of_readers_are_brought_along(drive):
     g, fifth = data.gnss, np.arange(len(data.gnss)) == 5
     lat, lon = (np.where(fifth, 0.0, x) for x in (g.lat_rad, g.lon_rad))
     codes = found(with_gnss(data, lat_rad=lat, lon_rad=lon))
-    assert codes == ["no_fix_as_zero", "ends_early", "little_overlap", "motion_not_checked"]
+    assert codes == ["no_fix_as_zero", "ends_early", "little_overlap"]
 
 
 def test_the_doctor_survives_what_it_is_given(drive):
