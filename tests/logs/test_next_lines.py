@@ -20,7 +20,7 @@ def bag(speed, seconds=14):
         now = begin + k * NS // 50
         shake = (0.3 if speed else 0.01) * rng.normal(size=3)
         gyro = rng.normal(0.0, 1e-3, 3)
-        out.append(("/imu", IMU, imu(now, tuple(gyro), tuple(shake + (0.0, 0.0, 9.81)))))
+        out.append(("/imu", IMU, imu(now, tuple(gyro), (*shake[:2], shake[2] + 9.81))))
         if k % 25 == 5:
             way = speed * k / 50 / 6.37e6 * np.array([0.8, 0.6 / np.cos(np.radians(48.0))])
             north, east = np.degrees(way + 0.2 / 6.37e6 * rng.normal(size=2))

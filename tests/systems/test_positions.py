@@ -1,15 +1,20 @@
 """Velocity, course and sigmas of logs whose receiver states none; the verdict on a replay."""
 
+import io
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from short_drive import DRIVE
 
+from robins import scenario
 from robins.dataset import Dataset, Finding, GnssTable, ImuTable
 from robins.earth import Geodetic
 from robins.filters import Code
 from robins.ins.increments import Increments
+from robins.systems.ins_gnss import Drive, drive_dataset, replay
 from robins.systems.ins_gnss.model import POSITION
 from robins.systems.ins_gnss.parameters import Aids, Gnss, Replay, Start
 from robins.systems.ins_gnss.positions import _lines, course_fix, fitted, heading_of
@@ -226,3 +231,40 @@ def test_a_verdict_says_whether_a_replay_is_good(nis, refused, apart_m, doubts, 
     assert said.startswith(begins)
     assert ("sigmas from its smoother" in said) == (apart_m is not None)
     assert verdict({"ekf+rts": answer(1.0)}, {"ekf+rts": {}}, []) == ""
+
+
+# ----------------------------------------------------------------------------------- every sample
+
+
+def test_states_at_every_sample_are_those_of_the_epochs_carried_on():
+    """Against Euler steps from epoch to epoch, with the biases of the epoch."""
+    log = drive_dataset(scenario.parse(Drive, DRIVE), seed=4)
+    found = replay(log, Replay(every_sample=True), ("ekf", "ekf+rts"))
+    assert set(found.files) == {"exports/ekf-sample.npz", "exports/ekf+rts-sample.npz"}
+    for name in ("ekf", "ekf+rts"):
+        with np.load(io.BytesIO(found.files[f"exports/{name}-sample.npz"])) as file:
+            x = {key: file[key] for key in file.files}
+        s = found.solution.sel(filter=name)
+        epoch = np.round(s["time"].values * 1e9).astype(np.int64) + log.imu.time_ns[0]
+        assert np.all(np.diff(x["time_ns"]) == 20_000_000)
+        assert x["time_ns"][-1] == epoch[-1]
+        there = np.isin(x["time_ns"], epoch)
+        epochs = np.isin(epoch, x["time_ns"])
+        assert np.sum(there) > 30
+        for key, of in (("v_n", "estimate_velocity"), ("q_nb", "q_nb")):
+            np.testing.assert_allclose(x[key][there], s[of].values[epochs], atol=1e-12)
+        bias_g, bias_f = s["estimate_gyro_bias"].values, s["estimate_accel_bias"].values
+        imu, first = log.imu, int(np.searchsorted(log.imu.time_ns, x["time_ns"][0]))
+        for k in range(0, len(epoch) - 1, 7):
+            at = int(np.searchsorted(x["time_ns"], epoch[k]))
+            if not epochs[k] or x["time_ns"][at + 1] in epoch:
+                continue
+            q = Rotation.from_quat(np.roll(x["q_nb"][at], -1))
+            v = x["v_n"][at] + q.apply(imu.accel[first + at + 1] - 0.02 * bias_f[k])
+            v[2] += 0.02 * 9.807
+            q = q * Rotation.from_rotvec(imu.gyro[first + at + 1] - 0.02 * bias_g[k])
+            np.testing.assert_allclose(x["v_n"][at + 1], v, atol=2e-3)
+            turned = (q.inv() * Rotation.from_quat(np.roll(x["q_nb"][at + 1], -1))).magnitude()
+            assert turned < 1e-4
+            north = (x["lat_rad"][at + 1] - x["lat_rad"][at]) * 6.37e6
+            assert abs(north - 0.02 * v[0]) < 5e-3

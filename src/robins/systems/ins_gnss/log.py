@@ -52,6 +52,7 @@ from robins.systems.ins_gnss.robust import (
     supposed,
     weighed,
 )
+from robins.systems.ins_gnss.samples import as_files
 from robins.systems.ins_gnss.start import StartPoint, find_start
 from robins.systems.ins_gnss.study import NAMES as STUDIED
 from robins.systems.ins_gnss.study import SMOOTHERS, make_filter
@@ -425,7 +426,11 @@ def replay(
         origin_ns=int(dataset.imu.time_ns[0]),
     )
     outcome.warnings[:0] = doubts
-    return replace(outcome, verdict=verdict(answers, outcome.metrics, outcome.warnings))
+    origin_ns, files = int(dataset.imu.time_ns[0]), {}
+    if parameters.every_sample:
+        files = as_files(log.time_s, origin_ns, pieces, answers)
+    word = verdict(answers, outcome.metrics, outcome.warnings)
+    return replace(outcome, verdict=word, files=files)
 
 
 def _estimates(mean: InsState) -> Mapping[str, Any]:

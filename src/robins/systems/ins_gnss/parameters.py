@@ -157,6 +157,7 @@ class Replay(Parameters):
     update: Update = pydantic.Field(default_factory=Update)
     outages: Outages | None = None
     filters: Names = ("robust", "robust+rts")
+    every_sample: bool = False  # write positions and attitudes at every inertial sample as well
 
     def withheld(self, time_s: np.ndarray, fix_s: np.ndarray) -> np.ndarray:
         """Which times (N,) lie in an outage, of a log with fixes at some times (M,)."""
