@@ -1,7 +1,8 @@
 """INS/GNSS on logs without velocities, beginning at rest or in motion, beside the same with them.
 
     python benchmarks/positions_only.py --runs 30 --seed 1000
-    python benchmarks/positions_only.py --runs 300 --seed 1000 --starts
+    python benchmarks/positions_only.py --runs 150 --seed 1000 --starts
+    python benchmarks/positions_only.py --runs 12 --seed 1000 --verdicts
 
 Cars of 60 s, made here by NumPy: speed and turns are sums of smooth steps, the specific force and
 the turn rates follow from them with the rotating Earth (Groves 2013, 5.3 and 2.4.7). Receivers of 1
@@ -12,6 +13,7 @@ but that a third of the replays is given the heading at the first sample. `SURE`
 
 import argparse
 import warnings
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -159,6 +161,47 @@ def navigated(log: Dataset, parameters: Replay, truth: Truth, name: str) -> list
     return [rms, m["nis_gnss_position"], m.get("refused_gnss_position", 0)]
 
 
+def spoilt(log: Dataset, truth: Truth):
+    """Name, log and parameters of ways in which a replay of one drive is right or wrong."""
+    g, imu = log.gnss, log.imu
+    assert g is not None
+    yield "sound", log, {}
+    for factor in (0.2, 5.0):
+        gnss = replace(g, sigma_m=factor * g.sigma_m)
+        yield f"sigmas stated {factor:g} times what they are", replace(log, gnss=gnss), {}
+    yield "unit mounted 90 deg off", log, {"imu": {"orientation": ["0 deg", "0 deg", "90 deg"]}}
+    back = {"known_heading": truth.heading[0] + np.pi, "heading": "5 deg"}
+    yield "heading given half a turn off", log, {"start": back}
+    slow = replace(imu, gyro=0.25 * imu.gyro)
+    yield "gyros a quarter of what they are", replace(log, imu=slow), {}
+
+
+def verdicts(runs: int, seed: int) -> None:
+    """Print how often each word begins the verdict on replays that are right and wrong."""
+    words = "Consistent", "With care", "Do not trust"
+    print(f"| log | {' | '.join(words)} | not navigated | north RMS, median [m] |")
+    print("|---" * (len(words) + 3) + "|")
+    found: dict[str, list] = {}
+    for one in range(seed, seed + runs):
+        log, truth = log_of(one, at_rest=bool(one % 2))
+        for kind, given, parameters in spoilt(without_velocities(log), truth):
+            row = found.setdefault(kind, [])
+            try:
+                outcome = replay(given, Replay.model_validate(parameters), ("robust", "robust+rts"))
+            except ValueError:
+                row.append(("none", np.nan))
+                continue
+            s = outcome.solution
+            assert s is not None
+            north = np.interp(s["time"].values, truth.time_s, truth.place[:, 0])
+            north = A_M * (s["lat_rad"].values[0] - north)
+            row.append((outcome.verdict.partition(":")[0], float(np.sqrt(np.mean(north**2)))))
+    for kind, row in found.items():
+        counts = [sum(word == of for of, _ in row) for word in (*words, "none")]
+        error = np.nanmedian([size for _, size in row])
+        print(f"| {kind} | {' | '.join(map(str, counts))} | {error:.2g} |")
+
+
 def main() -> None:
     """Print a line for each way to begin and to navigate."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -166,8 +209,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1000)
     parser.add_argument("--filter", default="ekf")
     parser.add_argument("--starts", action="store_true", help="look at the starts alone")
+    parser.add_argument("--verdicts", action="store_true", help="look at the verdicts alone")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
+    if given.verdicts:
+        verdicts(given.runs, given.seed)
+        return
     heads = ["start [s]", "heading [deg]", "sigma [deg]", "velocity NEES a component"]
     if not given.starts:
         heads = ["horizontal RMS [m]", "position NIS", "refused fixes"]

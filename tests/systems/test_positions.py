@@ -202,13 +202,21 @@ def test_sigmas_are_stated_assumed_or_given(settings, assumed, sigmas):
 @pytest.mark.parametrize(
     ("nis", "refused", "apart_m", "doubts", "begins"),
     [
-        (1.01, 0, 1.0, [], "Consistent: ekf, position NIS 1.01 (95 % band 0.90 to 1.10), 0 of 40"),
+        (1.01, 0, 1.0, [], "Consistent: ekf, position NIS 1.01 (0.37 to 1.94 is consistent), 0 of"),
         (1.01, 0, None, [], "Consistent: ekf"),
-        (1.3, 0, 1.0, [], "With care"),
+        (1.3, 0, 1.0, [], "Consistent"),
+        (2.2, 0, 1.0, [], "With care"),
+        (0.2, 0, 1.0, [], "With care"),
         (1.01, 0, 1.0, ["ekf: beware."], "With care"),
         (1.01, 0, 1.0, ["robust: of another filter."], "Consistent"),
         (4.2, 0, 1.0, [], "Do not trust"),
-        (1.01, 14, 1.0, [], "Do not trust: ekf, position NIS 1.01 (95 % band 0.90 to 1.10), 14 of"),
+        (
+            1.01,
+            14,
+            1.0,
+            [],
+            "Do not trust: ekf, position NIS 1.01 (0.24 to 2.29",
+        ),
         (1.01, 0, 14.0, [], "Do not trust"),
         (1.01, 0, 1.0, [f"ekf: {DIVERGED}: 3 s."], "Do not trust"),
     ],
@@ -229,6 +237,7 @@ def test_a_verdict_says_whether_a_replay_is_good(nis, refused, apart_m, doubts, 
     of = {key: nis, f"{key}_band": [0.9, 1.1], f"refused_{POSITION}": refused}
     said = verdict(answers, {"ekf": of, "ekf+rts": {}}, doubts)
     assert said.startswith(begins)
+    assert f"{refused} of 40 fixes refused" in said
     assert ("sigmas from its smoother" in said) == (apart_m is not None)
     assert verdict({"ekf+rts": answer(1.0)}, {"ekf+rts": {}}, []) == ""
 

@@ -12,6 +12,8 @@ from jaxtyping import Array
 from robins.dataset import Dataset
 from robins.earth import Geodetic
 from robins.filters import Code
+from robins.filters.chi_square import chi2_band
+from robins.filters.tally import CORRELATED
 from robins.ins.state import InsState
 from robins.program.scanned import named_scan, on_each
 from robins.results import array, variable
@@ -106,8 +108,8 @@ def verdict(answers: Mapping[str, Answer], metrics: Metrics, doubts: list[str]) 
 
     "Do not trust" where sigmas are too small by a factor of two (NIS above `NIS_MOST`) or a third
     of the fixes was refused, where the estimate was off, or is more than `FAR` sigmas from that of
-    its smoother. "Consistent" where NIS is inside its band and there is no warning, else "With
-    care".
+    its smoother. "Consistent" where NIS is inside the 95 % band of a tenth of the innovations, for
+    those of real fixes are correlated, and there is no warning; else "With care".
 
     Args:
         answers: by filter.
@@ -118,11 +120,13 @@ def verdict(answers: Mapping[str, Answer], metrics: Metrics, doubts: list[str]) 
     name = next((n for n in answers if key in metrics[n]), None)
     if name is None:
         return ""
-    nis, (low, high) = metrics[name][key], metrics[name][f"{key}_band"]
-    refused = metrics[name][f"refused_{model.POSITION}"]
+    nis, refused = metrics[name][key], metrics[name][f"refused_{model.POSITION}"]
     update = answers[name].updates[model.POSITION]
-    count = int(np.sum((np.asarray(update.dof) > 0) | (np.asarray(update.code) == Code.REFUSED)))
-    parts = [f"position NIS {nis:.2f} (95 % band {low:.2f} to {high:.2f})"]
+    spoke, unused = np.asarray(update.dof), np.asarray(update.code) == Code.REFUSED
+    independent = max(int(np.sum(spoke * ~unused)) // CORRELATED, 1)
+    low, high = chi2_band(independent, 1, 0.95) / independent
+    count = int(np.sum((spoke > 0) | unused))
+    parts = [f"position NIS {nis:.2f} ({low:.2f} to {high:.2f} is consistent)"]
     parts.append(f"{refused} of {count} fixes refused")
     far = 0.0
     if (smooth := answers.get(f"{name}+rts")) is not None:
