@@ -8,7 +8,7 @@ Cars of 60 s, made here by NumPy: speed and turns are sums of smooth steps, the 
 the turn rates follow from them with the rotating Earth (Groves 2013, 5.3 and 2.4.7). Receivers of 1
 to 5 Hz and 0.02 to 3 m, consumer IMUs at 50 Hz, shaken while they move. Everything is the default,
 but that a third of the replays is given the heading at the first sample. `SURE` and the windows of
-`robins.systems.ins_gnss.positions` were chosen on `--seed 0`.
+`robins.systems.ins_gnss.positions`, and the limits of a verdict, were looked at on `--seed 0`.
 """
 
 import argparse

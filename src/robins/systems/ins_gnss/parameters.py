@@ -56,7 +56,7 @@ class Start(Parameters):
     heading: q.Spread = default("20 deg")
     velocity: q.Speed = default("0.2 m/s")
     position: q.Length = default("0.1 m")
-    # heading of the body at the start; without it, the course once above the speed
+    # heading of the body at the first sample; without it, the course once above the speed
     known_heading: q.Angle | None = None
     course_speed: q.Speed = default("1 m/s")
 
