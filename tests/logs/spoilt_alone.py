@@ -243,14 +243,14 @@ GNSS = {
         (gnss(alt_m=plus(-1e3)), "warning"),
     ],
     "sigma_not_positive": [
-        (gnss(sigma_m=put((7, 1), 0.0)), "error line 10", 1),
-        (gnss(sigma_v=put((7, 1), 0.0)), "error line 10", 1),
-        (gnss(sigma_m=times(-1)), "error line 3", M),
-        (gnss(sigma_v=times(-1)), "error line 3", M),
+        (gnss(sigma_m=put((7, 1), 0.0)), "warning line 10", 1),
+        (gnss(sigma_v=put((7, 1), 0.0)), "warning line 10", 1),
+        (gnss(sigma_m=times(-1)), "warning line 3", M),
+        (gnss(sigma_v=times(-1)), "warning line 3", M),
     ],
     "sigma_missing": [
-        (gnss(sigma_m=times(np.nan)), "error: the position has no sigma"),
-        (gnss(sigma_v=times(np.nan)), "error: the velocity has no sigma"),
+        (gnss(sigma_m=times(np.nan)), "note: the position has no sigma"),
+        (gnss(sigma_v=times(np.nan)), "note: the velocity has no sigma"),
     ],
     "sigma_absurd": [
         (gnss(sigma_m=times(1e-3)), "warning", near(2e-5)),

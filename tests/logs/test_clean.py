@@ -287,26 +287,39 @@ def test_a_component_without_a_usable_sigma_is_missing(bad, reason):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "kept", "assumed"),
     [
         (
             {"sigma_m": np.zeros((M, 3))},
-            r"gnss.pos: sigma of north position = 0.0: the north position has 30 fixes and no posi",
+            "sigma_v",
+            [[0.02, 0.02, 0.04], [0.3, 0.3, 0.6], [3, 3, 6]],
         ),
         (
             {"sigma_v": -GNSS.sigma_v},
-            r"sigma of north velocity = -0.05: .*real sigmas, or leave the velocities out",
+            "sigma_m",
+            [[0.05, 0.05, 0.1], [0.1, 0.1, 0.2], [0.3, 0.3, 0.6]],
         ),
-        ({"sigma_v": GNSS.sigma_v * np.nan}, "sigma of north velocity = nan: .* no positive sigma"),
-        (
-            {"sigma_m": GNSS.sigma_m * [1, 1, 0]},
-            r"sigma of vertical position = 0.0: .*; zero means unknown, not exact: give real",
-        ),
+        ({"sigma_v": GNSS.sigma_v * np.nan}, "sigma_m", [[0.05] * 2, [0.1] * 2, [0.3] * 2]),
+        ({"sigma_m": GNSS.sigma_m * [1, 1, 0]}, "sigma_v", [[None, None, 0.04], [None, None, 0.6]]),
     ],
+    ids=["zero", "negative", "missing", "of the height"],
 )
-def test_sigmas_that_are_never_positive_are_refused_in_a_sentence(change, message):
-    with pytest.raises(LogError, match=message):
-        clean(with_gnss(DATA, **change))
+def test_sigmas_that_are_never_positive_are_assumed_by_the_kind_of_fix(change, kept, assumed):
+    """Fixed, float and single; what is stated stays."""
+    quality = np.repeat([1, 2, 5], M // 3)
+    got = clean(with_gnss(DATA, quality=quality, **change))
+    (name,) = change
+    for k, row in enumerate(assumed):
+        for axis, sigma in enumerate(row):
+            stated = getattr(GNSS, name)[:, axis]
+            expected = stated[quality == (1, 2, 5)[k]] if sigma is None else sigma
+            np.testing.assert_array_equal(
+                getattr(got.gnss, name)[quality == (1, 2, 5)[k], axis], expected
+            )
+    np.testing.assert_array_equal(getattr(got.gnss, kept), getattr(GNSS, kept))
+    assert [f.code for f in got.findings] == ["sigma_assumed"]
+    assert refused(got.counts) == {}
+    assert clean(got).findings == got.findings
 
 
 def test_a_fix_without_any_component_is_refused_whole():

@@ -98,9 +98,10 @@ def test_real_recordings_by_hand(data_dir, trial):
 def test_errors_come_first_and_those_of_readers_are_brought_along(drive):
     cut = Finding("warning", "ends_early", "f", "line 9", "", "f ends early at line 9: it was cut.")
     data = dataclasses.replace(drive, imu=rows_of(drive.imu, slice(0, 1100)), findings=[cut])
-    sigma = data.gnss.sigma_m * 0.0
-    codes = found(with_gnss(data, sigma_m=sigma))
-    assert codes == ["sigma_not_positive", "ends_early", "little_overlap", "motion_not_checked"]
+    g, fifth = data.gnss, np.arange(len(data.gnss)) == 5
+    lat, lon = (np.where(fifth, 0.0, x) for x in (g.lat_rad, g.lon_rad))
+    codes = found(with_gnss(data, lat_rad=lat, lon_rad=lon))
+    assert codes == ["no_fix_as_zero", "ends_early", "little_overlap"]
 
 
 def test_the_doctor_survives_what_it_is_given(drive):

@@ -105,6 +105,31 @@ def test_the_verdict_counts_the_claims(verdicts, text):
     assert report.verdict([{"verdict": v} for v in verdicts]) == text
 
 
+@pytest.mark.parametrize(
+    ("value", "band", "shown"),
+    [
+        (1.0, [0.9, 1.1], "1"),
+        (1.2, [0.9, 1.1], "1.2 !"),
+        (0.8, [0.9, 1.1], "0.8 !"),
+        (0.8, [None, 1.1], "0.8"),
+        (1.2, [None, 1.1], "1.2 !"),
+        (None, [0.9, 1.1], "–"),
+        (1.2, None, "1.2"),
+    ],
+)
+def test_a_number_outside_its_own_band_is_marked(value, band, shown):
+    assert numbers.marked({"nis_x": value, "nis_x_band": band}, "nis_x") == shown
+
+
+def test_the_verdict_on_a_replay_stands_above_its_numbers(town):
+    said = "With care: ekf, position NIS 1.3."
+    changed = {"ekf": {"nis_x": 1.3, "nis_x_band": [0.9, 1.1]}}
+    text = plain(town | {"verdict": said, "filters": changed})
+    assert text.startswith(said)
+    assert "1.3 !" in text
+    assert "! outside its band" in text
+
+
 def plain(summary, width=100):
     """The tables of a terminal as plain text."""
     console = Console(width=width, color_system=None, force_terminal=False)

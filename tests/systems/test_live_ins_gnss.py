@@ -149,14 +149,21 @@ def test_epochs_are_those_of_the_replay(live, log, order):
     assert live.start.startswith("levelled at rest")
 
 
-@pytest.mark.parametrize("velocities", [True, False])
-def test_steps_have_the_bits_of_those_of_a_replay(live, log, velocities, monkeypatch):
+@pytest.mark.parametrize(
+    ("parameters", "begin_s"),
+    [(None, 0.0), (Replay(), 0.0), (HEADED, 0.0), (HEADED, 6.0)],
+    ids=["velocities", "course of positions", "heading given", "heading given, in motion"],
+)
+def test_steps_have_the_bits_of_those_of_a_replay(live, log, parameters, begin_s, monkeypatch):
     """Samples one by one, and each fix up to 0.9 s late: the last word on each epoch."""
-    last, parameters = {}, Replay()
-    if not velocities:
-        log = replace(log, gnss=replace(log.gnss, v_n=None, sigma_v=None))
-        parameters = HEADED
-        live = LiveInsGnss(parameters, RATE_HZ, FIX_HZ, "ekf")
+    last = {}
+    if parameters is not None:
+        begin_ns = log.imu.time_ns[0] + round(begin_s * 1e9)
+        imu = rows_where(log.imu, log.imu.time_ns >= begin_ns)
+        gnss = rows_where(log.gnss, log.gnss.time_ns >= begin_ns)
+        log = replace(log, imu=imu, gnss=replace(gnss, v_n=None, sigma_v=None))
+        live = live if parameters == Replay() else LiveInsGnss(parameters, RATE_HZ, FIX_HZ, "ekf")
+    parameters = parameters or Replay()
 
     def noted(piece, used, begin_s, epochs, *others):
         last[round(1e9 * epochs[0])] = steps_of(piece, used, begin_s, epochs, *others)
@@ -166,6 +173,7 @@ def test_steps_have_the_bits_of_those_of_a_replay(live, log, velocities, monkeyp
     for event in events(log, np.random.default_rng(0).uniform(0.0, 0.9, len(log.gnss))):
         push(live, log, event)
     _, (piece,) = pieces_of(log, parameters)
+    assert live.start == piece.start.sentence
     whole, found = (piece.world.u, piece.world.y, piece.world.aux), 0
     for k, second in enumerate(piece.epoch_s):
         if (steps := last.get(round(1e9 * second))) is not None:

@@ -95,7 +95,8 @@ def test_start_says_why_it_cannot():
     with pytest.raises(ValueError, match="no whole GNSS fix"):
         find_start(log._replace(gnss=lost), Start(), Aids())
     found = find_start(with_velocity(None), Start(known_heading=1.25), Aids())
-    assert float(rotation.to_euler(jnp.asarray(found.q_nb))[2]) == pytest.approx(1.25, abs=1e-12)
+    # as given at the first sample, carried by gyros of 1e-5 rad a sample
+    assert float(rotation.to_euler(jnp.asarray(found.q_nb))[2]) == pytest.approx(1.25, abs=5e-4)
 
 
 def test_a_magnetometer_tells_the_heading_where_no_course_does():

@@ -80,6 +80,16 @@ def propagate(x: InsState, block: Increments, noise: InsNoise | None = None) -> 
     return _at(x, last, faded)
 
 
+def path(x: InsState, block: Increments, noise: InsNoise | None = None) -> Float[Array, "K 10"]:
+    """Attitude, velocity and position after each of K raw increments, as `mechanise.vector`."""
+    true, _ = _corrected(x, block, noise)
+
+    def step(at: Array, inc: Increments) -> tuple[Array, Array]:
+        return (now := advance(at, rows(inc))), now
+
+    return lax.scan(step, vector(x.nav), true)[1]
+
+
 def propagate_linear(
     x: InsState, block: Increments, noise: InsNoise, segments: int = 4
 ) -> tuple[InsState, Float[Array, "n n"], Float[Array, "n n"]]:

@@ -116,15 +116,17 @@ def _sigmas(gnss: GnssTable) -> Iterator[Finding]:
         if bad.any():
             k = int(np.argmax(bad))
             shown = ", ".join(f"{s:g}" for s in sigma[k])
-            yield error(gnss, "sigma_not_positive", int(bad.sum()), k)(
+            yield warning(gnss, "sigma_not_positive", int(bad.sum()), k)(
                 f"the {what} sigmas are ({shown}) {unit} here, and not all positive in {bad.sum()} "
-                f"of {len(gnss)} fixes. Zero means unknown, but a filter takes it for exact and "
-                "ends in NaN; write real sigmas (RTK 0.02 m, code 2 m; velocity 0.05 m/s)."
+                f"of {len(gnss)} fixes. Zero means unknown, not exact: a replay leaves such "
+                "components out, or assumes the usual sigma of the kind of fix where none is "
+                'positive; `[gnss] sigma = "2 m"` states another.'
             )
         if np.isfinite(values).any() and np.isnan(sigma).all():
-            yield error(gnss, "sigma_missing", len(gnss))(
-                f"the {what} has no sigma in any fix. A filter cannot weigh it; write real sigmas "
-                "(RTK 0.02 m, code 2 m; velocity 0.05 m/s)."
+            yield note(gnss, "sigma_missing", len(gnss))(
+                f"the {what} has no sigma in any fix. A replay assumes the usual one of the kind "
+                "of fix (fixed 0.02 m, float 0.3 m, single or unknown 3 m); "
+                '`[gnss] sigma = "2 m"` in its configuration states another.'
             )
         typical = median_of(sigma[sigma > 0.0])
         if typical < 1e-3 or typical > 1e3:

@@ -23,7 +23,8 @@ from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable
 from robins.errors import require_kind
 from robins.ins.plausible import ACCEL_LIMIT, GYRO_LIMIT
 from robins.logs.batches import spread, spread_counts, spread_like
-from robins.logs.findings import LogError, refused
+from robins.logs.findings import Finding, LogError
+from robins.logs.fix_kinds import with_usual_sigmas
 from robins.logs.limits import (
     ALT_LIMIT_M,
     FIELD_LIMIT_T,
@@ -54,26 +55,27 @@ def clean(dataset: Dataset) -> Dataset:
     not a positive number, a 1 that nobody uses. A fix with no component left is refused whole.
     Magnetic field and attitude keep their rows, NaN where something is missing.
 
-    ``imu_gaps`` lists the times between which IMU samples are missing.
+    ``imu_gaps`` lists the times between which IMU samples are missing. A component of fixes whose
+    sigma is never positive gets the usual one of the kind of each fix, which is a finding.
 
     Raises:
         TypeError: it is no dataset, or one of its tables is none of its kind.
-        LogError: arrays that are no tables (F04), fewer than two IMU samples left, or a GNSS
-            component whose sigma is never positive.
+        LogError: arrays that are no tables (F04), or fewer than two IMU samples left.
     """
     require_kind(dataset, Dataset, "clean", "make one of the table: Dataset(name, imu=table)")
     imu, counts, gaps = clean_imu(dataset.imu)
     tables: dict[str, Any] = {"imu": imu}
-    read = checked(dataset.imu)
+    read, findings = checked(dataset.imu), list(dataset.findings)
     even = spread(read)
     for kind, cleaner in _CLEANERS.items():
         if (table := getattr(dataset, kind)) is not None:
             table = checked(table)
             like = spread_like(table, read, even)
-            tables[kind], more = cleaner(like)
+            even_table = _with_sigmas(like, findings) if isinstance(like, GnssTable) else like
+            tables[kind], more = cleaner(even_table)
             counts |= more | spread_counts(kind, table, like)
     total = {k: dataset.counts.get(k, 0) + counts.get(k, 0) for k in dataset.counts | counts}
-    return dataclasses.replace(dataset, **tables, counts=total, imu_gaps=gaps)
+    return dataclasses.replace(dataset, **tables, counts=total, imu_gaps=gaps, findings=findings)
 
 
 def clean_imu(imu: ImuTable) -> tuple[ImuTable, dict[str, int], list[tuple[int, int]]]:
@@ -136,16 +138,33 @@ def clean_master(master: Trajectory) -> tuple[Trajectory, dict[str, int]]:
     return rows_where(table, keep), counts
 
 
+def _with_sigmas(gnss: GnssTable, findings: list[Finding]) -> GnssTable:
+    """Fixes with the usual sigmas of components whose sigma is never positive; adds the note."""
+    blank: dict[str, np.ndarray] = {}
+    for name, values in (("sigma_m", place_of(gnss)), ("sigma_v", gnss.v_n)):
+        sigma = getattr(gnss, name)
+        if values is not None and sigma is not None:
+            with np.errstate(invalid="ignore"):
+                never = ~np.any(np.isfinite(values) & (sigma > 0.0), axis=0)
+            blank[name] = np.where(never, np.nan, np.where(np.isnan(sigma), 0.0, sigma))
+    filled = with_usual_sigmas(dataclasses.replace(gnss, **blank), findings)
+    kept = {
+        name: np.where(np.isnan(one), getattr(filled, name), getattr(gnss, name))
+        for name, one in blank.items()
+    }
+    return dataclasses.replace(gnss, **kept)
+
+
 def clean_gnss(gnss: GnssTable) -> tuple[GnssTable, dict[str, int]]:
     """Clean one GNSS table: the table and counts by reason. See `clean`."""
     gnss = checked(gnss)
-    place, sigma_m, bad = _components(gnss, "position", place_of(gnss), gnss.sigma_m, _PLACE_LIMIT)
+    place, sigma_m, bad = _components(place_of(gnss), gnss.sigma_m, _PLACE_LIMIT)
     have = np.isfinite(place).any(axis=1)
     lat, lon, alt = place.T
     kept = {"lat_rad": lat, "lon_rad": lon, "alt_m": alt, "sigma_m": sigma_m}
     if gnss.v_n is not None and gnss.sigma_v is not None:
         limit = np.full(3, SPEED_LIMIT)
-        v_n, sigma_v, more = _components(gnss, "velocity", gnss.v_n, gnss.sigma_v, limit)
+        v_n, sigma_v, more = _components(gnss.v_n, gnss.sigma_v, limit)
         bad = {reason: bad[reason] | more[reason] for reason in bad}
         have |= np.isfinite(v_n).any(axis=1)
         kept |= {"v_n": v_n, "sigma_v": sigma_v}
@@ -163,18 +182,9 @@ def _whole_rows(values: np.ndarray, limit: np.ndarray) -> tuple[Rows, dict[str, 
 
 
 def _components(
-    gnss: GnssTable, what: str, values: np.ndarray, sigma: np.ndarray, limit: np.ndarray
+    values: np.ndarray, sigma: np.ndarray, limit: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Values with NaN where a component is missing, sigmas, rows touched by each reason."""
-    for k, name in enumerate(("north", "east", "vertical")):
-        known = np.isfinite(values[:, k])
-        if known.any() and not (sigma[known, k] > 0.0).any():
-            at = gnss.source or "GnssTable", "", f"sigma of {name} {what}"
-            raise refused(*at, float(sigma[known, k][0]))(
-                f"the {name} {what} has {np.count_nonzero(known)} fixes and no positive sigma",
-                "zero means unknown, not exact: give real sigmas"
-                + (", or leave the velocities out" if what == "velocity" else ""),
-            )
     nan = np.isnan(values) | np.isnan(sigma)
     inf = (np.isinf(values) | np.isinf(sigma)) & ~nan
     with np.errstate(invalid="ignore"):

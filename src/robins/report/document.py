@@ -64,7 +64,7 @@ def _page(summary: Mapping[str, Any], figures: str, origin: Origin) -> str:
 <header>
 <h1>{title}</h1>
 <p class="meta">{" · ".join(meta)}</p>
-{_verdict(summary["claims"])}
+{_verdict(summary["claims"], summary.get("verdict", ""))}
 {_sentences("warning", summary.get("warnings", ()))}
 {_sentences("note", origin.notes)}
 </header>
@@ -79,7 +79,10 @@ def _page(summary: Mapping[str, Any], figures: str, origin: Origin) -> str:
 """
 
 
-def _verdict(claims: Sequence[Mapping[str, Any]]) -> str:
+def _verdict(claims: Sequence[Mapping[str, Any]], sentence: str) -> str:
+    if sentence:
+        worst = numbers.state_of(sentence)
+        return f'<p class="verdict {worst}">{_SIGNS.get(worst, "")} {escape(sentence)}</p>'
     verdicts = {claim["verdict"] for claim in claims}
     worst = next((v for v in ("not", "undecided", "partly", "reproduced") if v in verdicts), "")
     sign = f"{_SIGNS[worst]} " if worst else ""
@@ -115,10 +118,15 @@ def _metrics(filters: Mapping[str, Mapping[str, Any]]) -> str:
     rows = []
     for name in names:
         text, unit = numbers.label(name)
-        cells = [_td(numbers.show(values.get(name)), "number") for values in filters.values()]
+        cells = [
+            _td(numbers.marked(of, name), f"number{' outside' * numbers.outside(of, name)}")
+            for of in filters.values()
+        ]
         rows.append([f'<th scope="row" title="{escape(name)}">{escape(text)}</th>'])
         rows[-1] += [_td(unit, "unit"), *cells]
-    return f"<section>\n<h2>Summary</h2>\n{_table(head, rows, 'metrics')}\n</section>"
+    far = any(numbers.outside(of, name) for of in filters.values() for name in names)
+    note = f'<p class="meta">{numbers.MARK} outside its band</p>' if far else ""
+    return f"<section>\n<h2>Summary</h2>\n{_table(head, rows, 'metrics')}\n{note}</section>"
 
 
 def _claims(claims: Sequence[Mapping[str, Any]]) -> str:

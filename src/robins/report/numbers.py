@@ -25,6 +25,9 @@ _CAPITALS = {
     *("kf", "ekf", "mekf", "ukf", "sar", "rtk", "2d", "3d", "nhc", "zupt", "lmi"),
 }
 
+Values = Mapping[str, Any]  # metrics of a filter
+MARK = " !"  # behind a number outside its own band
+_STATES = {"Consistent": "reproduced", "With care": "partly", "Do not trust": "not"}
 _WORDS = {"euler": "Euler angles", "accel": "accelerometer"}
 
 
@@ -115,6 +118,25 @@ def band(value: Any) -> str:
             return f"at least {show(low)}"
         return f"{show(low)} to {show(high)}"
     return show(value)
+
+
+def outside(values: Values, metric: str) -> bool:
+    """True if a metric lies outside its own band, the metric of that name with `_band` behind."""
+    value, limits = values.get(metric), values.get(f"{metric}_band")
+    if not isinstance(value, int | float) or not isinstance(limits, Sequence) or len(limits) != 2:
+        return False
+    low, high = (math.nan if x is None else x for x in limits)
+    return value < low or value > high
+
+
+def marked(values: Values, metric: str) -> str:
+    """A metric as `show` has it, with `MARK` behind it where it lies outside its band."""
+    return show(values.get(metric)) + (MARK if outside(values, metric) else "")
+
+
+def state_of(verdict: str) -> str:
+    """The verdict of a claim that has the colour of the sentence on a replay; "" for none."""
+    return next((state for begin, state in _STATES.items() if verdict.startswith(begin)), "")
 
 
 def found(

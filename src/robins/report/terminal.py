@@ -24,7 +24,9 @@ def table(summary: Mapping[str, Any], width: int = 100) -> Group:
     filters = summary["filters"]
     names = list(dict.fromkeys(name for values in filters.values() for name in values))
     labels = [str(numbers.label(name)) for name in names]
-    cells = {f: [numbers.show(v.get(name)) for name in names] for f, v in filters.items()}
+    cells = {f: [numbers.marked(v, name) for name in names] for f, v in filters.items()}
+    if sentence := summary.get("verdict"):
+        parts.append(Text(sentence, style=f"bold {_COLOURS.get(numbers.state_of(sentence), '')}"))
     for group in _groups(cells, width - max(map(len, labels), default=0)) if names else ():
         metrics = _new("metric")
         for name in group:
@@ -33,6 +35,8 @@ def table(summary: Mapping[str, Any], width: int = 100) -> Group:
             if any(metric in filters[name] for name in group):
                 metrics.add_row(Text(labels[row]), *(Text(cells[name][row]) for name in group))
         parts += [Text(), metrics] if parts else [metrics]
+    if any(numbers.outside(v, name) for v in filters.values() for name in names):
+        parts.append(Text(f"{numbers.MARK.strip()} outside its band"))
     if summary["claims"]:
         claims = _new("verdict", "claim")
         claims.add_column("found", justify="right")

@@ -31,6 +31,7 @@ class Outcome:
     files: dict[str, bytes | Path] = field(default_factory=dict)  # more; a path is moved in
     notes: list[str] = field(default_factory=list)  # sentences for the reader
     warnings: list[str] = field(default_factory=list)  # why a reader should doubt the figures
+    verdict: str = ""  # "Consistent: ...", "With care: ..." or "Do not trust: ..."
 
     # of the request
     scenario: str = ""  # its name
@@ -56,6 +57,7 @@ class Outcome:
             "seed": self.seed,
             "runs": self.runs,
             **({"machine": self.machine} if self.machine else {}),
+            **({"verdict": self.verdict} if self.verdict else {}),
             "filters": self.metrics,
             "claims": self.claims,
             "counts": self.counts,

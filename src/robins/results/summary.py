@@ -26,9 +26,10 @@ _GIVEN = {
 }
 _CLAIM = ("id", "text", "verdict", "value", "band")
 _MORE = ("interval", "more_runs")  # of a claim, where runs were simulated
+_OPTIONAL = ("machine", "verdict")  # of a campaign, and of a replay
 _ORDER = (
-    *("scenario", "seed", "runs", "machine", "filters", "claims", "counts", "warnings", "files"),
-    "seconds",
+    *("scenario", "seed", "runs", "machine", "verdict", "filters", "claims", "counts", "warnings"),
+    *("files", "seconds"),
 )
 
 
@@ -96,10 +97,11 @@ def checked(summary: Mapping[str, Any]) -> dict[str, Any]:
     for i, sentence in enumerate(flat.setdefault("warnings", [])):
         if not isinstance(sentence, str):
             raise TypeError(f"summary.warnings[{i}]: {sentence!r} is not a sentence")
-    if not isinstance(flat.get("machine", ""), str):
-        raise TypeError(f"summary.machine: {flat['machine']!r} is not text")
-    # Only a campaign has a machine; `files` are the writer's.
-    return {key: flat.get(key, {}) for key in _ORDER if key in flat or key != "machine"}
+    for key in _OPTIONAL:
+        if not isinstance(flat.get(key, ""), str):
+            raise TypeError(f"summary.{key}: {flat[key]!r} is not text")
+    # `files` are the writer's
+    return {key: flat.get(key, {}) for key in _ORDER if key in flat or key not in _OPTIONAL}
 
 
 def _name(kind: type) -> str:

@@ -13,9 +13,8 @@ at once and a live object has not:
   the filter is that much behind, and the answer to a sample is its state carried on over what came
   since, exactly what it predicts; the last increment is made of the samples so far.
 - **The start.** With a given heading the filter waits for rest, at most ten seconds from the first
-  fix on, and then takes the quietest window so far, where a replay takes the quietest of the log. A
-  magnetometer is asked where for 30 s no fix was fast enough; a replay asks it where none of the
-  log is. Answers before are `STARTING`, without numbers.
+  whole fix on. A magnetometer is asked where for 30 s no fix was fast enough; a replay asks it
+  where none of the log is. Answers before are `STARTING`, without numbers.
 - A gap longer than `update.longest_gap` begins anew. `outages` are not looked at.
 - Rates that a replay takes from the whole log (of samples, of fixes) are told by who makes it.
 """
@@ -52,9 +51,10 @@ from robins.systems.ins_gnss.log import (
     steps_of,
 )
 from robins.systems.ins_gnss.parameters import Replay
+from robins.systems.ins_gnss.positions import attitudes
 from robins.systems.ins_gnss.recording import Log, axes_of, believed_sigmas
 from robins.systems.ins_gnss.rest import WAYS_S, Usual, known_until
-from robins.systems.ins_gnss.start import find_start, turned
+from robins.systems.ins_gnss.start import REST_S, fast_fix, find_start
 from robins.systems.parts import Block
 from robins.systems.streaming import (
     Door,
@@ -70,7 +70,7 @@ from robins.systems.streaming import (
 from robins.systems.study import Case
 
 _PATIENCE_S, _AHEAD_S = 0.1, 10.0  # of the newest sample, by which a fix may be
-_REST_S, _COURSE_S = 10.0, 30.0  # how long rest is waited for, and a course
+_COURSE_S = 30.0  # how long a course is waited for
 _UNITS_S, _MOST_START_S = 1.0, 600.0  # of samples: whose size tells their unit, for the start
 
 
@@ -255,7 +255,8 @@ class LiveInsGnss(Live):
         at = int(np.searchsorted(self._fixes[:, 0], row[0]))
         self._fixes = np.insert(self._fixes, at, row, axis=0)
         self._velocities |= bool(np.any(np.isfinite(row[7:10])))
-        self._first_fix_s = min(self._first_fix_s, float(row[0]))
+        if np.all(np.isfinite(row[1:4])):
+            self._first_fix_s = min(self._first_fix_s, float(row[0]))
         self._go_back(float(row[0]))
         self._advance()
         return self._answer(self._raw_ns[-1], Flag.REFUSED if why else Flag(0))
@@ -344,12 +345,8 @@ class LiveInsGnss(Live):
             self._fixes = self._fixes[self._fixes[:, 0] > rows[0, 0]]
         if int(10.0 * rows[-1, 0]) == int(10.0 * (rows[-1, 0] - rows[-1, 1])):
             return  # ten times a second are enough
-        heard = self._fixes[self._fixes[:, 0] <= rows[-1, 0] - self._reach_s]
         given, waits = p.start.known_heading is not None, rows[-1, 0] - self._first_fix_s
-        fast = np.hypot(heard[:, 7], heard[:, 8]) >= p.start.course_speed
         compass = len(self._field) > 0 and waits > _COURSE_S
-        if not len(heard) or not (given or compass or np.any(fast)):
-            return
         log = self._log()
         within = self._fixes[:, 0] <= rows[-1, 0] - self._reach_s
         log = log._replace(
@@ -359,12 +356,14 @@ class LiveInsGnss(Live):
                 for name in ("gnss_s", "sigma_m", "v_n", "sigma_v", "withheld")
             },
         )
+        if not (given or compass) and fast_fix(log, p.start)[0] is None:
+            return
         try:
-            found = find_start(log, p.start, p.aids, self._usual)
+            found = find_start(log, p.start, p.aids, self._usual, p.gnss)
         except ValueError:
             return  # not yet
         rested = found.sentence.startswith("levelled at rest")
-        if given and not rested and waits < _REST_S:
+        if given and not rested and waits < REST_S:
             return
         begin_s = float(log.gnss_s[found.fix])
         raw = rows[rows[:, 0] <= rows[0, 0] + _UNITS_S]
@@ -470,7 +469,7 @@ class LiveInsGnss(Live):
     def _compile(self) -> None:
         """Have all compiled by a standstill that is thrown away."""
         step = round(1e9 * self._usual.sample_s)
-        turned(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros((0, 3)))
+        attitudes(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros((0, 3)))
         second, ones = max(1, round(1e9 / step)), np.ones(3)
         place = Replay.model_validate({"start": {"known_heading": 0.0}}).start
         p, self.parameters = self.parameters, self.parameters.model_copy(update={"start": place})

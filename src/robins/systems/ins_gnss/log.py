@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from robins.dataset import Dataset
 from robins.earth import Geodetic
@@ -25,14 +24,21 @@ from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsState
 from robins.program.evaluated import evaluated
-from robins.program.scanned import named_scan, on_each
-from robins.results import Outcome, Progress, array, silent, variable
+from robins.results import Outcome, Progress, array, silent
 from robins.rotation import Rotation
 from robins.systems import replaying
 from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.lasting import with_lasting
 from robins.systems.ins_gnss.parameters import Aids, Replay
 from robins.systems.ins_gnss.recording import Log, in_body_axes, on_one_clock, with_lever_arm
+from robins.systems.ins_gnss.reported import (
+    DIVERGED,
+    antenna_of,
+    distances,
+    fix_arrays,
+    sigma_notes,
+    verdict,
+)
 from robins.systems.ins_gnss.rest import Usual, at_rest, usual_of
 from robins.systems.ins_gnss.robust import (
     AS_TOLD,
@@ -47,6 +53,7 @@ from robins.systems.ins_gnss.robust import (
     supposed,
     weighed,
 )
+from robins.systems.ins_gnss.samples import as_files
 from robins.systems.ins_gnss.start import StartPoint, find_start
 from robins.systems.ins_gnss.study import NAMES as STUDIED
 from robins.systems.ins_gnss.study import SMOOTHERS, make_filter
@@ -54,7 +61,7 @@ from robins.systems.parts import Block
 from robins.systems.replaying import PROBABILITY, Answer, Piece, Recorded, Reported
 from robins.systems.study import Case, Contender
 from robins.systems.suspects import spans
-from robins.systems.tables import place_arrays, track_arrays
+from robins.systems.tables import track_arrays
 
 CAUSES = (
     "Likely causes: the lever arm or the latency of the GNSS, the mounting of the unit, sigmas "
@@ -68,8 +75,6 @@ ROBUST, WEIGHED = "robust", "weighed"
 SMOOTHED = {**SMOOTHERS, f"{ROBUST}+rts": WEIGHED}
 NAMES = (ROBUST, f"{ROBUST}+rts", *STUDIED)
 """Filters and smoothers of recorded logs; the first is what a log gets that nobody tuned it for."""
-
-RTK_QUALITY = {1: "fix", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +96,7 @@ def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
     increments = Increments(*(a[rows] for a in whole.increments[:3]))
     usual = usual_of(whole)
     log = whole._replace(increments=increments, time_s=whole.time_s[rows])
-    start = find_start(log, parameters.start, parameters.aids, usual)
+    start = find_start(log, parameters.start, parameters.aids, usual, parameters.gnss)
     begin_s, end_s = float(log.gnss_s[start.fix]), float(log.time_s[-1])
     used = (log.gnss_s > begin_s) & (log.gnss_s <= end_s)
     if not np.any(used):
@@ -155,24 +160,34 @@ def steps_of(
 def first_belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
     """Belief at the first fix, moved from the antenna to the IMU."""
     g, row = log.gnss, start.fix
-    v = np.zeros(3) if log.v_n is None else np.nan_to_num(log.v_n[row])
     antenna = Geodetic(*(np.asarray(a[row]) for a in (g.lat_rad, g.lon_rad, g.alt_m)))
 
     def imu_at(antenna, q_nb, arm_b, moved_n):
         return antenna.retract(moved_n - q_nb.apply(arm_b))
 
     q_nb, arm_b = Rotation(jnp.asarray(start.q_nb)), np.asarray(parameters.gnss.lever_arm)
-    position = evaluated(imu_at, antenna, q_nb, arm_b, v * parameters.gnss.latency)
-    nav = Nav(q_nb, jnp.asarray(v), position)
-    return model.start_belief(
+    moved_n = start.v_n * parameters.gnss.latency
+    if start.offset_n is not None:
+        arm_b, moved_n = np.zeros(3), start.offset_n
+    position = evaluated(imu_at, antenna, q_nb, arm_b, moved_n)
+    nav = Nav(q_nb, jnp.asarray(start.v_n), position)
+    belief = model.start_belief(
         nav,
         parameters.imu,
         parameters.start,
         tilt_rad=start.tilt_sigma_rad,
-        heading_rad=parameters.start.heading,
+        heading_rad=start.heading_sigma_rad,
         gyro_bias=start.gyro_bias,
         fix_sigma_m=np.nan_to_num(log.sigma_m[row]),
     )
+    if start.spread is None:
+        return belief
+    factor, each = np.array(belief.factor), np.linalg.cholesky(start.spread)
+    for k in range(3):  # velocity and position of one axis stand three places apart
+        factor[3 + k, 3 + k] = each[k, 0, 0]
+        if not parameters.gnss.lasting_share:  # else the mean of fixes is as far off as one of them
+            factor[6 + k, 3 + k : 9 : 3] = each[k, 1]
+    return belief._replace(factor=factor)
 
 
 def measured_fixes(
@@ -321,10 +336,7 @@ def _doubts(piece: Stretch, probability: np.ndarray, verdict: Verdict) -> list[s
     if np.any(verdict.strayed > 0.5):
         at = piece.epoch_s[np.flatnonzero(verdict.strayed > 0.5)]
         shown = ", ".join(f"{t:.1f} s" for t in at[:6])
-        said.append(
-            f"{ROBUST}: the estimate was off and took the word of positions that stayed away: "
-            f"{shown}. Before, its sigma did not hold."
-        )
+        said.append(f"{ROBUST}: {DIVERGED}: {shown}. Before, its sigma did not hold.")
     return said
 
 
@@ -418,79 +430,19 @@ def replay(
         counts=dict(dataset.counts) | counts,
         notes=[f"Start: {piece.start.sentence}." for piece in pieces]
         + notes
+        + sigma_notes(dataset, parameters)
         + found
         + [f"Not navigated, {problem}." for problem in problems],
         origin_ns=int(dataset.imu.time_ns[0]),
     )
     outcome.warnings[:0] = doubts
-    return outcome
-
-
-def antenna_of(mount: model.Mount, mean: InsState, rate_b: Array | np.ndarray) -> Geodetic:
-    """Position of the antenna as a filter estimates it, at each epoch."""
-    return named_scan(_antenna, mount, (mean, rate_b))[1]
-
-
-def _antenna(mount: model.Mount, row: tuple[InsState, Array]) -> tuple[model.Mount, Geodetic]:
-    return mount, model.read_position(mount, *row)
+    origin_ns, files = int(dataset.imu.time_ns[0]), {}
+    if parameters.every_sample:
+        files = as_files(log.time_s, origin_ns, pieces, answers)
+    word = verdict(answers, outcome.metrics, outcome.warnings)
+    return replace(outcome, verdict=word, files=files)
 
 
 def _estimates(mean: InsState) -> Mapping[str, Any]:
     biases_and_scales = {name: getattr(mean, name) for name in InsState._fields[3:]}
     return {"velocity": mean.v_n, "q_nb": mean.q_nb.wxyz, **biases_and_scales}
-
-
-def _between(places: tuple[Geodetic, Geodetic]) -> Array:
-    """(3,) m, north, east, down, from one place to another."""
-    return places[0].local(places[1])
-
-
-def distances(log: Log, used: np.ndarray, epoch_s: np.ndarray, antenna: Geodetic) -> dict[str, Any]:
-    """Distances of the antenna from the best fixes, with aids and in outages.
-
-    The best fixes are those of quality 1 where the receiver states a quality, else all.
-    """
-    g = log.gnss
-    use = used & np.isfinite(g.lat_rad) & np.isfinite(g.alt_m)
-    if g.quality is not None and np.any(use):
-        use = use & (g.quality == np.min(g.quality[use]))
-    epoch = np.searchsorted(epoch_s, log.gnss_s[use] - 1e-9)
-    at = jax.tree_util.tree_map(lambda x: np.asarray(x)[epoch], antenna)
-    fix = Geodetic(*(v[use] for v in (g.lat_rad, g.lon_rad, g.alt_m)))
-    error, withheld = on_each(_between, (fix, at)), log.withheld[use]
-    across = np.hypot(error[:, 0], error[:, 1])
-    out: dict[str, Any] = {
-        "aided_horizontal_rms_m": _rms(across[~withheld]),
-        "aided_vertical_rms_m": _rms(error[~withheld, 2]),
-        "aided_fixes": int(np.sum(~withheld)),
-    }
-    if np.any(withheld):
-        out |= {
-            "outage_horizontal_rms_m": _rms(across[withheld]),
-            "outage_horizontal_max_m": float(np.max(across[withheld])),
-            "outage_vertical_rms_m": _rms(error[withheld, 2]),
-            "outage_fixes": int(np.sum(withheld)),
-        }
-    return out
-
-
-def _rms(x: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(x**2))) if x.size else float("nan")
-
-
-def fix_arrays(log: Log) -> dict[str, Any]:
-    """The fixes of a log, on its clock."""
-    g = log.gnss
-    out: dict[str, Any] = {
-        "gnss_time": variable("gnss_time", log.gnss_s, "s", "time of the fixes"),
-    }
-    out |= place_arrays("gnss", (g.lat_rad, g.lon_rad, g.alt_m), "{} of the fixes")
-    if g.quality is not None:
-        known = [q for q in RTK_QUALITY if np.any(g.quality == q)]
-        out |= array(
-            "gnss_quality",
-            g.quality.astype(np.int32),
-            flag_values=np.asarray(known, dtype=np.int32),
-            flag_meanings=" ".join(RTK_QUALITY[q] for q in known),
-        )
-    return out

@@ -60,7 +60,7 @@ class Start(Parameters):
     heading: q.Spread = default("20 deg")
     velocity: q.Speed = default("0.2 m/s")
     position: q.Length = default("0.1 m")
-    # heading of the body at the start; without it, the course once above the speed
+    # heading of the body at the first sample; without it, the course once above the speed
     known_heading: q.Angle | None = None
     course_speed: q.Speed = default("1 m/s")
 
@@ -137,6 +137,9 @@ class Unit(Imu):
 class Rover(Gnss):
     """A receiver of which nothing is told."""
 
+    # of every fix, in the place of what the log states; north, east, down, or one for all
+    sigma: Annotated[q.Three, Quantity("length", above="0 m")] | None = None
+    velocity_sigma: Annotated[q.Three, Quantity("speed", above="0 m/s")] | None = None
     sigma_factor: dict[str, Positive] = pydantic.Field(default_factory=lambda: {"2": 3.0, "5": 3.0})
 
 
@@ -158,6 +161,7 @@ class Replay(Parameters):
     update: Update = pydantic.Field(default_factory=Update)
     outages: Outages | None = None
     filters: Names = ("robust", "robust+rts")
+    every_sample: bool = False  # write positions and attitudes at every inertial sample as well
 
     def withheld(self, time_s: np.ndarray, fix_s: np.ndarray) -> np.ndarray:
         """Which times (N,) lie in an outage, of a log with fixes at some times (M,)."""

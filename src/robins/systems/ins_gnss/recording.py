@@ -12,7 +12,7 @@ from robins import rotation
 from robins.dataset import Dataset, GnssTable
 from robins.ins.frames import to_ned_frd
 from robins.ins.increments import Increments, from_imu
-from robins.systems.ins_gnss.parameters import Gnss, Replay
+from robins.systems.ins_gnss.parameters import Replay, Rover
 
 TYRES = 0.02  # share of the speed by which wheels may read wrong: tyres, pressure, slip
 
@@ -68,16 +68,29 @@ def axes_of(orientation: Sequence[float]) -> np.ndarray:
     return np.where(np.abs(C_bs - whole) < 1e-15, whole, C_bs) + 0.0
 
 
-def believed_sigmas(gnss: GnssTable, parameters: Gnss) -> tuple[np.ndarray, np.ndarray | None]:
-    """(M, 3) m and m/s, sigmas of fixes as the filter shall believe them; None where not used."""
+def believed_sigmas(
+    gnss: GnssTable, parameters: Rover, stated: bool = True
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """(M, 3) m and m/s, sigmas of fixes as the filter shall believe them; None where not used.
+
+    Args:
+        gnss: with sigmas.
+        parameters: of the receiver; its own sigmas stand in the place of those of the log.
+        stated: by the receiver, whose factors by quality apply; else assumed, by quality.
+    """
     g, factor = parameters, np.ones(len(gnss))
     if gnss.quality is not None:
-        for quality, value in g.sigma_factor.items():
+        for quality, value in g.sigma_factor.items() if stated or g.sigma is not None else ():
             factor[gnss.quality == int(quality)] = value
+
+    def of(sigma: np.ndarray, own: tuple[float, ...] | None, least: float) -> np.ndarray:
+        sigma = sigma if own is None else np.tile(own, (len(sigma), 1))
+        return np.maximum(sigma * factor[:, None], least)
+
     sigma_v = gnss.sigma_v if g.use_velocity else None
     if sigma_v is not None:
-        sigma_v = np.maximum(sigma_v * factor[:, None], g.least_velocity_sigma)
-    return np.maximum(gnss.sigma_m * factor[:, None], g.least_sigma), sigma_v
+        sigma_v = of(sigma_v, g.velocity_sigma, g.least_velocity_sigma)
+    return of(gnss.sigma_m, g.sigma, g.least_sigma), sigma_v
 
 
 def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
@@ -97,7 +110,8 @@ def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
             f"no GNSS fix lies within the IMU log: the IMU spans 0 to {time_s[-1]:.1f} s, the "
             f"fixes {gnss_s[0]:.1f} to {gnss_s[-1]:.1f} s; do both use the same time scale?"
         )
-    sigma_m, sigma_v = believed_sigmas(gnss, g)
+    stated = not any(finding.code == "sigma_assumed" for finding in dataset.findings)
+    sigma_m, sigma_v = believed_sigmas(gnss, g, stated)
     return Log(
         Increments(*(np.asarray(a, dtype=float) for a in increments[:3])),
         time_s,

@@ -223,7 +223,7 @@ def _by_way(log: Log, speed: float, wait_s: float) -> Evidence:
     for way_s in WAYS_S if len(time_s) else ():
         before = np.searchsorted(time_s, time_s - way_s + 1e-6, side="right") - 1
         before = np.maximum(before, 0)
-        way = _distance(lat, lat - lat[before], lon - lon[before])
+        way = np.hypot(*ways(lat, lat - lat[before], lon - lon[before]))
         lasted, spread = time_s - time_s[before], _SIGMAS * np.hypot(noise, noise[before])
         moved = (lasted > 0.0) & (way > np.maximum(speed * lasted, spread))
         rested = (lasted > 0.0) & ~moved & (way + spread < _SEEN * speed * lasted)
@@ -237,9 +237,9 @@ def _by_way(log: Log, speed: float, wait_s: float) -> Evidence:
     return Evidence(*(a[alone] for a in (time_s, moves, moved_s, rests_s)))
 
 
-def _distance(lat: np.ndarray, dlat: np.ndarray, dlon: np.ndarray) -> np.ndarray:
-    """(M,) m, of places that differ by so little [rad] that their chart is flat."""
+def ways(lat: np.ndarray, dlat: np.ndarray, dlon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """North and east [m] between places that differ by so little [rad] that their chart is flat."""
     square = 1.0 - E2 * np.sin(lat) ** 2
     across = A_M / np.sqrt(square)  # radius of curvature in the prime vertical
     along = across * (1.0 - E2) / square  # in the meridian
-    return np.hypot(along * dlat, across * np.cos(lat) * np.angle(np.exp(1j * dlon)))
+    return along * dlat, across * np.cos(lat) * np.angle(np.exp(1j * dlon))

@@ -1,4 +1,4 @@
-"""Where a replay begins: at rest or not, level, and with which heading."""
+"""Where a replay begins: at rest or not, level, and with which heading and velocity."""
 
 from __future__ import annotations
 
@@ -6,18 +6,25 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from robins import rotation
 from robins.earth import gravity_n
 from robins.earth.magnetic import decimal_year, elements, field_n, wmm_for
 from robins.ins.alignment import level
 from robins.ins.rest import moving_statistics
-from robins.program.evaluated import evaluated
-from robins.program.scanned import named_scan
-from robins.systems.ins_gnss.parameters import Aids, Start
+from robins.systems.ins_gnss.parameters import Aids, Gnss, Start
+from robins.systems.ins_gnss.positions import (
+    attitudes,
+    best_lines,
+    course_fix,
+    fitted,
+    with_heading,
+)
 from robins.systems.ins_gnss.recording import Log
-from robins.systems.ins_gnss.rest import Usual, looks_still, usual_of
+from robins.systems.ins_gnss.rest import WAYS_S, Usual, at_rest, looks_still, usual_of
+
+REST_S = 10.0  # after the first whole fix, within which a filter with a given heading levels
+UNKNOWN_SPEED = 10.0  # m/s, sigma of a velocity of which nothing is known
 
 
 class StartPoint(NamedTuple):
@@ -28,43 +35,35 @@ class StartPoint(NamedTuple):
     tilt_sigma_rad: float
     gyro_bias: np.ndarray  # (3,) rad/s, mean rate of a standstill, else zero
     sentence: str  # how it was found, for the reader
+    heading_sigma_rad: float
+    v_n: np.ndarray  # (3,) m/s, of the antenna where the receiver states it
+    # (3, 2, 2) of velocity and position on each axis; None: as `Start` has them
+    spread: np.ndarray | None = None
+    offset_n: np.ndarray | None = None  # (3,) m, IMU from the fix; None: by lever arm and attitude
 
 
-def turned(q: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """Attitude (4,) after rotation vectors (N, 3) in body axes."""
-    return named_scan(_turned_by, q, theta)[0]
-
-
-def _turned_by(q: Array, theta: Array) -> tuple[Array, None]:
-    return rotation.normalise(rotation.multiply(q, rotation.from_rotvec(theta))), None
-
-
-def with_heading(q_nb: np.ndarray, heading_rad: float) -> np.ndarray:
-    """The same tilt with another heading."""
-
-    def turned_to(q_nb, heading_rad):
-        _, _, now = rotation.to_euler(q_nb)
-        turn = rotation.from_rotvec(jnp.array([0.0, 0.0, 1.0]) * (heading_rad - now))
-        return rotation.multiply(turn, q_nb)
-
-    return np.asarray(evaluated(turned_to, q_nb, heading_rad))
-
-
-def _fast_fix(log: Log, start: Start) -> tuple[int | None, str]:
-    """The first fix that a course can be taken from; None and why where there is none."""
+def fast_fix(log: Log, start: Start) -> tuple[int | None, bool, str]:
+    """First fix that a course can be taken from, and whether by positions; None and why, else."""
     v_n = log.gnss.v_n
-    if v_n is None:
-        return None, (
-            "the log has no GNSS velocity to take a course from; give start.known_heading"
-        )
-    speed = np.hypot(v_n[:, 0], v_n[:, 1])
+    speed = np.zeros(len(log.gnss_s)) if v_n is None else np.hypot(v_n[:, 0], v_n[:, 1])
     usable = np.flatnonzero((speed >= start.course_speed) & (log.gnss_s > log.time_s[0]))
+    by_way = course_fix(log, start)
+    if by_way is not None and not (len(usable) and usable[0] < by_way):
+        return by_way, True, ""
     if len(usable):
-        return int(usable[0]), ""
-    return None, (
-        f"the fastest fix moves at {np.nanmax(speed):.2f} m/s and a course is taken from "
-        f"{start.course_speed:.2f} m/s on; lower start.course_speed or give start.known_heading"
-    )
+        return int(usable[0]), False, ""
+    least = f"{start.course_speed:.2f} m/s"
+    if v_n is None:
+        why = (
+            f"the log has no GNSS velocity, and its positions prove no motion of {least}; give "
+            "start.known_heading, or lower start.course_speed"
+        )
+    else:
+        why = (
+            f"the fastest fix moves at {np.nanmax(speed, initial=0.0):.2f} m/s and a course is "
+            f"taken from {least} on; lower start.course_speed or give start.known_heading"
+        )
+    return None, False, why
 
 
 def _compass(
@@ -112,43 +111,102 @@ def _compass(
     )
 
 
-def find_start(log: Log, start: Start, aids: Aids, usual: Usual | None = None) -> StartPoint:
-    """Level on the quietest early window; take the heading as given or from the GNSS course.
+def find_start(
+    log: Log, start: Start, aids: Aids, usual: Usual | None = None, gnss: Gnss | None = None
+) -> StartPoint:
+    """Level on the quietest early window; take the heading as given or from the course.
 
-    The gyros carry the tilt from that window to the moment the course is known (first fix faster
-    than ``start.course_speed``); body forward is then taken along the course. The filter begins at
-    the first whole fix from there on. Where no fix is fast enough a magnetometer is asked, if there
-    is one.
+    The gyros carry the tilt from that window to the moment the course is known, by the first fix
+    faster than ``start.course_speed`` or by positions (`course_fix`); body forward is then along
+    the course. A heading that is given is that at the first sample, and the window ends `REST_S`
+    after the first whole fix. The filter begins at the first whole fix from there on with a known
+    velocity. Where no fix is fast enough a magnetometer is used, if there is one.
 
     Args:
         log: at least up to that moment.
         start: how well it is known.
         aids: what rest is.
         usual: where the log is too short to tell.
+        gnss: lever arm and latency; None: none.
 
     Raises:
-        ValueError: no heading is known: none was given, no fix is fast enough, and there is no
-            magnetometer that reads the Earth's field; there is no whole fix, or none after that
-            moment; or the mean specific force is not gravity's.
+        ValueError: no heading is known, nor a magnetometer that reads the Earth's field; there is
+            no whole fix, or none after that moment; or the mean force is not gravity's.
     """
-    (dt, theta, dv), time_s, gnss_s = log.increments[:3], log.time_s, log.gnss_s
-    g, v_n, begin_s = log.gnss, log.gnss.v_n, time_s[0] - dt[0]
+    usual, gnss, g = usual or usual_of(log), gnss or Gnss(), log.gnss
+    whole = _whole_fixes(log)
+    some, given = int(whole[0]), start.known_heading is not None
+    fast, by_way, unknown = (None, False, "") if given else fast_fix(log, start)
+    if unknown and log.field_b is None:
+        raise ValueError(f"the heading at the start is not known: {unknown}")
+    until_s = log.gnss_s[some] + REST_S if given else np.inf
+    at, last, q_nb, tilt, bias, sentence = _levelled(log, start, aids, usual, fast, until_s)
+    begin_s = float(log.time_s[at])
+    if start.known_heading is not None:
+        q_nb = with_heading(_carried(log, q_nb, at, 0, bias), start.known_heading)
+        sentence += f", heading given as {np.degrees(start.known_heading):.1f} deg"
+        at, begin_s = 0, begin_s if tilt == start.tilt else float(log.gnss_s[some])
+    elif fast is None:
+        place = float(g.lat_rad[some]), float(g.lon_rad[some]), float(g.alt_m[some])
+        heading, told = _compass(log, q_nb, begin_s, place, int(g.time_ns[some]), unknown)
+        q_nb = with_heading(q_nb, heading)
+        sentence += f", {told}"
+    else:
+        q_nb, at, begin_s = _carried(log, q_nb, at, last, bias), last, float(log.gnss_s[fast])
+    if fast is not None and not by_way and g.v_n is not None:
+        heading = float(np.arctan2(g.v_n[fast, 1], g.v_n[fast, 0]))
+        q_nb = with_heading(q_nb, heading)
+        sentence += _course(heading, begin_s, float(np.hypot(*g.v_n[fast, :2])), "")
+    later = whole[log.gnss_s[whole] >= begin_s - 1e-6]
+    if len(later) == 0:
+        raise ValueError(f"no whole GNSS fix after the attitude is known, at {begin_s:.1f} s")
+    first = int(later[0])
+    found = StartPoint(first, q_nb, tilt, bias, sentence, start.heading, np.zeros(3))
+    if log.v_n is not None and not by_way and np.all(np.isfinite(log.v_n[first])):
+        if fast is None:
+            q_nb = _carried(log, q_nb, at, _row(log, first), bias)
+        return found._replace(q_nb=q_nb, v_n=log.v_n[first])
+    later = later[log.gnss_s[later] <= log.gnss_s[first] + WAYS_S[-1]]
+    stands = np.zeros(len(later), bool)
+    if not by_way:
+        stands = at_rest(log, aids, usual, log.gnss_s[later])[0]
+    return _by_positions(log, found, at, later, stands, start, gnss, by_way)
+
+
+def _whole_fixes(log: Log) -> np.ndarray:
+    """Rows of fixes with three coordinates, within the time of the increments.
+
+    Raises:
+        ValueError: there is none.
+    """
+    g, begin_s, end_s = log.gnss, log.time_s[0] - log.increments.dt[0], log.time_s[-1]
     whole = np.all(np.isfinite([g.lat_rad, g.lon_rad, g.alt_m]), axis=0)
-    whole &= (gnss_s > begin_s) & (gnss_s <= time_s[-1])
-    if not np.any(whole):
-        raise ValueError(f"no whole GNSS fix between {begin_s:.1f} and {time_s[-1]:.1f} s")
-    fast, unknown = None, ""
-    if start.known_heading is None:
-        fast, unknown = _fast_fix(log, start)
-        if unknown and log.field_b is None:
-            raise ValueError(f"the heading at the start is not known: {unknown}")
-    usual = usual or usual_of(log)
+    rows = np.flatnonzero(whole & (log.gnss_s > begin_s) & (log.gnss_s <= end_s))
+    if not len(rows):
+        raise ValueError(f"no whole GNSS fix between {begin_s:.1f} and {end_s:.1f} s")
+    return rows
+
+
+def _levelled(
+    log: Log, start: Start, aids: Aids, usual: Usual, fast: int | None, until_s: float
+) -> tuple[int, int, np.ndarray, float, np.ndarray, str]:
+    """Level on rest, or on the quietest second, of the samples up to a time or a fast fix.
+
+    Returns:
+        Row of the increment there, row of the last one looked at, attitude (4,) of heading zero,
+        sigma of its tilt [rad], (3,) gyro bias [rad/s], and a sentence.
+
+    Raises:
+        ValueError: the mean specific force is not gravity's.
+    """
+    dt, _, dv = log.increments[:3]
     still, mean_rate = looks_still(log, aids, usual)
     width = max(2, round(2.0 * aids.window / usual.sample_s))
     mean_force, spread = moving_statistics(dv / dt[:, None], width, log.first)
     # without a course nothing is taken from after the rest that it begins at
-    enough = np.append(np.flatnonzero(still)[width : width + 1], len(dt) - 1)[0]
-    last = int(enough) if fast is None else int(np.searchsorted(time_s, gnss_s[fast]))
+    end = min(int(np.searchsorted(log.time_s, until_s)), len(dt) - 1)
+    enough = min(int(np.append(np.flatnonzero(still)[width : width + 1], end)[0]), end)
+    last = enough if fast is None else _row(log, fast)
     quiet_enough = np.flatnonzero(still[: last + 1])
     if len(quiet_enough):
         at = int(quiet_enough[min(len(quiet_enough) - 1, width)])
@@ -157,36 +215,93 @@ def find_start(log: Log, start: Start, aids: Aids, usual: Usual | None = None) -
         first = min(width - 1, last)
         at = first + int(np.argmin(np.sum(spread[first : last + 1] ** 2, axis=1)))
         tilt, how, bias = 3.0 * start.tilt, "on the quietest second, moving", np.zeros(3)
-    force, some = mean_force[at], np.flatnonzero(whole)[0]
-    here = np.linalg.norm(gravity_n(*(np.asarray(x[some], float) for x in (g.lat_rad, g.alt_m))))
+    force, some = mean_force[at], _whole_fixes(log)[0]
+    place = (np.asarray(x[some], float) for x in (log.gnss.lat_rad, log.gnss.alt_m))
+    here = np.linalg.norm(gravity_n(*place))
     if not 0.5 * here < np.linalg.norm(force) < 1.5 * here:
         raise ValueError(
-            f"cannot level: the mean specific force at {time_s[at]:.2f} s is "
+            f"cannot level: the mean specific force at {log.time_s[at]:.2f} s is "
             f"{np.linalg.norm(force):.2f} m/s^2, gravity is {here:.2f}"
         )
-    sentence = f"levelled {how} at {time_s[at]:.1f} s"
-    heading = start.known_heading or 0.0
-    q_nb = np.asarray(level(force, 0.0, heading).q_nb.wxyz)
-    begin_s = float(time_s[at])
-    if unknown:
-        place = float(g.lat_rad[some]), float(g.lon_rad[some]), float(g.alt_m[some])
-        heading, told = _compass(log, q_nb, begin_s, place, int(g.time_ns[some]), unknown)
-        q_nb = with_heading(q_nb, heading)
-        sentence += f", {told}"
-    elif fast is None:
-        sentence += f", heading given as {np.degrees(heading):.1f} deg"
-    else:
-        assert v_n is not None
-        assert fast is not None
-        carried = theta[at + 1 : last + 1] - bias * dt[at + 1 : last + 1, None]
-        heading = float(np.arctan2(v_n[fast, 1], v_n[fast, 0]))
-        q_nb = with_heading(turned(q_nb, carried), heading)
-        begin_s = float(gnss_s[fast])
-        sentence += (
-            f"; heading {np.degrees(heading) % 360:.1f} deg from the course at {begin_s:.1f} s, "
-            f"when the speed reached {np.hypot(*v_n[fast, :2]):.2f} m/s"
+    q_nb = np.asarray(level(force, 0.0, 0.0).q_nb.wxyz)
+    return at, last, q_nb, tilt, bias, f"levelled {how} at {log.time_s[at]:.1f} s"
+
+
+def _carried(log: Log, q_nb: np.ndarray, at: int, to: int, bias: np.ndarray) -> np.ndarray:
+    """Attitude (4,) carried by the gyros from the end of one increment to that of another."""
+    low, high = min(at, to) + 1, max(at, to) + 1
+    theta = log.increments.theta[low:high] - bias * log.increments.dt[low:high, None]
+    theta = theta if to > at else -theta[::-1]
+    return attitudes(q_nb, theta)[-1] if len(theta) else q_nb
+
+
+def _course(heading: float, at_s: float, speed: float, by: str) -> str:
+    """Words of the sentence on a start."""
+    return (
+        f"; heading {np.degrees(heading) % 360:.1f} deg from the course{by} at {at_s:.1f} s, "
+        f"when the speed reached {speed:.2f} m/s"
+    )
+
+
+def _by_positions(
+    log: Log,
+    level_: StartPoint,
+    at: int,
+    later: np.ndarray,
+    stands: np.ndarray,
+    start: Start,
+    gnss: Gnss,
+    by_way: bool,
+) -> StartPoint:
+    """Begin at the first of some whole fixes at which the velocity is known.
+
+    It is that of the receiver; else zero, where the vehicle certainly stands; else that of a line
+    through the positions. Where there is none within 32 s, it is 0 +- `UNKNOWN_SPEED`. The attitude
+    of `level_` is that at the end of increment `at`; `later` (K,) are rows of whole fixes, `stands`
+    (K,) is rest at them, and with `by_way` the course is that of the positions.
+
+    Raises:
+        ValueError: the log ends before the velocity is known.
+    """
+    v_n = np.full((len(log.gnss_s), 3), np.nan) if log.v_n is None else log.v_n
+    tilt, bias = level_.tilt_sigma_rad, level_.gyro_bias
+    sure = np.isfinite(best_lines(log, later, tilt)[1]) & ~log.withheld[later]
+    known = np.all(np.isfinite(v_n[later]), axis=1) | stands | sure
+    if not np.any(known) and log.time_s[-1] - log.gnss_s[later[0]] < WAYS_S[-1]:
+        raise ValueError(
+            f"the velocity at the start is not known: from {log.gnss_s[later[0]]:.1f} s on there "
+            f"are no three whole fixes within {WAYS_S[-1]:.0f} s, and no rest; give more of the log"
         )
-    later = np.flatnonzero(whole & (gnss_s >= begin_s - 1e-6))
-    if len(later) == 0:
-        raise ValueError(f"no whole GNSS fix after the attitude is known, at {begin_s:.1f} s")
-    return StartPoint(int(later[0]), q_nb, tilt, bias, sentence)
+    k = int(np.argmax(known))
+    fix, own = int(later[k]), np.isfinite(v_n[later[k]])
+    q_nb = _carried(log, level_.q_nb, at, _row(log, fix), bias)
+    found = level_._replace(fix=fix, q_nb=q_nb)
+    size = np.where(own, start.velocity, start.velocity if stands[k] else UNKNOWN_SPEED)
+    if not sure[k] or stands[k]:
+        place = np.maximum(start.position, log.sigma_m[fix])
+        spread = np.stack([np.diag(x) for x in np.stack([size, place], axis=1) ** 2])
+        return found._replace(v_n=np.where(own, v_n[fix], 0.0), spread=spread)
+    q_nb, offset, v, spread = fitted(log, fix, q_nb, tilt, gnss, bias, not by_way)
+    sigma, speed = float(np.sqrt(np.max(spread[:2, 0, 0]))), float(np.hypot(*v[:2]))
+    heading, sentence = start.heading, level_.sentence
+    if by_way:
+        heading = float(np.hypot(heading, sigma / speed))
+        sentence += _course(float(np.arctan2(v[1], v[0])), log.gnss_s[fix], speed, " of positions")
+    else:
+        sentence += f"; velocity from positions, {speed:.2f} +- {sigma:.2f} m/s"
+    # what the receiver states is better than a line
+    for axis in np.flatnonzero(own):
+        spread[axis] = np.diag([start.velocity**2, spread[axis, 1, 1]])
+    return found._replace(
+        q_nb=q_nb,
+        sentence=sentence,
+        heading_sigma_rad=heading,
+        v_n=np.where(own, v_n[fix], v),
+        spread=spread,
+        offset_n=offset,
+    )
+
+
+def _row(log: Log, fix: int) -> int:
+    """Row of the increment that holds a fix."""
+    return int(np.searchsorted(log.time_s, log.gnss_s[fix]))

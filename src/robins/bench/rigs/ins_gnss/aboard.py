@@ -59,6 +59,12 @@ def aboard(flight: Any) -> Aboard:
     if given.start.known_heading is not None:
         what = "start.known_heading is given, and the loop in C takes the heading from the course"
         raise RigError(what, "--board", "leave it out")
+    if dataset.gnss.v_n is None:
+        what = "the loop in C begins by velocities, and the receiver of this log states none"
+        raise RigError(what, "--board", "take a log with velocities")
+    if given.gnss.sigma is not None or given.gnss.velocity_sigma is not None:
+        what = "gnss.sigma or gnss.velocity_sigma is set, and the loop in C has those of the fixes"
+        raise RigError(what, "--board", "leave them out")
     if given.aids.non_holonomic:
         what = "aids.non_holonomic is set, and the loop in C knows no road"
         raise RigError(what, "--board", "--set aids.non_holonomic=false, here and on the bench")

@@ -33,9 +33,9 @@ from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.live import LiveInsGnss
 from robins.systems.ins_gnss.live_answers import Navigation
 from robins.systems.ins_gnss.live_fixes import some
-from robins.systems.ins_gnss.log import antenna_of, distances, fix_arrays
 from robins.systems.ins_gnss.parameters import Drive, Gnss, Replay
 from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock, with_lever_arm
+from robins.systems.ins_gnss.reported import antenna_of, distances, fix_arrays
 from robins.systems.ins_gnss.world import drive_dataset, motion_of
 from robins.systems.suspects import sentences, tables, words
 from robins.systems.tables import attitude_array, block_array, track_arrays

@@ -1,0 +1,142 @@
+"""Arrays, distances and sentences that a replay of INS/GNSS reports beside its estimates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from robins.dataset import Dataset
+from robins.earth import Geodetic
+from robins.filters import Code
+from robins.filters.chi_square import chi2_band
+from robins.filters.tally import CORRELATED
+from robins.ins.state import InsState
+from robins.program.scanned import named_scan, on_each
+from robins.results import array, variable
+from robins.systems.ins_gnss import model
+from robins.systems.ins_gnss.parameters import Replay
+from robins.systems.ins_gnss.recording import Log
+from robins.systems.judgement import Metrics
+from robins.systems.replaying import Answer
+from robins.systems.tables import place_arrays
+
+DIVERGED = "the estimate was off and took the word of positions that stayed away"
+NIS_MOST, FAR = 4.0, 6.0  # beyond which a replay is not to be trusted
+RTK_QUALITY = {1: "fix", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp"}
+
+
+def sigma_notes(dataset: Dataset, parameters: Replay) -> list[str]:
+    """Sentences on sigmas of positions that the log does not state."""
+    if parameters.gnss.sigma is not None:
+        shown = " ".join(f"{x:g}" for x in parameters.gnss.sigma)
+        return [f"Sigmas of positions: {shown} m north, east, down, from gnss.sigma."]
+    assumed = [f.sentence for f in dataset.findings if f.code == "sigma_assumed"]
+    return [f"{one} Another: gnss.sigma." for one in assumed]
+
+
+def antenna_of(mount: model.Mount, mean: InsState, rate_b: Array | np.ndarray) -> Geodetic:
+    """Position of the antenna as a filter estimates it, at each epoch."""
+    return named_scan(_antenna, mount, (mean, rate_b))[1]
+
+
+def _antenna(mount: model.Mount, row: tuple[InsState, Array]) -> tuple[model.Mount, Geodetic]:
+    return mount, model.read_position(mount, *row)
+
+
+def _between(places: tuple[Geodetic, Geodetic]) -> Array:
+    """(3,) m, north, east, down, from one place to another."""
+    return places[0].local(places[1])
+
+
+def distances(log: Log, used: np.ndarray, epoch_s: np.ndarray, antenna: Geodetic) -> dict[str, Any]:
+    """Distances of the antenna from the best fixes, with aids and in outages.
+
+    The best fixes are those of quality 1 where the receiver states a quality, else all.
+    """
+    g = log.gnss
+    use = used & np.isfinite(g.lat_rad) & np.isfinite(g.alt_m)
+    if g.quality is not None and np.any(use):
+        use = use & (g.quality == np.min(g.quality[use]))
+    epoch = np.searchsorted(epoch_s, log.gnss_s[use] - 1e-9)
+    at = jax.tree_util.tree_map(lambda x: np.asarray(x)[epoch], antenna)
+    fix = Geodetic(*(v[use] for v in (g.lat_rad, g.lon_rad, g.alt_m)))
+    error, withheld = on_each(_between, (fix, at)), log.withheld[use]
+    across = np.hypot(error[:, 0], error[:, 1])
+    out: dict[str, Any] = {
+        "aided_horizontal_rms_m": _rms(across[~withheld]),
+        "aided_vertical_rms_m": _rms(error[~withheld, 2]),
+        "aided_fixes": int(np.sum(~withheld)),
+    }
+    if np.any(withheld):
+        out |= {
+            "outage_horizontal_rms_m": _rms(across[withheld]),
+            "outage_horizontal_max_m": float(np.max(across[withheld])),
+            "outage_vertical_rms_m": _rms(error[withheld, 2]),
+            "outage_fixes": int(np.sum(withheld)),
+        }
+    return out
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2))) if x.size else float("nan")
+
+
+def fix_arrays(log: Log) -> dict[str, Any]:
+    """The fixes of a log, on its clock."""
+    g = log.gnss
+    out: dict[str, Any] = {
+        "gnss_time": variable("gnss_time", log.gnss_s, "s", "time of the fixes"),
+    }
+    out |= place_arrays("gnss", (g.lat_rad, g.lon_rad, g.alt_m), "{} of the fixes")
+    if g.quality is not None:
+        known = [q for q in RTK_QUALITY if np.any(g.quality == q)]
+        out |= array(
+            "gnss_quality",
+            g.quality.astype(np.int32),
+            flag_values=np.asarray(known, dtype=np.int32),
+            flag_meanings=" ".join(RTK_QUALITY[q] for q in known),
+        )
+    return out
+
+
+def verdict(answers: Mapping[str, Answer], metrics: Metrics, doubts: list[str]) -> str:
+    """One sentence on whether a replay is good, by its first causal filter; "" without one.
+
+    "Do not trust" where sigmas are too small by a factor of two (NIS above `NIS_MOST`) or a third
+    of the fixes was refused, where the estimate was off, or is more than `FAR` sigmas from that of
+    its smoother. "Consistent" where NIS is inside the 95 % band of a tenth of the innovations, for
+    those of real fixes are correlated, and there is no warning; else "With care".
+
+    Args:
+        answers: by filter.
+        metrics: by filter, as of `robins.systems.replaying.outcome`.
+        doubts: warnings, which begin with the name of a filter.
+    """
+    key = f"nis_{model.POSITION}"
+    name = next((n for n in answers if key in metrics[n]), None)
+    if name is None:
+        return ""
+    nis, refused = metrics[name][key], metrics[name][f"refused_{model.POSITION}"]
+    update = answers[name].updates[model.POSITION]
+    spoke, unused = np.asarray(update.dof), np.asarray(update.code) == Code.REFUSED
+    independent = max(int(np.sum(spoke * ~unused)) // CORRELATED, 1)
+    low, high = chi2_band(independent, 1, 0.95) / independent
+    count = int(np.sum((spoke > 0) | unused))
+    parts = [f"position NIS {nis:.2f} ({low:.2f} to {high:.2f} is consistent)"]
+    parts.append(f"{refused} of {count} fixes refused")
+    far = 0.0
+    if (smooth := answers.get(f"{name}+rts")) is not None:
+        apart = on_each(_between, (answers[name].mean.position, smooth.mean.position))
+        far = float(np.nanmax(np.abs(apart) / np.asarray(answers[name].sigma)[:, 6:9]))
+        parts.append(f"at most {far:.1f} sigmas from its smoother")
+    own = [one for one in doubts if one.startswith(f"{name}: ")]
+    if own:
+        parts.append(f"{len(own)} warning{'s' * (len(own) > 1)} below")
+    bad = nis > NIS_MOST or refused > count / 3 or far > FAR or any(DIVERGED in x for x in own)
+    sound = low <= nis <= high and not own
+    word = "Do not trust" if bad else "Consistent" if sound else "With care"
+    return f"{word}: {name}, {', '.join(parts)}."

@@ -1,0 +1,85 @@
+"""Positions and attitudes at every inertial sample of a replay, on request.
+
+Between two epochs a state is that of the earlier one, carried over the samples since; at an epoch
+it is the epoch's own. So a causal filter uses nothing of the future, and a smoother no more of it
+than its epochs do.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from robins.ins.increments import Increments
+from robins.ins.mechanise import vector
+from robins.ins.state import InsState, path
+from robins.program.scanned import named_scan
+from robins.systems.replaying import Answer, Piece
+
+COLUMNS = ("q_nb_w", "q_nb_x", "q_nb_y", "q_nb_z", "v_north", "v_east", "v_down")
+COLUMNS += ("lat_rad", "lon_rad", "alt_m")
+
+
+def at_samples(
+    time_s: np.ndarray, pieces: Sequence[Piece], mean: InsState
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times (K,) and rows (K, 10), `COLUMNS`, at the samples of all pieces.
+
+    Args:
+        time_s: (N,) of the samples of the log.
+        pieces: E epochs in all, whose worlds are a `Case` with blocks of increments.
+        mean: leading axis E and a row between two pieces, as `replaying.end_to_end` joins them.
+    """
+    times, rows, first = [], [], 0
+    for piece in pieces:
+        count = len(piece.epoch_s)
+        own = jax.tree_util.tree_map(lambda x, a=first, n=count: np.asarray(x)[a : a + n], mean)
+        first += count + 1
+        before = jax.tree_util.tree_map(
+            lambda start, x: np.concatenate([np.asarray(start)[None], x[:-1]]),
+            piece.world.start.mean,
+            own,
+        )
+        block = piece.world.u.increments
+        dt = np.asarray(block.dt)
+        found = named_scan(_through, np.zeros(1), (before, Increments(*block[:3])))[1]
+        begins = np.append(piece.begin_s, piece.epoch_s[:-1])[:, None]
+        ends = np.where(dt > 0.0, begins + np.cumsum(dt, axis=1), -np.inf)
+        last = np.argmax(ends, axis=1)
+        found[np.arange(count), last] = np.asarray(vector(own.nav))
+        near = np.clip(np.searchsorted(time_s, ends - 1e-6), 0, len(time_s) - 1)
+        real = np.abs(time_s[near] - ends) < 1e-6  # no part of a sample that an epoch splits
+        times.append(time_s[near[real]])
+        rows.append(found[real])
+    return np.concatenate(times), np.concatenate(rows)
+
+
+def _through(carry: Array, row: tuple[InsState, Increments]) -> tuple[Array, Array]:
+    return carry, path(*row)
+
+
+def as_files(
+    time_s: np.ndarray, origin_ns: int, pieces: Sequence[Piece], answers: Mapping[str, Answer]
+) -> dict[str, bytes]:
+    """A file NAME-sample.npz for each filter, by its path in the result.
+
+    It holds `time_ns` (K,) int64, the stamps of the log, and float64 arrays `q_nb` (K, 4), body FRD
+    to NED, scalar first, `v_n` (K, 3) m/s, `lat_rad`, `lon_rad` and `alt_m` (K,) of the IMU.
+    """
+    files = {}
+    for name, answer in answers.items():
+        when_s, rows = at_samples(time_s, pieces, answer.mean)
+        out = io.BytesIO()
+        np.savez_compressed(
+            out,
+            time_ns=np.round(when_s * 1e9).astype(np.int64) + origin_ns,
+            q_nb=rows[:, :4],
+            v_n=rows[:, 4:7],
+            **dict(zip(COLUMNS[7:], rows[:, 7:].T, strict=True)),
+        )
+        files[f"exports/{name}-sample.npz"] = out.getvalue()
+    return files
