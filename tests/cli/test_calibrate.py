@@ -160,3 +160,13 @@ def test_what_cannot_be_calibrated_is_told_in_a_line(robins, log, tmp_path):
         assert answer.status == 2
         assert says in answer.err
         assert not (tmp_path / "none").exists()
+
+
+def test_a_vehicle_that_cannot_tilt_drives_a_circle(tmp_path):
+    log = write(tmp_path / "circle.npz", tumbling() * [1.0, 0.0, 0.0])
+    found = command.calibrate([log], horizontal=True)
+    offset = [found.metrics[axis]["offset_ut"] for axis in "xyz"]
+    np.testing.assert_allclose(offset, [12.0, -25.0, 0.0], atol=0.1)
+    assert found.notes[0].startswith("The horizontal axes alone were calibrated")
+    half = write(tmp_path / "half.npz", tumbling() * [0.06, 0.0, 0.0])
+    assert any("A sector of 1" in note for note in command.calibrate([half], horizontal=True).notes)

@@ -256,7 +256,7 @@ def _refuse_flat(z: np.ndarray) -> None:
         raise CalibrationError(
             f"the samples lie in a plane ({share}): the sensor was turned about one axis only",
             fix="turn it about two more, so that each of its axes points up and down once; of a "
-            "vehicle that cannot tilt calibrate the horizontal axes alone",
+            "vehicle that cannot tilt calibrate the horizontal axes alone (--horizontal)",
         )
 
 
