@@ -83,8 +83,8 @@ def telling(
 
 def damaged(file: str) -> Callable[[str], LogError]:
     """Makes the error about a damaged file of the reason."""
-    mend = "fetch it again; nothing of it was used, for no number in it can be trusted"
-    return lambda why: LogError(file, f"is damaged ({why})", mend)
+    fix = "fetch it again; nothing of it was used, for no number in it can be trusted"
+    return lambda why: LogError(file, f"is damaged ({why})", fix)
 
 
 def left_out(findings: list[Finding] | None, file: str, count: int, what: str) -> None:
@@ -109,11 +109,11 @@ def breaks_off(findings: list[Finding] | None, file: str, at: int) -> None:
     )
 
 
-def above_geoid(findings: list[Finding] | None, file: str, mend: str) -> None:
+def above_geoid(findings: list[Finding] | None, file: str, fix: str) -> None:
     """Report heights that are not above the ellipsoid."""
     telling(findings, "warning", "height_above_geoid", file, value="geoid")(
         "heights are above the geoid, and robins takes them as above the WGS-84 ellipsoid. "
-        f"Differences of height stay right; gravity errs by 3e-6 m/s^2 per metre. {mend}"
+        f"Differences of height stay right; gravity errs by 3e-6 m/s^2 per metre. {fix}"
     )
 
 

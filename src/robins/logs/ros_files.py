@@ -233,8 +233,8 @@ def _from_bag(
         raise LogError(file, cause, INSTALL) from error
 
     def refuse(why: str) -> LogError:
-        mend = "fetch it again, or restore its index: rosbag reindex FILE"
-        return LogError(file, f"is damaged or was not closed ({why})", mend)
+        fix = "fetch it again, or restore its index: rosbag reindex FILE"
+        return LogError(file, f"is damaged or was not closed ({why})", fix)
 
     # the reader takes whatever opens: a map gives no more bytes than there are
     stream = io.BytesIO(data) if isinstance(data, bytes) else data

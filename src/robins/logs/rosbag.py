@@ -20,7 +20,7 @@ import os
 from array import array
 from collections import defaultdict
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -53,6 +53,10 @@ class _Found(NamedTuple):
     frame_id: str  # of the first
     time_ns: np.ndarray
     values: np.ndarray  # (n, numbers of a message)
+
+
+Topics: TypeAlias = dict[tuple[str, str], _Found]
+"""Messages by type and topic."""
 
 
 def read_rosbag(
@@ -91,7 +95,7 @@ def read_rosbag(
 
 def _topics(
     path: str | os.PathLike[str], findings: list[Finding] | None
-) -> tuple[dict[tuple[str, str], _Found], set[str]]:
+) -> tuple[Topics, set[str]]:
     """All messages that are read, by type and topic, and the types of all that are there.
 
     Raises:
@@ -114,7 +118,7 @@ def _topics(
             frames.setdefault(key, frame_id)
             stamps[key].append(time_ns)
             values[key].extend(numbers)
-    found: dict[tuple[str, str], _Found] = {}
+    found: Topics = {}
     for key, frame_id in frames.items():
         time_ns = np.array(stamps.pop(key), np.int64)
         dated = time_ns >= GPS_EPOCH_S * 1_000_000_000
@@ -124,11 +128,7 @@ def _topics(
 
 
 def _first(
-    file: str,
-    topics: dict[tuple[str, str], _Found],
-    name: str,
-    findings: list[Finding] | None,
-    beside: str = "",
+    file: str, topics: Topics, name: str, findings: list[Finding] | None, beside: str = ""
 ) -> _Found | None:
     """The first topic of a type, and a note of the others but that `beside` it."""
     found = [one for (of, _), one in topics.items() if of == name]
@@ -141,9 +141,7 @@ def _first(
     return found[0] if found else None
 
 
-def _inertial(
-    file: str, topics: dict[tuple[str, str], _Found], findings: list[Finding] | None
-) -> ImuTable | None:
+def _inertial(file: str, topics: Topics, findings: list[Finding] | None) -> ImuTable | None:
     """Samples of the first topic, with those of another where it has one half of them only."""
 
     def known(one: _Found, place: slice, at: int) -> np.ndarray:
@@ -164,12 +162,7 @@ def _inertial(
     return merged(first, other[1], findings) if other else first
 
 
-def _fixes(
-    file: str,
-    gnss: _Found,
-    topics: dict[tuple[str, str], _Found],
-    findings: list[Finding] | None,
-) -> GnssTable:
+def _fixes(file: str, gnss: _Found, topics: Topics, findings: list[Finding] | None) -> GnssTable:
     status = gnss.values[:, _STATUS]
     lost = status < 0
     variance = gnss.values[:, _VARIANCE][:, _NED]
@@ -193,10 +186,7 @@ def _fixes(
 
 
 def _velocities(
-    file: str,
-    gnss: _Found,
-    topics: dict[tuple[str, str], _Found],
-    findings: list[Finding] | None,
+    file: str, gnss: _Found, topics: Topics, findings: list[Finding] | None
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Velocities of the fixes and their sigmas, where the receiver's driver wrote them."""
     for (name, topic), one in topics.items():

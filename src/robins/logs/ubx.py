@@ -16,6 +16,7 @@ import re
 import struct
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -45,6 +46,10 @@ _NAV_HIGH.names = ("_1", "invalid", "tow", "place", "h_m", "_2", "more", "acc")
 _DATED = 3  # bits of valid: date, time
 _GYRO, _ACCEL = (14, 13, 5), (16, 17, 18)  # types of x, y, z in ESF-MEAS
 _GYRO_DEG_S, _ACCEL_M_S2 = 2.0**-12, 2.0**-10
+
+
+Frames: TypeAlias = dict[int, list[tuple[int, int]]]
+"""Place and length of the content of messages, by their kind."""
 
 
 def is_ubx(head: Head) -> bool:
@@ -94,11 +99,9 @@ def read_ubx(
     return Dataset(Path(file).name.split(".")[0], imu, gnss, time_unit_known=(file,))
 
 
-def _frames(
-    file: str, data: Bytes, findings: list[Finding] | None
-) -> dict[int, list[tuple[int, int]]]:
+def _frames(file: str, data: Bytes, findings: list[Finding] | None) -> Frames:
     """Place and length of the content of each message with a right checksum, by its kind."""
-    found: dict[int, list[tuple[int, int]]] = {k: [] for k in (_PVT, _HIGH, _MEAS, _RAW)}
+    found: Frames = {k: [] for k in (_PVT, _HIGH, _MEAS, _RAW)}
     at, wrong, open_at = data.find(_SYNC), 0, -1
     while at >= 0:
         head = data[at : at + _HEAD.size].ljust(_HEAD.size, b"\xff")
@@ -136,10 +139,7 @@ def _rows(
 
 
 def _fixes(
-    file: str,
-    data: Bytes,
-    frames: dict[int, list[tuple[int, int]]],
-    findings: list[Finding] | None,
+    file: str, data: Bytes, frames: Frames, findings: list[Finding] | None
 ) -> tuple[GnssTable, np.ndarray]:
     """Fixes that have a date, and the place of each in the file."""
     pvt, at = _rows(data, frames[_PVT], _NAV_PVT)
