@@ -27,6 +27,7 @@ from robins.dataset import Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.gps_time import gps_of
 from robins.logs.findings import Finding, LogError, refused, telling
 from robins.logs.merging import on_clock_of
+from robins.logs.opening import whole
 from robins.logs.phone import fixes_of
 from robins.logs.read_text import read_text
 from robins.logs.text import Columns, Layout, peek, read_columns
@@ -38,6 +39,7 @@ Findings = list[Finding] | None
 _XYZ = ("x", "y", "z")
 _ROWS = {row.name: row for row in TEXT_FORMATS}
 _OXTS = 30  # numbers of a record
+_LARGEST = 1 << 26  # bytes of a file of OXTS
 _FLU = np.array([1.0, -1.0, -1.0])
 _SEPARATORS = (",", ";", "\t")
 
@@ -54,20 +56,28 @@ def read_folder(path: str | os.PathLike[str], findings: Findings = None) -> Data
         LogError: it is of no known kind; a file of it is missing or cannot be read.
     """
     folder = Path(path)
-    for mark, read in _FOLDERS.items():
-        for place in (folder, folder / "mav0", folder / "oxts"):
-            if (place / mark).exists():
-                return read(place, findings)
-    held = ", ".join(sorted(p.name for p in folder.iterdir())[:5]) or "nothing"
+    try:
+        for mark, read in _FOLDERS.items():
+            for place in (folder, folder / "mav0", folder / "oxts"):
+                if (place / mark).exists():
+                    return read(place, findings)
+        held = ", ".join(sorted(p.name for p in folder.iterdir())[:5]) or "nothing"
+    except OSError as error:
+        why = error.strerror or str(error)
+        raise LogError(str(path), f"cannot be read: {why}", "check its permissions") from error
     marks = ", ".join(_FOLDERS)
     raise LogError(str(path), f"is a folder with {held}", f"give files, or one with {marks}")
 
 
-def _table(path: Path, clock: str, names: Sequence[str], findings: Findings) -> Columns:
-    """Columns by patterns of their names: the stamps, if any, and numbers, NaN where one lacks.
+def _table(
+    path: Path, clock: str, names: Sequence[str], findings: Findings, needed: int | None = None
+) -> Columns:
+    """Columns by patterns of their names: the stamps, if any, and numbers.
+
+    Of the names so many are needed, by default all; other columns that lack are NaN.
 
     Raises:
-        LogError: the column of the first name lacks, or the file cannot be read.
+        LogError: a column that is needed lacks, or the file cannot be read.
     """
     line, text = (peek(path).data(1) or [(1, "")])[0]
     separator = max(_SEPARATORS, key=text.count)
@@ -78,9 +88,8 @@ def _table(path: Path, clock: str, names: Sequence[str], findings: Findings) -> 
         return next(found, -1)
 
     places = [place(name) for name in names]
-    wanted = dict(zip(names[:1], places[:1], strict=True))
-    wanted |= {clock: place(clock)} if clock else {}
-    if lacking := [name for name, at in wanted.items() if at < 0]:
+    wanted = [*names[:needed], *([clock] if clock else ())]
+    if lacking := [name for name in wanted if place(name) < 0]:
         raise refused(str(path), f"line {line}")(
             f"no column fits {lacking[0]}; there are {', '.join(held)}", "export it again"
         )
@@ -113,8 +122,8 @@ def _euroc(folder: Path, findings: Findings) -> Dataset:
 def _oxts(folder: Path, findings: Findings) -> Dataset:
     file, clock = str(folder), folder / "timestamps.txt"
     records = sorted((folder / "data").glob("*.txt"))
-    stamps = clock.read_text("ascii", "replace").split("\n")
-    stamps = [stamp.strip() for stamp in stamps if stamp.strip()]
+    lines = whole(clock, _LARGEST)[0].decode("ascii", "replace").split("\n")
+    stamps = [stamp.strip()[:39] for stamp in lines if stamp.strip()]
     if len(stamps) != len(records) or not records:
         cause = f"{clock.name} has {len(stamps)} stamps for {len(records)} files in data"
         raise LogError(file, cause, "copy the folder again")
@@ -139,9 +148,8 @@ def _oxts(folder: Path, findings: Findings) -> Dataset:
 
 
 def _record(path: Path) -> np.ndarray:
-    text = path.read_bytes()[: 1 << 16]
     try:
-        numbers = np.array([text.split()], np.float64)
+        numbers = np.array([whole(path, _LARGEST)[0].split()], np.float64)
     except ValueError as error:
         raise LogError(str(path), f"is no record: {error}", "copy it again") from error
     if numbers.shape != (1, _OXTS):
@@ -159,11 +167,13 @@ def _phone(folder: Path, findings: Findings) -> Dataset:
     clock = "time" if logger else r"Time \(s\)"
     xyz = _XYZ if logger else [rf"(.* )?{axis} \(.*\)" for axis in _XYZ]
 
-    def samples(name: str, names: Sequence[str] = xyz) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def samples(
+        name: str, names: Sequence[str] = xyz, needed: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         path = folder / f"{name}.csv"
         if not path.exists():
             raise LogError(str(folder), f"has no {path.name}", "record that sensor as well")
-        read = _table(path, clock, names, findings)
+        read = _table(path, clock, names, findings, needed)
         exponent = 0 if logger else 9
         time_ns = stamps_to_ns(str(path), "time", read.texts[:, 0], read.rows, exponent)
         return gps_of(time_ns) if logger else time_ns, read.values, read.rows
@@ -182,7 +192,7 @@ def _phone(folder: Path, findings: Findings) -> Dataset:
         mag_ns, field, mag_rows = samples("Magnetometer")
         mag = MagTable(mag_ns, to_si(field, "uT"), "RFU", str(path), mag_rows)
     if (path := folder / "Location.csv").exists():
-        fix_ns, v, fix_rows = samples("Location", _LOCATION)
+        fix_ns, v, fix_rows = samples("Location", _LOCATION, 2)
         for k in range(3, 9):
             v[v[:, k] < 0.0, k] = np.nan  # what is not known
         gnss = fixes_of(str(path), fix_ns, v[:, :5], v[:, 5:], fix_rows)
