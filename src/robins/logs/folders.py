@@ -122,7 +122,7 @@ def _euroc(folder: Path, findings: Findings) -> Dataset:
 def _oxts(folder: Path, findings: Findings) -> Dataset:
     file, clock = str(folder), folder / "timestamps.txt"
     records = sorted((folder / "data").glob("*.txt"))
-    lines = whole(clock, _LARGEST)[0].decode("ascii", "replace").split("\n")
+    lines = whole(clock, _LARGEST)[0].split(b"\n")
     stamps = [stamp.strip()[:39] for stamp in lines if stamp.strip()]
     if len(stamps) != len(records) or not records:
         cause = f"{clock.name} has {len(stamps)} stamps for {len(records)} files in data"
@@ -222,13 +222,14 @@ def _apple(folder: Path) -> float:
         LogError: the file that tells the make of the phone is missing.
     """
     path = folder / "Metadata.csv"
-    if not path.exists():
-        cause = "has neither TotalAcceleration.csv nor Metadata.csv, so the sign is not known"
+    lines = peek(path).lines[:2] if path.exists() else []
+    cells = [[cell.strip('" ') for cell in text.split(",")] for text in lines]
+    stated = dict(zip(*cells, strict=False)) if len(cells) == 2 else {}
+    make, standard = (stated.get(n, "").lower() for n in ("platform", "standardisation"))
+    if make not in ("ios", "android") or standard not in ("true", "false", ""):
+        cause = f"{path.name} does not state the make of the phone, so the sign is not known"
         raise LogError(str(folder), cause, "export the recording with its metadata")
-    names, values = ([c.strip('" \r') for c in text.split(",")] for text in peek(path).lines[:2])
-    stated = dict(zip(names, values, strict=False))
-    apple = stated.get("platform", "").lower() == "ios"
-    return -1.0 if apple and stated.get("standardisation", "false").lower() != "true" else 1.0
+    return -1.0 if make == "ios" and standard != "true" else 1.0
 
 
 # ------------------------------------------------------------------------------- gnss-ins-sim
