@@ -314,6 +314,8 @@ def test_sensor_logger_of_both_makes(tmp_path):
         assert data.gnss.v_n[0, 1] == pytest.approx(2.0)
         assert np.isnan(data.gnss.v_n[1]).all()
     np.testing.assert_allclose(android.mag.field_t[0], [1e-6, 20e-6, -40e-6])
+    with pytest.raises(LogError, match=r"Gyroscope.csv line 1: no column fits y; there are time"):
+        phone(tmp_path / "b", files | total | {"Gyroscope": logger("3,2,1").replace("y", "v")})
     with pytest.raises(LogError, match="so the sign is not known"):
         phone(tmp_path / "n", files | apart)
 

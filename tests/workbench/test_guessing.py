@@ -77,6 +77,8 @@ def test_what_numbers_do_not_tell_is_marked(tmp_path):
     assert "NOT KNOWN: no column of time was found; state the rate" in text
     assert "mag_x" not in tomllib.loads(text)["columns"]
     assert '# mag_x = { name = "mx", unit = "" }   # UNIT NOT KNOWN: median size 77.9' in text
+    (tmp_path / "b.csv").write_text("t,ax,ay,az,wx,wy,wz\n0,,,,1,2,3\n")  # one row, of the gyros
+    assert "accel_x = " in guess(tmp_path / "b.csv")
     sheet(tmp_path / "c.csv", ["a", "b", "c", "d"], [zero, t])
     with pytest.raises(InputError, match="no headings of a whole table; there are a, b, c, d"):
         guess(tmp_path / "c.csv")

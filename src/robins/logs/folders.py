@@ -27,7 +27,7 @@ from robins.dataset import Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.gps_time import gps_of
 from robins.logs.findings import Finding, LogError, refused, telling
 from robins.logs.merging import interpolated
-from robins.logs.opening import RECORDING
+from robins.logs.opening import RECORDING, whole
 from robins.logs.phone import fixes_of
 from robins.logs.read_text import read_text
 from robins.logs.rosbag import read_rosbag
@@ -41,6 +41,7 @@ Findings = list[Finding] | None
 _XYZ = ("x", "y", "z")
 _ROWS = {row.name: row for row in TEXT_FORMATS}
 _OXTS = 30  # numbers of a record
+_LARGEST = 1 << 26  # bytes of a file of OXTS
 _FLU = np.array([1.0, -1.0, -1.0])
 _SEPARATORS = (",", ";", "\t")
 
@@ -57,27 +58,32 @@ def read_folder(path: str | os.PathLike[str], findings: Findings = None) -> Tabl
         LogError: it is of no known kind; a file of it is missing or cannot be read.
     """
     folder = Path(path)
-    for mark, read in _FOLDERS.items():
-        for place in (folder, folder / "mav0", folder / "oxts"):
-            if (place / mark).exists():
-                return read(place, findings)
-    names = sorted(p.name for p in folder.iterdir())
-    if "metadata.yaml" in names or any(map(RECORDING.fullmatch, names)):
-        return read_rosbag(folder, findings)
+    try:
+        for mark, read in _FOLDERS.items():
+            for place in (folder, folder / "mav0", folder / "oxts"):
+                if (place / mark).exists():
+                    return read(place, findings)
+        names = sorted(p.name for p in folder.iterdir())
+        if "metadata.yaml" in names or any(map(RECORDING.fullmatch, names)):
+            return read_rosbag(folder, findings)
+    except OSError as error:
+        why = error.strerror or str(error)
+        raise LogError(str(path), f"cannot be read: {why}", "check its permissions") from error
     held = ", ".join(names[:5]) or "nothing"
     marks = ", ".join(_FOLDERS)
-    raise LogError(
-        str(path),
-        f"is a folder with {held}",
-        f"give files, or a folder of ROS, or one with {marks}",
-    )
+    mend = f"give files, or a folder of ROS or with {marks}"
+    raise LogError(str(path), f"is a folder with {held}", mend)
 
 
-def _table(path: Path, clock: str, names: Sequence[str], findings: Findings) -> Columns:
-    """Columns by patterns of their names: the stamps, if any, and numbers, NaN where one lacks.
+def _table(
+    path: Path, clock: str, names: Sequence[str], findings: Findings, needed: int | None = None
+) -> Columns:
+    """Columns by patterns of their names: the stamps, if any, and numbers.
+
+    Of the names so many are needed, by default all; other columns that lack are NaN.
 
     Raises:
-        LogError: the column of the first name lacks, or the file cannot be read.
+        LogError: a column that is needed lacks, or the file cannot be read.
     """
     line, text = (peek(path).data(1) or [(1, "")])[0]
     separator = max(_SEPARATORS, key=text.count)
@@ -88,9 +94,8 @@ def _table(path: Path, clock: str, names: Sequence[str], findings: Findings) -> 
         return next(found, -1)
 
     places = [place(name) for name in names]
-    wanted = dict(zip(names[:1], places[:1], strict=True))
-    wanted |= {clock: place(clock)} if clock else {}
-    if lacking := [name for name, at in wanted.items() if at < 0]:
+    wanted = [*names[:needed], *([clock] if clock else ())]
+    if lacking := [name for name in wanted if place(name) < 0]:
         raise refused(str(path), f"line {line}")(
             f"no column fits {lacking[0]}; there are {', '.join(held)}", "export it again"
         )
@@ -123,8 +128,8 @@ def _euroc(folder: Path, findings: Findings) -> Dataset:
 def _oxts(folder: Path, findings: Findings) -> Dataset:
     file, clock = str(folder), folder / "timestamps.txt"
     records = sorted((folder / "data").glob("*.txt"))
-    stamps = clock.read_text("ascii", "replace").split("\n")
-    stamps = [stamp.strip() for stamp in stamps if stamp.strip()]
+    lines = whole(clock, _LARGEST)[0].split(b"\n")
+    stamps = [stamp.strip()[:39] for stamp in lines if stamp.strip()]
     if len(stamps) != len(records) or not records:
         cause = f"{clock.name} has {len(stamps)} stamps for {len(records)} files in data"
         raise LogError(file, cause, "copy the folder again")
@@ -149,9 +154,8 @@ def _oxts(folder: Path, findings: Findings) -> Dataset:
 
 
 def _record(path: Path) -> np.ndarray:
-    text = path.read_bytes()[: 1 << 16]
     try:
-        numbers = np.array([text.split()], np.float64)
+        numbers = np.array([whole(path, _LARGEST)[0].split()], np.float64)
     except ValueError as error:
         raise LogError(str(path), f"is no record: {error}", "copy it again") from error
     if numbers.shape != (1, _OXTS):
@@ -169,11 +173,13 @@ def _phone(folder: Path, findings: Findings) -> Dataset:
     clock = "time" if logger else r"Time \(s\)"
     xyz = _XYZ if logger else [rf"(.* )?{axis} \(.*\)" for axis in _XYZ]
 
-    def samples(name: str, names: Sequence[str] = xyz) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def samples(
+        name: str, names: Sequence[str] = xyz, needed: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         path = folder / f"{name}.csv"
         if not path.exists():
             raise LogError(str(folder), f"has no {path.name}", "record that sensor as well")
-        read = _table(path, clock, names, findings)
+        read = _table(path, clock, names, findings, needed)
         exponent = 0 if logger else 9
         time_ns = stamps_to_ns(str(path), "time", read.texts[:, 0], read.rows, exponent)
         return gps_of(time_ns) if logger else time_ns, read.values, read.rows
@@ -192,7 +198,7 @@ def _phone(folder: Path, findings: Findings) -> Dataset:
         mag_ns, field, mag_rows = samples("Magnetometer")
         mag = MagTable(mag_ns, to_si(field, "uT"), "RFU", str(path), mag_rows)
     if (path := folder / "Location.csv").exists():
-        fix_ns, v, fix_rows = samples("Location", _LOCATION)
+        fix_ns, v, fix_rows = samples("Location", _LOCATION, 2)
         for k in range(3, 9):
             v[v[:, k] < 0.0, k] = np.nan  # what is not known
         gnss = fixes_of(str(path), fix_ns, v[:, :5], v[:, 5:], fix_rows)
@@ -222,13 +228,14 @@ def _apple(folder: Path) -> float:
         LogError: the file that tells the make of the phone is missing.
     """
     path = folder / "Metadata.csv"
-    if not path.exists():
-        cause = "has neither TotalAcceleration.csv nor Metadata.csv, so the sign is not known"
+    lines = peek(path).lines[:2] if path.exists() else []
+    cells = [[cell.strip('" ') for cell in text.split(",")] for text in lines]
+    stated = dict(zip(*cells, strict=False)) if len(cells) == 2 else {}
+    make, standard = (stated.get(n, "").lower() for n in ("platform", "standardisation"))
+    if make not in ("ios", "android") or standard not in ("true", "false", ""):
+        cause = f"{path.name} does not state the make of the phone, so the sign is not known"
         raise LogError(str(folder), cause, "export the recording with its metadata")
-    names, values = ([c.strip('" \r') for c in text.split(",")] for text in peek(path).lines[:2])
-    stated = dict(zip(names, values, strict=False))
-    apple = stated.get("platform", "").lower() == "ios"
-    return -1.0 if apple and stated.get("standardisation", "false").lower() != "true" else 1.0
+    return -1.0 if make == "ios" and standard != "true" else 1.0
 
 
 # ------------------------------------------------------------------------------- gnss-ins-sim

@@ -25,7 +25,7 @@ from robins.dataset import (
 from robins.ins.frames import swap, swap_q
 from robins.logs.archives import head_of, rows_of
 from robins.logs.findings import Finding, LogError, refused, telling
-from robins.logs.merging import on_clock_of
+from robins.logs.merging import interpolated
 from robins.logs.mounting import LocalPath, Origin, from_local
 from robins.logs.quantities import CLOCKS, DATES, QUANTITIES, TABLES, parts, words_of
 from robins.logs.tables import Table, kind_of, unit_quaternions
@@ -276,9 +276,8 @@ def _imu(read: Read) -> ImuTable:
     turn, force = map(read.stack, ("gyro", "accel") if rate else ("dtheta", "dv"))
     turns, forces = (np.asarray(np.isfinite(v).any(axis=1)) for v in (turn, force))
     if rate and turns.any() and forces.any() and not (turns & forces).any():
-        own = read.time_ns[turns], turn[turns], read.time_ns[forces], force[forces]
-        read = read.of(turns)
-        _, turn, force = on_clock_of(*own)
+        force = interpolated(read.time_ns[turns], read.time_ns[forces], force[forces])
+        read, turn = read.of(turns), turn[turns]
     return ImuTable(
         read.time_ns,
         turn,

@@ -13,6 +13,7 @@ import json
 import math
 import os
 import re
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
@@ -73,6 +74,7 @@ _QUANTITY_OF = {word: quantity for quantity, line in _SINGLE.items() for word in
 _ISO = re.compile(r'"?\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d[.,\d]*(Z|[-+]\d\d:?\d\d)?"?')
 _EPOCHS = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18}  # seconds of today since 1970, roughly
 _FIELD_T = (2.0e-5, 7.0e-5)
+_FEWEST = 20  # fifths of a second in which gravity must have turned
 _FASTEST = 35.0  # rad/s, 2000 deg/s: the range of most gyros
 
 Columns = dict[str, tuple[str, str, str]]  # quantity -> name, unit or "", why
@@ -100,9 +102,11 @@ def guess(path: str | os.PathLike[str]) -> str:
         raise InputError(f"no headings of a whole table; there are {held}", os.fspath(path), mend)
     texts = {q: [row[names.index(name)] for row in cells] for q, (name, _, _) in columns.items()}
     numbers = {q: np.array([_number(text, decimal) for text in texts[q]]) for q in columns}
-    _fill(columns, numbers, texts.get("time", []))
-    settings, notes = _settings(separator, decimal, numbers, columns)
-    _prove_gyros(path, settings, columns, numbers)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of columns without a number
+        _fill(columns, numbers, texts.get("time", []))
+        settings, notes = _settings(separator, decimal, numbers, columns)
+        _prove_gyros(path, settings, columns, numbers)
     taken = {name for name, _, _ in columns.values()}
     unused = [f"  {name}: {aside.get(name, 'not known')}" for name in names if name not in taken]
     notes += ["not used:", *unused] if unused else []
@@ -323,10 +327,12 @@ def _turned_by_gravity(imu: ImuTable) -> tuple[float, bool]:
     At rest in translation f' = f x omega. Both sides are summed up over a fifth of a second; the
     factor is that of least squares, trusted where they correlate by 0.9.
     """
+    if len(imu) < _FEWEST:
+        return 0.0, False
     dt = np.diff(imu.time_ns) * 1e-9
     size = max(int(0.2 / max(float(np.median(dt)), 1e-6)), 1)
     f, n = imu.accel, len(imu.accel) // size
-    if n < 20:
+    if n < _FEWEST:
         return 0.0, False
     change = np.cross(f[:-1], imu.gyro[:-1]) * dt[:, None]
     summed = np.add.reduceat(change, np.arange(0, len(change), size))[: n - 1]
