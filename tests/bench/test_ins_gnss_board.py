@@ -274,8 +274,6 @@ def test_what_the_loop_does_not_do_is_refused(scenario, tmp_path, capsys):
     given = {**rest, "settings": ["start.known_heading=10 deg"]}
     with pytest.raises(RigError, match=r"known_heading is given, .* from the course; leave it out"):
         export_filter(scenario, to, **given)
-    with pytest.raises(RigError, match=r"gnss.sigma .* is set, .* leave them out"):
-        export_filter(scenario, to, **{**rest, "settings": ["gnss.sigma=2 m"]})
     with pytest.raises(InputError, match=r"--float32: .* single precision; leave it out"):
         export_filter(scenario, to, filter_name="ekf", float32=True, board=True)
     asked = ["export", "ins-gnss/walk", "--filter", "ekf", "--to", str(to), "--board"]

@@ -20,14 +20,11 @@ from robins.ins.state import InsState, path
 from robins.program.scanned import named_scan
 from robins.systems.replaying import Answer, Piece
 
-COLUMNS = ("q_nb_w", "q_nb_x", "q_nb_y", "q_nb_z", "v_north", "v_east", "v_down")
-COLUMNS += ("lat_rad", "lon_rad", "alt_m")
-
 
 def at_samples(
     time_s: np.ndarray, pieces: Sequence[Piece], mean: InsState
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times (K,) and rows (K, 10), `COLUMNS`, at the samples of all pieces.
+    """Times (K,) and rows (K, 10), as `mechanise.vector` has them, at the samples of all pieces.
 
     Args:
         time_s: (N,) of the samples of the log.
@@ -79,7 +76,9 @@ def as_files(
             time_ns=np.round(when_s * 1e9).astype(np.int64) + origin_ns,
             q_nb=rows[:, :4],
             v_n=rows[:, 4:7],
-            **dict(zip(COLUMNS[7:], rows[:, 7:].T, strict=True)),
+            lat_rad=rows[:, 7],
+            lon_rad=rows[:, 8],
+            alt_m=rows[:, 9],
         )
         files[f"exports/{name}-sample.npz"] = out.getvalue()
     return files
