@@ -13,7 +13,7 @@ from robins.dataset import AttitudeTable, GnssTable, ImuTable, MagTable, Traject
 from robins.gps_time import GPS_EPOCH_S
 from robins.logs.findings import Finding
 from robins.logs.ordering import increasing
-from robins.logs.quiet import error, finding, name_of, place, usual_step_s, warning
+from robins.logs.quiet import error, finding, name_of, note, place, usual_step_s, warning
 from robins.logs.tables import Table
 from robins.logs.timebase import WEEK_S
 
@@ -237,10 +237,10 @@ def _span_of(imu: ImuTable, other: Table) -> Iterator[Finding]:
         )
         return
     if abs(abs(c - a) - _LEAP) < 1.0 and abs(abs(d - b) - _LEAP) < 1.0 and (c - a) * (d - b) > 0:
-        yield warning(other, "leap_seconds", c - a)(
-            f"begins {c - a:+.3f} s and ends {d - b:+.3f} s against {name_of(imu)}. Both were "
-            "probably recorded together, one stamped in UTC (Unix time) and one in GPS time, which "
-            "is 18 s ahead since 2017; shift one of them."
+        yield note(other, "leap_seconds", c - a)(
+            f"begins {c - a:+.3f} s and ends {d - b:+.3f} s against {name_of(imu)}. If both were "
+            "recorded together, one is stamped in UTC (Unix time) and one in GPS time, which is "
+            "18 s ahead since 2017; then shift one of them."
         )
     if overlap < 0.5 * (d - c):
         yield warning(other, "little_overlap", overlap)(
