@@ -18,11 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable
-from robins.logs import examine
-from robins.logs.checks_motion import estimates
-from robins.logs.gnss_motion import track_of
-from robins.logs.motion_models import judge
-from robins.logs.quiet import signal_of
+from robins.logs import checks_motion, examine
 
 A, E2, EARTH, G0 = 6378137.0, 0.00669437999014, 7.292115e-5, 9.80665
 SECOND = 1_000_000_000
@@ -290,11 +286,23 @@ NAMES = f"{AXES} gyro_unit gyro_scale force_scale time_offset time_jump leap_sec
 NAMES = set(f"{NAMES} forward_axis".split())
 
 
-def measured(d):
-    """Estimates of a log; none where there is too little motion."""
-    signal, track = signal_of(d.imu), track_of(d.gnss)
-    verdict = judge(d.imu, d.gnss, signal, track) if signal and track else None
-    return {} if verdict is None else estimates(verdict)
+class Seen(NamedTuple):
+    """Findings of a log, and the estimates behind them."""
+
+    findings: list
+    estimates: dict
+
+
+def seen(d):
+    """Examine a log, and keep what was estimated of it."""
+    kept = []
+    judged = checks_motion.judge
+    checks_motion.judge = lambda *args: kept.append(judged(*args)) or kept[-1]
+    try:
+        findings = examine(d)
+    finally:
+        checks_motion.judge = judged
+    return Seen(findings, checks_motion.estimates(kept[-1]) if kept and kept[-1] else {})
 
 
 def quoted(name, fault, drives, found_in):
@@ -303,14 +311,14 @@ def quoted(name, fault, drives, found_in):
     codes_all = Counter()
     for d in drives:
         spoilt = fault.spoil(d)
-        findings = examine(spoilt)
+        findings, found_here = seen(spoilt)
         codes = {f.code for f in findings if f.severity != "note"}
         codes_all.update(codes)
         hit = bool({f.code for f in findings} & set(fault.codes.split()))
         found += hit
         wrong += bool(codes & NAMES - set(f"{fault.codes} {fault.beside}".split()))
         if hit and fault.estimate:
-            value, sigma = measured(spoilt).get(fault.estimate, (np.nan, np.nan))
+            value, sigma = found_here.get(fault.estimate, (np.nan, np.nan))
             known += 1
             ok = abs(value - fault.value) < 3 * sigma
             within += ok

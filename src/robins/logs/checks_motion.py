@@ -92,7 +92,7 @@ def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
     before = verdict.nothing.left(verdict.views)
     share = f"(then {left:.0%} of the change of velocity is left unexplained, now {_all(before)})"
     wrong = []
-    if "gyros" in verdict.free:
+    if {"gyros", "scale"} & {*verdict.free}:
         wrong += _gyros(imu, verdict, found, signal.step_s, share)
     if "forces" in verdict.free:
         wrong += _forces(imu, found, share)
@@ -114,6 +114,7 @@ def estimates(verdict: Verdict) -> dict[str, tuple[float, float]]:
     [deg].
     """
     state, sigma = verdict.fit.state, verdict.fit.sigma
+    levers = verdict.fit if "clock" in verdict.free else verdict.clocked
     P = _nearest(state.M_g)
     relative = np.maximum(sigma[SCALE].reshape(3, 3), _LEAST_SCALE)
     factors, own = np.abs(np.diag(state.M_g @ P.T)), np.diag(relative)
@@ -132,7 +133,8 @@ def estimates(verdict: Verdict) -> dict[str, tuple[float, float]]:
     for k, axis in enumerate("xyz"):
         out[f"gyro {axis}"] = factors[k], factors[k] * own[k]
         out[f"accel {axis}"] = abs(state.M_a[k, k]), abs(state.M_a[k, k]) * of_force[k]
-        out[f"lever {axis}"] = state.lever[k], sigma[LEVER][k]
+        # an offset of the clock and an antenna ahead look alike at constant speed
+        out[f"lever {axis}"] = levers.state.lever[k], levers.sigma[LEVER][k]
     out["rate"] = state.rate, sigma[RATE]
     offset, of_offset = state.offset, np.maximum(sigma[OFFSET:], _LEAST_S)
     out["offset"] = offset[0], of_offset[0]
@@ -192,6 +194,7 @@ def _unclear(
         return
     tried = {
         "clock": "a shift of {0[0]:+.2f} +- {0[1]:.2f} s",
+        "scale": "a factor of {1[0]:.3g} +- {1[1]:.2g} of the gyros",
         "gyros": "another gyro unit, exchanged or reversed axes",
         "forces": "other accelerometers",
     }
@@ -203,7 +206,10 @@ def _unclear(
             "to the vehicle?"
         )
     else:
-        causes = [tried[b].format(found["offset"]) for b in (verdict.free[0], verdict.rival)]
+        causes = [
+            tried[b].format(found["offset"], found["gyros"])
+            for b in (verdict.free[0], verdict.rival)
+        ]
         yield warning(imu, "motion_disagrees", left)(
             f"the IMU does not explain the velocities of {name_of(gnss)} as it is; {causes[0]} and "
             f"{causes[1]} explain them about equally. Drive more turns and stops to tell which."
@@ -439,7 +445,7 @@ def check_turning(imu: ImuTable) -> Iterator[Finding]:
     scales = np.array([*STARTS, 0.0])  # the last: as if it had not turned at all
     maps = np.concatenate([signed_permutations(), scales[:, None, None] * np.eye(3)])
     squares = squares_by_map(views, maps, np.zeros(len(views.start_s)))[:, 0]
-    left = squares / np.sum(views.gained**2)
+    left = squares / np.sum(power_of(views))
     if not left[0] > _TURNED_WRONG:
         return
     k = int(np.argmin(left))

@@ -30,6 +30,7 @@ _STRETCH_S = 15.0  # long enough to turn, short enough for the drift of cheap gy
 _CHANGES = 8  # of velocity in a stretch at least
 _MOST_STRETCHES, _MOST_OUTSIDE, _MOST_SEARCHED = 32, 8, 12
 _GAP_S = 0.5  # without IMU samples, across which nothing is added up
+_FIX_S, _LOST_S = 0.25, 1.2  # between fixes that are used, and without one in a stretch
 _NOISE = 0.5  # m/s, of a mean velocity between fixes that are far enough apart
 
 # Of steps by which something else that turned is compared with the gyros.
@@ -51,7 +52,7 @@ def signed_permutations() -> np.ndarray:
 class Views(NamedTuple):
     """Integrals of the IMU and changes of velocity, both from one zero of time.
 
-    Changes are between consecutive nodes of one stretch. A node is a velocity at a time, or the
+    Changes are between nodes of one stretch a second apart or more; they overlap. A node is a velocity at a time, or the
     mean velocity between two positions.
     """
 
@@ -69,6 +70,7 @@ class Views(NamedTuple):
     start_s: np.ndarray  # (stretches,) s, first node
     length_s: float  # of the longest stretch
     middle_s: float  # about which a rate of the clock counts
+    stride: int = 1  # nodes from the first of a change to its second
     noise: float = 0.0  # m/s, one sigma of a change by the stated sigmas
     power: str = "change"  # what the share left is a share of: "change" of velocity, or "gravity"
 
@@ -98,36 +100,33 @@ def views_of(
     lat, lon, alt = gnss.lat_rad[rows], gnss.lon_rad[rows], gnss.alt_m[rows]
     means = v_n is None
     spacing = min(max(1.0, np.sqrt(6.0) * noise[0] / _NOISE), 5.0) if means else 1.0
-    keep = _apart(when_s, spacing)
-    step = np.diff(when_s[keep])
-    if len(step) < 3:
+    keep = np.arange(0, len(when_s), max(1, round(_FIX_S / float(np.median(np.diff(when_s))))))
+    step = float(np.median(np.diff(when_s[keep]))) if len(keep) > 1 else np.inf
+    stride = max(1, round(spacing / step))
+    if len(keep) < 4 * stride:
         return None
-    near = step < 2.5 * np.median(step)
+    near = np.diff(when_s[keep]) < max(2.5 * step, _LOST_S)
     if means:
-        v = np.diff(r_n[keep], axis=0) / step[:, None]
-        begin, end, at_row = when_s[keep[:-1]], when_s[keep[1:]], keep[:-1]
-        scatter = np.sqrt(12.0) * noise[0] / float(np.median(step))
-        joined = near[:-1] & near[1:]
+        first, last = keep[:-stride], keep[stride:]
+        v = (r_n[last] - r_n[first]) / (when_s[last] - when_s[first])[:, None]
+        begin, end, at_row = when_s[first], when_s[last], first
+        whole = np.lib.stride_tricks.sliding_window_view(near, stride).all(axis=1)
+        scatter = np.sqrt(12.0) * noise[0] / (stride * step)
+        joined = whole[:-1] & whole[1:]
     else:
         v, begin, end, at_row, joined = v_n[keep], when_s[keep], when_s[keep], keep, near
         scatter = np.sqrt(6.0) * noise[1]
     C = axes_at(lat[at_row], lon[at_row])
     v_e = np.einsum("nij,nj->ni", C, v)
     g_e = C[:, :, 2] * normal_gravity(lat[at_row], alt[at_row])[:, None]
-    length = max(_STRETCH_S, _CHANGES * float(np.median(step)))
+    length = max(_STRETCH_S, _CHANGES * stride * step)
     end_s = float(signal.time_s[-1]) + 0.1
-    chosen = _lively(0.5 * (begin + end), v, joined, length, max(0.2, scatter), end_s)
+    chosen = _lively(0.5 * (begin + end), v, joined, length, max(0.2, scatter), stride, end_s)
     if not chosen:
         return None
     turn, push = on_grid(signal, kind)
-    fields = _joined(chosen, begin, end, means, v_e, g_e)
-    return Views(turn, push, _gaps(signal), *fields, scatter)
-
-
-def _apart(when_s: np.ndarray, spacing: float) -> np.ndarray:
-    """Rows that are about the spacing apart, or as far as they are."""
-    step = float(np.median(np.diff(when_s)))
-    return np.arange(0, len(when_s), max(1, round(spacing / step)))
+    fields = _joined(chosen, begin, end, means, v_e, g_e, stride)
+    return Views(turn, push, _gaps(signal), *fields, stride, scatter)
 
 
 def _lively(
@@ -136,6 +135,7 @@ def _lively(
     joined: np.ndarray,
     length: float,
     least: float,
+    stride: int,
     end_s: float,
 ) -> list[np.ndarray]:
     """Nodes of each stretch with enough motion: of each part of the log the liveliest.
@@ -150,8 +150,8 @@ def _lively(
             last = int(np.searchsorted(time_s[:high], time_s[first] + length + 1e-6, "right"))
             nodes = np.arange(first, last)
             first = max(last - 1, first + 1)
-            if len(nodes) > 4 and time_s[nodes[-1]] - time_s[nodes[0]] > 0.6 * length:
-                change = np.diff(v[nodes], axis=0)
+            if len(nodes) > 4 * stride and time_s[nodes[-1]] - time_s[nodes[0]] > 0.6 * length:
+                change = v[nodes[stride:]] - v[nodes[:-stride]]
                 power = float(np.mean(np.sum((change - change.mean(axis=0)) ** 2, axis=1)))
                 if np.sqrt(power) > least:
                     found.append((power, nodes))
@@ -172,6 +172,7 @@ def _joined(
     means: bool,
     v_e: np.ndarray,
     g_e: np.ndarray,
+    stride: int,
 ) -> tuple:
     """Fields of `Views` from `begin_s` on, in axes that are inertial during a stretch."""
     nodes = np.concatenate(chosen)
@@ -179,14 +180,14 @@ def _joined(
     time_s = 0.5 * (begin + end)[nodes]
     start = np.array([begin[k[0]] for k in chosen])
     v, g = v_e[nodes], g_e[nodes]
-    node = np.flatnonzero(node_of[1:] == node_of[:-1])
-    dt = (time_s[node + 1] - time_s[node])[:, None]
-    mean = 0.5 * (v[node] + v[node + 1])
+    node = np.flatnonzero(node_of[stride:] == node_of[:-stride])
+    dt = (time_s[node + stride] - time_s[node])[:, None]
+    mean = 0.5 * (v[node] + v[node + stride])
     rate = np.array([0.0, 0.0, EARTH_RATE])
-    gained = v[node + 1] - v[node] + dt * (2.0 * np.cross(rate, mean) - g[node])
+    gained = v[node + stride] - v[node] + dt * (2.0 * np.cross(rate, mean) - g[node])
     since = time_s - start[node_of]
     turned = rotations(since[:, None] * rate)
-    midway = rotations(0.5 * (since[node] + since[node + 1])[:, None] * rate)
+    midway = rotations(0.5 * (since[node] + since[node + stride])[:, None] * rate)
     gained = np.einsum("kij,kj->ki", midway, gained)
     v = np.einsum("kij,kj->ki", turned, v)
     length = max(float(end[k[-1]] - begin[k[0]]) for k in chosen)
@@ -267,7 +268,7 @@ def power_of(views: Views) -> np.ndarray:
 
 
 def squares_by_lag(views: Views, lags_s: np.ndarray) -> np.ndarray:
-    """(stretches, lags) squares left by the tables as they are, if fixes are that much later.
+    """(stretches, lags) mean of the squares left by the tables as they are, if fixes are that much later.
 
     Args:
         views: the tables.
@@ -293,12 +294,12 @@ def squares_by_lag(views: Views, lags_s: np.ndarray) -> np.ndarray:
             v = np.subtract(*ends) / (end - begin)[:, None]
         else:
             v = between((end + lags) * RATE_HZ, S)
-        out[s, inside] = kabsch(np.diff(v, axis=1), views.gained[views.of == s])[1]
+        out[s, inside] = _compared(views, s, v)[0]
     return out
 
 
 def squares_by_map(views: Views, maps: np.ndarray, shift_s: np.ndarray) -> np.ndarray:
-    """(maps, 2) squares left by the best rotation and by the best reflection.
+    """(maps, 2) means of the squares left by the best rotation and by the best reflection, summed.
 
     Args:
         views: the tables.
@@ -326,9 +327,16 @@ def squares_by_map(views: Views, maps: np.ndarray, shift_s: np.ndarray) -> np.nd
             v = (_along(end, D) - _along(begin, D)) / (end - begin)[:, None]
         else:
             v = _along(end, S)
-        _, *both = kabsch(np.diff(v, axis=1), views.gained[views.of == s])
-        left += np.stack(both, axis=-1)
+        left += np.stack(_compared(views, s, v), axis=-1)
     return left
+
+
+def _compared(views: Views, s: int, v: np.ndarray) -> list[np.ndarray]:
+    """Means of the squares left (h,) of velocities (h, nodes, 3) by a rotation, by a reflection."""
+    once = slice(None, None, views.stride)  # changes that do not overlap
+    u = (v[:, views.stride :] - v[:, : -views.stride])[:, once]
+    _, *both = kabsch(u, views.gained[views.of == s][once])
+    return [left / u.shape[1] for left in both]
 
 
 def _along(index: np.ndarray, values: np.ndarray) -> np.ndarray:

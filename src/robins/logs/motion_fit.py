@@ -28,7 +28,7 @@ SCALE, GYRO_BIAS, FORCE, FORCE_BIAS = slice(0, 9), slice(9, 12), slice(12, 18), 
 LEVER, RATE, OFFSET = slice(21, 24), 24, 25  # an offset for each part of the log
 _UPPER = np.triu_indices(3)
 _PAD_S, _SMOOTH_S, _EDGE_S = 0.5, 0.1, 0.1
-_MOST = 0.3  # of a step of Gauss and Newton, relative or s
+_MOST, _MOST_BIAS, _MOST_LEVER_M = 0.3, 1.0, 5.0  # of a step of Gauss and Newton
 _STILL = 0.03  # sigmas of a step that ends the search
 _TRIMMED = 0.95  # share of the residuals that judges a fit, the smallest
 _ROBUST = 3.0  # typical residuals, beyond which one counts less
@@ -59,6 +59,7 @@ class Fit(NamedTuple):
     R: np.ndarray  # (stretches, 3, 3) from the first axes of each to those of its velocities
     squares: np.ndarray  # (k,) squares left of each change of velocity; NaN where no IMU was
     turned: np.ndarray  # (nodes, 3, 3) attitude C at each node
+    strain: float = 0.0  # chi-square of the parameters against what they were expected to be
 
     def left(self, views: Views) -> float:
         """Share of the change of velocity that is left unexplained; infinite where no IMU was."""
@@ -112,7 +113,7 @@ def _sums(views: Views, state: State) -> _Sums:
     of_rate = np.einsum("skij,skl->skijl", Cm, dphi).reshape(*Cm.shape[:2], 3, 9)
     psi = np.concatenate([of_rate, bias], axis=-1)
     psi = np.cumsum(psi, axis=1) - 0.5 * psi
-    by_turn = np.cross(psi, dS[..., None], axis=-2)
+    by_turn = -skew(dS) @ psi
     by_force = np.einsum("skij,skl->skijl", Cm, dp)[..., _UPPER[0], _UPPER[1]]
     S = _cumulative(np.concatenate([dS[..., None], by_turn, by_force, bias], axis=-1))
     begin, end = (
@@ -150,7 +151,7 @@ def _sums(views: Views, state: State) -> _Sums:
     last = np.zeros(len(all_))
     np.maximum.at(last, views.node_of, end)
     seen = _recorded(views, first + _PAD_S, first + last / RATE_HZ)[views.of]
-    return _Sums(u[views.node + 1] - u[views.node], C_end, seen)
+    return _Sums(u[views.node + views.stride] - u[views.node], C_end, seen)
 
 
 def _cumulative(steps: np.ndarray) -> np.ndarray:
@@ -171,7 +172,7 @@ def fit(views: Views, start: State, prior: np.ndarray, rounds: int = 8) -> Fit:
     Args:
         views: the tables.
         start: where to start; also what the parameters are expected to be.
-        prior: (parameters,) one sigma of what they differ from that by, relative of the matrices.
+        prior: (parameters, parameters) covariance of what they differ from that by.
         rounds: steps at most.
     """
     state, best, cost = start, None, np.inf
@@ -180,11 +181,14 @@ def fit(views: Views, start: State, prior: np.ndarray, rounds: int = 8) -> Fit:
         seen = result.squares[np.isfinite(result.squares)]
         if not len(seen):
             break
-        if trimmed(seen) < cost:
-            best, cost = result, trimmed(seen)
+        now = 3 * len(seen) * np.log(trimmed(seen) + 1e-12) + result.strain
+        if now < cost:
+            best, cost = result, now
         if np.max(np.abs(step / result.sigma)) < _STILL:
             break
-        state = _moved(state, np.clip(step, -_MOST, _MOST))
+        most = np.full(len(step), _MOST)
+        most[FORCE_BIAS], most[LEVER] = _MOST_BIAS, _MOST_LEVER_M
+        state = _moved(state, np.clip(step, -most, most))
     return result if best is None else best
 
 
@@ -245,20 +249,23 @@ def _step(views: Views, state: State, start: State, prior: np.ndarray) -> tuple[
     free = 3.0 * np.sum(sums.seen) - min(count, np.sum(sums.seen)) - 3.0 * stretches
     free = max(free, 0.5 * np.sum(sums.seen), 1.0)
     variance = max(float(np.nansum(weight * squares)) / free, 1e-10)
-    inverse = np.linalg.inv(H / variance + np.diag(prior**-2))
-    step = inverse @ (g / variance - _moved_by(state, start) / prior**2)
+    expected = np.linalg.inv(prior)
+    inverse = np.linalg.inv(H / variance + expected)
+    moved = _moved_by(state, start)
+    step = inverse @ (g / variance - expected @ moved)
     meat = np.array(scores).T @ np.array(scores) if scores else np.zeros_like(H)
     meat *= len(scores) / max(len(scores) - 1, 1) / variance**2
     spread = np.maximum(np.diag(inverse), np.diag(inverse @ meat @ inverse))
-    return Fit(state, np.sqrt(spread), R, squares, sums.C), step
+    strain = float(moved @ expected @ moved)
+    return Fit(state, np.sqrt(spread), R, squares, sums.C, strain), step
 
 
 def prior_of(parts: int = 1, *free: str) -> np.ndarray:
-    """Standard deviations of what sound tables differ by, wide for the blocks that are free.
+    """Covariance of what sound tables differ by from what they claim, wide where blocks are free.
 
     Args:
         parts: parts of the log with a clock of their own.
-        free: among "offset", "rate", "gyros", "forces".
+        free: among "offset", "rate", "scale" (one of all gyros), "gyros", "forces".
     """
     sigma = np.empty(OFFSET + parts)
     sigma[SCALE] = 0.3 if "gyros" in free else 0.02
@@ -266,4 +273,8 @@ def prior_of(parts: int = 1, *free: str) -> np.ndarray:
     sigma[GYRO_BIAS], sigma[FORCE_BIAS], sigma[LEVER] = 0.01, 0.3, 2.0
     sigma[RATE] = 0.02 if "rate" in free else 2e-5
     sigma[OFFSET:] = 1.0 if "offset" in free else 0.01
-    return sigma
+    out = np.diag(sigma**2)
+    if "scale" in free:
+        alike = np.eye(3).ravel()
+        out[SCALE, SCALE] += 0.3**2 * np.outer(alike, alike)
+    return out

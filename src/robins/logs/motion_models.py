@@ -28,13 +28,19 @@ from robins.logs.motion_fit import Fit, State, fit, prior_of, start_of
 from robins.logs.quiet import Signal, usual_force, windows_of
 
 SCALES = np.exp(np.arange(np.log(1e-6), np.log(1e3), 0.2))  # of gyros, where a fit may start
-_BLOCKS = {"clock": ("offset", "rate"), "gyros": ("gyros",), "forces": ("forces",)}
-_COST = {"clock": 2, "gyros": 9, "forces": 6}  # parameters
+_BLOCKS = {
+    "clock": ("offset", "rate"),
+    "scale": ("scale",),
+    "gyros": ("gyros",),
+    "forces": ("forces",),
+}
+_COST = {"clock": 2, "scale": 1, "gyros": 9, "forces": 6}  # parameters
 _CLEAR = 8.0  # log-likelihood beyond the number of parameters
 _SUSPICIOUS = 0.02, 0.3  # shares left, of all and of a stretch, from which starts are searched
 _NEAR_S, _FAR_S, _FINE_S, _COARSE_S = 60.0, 4000.0, 0.25, 0.5
 _SWITCH = 40.0  # log-likelihood that a step of the clock must gain
 _RATES = np.arange(-0.02, 0.0201, 0.0005)
+_PART = 5.0  # log-likelihood that each of its parts must gain
 _ROUNDS = 14
 _LEAST_SHARE = 1e-4  # left, below which nothing is gained
 
@@ -44,6 +50,7 @@ class Verdict(NamedTuple):
 
     views: Views
     nothing: Fit  # with nuisances only
+    clocked: Fit  # likewise, and the clock free
     fit: Fit  # with the blocks that are free
     free: tuple[str, ...]  # "clock", "gyros", "forces", in the order of what they explain
     rival: str  # a block that explains nearly as much as the first, or ""
@@ -99,49 +106,81 @@ def _stood(track: Track) -> bool:
     return float(np.sum(step[slow])) > 3.0
 
 
-def choose(views: Views) -> tuple[Fit, Fit, tuple[str, ...], str]:
-    """The fit with nuisances only, the one chosen, its blocks, and a rival of the first."""
+def choose(views: Views) -> tuple[Fit, Fit, Fit, tuple[str, ...], str]:
+    """Fits of `Verdict`, the blocks that are free, and a rival of the first."""
     nothing = fit(views, start_of(views), prior_of())
-    best, free, rival = nothing, (), ""
+    best, clocked, free, rival = nothing, nothing, (), ""
     for _ in range(2):
-        fits = {}
-        for block in _BLOCKS.keys() - set(free):
-            for start in _starts(views, block, best, free):
-                parts = len(start.offset)
-                names = [name for b in (*free, block) for name in _BLOCKS[b]]
-                if parts > 1:
-                    names.remove("rate")
-                tried = fit(views, start, prior_of(parts, *names), _ROUNDS)
-                if block not in fits or _gain(views, fits[block], tried) > 0.0:
-                    fits[block] = tried
+        fits = {
+            block: _freed(views, block, best, free)
+            for block in _BLOCKS
+            if not {block, *(("scale",) if block == "gyros" else ())} <= {*free}
+        }
+        clocked = clocked if free else fits["clock"]
         gain = {b: _gain(views, best, f) - _COST[b] for b, f in fits.items()}
         order = sorted(gain, key=lambda b: -gain[b])
-        if not gain[order[0]] > _CLEAR:
+        first = order[0]
+        if not gain[first] > _CLEAR:
             break
-        if not free and len(order) > 1 and gain[order[1]] > gain[order[0]] - _CLEAR:
-            rival = order[1]
-        best, free = fits[order[0]], (*free, order[0])
-    return nothing, best, free, rival
+        others = [b for b in order[1:] if not {b, first} <= {"scale", "gyros"}]
+        if not free and gain[others[0]] > gain[first] - _CLEAR:
+            rival = others[0]
+        best, free = fits[first], (*free, first)
+    return nothing, clocked, best, free, rival
+
+
+def _freed(views: Views, block: str, best: Fit, free: tuple[str, ...]) -> Fit:
+    """A model with one more block, from the most promising start."""
+    trials = []
+    for start in _starts(views, block, best, free):
+        parts = len(start.offset)
+        names = [name for b in (*free, block) for name in _BLOCKS[b]]
+        if parts > 1 and "rate" in names:
+            names.remove("rate")
+        trials.append((start, prior_of(parts, *names)))
+    if len(trials) == 1:
+        return fit(views, *trials[0], _ROUNDS)
+    seen = [_gain(views, best, fit(views, *trial, 1)) for trial in trials]
+    promising = np.argsort(seen)[-2 if block == "clock" else -1 :]
+    fits = [fit(views, *trials[k], _ROUNDS) for k in promising]
+    # a part of the log with an offset of its own must be worth it
+    gains = [_gain(views, best, one) - _PART * len(one.state.offset) for one in fits]
+    return fits[int(np.argmax(gains))]
 
 
 def _gain(views: Views, before: Fit, after: Fit) -> float:
     """Log-likelihood gained, of which a third counts; each stretch has a variance of its own."""
     least = _LEAST_SHARE * float(np.median(power_of(views)))
     one, other = (np.log(f.by_stretch(views) + least) for f in (before, after))
-    return 0.5 * float(np.bincount(views.of) @ (one - other))
+    strain = (before.strain - after.strain) / 3.0
+    return 0.5 * (float(np.bincount(views.of) @ (one - other)) / np.sqrt(views.stride) + strain)
 
 
 def _starts(views: Views, block: str, best: Fit, free: tuple[str, ...]) -> list[State]:
     """States from which a model with one more free block is fitted."""
-    out = [best.state]
-    worst = float(np.max(best.by_stretch(views) / power_of(views)))
-    if best.left(views) < _SUSPICIOUS[0] and worst < _SUSPICIOUS[1]:
+    state = _known(views, best.state, free)
+    out, power = [state], power_of(views)
+    share, noise = best.by_stretch(views) / power, views.noise**2 / power
+    usual = max(_SUSPICIOUS[0], 1.5 * float(np.median(noise)))
+    if best.left(views) < usual and np.all(share < np.maximum(_SUSPICIOUS[1], 4.0 * noise)):
         return out
-    if block == "clock" and "gyros" not in free:
+    if block == "clock" and not {"gyros", "scale"} & {*free}:
         out += _clocks(views)
     if block == "gyros":
-        out += _maps(views, best.state)
+        out += _maps(views, state, signed_permutations())
+    if block == "scale":
+        out += _maps(views, state, np.eye(3)[None])
     return out
+
+
+def _known(views: Views, state: State, free: tuple[str, ...]) -> State:
+    """What the free blocks have shown; nuisances start again from what tables claim."""
+    out = start_of(views, mirror=float(np.sign(np.linalg.det(state.M_a))))
+    if "clock" in free:
+        out = out._replace(offset=state.offset, rate=state.rate, part=state.part)
+    if {"gyros", "scale"} & {*free}:
+        out = out._replace(M_g=state.M_g)
+    return out._replace(M_a=state.M_a) if "forces" in free else out
 
 
 def _clocks(views: Views) -> list[State]:
@@ -153,11 +192,11 @@ def _clocks(views: Views) -> list[State]:
         beyond = np.arange(_NEAR_S + _COARSE_S, far, _COARSE_S)
         lags = np.concatenate([-beyond[::-1], lags, beyond])
     squares = squares_by_lag(views, lags)
-    changes = np.bincount(views.of, minlength=len(squares))[:, None]
+    changes = np.bincount(views.of)[:, None] / views.stride
     power = power_of(views)
     # where no IMU was, or it stood: all is left
     missing = np.isnan(squares)
-    left = np.where(missing, power[:, None], squares / changes)
+    left = np.where(missing, power[:, None], squares)
     cost = changes * np.log(left + 1e-3 * np.median(power))
     start = start_of(views)
     return [_line(views, start, lags, cost), _steps(start, lags, cost)]
@@ -203,22 +242,18 @@ def _steps(start: State, lags: np.ndarray, cost: np.ndarray) -> State:
     return start._replace(offset=offset, part=part)
 
 
-def _maps(views: Views, state: State) -> list[State]:
-    """Maps of the gyros that explain most: an axis order, signs and a factor."""
+def _maps(views: Views, state: State, axes: np.ndarray) -> list[State]:
+    """Maps of the gyros that explain most: one of some orders and signs of axes, and a factor."""
     shift = state.shift(np.arange(len(views.start_s)), views.start_s, views.middle_s)
-    axes, scale = signed_permutations(), 1.0
-    order, mirror, out = np.eye(3), 0, []
+    scale, out = 1.0, []
     for _ in range(2):
-        by_scale = squares_by_map(views, SCALES[:, None, None] * order, shift)
-        best = int(np.argmin(by_scale[:, mirror]))
-        scale = float(SCALES[best])
         by_axes = squares_by_map(views, scale * axes, shift)
+        by_axes = by_axes if len(axes) > 1 else by_axes[:, :1]
         k, mirror = map(int, np.unravel_index(int(np.argmin(by_axes)), by_axes.shape))
-        order = axes[k]
-        out.append((scale * order, 1.0 - 2.0 * mirror))
-    as_is = squares_by_map(views, axes, shift)
-    k, mirror = map(int, np.unravel_index(int(np.argmin(as_is)), as_is.shape))
-    out.append((axes[k], 1.0 - 2.0 * mirror))
+        out.append((scale * axes[k], 1.0 - 2.0 * mirror))
+        by_scale = squares_by_map(views, SCALES[:, None, None] * axes[k], shift)[:, mirror]
+        scale = float(SCALES[int(np.argmin(by_scale))])
+        out.append((scale * axes[k], 1.0 - 2.0 * mirror))
     return [
         start_of(views, M, sign)._replace(offset=state.offset, rate=state.rate, part=state.part)
         for M, sign in out
