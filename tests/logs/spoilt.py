@@ -190,7 +190,7 @@ MOTION = {
     "accel_reversed": [(with_imu(accel=times(-1)), "error", None, "z_axis_reversed")],
     "forward_axis": [
         (with_imu(**about_vertical(angle)), "warning", near(angle, abs=3.0))
-        for angle in (90, 180, -50)
+        for angle in (90, 170, -50)
     ],
     "time_offset": [
         (with_imu(time_ns=plus(round(offset * S))), kind, near(offset, abs=0.06))

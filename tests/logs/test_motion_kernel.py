@@ -78,12 +78,14 @@ def test_derivatives_against_differences(drive, velocities):
     state = start_of(views)._replace(
         b_g=np.array([0.01, 0.0, -0.02]), lever=np.array([1.0, -2.0, 0.5]), offset=np.array([0.2])
     )
-    columns = motion_fit._sums(views, state).u[..., 1:]
+    columns = motion_fit._sums(views, state)[0][..., 1:]
     for k in range(columns.shape[-1]):
         # those of the clock are smoothed over 0.2 s, for forces are noisy
         step = 1e-5 if k < motion_fit.RATE else 2e-3 if k == motion_fit.RATE else 0.1
         ends = (
-            motion_fit._sums(views, motion_fit._moved(state, sign * step * np.eye(26)[k])).u[..., 0]
+            motion_fit._sums(views, motion_fit._moved(state, sign * step * np.eye(26)[k]))[0][
+                ..., 0
+            ]
             for sign in (1, -1)
         )
         slope = np.subtract(*ends) / (2 * step)

@@ -18,6 +18,7 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from robins.dataset import GnssTable
 from robins.logs.quiet import Signal
@@ -52,8 +53,8 @@ def signed_permutations() -> np.ndarray:
 class Views(NamedTuple):
     """Integrals of the IMU and changes of velocity, both from one zero of time.
 
-    Changes are between nodes of one stretch a second apart or more; they overlap. A node is a velocity at a time, or the
-    mean velocity between two positions.
+    Changes are between nodes of one stretch a second apart or more; they overlap. A node is a
+    velocity at a time, or the mean velocity between two positions.
     """
 
     turn: np.ndarray  # (n + 1, 3) integral of the rate up to each time of the grid [rad]
@@ -97,36 +98,56 @@ def views_of(
         v_n: (m, 3) velocities, north-east-down [m/s], or None: then positions serve.
         noise: standard deviations of a position [m] and of a velocity [m/s].
     """
-    lat, lon, alt = gnss.lat_rad[rows], gnss.lon_rad[rows], gnss.alt_m[rows]
-    means = v_n is None
-    spacing = min(max(1.0, np.sqrt(6.0) * noise[0] / _NOISE), 5.0) if means else 1.0
+    spacing = min(max(1.0, np.sqrt(6.0) * noise[0] / _NOISE), 5.0) if v_n is None else 1.0
     keep = np.arange(0, len(when_s), max(1, round(_FIX_S / float(np.median(np.diff(when_s))))))
     step = float(np.median(np.diff(when_s[keep]))) if len(keep) > 1 else np.inf
     stride = max(1, round(spacing / step))
     if len(keep) < 4 * stride:
         return None
-    near = np.diff(when_s[keep]) < max(2.5 * step, _LOST_S)
-    if means:
-        first, last = keep[:-stride], keep[stride:]
-        v = (r_n[last] - r_n[first]) / (when_s[last] - when_s[first])[:, None]
-        begin, end, at_row = when_s[first], when_s[last], first
-        whole = np.lib.stride_tricks.sliding_window_view(near, stride).all(axis=1)
-        scatter = np.sqrt(12.0) * noise[0] / (stride * step)
-        joined = whole[:-1] & whole[1:]
-    else:
-        v, begin, end, at_row, joined = v_n[keep], when_s[keep], when_s[keep], keep, near
-        scatter = np.sqrt(6.0) * noise[1]
-    C = axes_at(lat[at_row], lon[at_row])
-    v_e = np.einsum("nij,nj->ni", C, v)
-    g_e = C[:, :, 2] * normal_gravity(lat[at_row], alt[at_row])[:, None]
+    v, begin, end, joined = _velocities(when_s[keep], r_n[keep], v_n, keep, stride)
+    means = v_n is None
+    scatter = np.sqrt(12.0) * noise[0] / (stride * step) if means else np.sqrt(6.0) * noise[1]
     length = max(_STRETCH_S, _CHANGES * stride * step)
     end_s = float(signal.time_s[-1]) + 0.1
     chosen = _lively(0.5 * (begin + end), v, joined, length, max(0.2, scatter), stride, end_s)
     if not chosen:
         return None
+    nodes = np.concatenate(chosen)
+    node_of = np.repeat(np.arange(len(chosen)), [len(k) for k in chosen])
+    start = np.array([begin[k[0]] for k in chosen])
+    since = 0.5 * (begin + end)[nodes] - start[node_of]
+    node = np.flatnonzero(node_of[stride:] == node_of[:-stride])
+    at_fix = rows[keep[nodes]]
+    C = axes_at(gnss.lat_rad[at_fix], gnss.lon_rad[at_fix])
+    g_e = C[:, :, 2] * normal_gravity(gnss.lat_rad[at_fix], gnss.alt_m[at_fix])[:, None]
+    v_e = np.einsum("nij,nj->ni", C, v[nodes])
+    v, gained = _inertial(since, v_e, g_e, node, node + stride)
     turn, push = on_grid(signal, kind)
-    fields = _joined(chosen, begin, end, means, v_e, g_e, stride)
-    return Views(turn, push, _gaps(signal), *fields, stride, scatter)
+    return Views(
+        *(turn, push, _gaps(signal), begin[nodes], end[nodes], means),
+        *(node_of, v, node, node_of[node], gained, start),
+        length_s=max(float(end[k[-1]] - begin[k[0]]) for k in chosen),
+        middle_s=0.5 * float(start[0] + start[-1]),
+        stride=stride,
+        noise=scatter,
+    )
+
+
+def _velocities(
+    time_s: np.ndarray, r_n: np.ndarray, v_n: np.ndarray | None, keep: np.ndarray, stride: int
+) -> tuple[np.ndarray, ...]:
+    """Velocities (n, 3), times at which each begins and ends, and no gap up to the next (n - 1,).
+
+    They are means between positions a stride apart where the receiver gave none.
+    """
+    step = np.diff(time_s)
+    near = step < max(2.5 * float(np.median(step)), _LOST_S)
+    if v_n is not None:
+        return v_n[keep], time_s, time_s, near
+    begin, end = time_s[:-stride], time_s[stride:]
+    whole = np.logical_and.reduce(sliding_window_view(near, stride), axis=1)
+    v = (r_n[stride:] - r_n[:-stride]) / (end - begin)[:, None]
+    return v, begin, end, whole[:-1] & whole[1:]
 
 
 def _lively(
@@ -165,36 +186,25 @@ def _lively(
     return sorted(chosen, key=lambda nodes: int(nodes[0]))
 
 
-def _joined(
-    chosen: list[np.ndarray],
-    begin: np.ndarray,
-    end: np.ndarray,
-    means: bool,
-    v_e: np.ndarray,
-    g_e: np.ndarray,
-    stride: int,
-) -> tuple:
-    """Fields of `Views` from `begin_s` on, in axes that are inertial during a stretch."""
-    nodes = np.concatenate(chosen)
-    node_of = np.repeat(np.arange(len(chosen)), [len(k) for k in chosen])
-    time_s = 0.5 * (begin + end)[nodes]
-    start = np.array([begin[k[0]] for k in chosen])
-    v, g = v_e[nodes], g_e[nodes]
-    node = np.flatnonzero(node_of[stride:] == node_of[:-stride])
-    dt = (time_s[node + stride] - time_s[node])[:, None]
-    mean = 0.5 * (v[node] + v[node + stride])
+def _inertial(
+    since_s: np.ndarray, v_e: np.ndarray, g_e: np.ndarray, first: np.ndarray, second: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities, and changes of them less gravity, in axes that do not turn with the Earth.
+
+    Args:
+        since_s: (nodes,) time since the axes were those of the Earth.
+        v_e: (nodes, 3) velocities over the Earth, along its axes [m/s].
+        g_e: (nodes, 3) gravity [m/s^2].
+        first: (k,) node at which a change begins.
+        second: (k,) node at which it ends.
+    """
     rate = np.array([0.0, 0.0, EARTH_RATE])
-    gained = v[node + stride] - v[node] + dt * (2.0 * np.cross(rate, mean) - g[node])
-    since = time_s - start[node_of]
-    turned = rotations(since[:, None] * rate)
-    midway = rotations(0.5 * (since[node] + since[node + stride])[:, None] * rate)
-    gained = np.einsum("kij,kj->ki", midway, gained)
-    v = np.einsum("kij,kj->ki", turned, v)
-    length = max(float(end[k[-1]] - begin[k[0]]) for k in chosen)
-    middle = 0.5 * float(start[0] + start[-1])
-    of = node_of[node]
-    begin, end = begin[nodes], end[nodes]
-    return begin, end, means, node_of, v, node, of, gained, start, length, middle
+    dt = (since_s[second] - since_s[first])[:, None]
+    mean, g = 0.5 * (v_e[first] + v_e[second]), 0.5 * (g_e[first] + g_e[second])
+    gained = v_e[second] - v_e[first] + dt * (2.0 * np.cross(rate, mean) - g)
+    turned = rotations(since_s[:, None] * rate)
+    midway = rotations(0.5 * (since_s[first] + since_s[second])[:, None] * rate)
+    return np.einsum("nij,nj->ni", turned, v_e), np.einsum("kij,kj->ki", midway, gained)
 
 
 def axes_at(lat: np.ndarray, lon: np.ndarray) -> np.ndarray:
@@ -268,7 +278,7 @@ def power_of(views: Views) -> np.ndarray:
 
 
 def squares_by_lag(views: Views, lags_s: np.ndarray) -> np.ndarray:
-    """(stretches, lags) mean of the squares left by the tables as they are, if fixes are that much later.
+    """(stretches, lags) means of the squares left by tables as they are, if fixes are later.
 
     Args:
         views: the tables.

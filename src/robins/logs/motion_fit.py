@@ -90,15 +90,14 @@ def start_of(views: Views, M_g: np.ndarray | None = None, mirror: float = 1.0) -
     return State(M_g, zero, mirror * eye, zero, zero, 0.0, np.zeros(1), part)
 
 
-class _Sums(NamedTuple):
-    """Gained velocity and its derivatives."""
+def _sums(views: Views, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gained velocity and its derivatives.
 
-    u: np.ndarray  # (k, 3, 1 + parameters) in the first axes of the stretch
-    C: np.ndarray  # (nodes, 3, 3)
-    seen: np.ndarray  # (k,) bool: the IMU was recorded
-
-
-def _sums(views: Views, state: State) -> _Sums:
+    Returns:
+        u: (k, 3, 1 + parameters) in the first axes of the stretch.
+        C: (nodes, 3, 3) attitudes.
+        seen: (k,) bool, changes for which the IMU was recorded.
+    """
     n_fine = int(np.ceil((views.length_s * (1 + abs(state.rate)) + 2 * _PAD_S) * RATE_HZ))
     all_ = np.arange(len(views.start_s))
     first = views.start_s + state.shift(all_, views.start_s, views.middle_s) - _PAD_S
@@ -106,16 +105,7 @@ def _sums(views: Views, state: State) -> _Sums:
     turn, push = (np.diff(between(index, x), axis=1) for x in (views.turn, views.push))
     dphi = turn @ state.M_g.T - state.b_g / RATE_HZ
     dp = push @ state.M_a.T - state.b_a / RATE_HZ
-    C = composed(rotations(dphi))
-    Cm = C[:, :-1] @ rotations(0.5 * dphi)
-    dS = np.einsum("skij,skj->ski", Cm, dp)
-    bias = -Cm / RATE_HZ
-    of_rate = np.einsum("skij,skl->skijl", Cm, dphi).reshape(*Cm.shape[:2], 3, 9)
-    psi = np.concatenate([of_rate, bias], axis=-1)
-    psi = np.cumsum(psi, axis=1) - 0.5 * psi
-    by_turn = -skew(dS) @ psi
-    by_force = np.einsum("skij,skl->skijl", Cm, dp)[..., _UPPER[0], _UPPER[1]]
-    S = _cumulative(np.concatenate([dS[..., None], by_turn, by_force, bias], axis=-1))
+    S, C = _grown(dphi, dp)
     begin, end = (
         (t + state.shift(views.node_of, t, views.middle_s) - first[views.node_of]) * RATE_HZ
         for t in (views.begin_s, views.end_s)
@@ -151,7 +141,30 @@ def _sums(views: Views, state: State) -> _Sums:
     last = np.zeros(len(all_))
     np.maximum.at(last, views.node_of, end)
     seen = _recorded(views, first + _PAD_S, first + last / RATE_HZ)[views.of]
-    return _Sums(u[views.node + views.stride] - u[views.node], C_end, seen)
+    return u[views.node + views.stride] - u[views.node], C_end, seen
+
+
+def _grown(dphi: np.ndarray, dp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity with its derivatives by the parameters of the triads, and attitude.
+
+    Args:
+        dphi: (stretches, fine, 3) small turns [rad].
+        dp: (stretches, fine, 3) small gains of velocity in body axes [m/s].
+
+    Returns:
+        (stretches, fine + 1, 3, 22) and (stretches, fine + 1, 3, 3).
+    """
+    C = composed(rotations(dphi))
+    Cm = C[:, :-1] @ rotations(0.5 * dphi)
+    dS = np.einsum("skij,skj->ski", Cm, dp)
+    bias = -Cm / RATE_HZ
+    of_rate = np.einsum("skij,skl->skijl", Cm, dphi).reshape(*Cm.shape[:2], 3, 9)
+    psi = np.concatenate([of_rate, bias], axis=-1)
+    psi = np.cumsum(psi, axis=1) - 0.5 * psi
+    by_turn = -skew(dS) @ psi
+    by_force = np.einsum("skij,skl->skijl", Cm, dp)[..., _UPPER[0], _UPPER[1]]
+    columns = np.concatenate([dS[..., None], by_turn, by_force, bias], axis=-1)
+    return _cumulative(columns), C
 
 
 def _cumulative(steps: np.ndarray) -> np.ndarray:
@@ -175,9 +188,10 @@ def fit(views: Views, start: State, prior: np.ndarray, rounds: int = 8) -> Fit:
         prior: (parameters, parameters) covariance of what they differ from that by.
         rounds: steps at most.
     """
-    state, best, cost = start, None, np.inf
+    state, cost = start, np.inf
+    result, step = _step(views, state, start, prior)
+    best = result
     for _ in range(rounds):
-        result, step = _step(views, state, start, prior)
         seen = result.squares[np.isfinite(result.squares)]
         if not len(seen):
             break
@@ -189,7 +203,8 @@ def fit(views: Views, start: State, prior: np.ndarray, rounds: int = 8) -> Fit:
         most = np.full(len(step), _MOST)
         most[FORCE_BIAS], most[LEVER] = _MOST_BIAS, _MOST_LEVER_M
         state = _moved(state, np.clip(step, -most, most))
-    return result if best is None else best
+        result, step = _step(views, state, start, prior)
+    return best
 
 
 def _moved(state: State, step: np.ndarray) -> State:
@@ -221,23 +236,23 @@ def _moved_by(state: State, start: State) -> np.ndarray:
 
 def _step(views: Views, state: State, start: State, prior: np.ndarray) -> tuple[Fit, np.ndarray]:
     """Judgement of a state, and the step from it."""
-    sums = _sums(views, state)
-    count, stretches = sums.u.shape[2] - 1, len(views.start_s)
+    u, C, recorded = _sums(views, state)
+    count, stretches = u.shape[2] - 1, len(views.start_s)
     R = np.tile(np.eye(3), (stretches, 1, 1))
     rest = np.full(views.gained.shape, np.nan)
-    rows = [np.flatnonzero((views.of == s) & sums.seen) for s in range(stretches)]
+    rows = [np.flatnonzero((views.of == s) & recorded) for s in range(stretches)]
     for s, k in enumerate(rows):
         if len(k):
-            R[s] = kabsch(sums.u[k, :, 0][None], views.gained[k])[0][0]
-            rest[k] = views.gained[k] - sums.u[k, :, 0] @ R[s].T
+            R[s] = kabsch(u[k, :, 0][None], views.gained[k])[0][0]
+            rest[k] = views.gained[k] - u[k, :, 0] @ R[s].T
     squares = np.sum(rest**2, axis=1)
-    usual = max(np.sqrt(np.nanmedian(squares) / 2.37), 1e-6) if sums.seen.any() else np.nan
+    usual = max(np.sqrt(np.nanmedian(squares) / 2.37), 1e-6) if recorded.any() else np.nan
     weight = 1.0 / (1.0 + squares / (3.0 * (_ROBUST * usual) ** 2))
     H, g, scores = np.zeros((count, count)), np.zeros(count), []
     for s, k in enumerate(rows):
         if len(k):
-            A = (R[s] @ sums.u[k, :, 1:]).reshape(-1, count)
-            B = -skew(sums.u[k, :, 0] @ R[s].T).reshape(-1, 3)
+            A = (R[s] @ u[k, :, 1:]).reshape(-1, count)
+            B = -skew(u[k, :, 0] @ R[s].T).reshape(-1, 3)
             w, r = np.repeat(weight[k], 3), rest[k].ravel()
             # what a turn of the stretch would explain is no evidence for the others
             inside = B.T @ (w[:, None] * B) + 1e-9 * np.eye(3)
@@ -246,8 +261,8 @@ def _step(views: Views, state: State, start: State, prior: np.ndarray) -> tuple[
             H += A.T @ (w[:, None] * A)
             scores.append(A.T @ (w * r))
             g += scores[-1]
-    free = 3.0 * np.sum(sums.seen) - min(count, np.sum(sums.seen)) - 3.0 * stretches
-    free = max(free, 0.5 * np.sum(sums.seen), 1.0)
+    free = 3.0 * np.sum(recorded) - min(count, np.sum(recorded)) - 3.0 * stretches
+    free = max(free, 0.5 * np.sum(recorded), 1.0)
     variance = max(float(np.nansum(weight * squares)) / free, 1e-10)
     expected = np.linalg.inv(prior)
     inverse = np.linalg.inv(H / variance + expected)
@@ -257,7 +272,7 @@ def _step(views: Views, state: State, start: State, prior: np.ndarray) -> tuple[
     meat *= len(scores) / max(len(scores) - 1, 1) / variance**2
     spread = np.maximum(np.diag(inverse), np.diag(inverse @ meat @ inverse))
     strain = float(moved @ expected @ moved)
-    return Fit(state, np.sqrt(spread), R, squares, sums.C, strain), step
+    return Fit(state, np.sqrt(spread), R, squares, C, strain), step
 
 
 def prior_of(parts: int = 1, *free: str) -> np.ndarray:

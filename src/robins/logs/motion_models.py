@@ -138,11 +138,11 @@ def _freed(views: Views, block: str, best: Fit, free: tuple[str, ...]) -> Fit:
         if parts > 1 and "rate" in names:
             names.remove("rate")
         trials.append((start, prior_of(parts, *names)))
-    if len(trials) == 1:
-        return fit(views, *trials[0], _ROUNDS)
-    seen = [_gain(views, best, fit(views, *trial, 1)) for trial in trials]
-    promising = np.argsort(seen)[-2 if block == "clock" else -1 :]
-    fits = [fit(views, *trials[k], _ROUNDS) for k in promising]
+    if len(trials) > 1:
+        seen = [_gain(views, best, fit(views, start, prior, 0)) for start, prior in trials]
+        promising = np.argsort(seen)[-2 if block == "clock" else -1 :]
+        trials = [trials[k] for k in promising]
+    fits = [fit(views, start, prior, _ROUNDS) for start, prior in trials]
     # a part of the log with an offset of its own must be worth it
     gains = [_gain(views, best, one) - _PART * len(one.state.offset) for one in fits]
     return fits[int(np.argmax(gains))]
