@@ -155,7 +155,7 @@ MOTION = {
             "error: only if ... by 1.8 ... No usual unit",
             near(1.87, abs=0.05),
         ),
-        (with_imu(gyro=times([1, 1, 0.5])), "error: about z reads 0.5 +- ", near(2.0, abs=0.05)),
+        (with_imu(gyro=times([1, 1, 0.5])), "error: about z reads 0.5", near(2.0, abs=0.05)),
     ],
     "force_scale": [
         (with_imu(accel=times([1.3, 1, 1])), "warning: along x reads 1.3 +- ", near(0.77, abs=0.02))
@@ -213,7 +213,7 @@ TURNING = {
         (hand(gyro=np.rad2deg), "error: deg/s: multiply by pi/180"),
         (hand(gyro=np.deg2rad), "error: rad/s converted to radians once"),
     ],
-    "gyro_scale": [(hand(gyro=times(0.4)), "error: read 0.4 times", near(2.5, abs=0.1))],
+    "gyro_scale": [(hand(gyro=times(0.4)), "error: read 0.4", near(2.5, abs=0.1))],
     "left_handed": [
         (hand(gyro=times(-1)), "error"),
         (hand(**turned(np.diag([1, -1, 1]))), "error"),

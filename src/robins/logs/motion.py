@@ -29,7 +29,8 @@ RATE_HZ = 20
 EARTH_RATE = 7.292115e-5  # rad/s, WGS 84
 _STRETCH_S = 15.0  # long enough to turn, short enough for the drift of cheap gyros
 _CHANGES = 8  # of velocity in a stretch at least
-_MOST_STRETCHES, _MOST_OUTSIDE, _MOST_SEARCHED = 32, 8, 12
+_MOST_STRETCHES, _MOST_OUTSIDE, _MOST_SEARCHED = 20, 6, 8
+_SPOT_S, _MOST_SPOTS = 30, 4  # likewise of an IMU that was turned about by hand
 _GAP_S = 0.5  # without IMU samples, across which nothing is added up
 _FIX_S, _LOST_S = 0.25, 1.2  # between fixes that are used, and without one in a stretch
 _NOISE = 0.5  # m/s, of a mean velocity between fixes that are far enough apart
@@ -227,9 +228,9 @@ def at_the_spot(signal: Signal, kind: str) -> Views | None:
     None unless it is turned about enough that the specific force points elsewhere by 10 deg or so.
     """
     turn, push = on_grid(signal, kind)
-    gaps, count, tilted = _gaps(signal), int(_STRETCH_S), []
-    for start in np.arange(1.0, len(turn) / RATE_HZ - _STRETCH_S - 1.0, _STRETCH_S):
-        if np.any((gaps[:, 0] < start + _STRETCH_S) & (gaps[:, 1] > start)):
+    gaps, count, tilted = _gaps(signal), _SPOT_S, []
+    for start in np.arange(1.0, len(turn) / RATE_HZ - _SPOT_S - 1.0, _SPOT_S):
+        if np.any((gaps[:, 0] < start + _SPOT_S) & (gaps[:, 1] > start)):
             continue
         force = np.diff(push[round(start * RATE_HZ) :: RATE_HZ][: count + 1], axis=0)
         direction = force / np.linalg.norm(force, axis=-1, keepdims=True)
@@ -238,7 +239,7 @@ def at_the_spot(signal: Signal, kind: str) -> Views | None:
             tilted.append((spread, float(start)))
     if not tilted:
         return None
-    starts = np.array(sorted(start for _, start in sorted(tilted)[-_MOST_SEARCHED:]))
+    starts = np.array(sorted(start for _, start in sorted(tilted)[-_MOST_SPOTS:]))
     node_of = np.repeat(np.arange(len(starts)), count + 1)
     when = (starts[:, None] + np.arange(count + 1.0)).ravel()
     node = np.flatnonzero(node_of[1:] == node_of[:-1])
@@ -319,7 +320,7 @@ def squares_by_map(views: Views, maps: np.ndarray, shift_s: np.ndarray) -> np.nd
     count = int(np.ceil(views.length_s * RATE_HZ)) + 2
     power = power_of(views)
     left = np.zeros((len(maps), 2))
-    for s in np.argsort(power)[-_MOST_SEARCHED:]:
+    for s in np.argsort(power)[-_MOST_SEARCHED:].tolist():
         first = views.start_s[s] + shift_s[s]
         index = first * RATE_HZ + np.arange(count + 1)
         turn, push = (np.diff(between(index, x), axis=0) for x in (views.turn, views.push))

@@ -103,9 +103,9 @@ def _sums(views: Views, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarra
     first = views.start_s + state.shift(all_, views.start_s, views.middle_s) - _PAD_S
     index = first[:, None] * RATE_HZ + np.arange(n_fine + 1)
     turn, push = (np.diff(between(index, x), axis=1) for x in (views.turn, views.push))
-    dphi = turn @ state.M_g.T - state.b_g / RATE_HZ
-    dp = push @ state.M_a.T - state.b_a / RATE_HZ
-    S, C = _grown(dphi, dp)
+    whole = turn @ state.M_g.T, push @ state.M_a.T
+    dphi = whole[0] - state.b_g / RATE_HZ
+    S, C = _grown(*whole, dphi, whole[1] - state.b_a / RATE_HZ)
     begin, end = (
         (t + state.shift(views.node_of, t, views.middle_s) - first[views.node_of]) * RATE_HZ
         for t in (views.begin_s, views.end_s)
@@ -144,10 +144,14 @@ def _sums(views: Views, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return u[views.node + views.stride] - u[views.node], C_end, seen
 
 
-def _grown(dphi: np.ndarray, dp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _grown(
+    turn: np.ndarray, push: np.ndarray, dphi: np.ndarray, dp: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Velocity with its derivatives by the parameters of the triads, and attitude.
 
     Args:
+        turn: (stretches, fine, 3) small turns, biases not yet taken off [rad].
+        push: (stretches, fine, 3) small gains of velocity in body axes, likewise [m/s].
         dphi: (stretches, fine, 3) small turns [rad].
         dp: (stretches, fine, 3) small gains of velocity in body axes [m/s].
 
@@ -158,11 +162,11 @@ def _grown(dphi: np.ndarray, dp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Cm = C[:, :-1] @ rotations(0.5 * dphi)
     dS = np.einsum("skij,skj->ski", Cm, dp)
     bias = -Cm / RATE_HZ
-    of_rate = np.einsum("skij,skl->skijl", Cm, dphi).reshape(*Cm.shape[:2], 3, 9)
+    of_rate = np.einsum("skij,skl->skijl", Cm, turn).reshape(*Cm.shape[:2], 3, 9)
     psi = np.concatenate([of_rate, bias], axis=-1)
     psi = np.cumsum(psi, axis=1) - 0.5 * psi
     by_turn = -skew(dS) @ psi
-    by_force = np.einsum("skij,skl->skijl", Cm, dp)[..., _UPPER[0], _UPPER[1]]
+    by_force = np.einsum("skij,skl->skijl", Cm, push)[..., _UPPER[0], _UPPER[1]]
     columns = np.concatenate([dS[..., None], by_turn, by_force, bias], axis=-1)
     return _cumulative(columns), C
 

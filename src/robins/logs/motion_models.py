@@ -38,6 +38,7 @@ _COST = {"clock": 2, "scale": 1, "gyros": 9, "forces": 6}  # parameters
 _CLEAR = 8.0  # log-likelihood beyond the number of parameters
 _SUSPICIOUS = 0.02, 0.3  # shares left, of all and of a stretch, from which starts are searched
 _NEAR_S, _FAR_S, _FINE_S, _COARSE_S = 60.0, 4000.0, 0.25, 0.5
+_NOISY = 1.5  # squares of the stated noise that noise may leave
 _SWITCH = 40.0  # log-likelihood that a step of the clock must gain
 _RATES = np.arange(-0.02, 0.0201, 0.0005)
 _PART = 5.0  # log-likelihood that each of its parts must gain
@@ -126,6 +127,8 @@ def choose(views: Views) -> tuple[Fit, Fit, Fit, tuple[str, ...], str]:
         if not free and gain[others[0]] > gain[first] - _CLEAR:
             rival = others[0]
         best, free = fits[first], (*free, first)
+        if best.left(views) * float(np.mean(power_of(views))) < _NOISY * views.noise**2:
+            break  # nothing is left to be explained
     return nothing, clocked, best, free, rival
 
 
