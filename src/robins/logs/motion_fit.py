@@ -130,8 +130,10 @@ def _sums(views: Views, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarra
         near = [at(end + k * _SMOOTH_S * RATE_HZ, S[..., :1]) for k in (-1, 1)]
         force = (near[1] - near[0]) / (2 * _SMOOTH_S)
         angle = _cumulative(dphi)
-        early, late = (at(end + k * _SMOOTH_S * RATE_HZ, angle) for k in (-1, 1))
-        swing = C_end @ skew((late - early) / (2 * _SMOOTH_S))
+        # by two differences (Richardson), for a mean over 0.2 s would lose the swing of a step
+        ends = [at(end + k, angle) for k in (-2, -1, 1, 2)]
+        omega = (8.0 * (ends[2] - ends[1]) - (ends[3] - ends[0])) * (RATE_HZ / 12.0)
+        swing = C_end @ skew(omega)
     u[..., 0] += swing @ state.lever
     middle = 0.5 * (views.begin_s + views.end_s) - views.middle_s
     in_part = state.part[views.node_of][:, None] == np.arange(len(state.offset))

@@ -37,11 +37,12 @@ _BLOCKS = {
 _COST = {"clock": 2, "scale": 1, "gyros": 9, "forces": 6}  # parameters
 _CLEAR = 8.0  # log-likelihood beyond the number of parameters
 _SUSPICIOUS = 0.02, 0.3  # shares left, of all and of a stretch, from which starts are searched
-_NEAR_S, _FAR_S, _FINE_S, _COARSE_S = 60.0, 4000.0, 0.25, 0.5
-_NOISY = 1.5  # squares of the stated noise that noise may leave
-_SWITCH = 40.0  # log-likelihood that a step of the clock must gain
+_NEAR_S, _FAR_S, _FINE_S, _COARSE_S = 60.0, 4000.0, 0.1, 0.5
+_NOISY = 1.25  # squares of the stated noise that noise may leave
+_SWITCH = 40.0, 12.0  # log-likelihood that a step of the clock must gain, to be tried
 _RATES = np.arange(-0.02, 0.0201, 0.0005)
 _PART = 5.0  # log-likelihood that each of its parts must gain
+_PROMISING = {"clock": 3, "gyros": 2}  # starts of which a fit is tried
 _ROUNDS = 14
 _LEAST_SHARE = 1e-4  # left, below which nothing is gained
 
@@ -143,7 +144,7 @@ def _freed(views: Views, block: str, best: Fit, free: tuple[str, ...]) -> Fit:
         trials.append((start, prior_of(parts, *names)))
     if len(trials) > 1:
         seen = [_gain(views, best, fit(views, start, prior, 0)) for start, prior in trials]
-        promising = np.argsort(seen)[-2 if block == "clock" else -1 :]
+        promising = np.argsort(seen)[-_PROMISING.get(block, 1) :]
         trials = [trials[k] for k in promising]
     fits = [fit(views, start, prior, _ROUNDS) for start, prior in trials]
     # a part of the log with an offset of its own must be worth it
@@ -164,7 +165,7 @@ def _starts(views: Views, block: str, best: Fit, free: tuple[str, ...]) -> list[
     state = _known(views, best.state, free)
     out, power = [state], power_of(views)
     share, noise = best.by_stretch(views) / power, views.noise**2 / power
-    usual = max(_SUSPICIOUS[0], 1.5 * float(np.median(noise)))
+    usual = max(_SUSPICIOUS[0], _NOISY * views.noise**2 / float(np.mean(power)))
     if best.left(views) < usual and np.all(share < np.maximum(_SUSPICIOUS[1], 4.0 * noise)):
         return out
     if block == "clock" and not {"gyros", "scale"} & {*free}:
@@ -202,7 +203,7 @@ def _clocks(views: Views) -> list[State]:
     left = np.where(missing, power[:, None], squares)
     cost = changes * np.log(left + 1e-3 * np.median(power))
     start = start_of(views)
-    return [_line(views, start, lags, cost), _steps(start, lags, cost)]
+    return [_line(views, start, lags, cost), *(_steps(start, lags, cost, s) for s in _SWITCH)]
 
 
 def _line(views: Views, start: State, lags: np.ndarray, cost: np.ndarray) -> State:
@@ -228,14 +229,14 @@ def _line(views: Views, start: State, lags: np.ndarray, cost: np.ndarray) -> Sta
     return start._replace(offset=np.array([best[1]]), rate=best[2])
 
 
-def _steps(start: State, lags: np.ndarray, cost: np.ndarray) -> State:
+def _steps(start: State, lags: np.ndarray, cost: np.ndarray, switch: float) -> State:
     """Offsets of parts: the path of least cost, which pays for each step (Viterbi 1967)."""
     total, before = cost[0], []
     for row in cost[1:]:
         k = int(np.argmin(total))
-        stay = total <= total[k] + _SWITCH
+        stay = total <= total[k] + switch
         before.append(np.where(stay, np.arange(len(lags)), k))
-        total = np.minimum(total, total[k] + _SWITCH) + row
+        total = np.minimum(total, total[k] + switch) + row
     path = [int(np.argmin(total))]
     for came in reversed(before):
         path.append(int(came[path[-1]]))
