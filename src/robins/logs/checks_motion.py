@@ -287,7 +287,7 @@ def _unit(imu: ImuTable, value: float, sigma: float, step_s: float, shown: str) 
     }
     name = _named(value, sigma, names)
     if name is None:
-        return error(imu, "gyro_scale", value)(
+        return error(imu, "gyro_unit", value)(
             f"{shown}: the gyros read {1 / value:.3g} times what they should. No usual unit is "
             "that; check the scale factor."
         )

@@ -222,8 +222,8 @@ TOGETHER = (
         Code("leap_seconds", "error", "likewise, by the 18 s between UTC and GPS time"),
         Code("time_jump", "error", "they fit only if one file is shifted from there on"),
         Code("clock_rate", "error", "the clocks of the two drift apart"),
-        Code("gyro_unit", "error", "turns fit those of the velocities in another unit"),
-        Code("gyro_scale", "error", "they fit with a factor that is no usual unit"),
+        Code("gyro_unit", "error", "turns fit those of the velocities in another unit or scale"),
+        Code("gyro_scale", "error", "they fit with another scale about one axis"),
         Code("force_scale", "warning", "likewise specific forces along an axis"),
         Code("left_handed", "error", "axes or signs of both triads"),
         Code("accel_reversed", "error", "the accelerometers have the opposite sign"),
@@ -242,8 +242,9 @@ TOGETHER = (
         but_after="motion_not_checked",
         proves="gyro_unit",
     )(
-        Code("gyro_unit", "error", "the gyros turn gravity as it was seen in another unit"),
-        Code("gyro_scale", "error", "likewise with a factor that is no usual unit"),
+        Code(
+            "gyro_unit", "error", "the gyros turn gravity as it was seen in another unit or scale"
+        ),
         Code("left_handed", "error", "they do with the opposite sense, or triads reflected"),
         Code("gyro_axes", "error", "they do with axes exchanged or reversed"),
     ),
