@@ -132,7 +132,8 @@ def estimates(verdict: Verdict) -> dict[str, tuple[float, float]]:
     of_force = np.maximum(sigma[FORCE][[0, 3, 5]], _LEAST_SCALE)
     for k, axis in enumerate("xyz"):
         out[f"gyro {axis}"] = factors[k], factors[k] * own[k]
-        out[f"accel {axis}"] = abs(state.M_a[k, k]), abs(state.M_a[k, k]) * of_force[k]
+        factor = verdict.factor * abs(state.M_a[k, k])
+        out[f"accel {axis}"] = factor, factor * of_force[k]
         # an offset of the clock and an antenna ahead look alike at constant speed
         out[f"lever {axis}"] = levers.state.lever[k], levers.sigma[LEVER][k]
     out["rate"] = state.rate, sigma[RATE]

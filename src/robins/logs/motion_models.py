@@ -56,7 +56,7 @@ class Verdict(NamedTuple):
     fit: Fit  # with the blocks that are free
     free: tuple[str, ...]  # "clock", "gyros", "forces", in the order of what they explain
     rival: str  # a block that explains nearly as much as the first, or ""
-    bias: np.ndarray  # (3,) of the gyros at rest, taken off before [rad/s]
+    factor: float  # by which specific forces were multiplied before, as gravity suggested
     late_s: float  # age of the velocities that was taken off their stamps [s]
 
 
@@ -72,7 +72,7 @@ def judge(
         track: complete fixes.
         late_s: age of velocities at their stamps; by default as the positions tell.
     """
-    scaled, bias = _at_rest(signal, track)
+    scaled, factor = _at_rest(signal, track)
     if scaled is None:
         return None
     late = lateness(track) if late_s is None else late_s
@@ -82,21 +82,21 @@ def judge(
     views = views_of(scaled, imu.kind, gnss, track.rows, when, track.r_n, track.v_n, noise)
     if views is None:
         return None
-    return Verdict(views, *choose(views), bias, late or 0.0)
+    return Verdict(views, *choose(views), factor, late or 0.0)
 
 
-def _at_rest(signal: Signal, track: Track) -> tuple[Signal | None, np.ndarray]:
-    """Signal without the bias of the gyros at rest, and in m/s^2 if gravity tells another unit."""
+def _at_rest(signal: Signal, track: Track) -> tuple[Signal | None, float]:
+    """Signal without the bias of the gyros at rest, in m/s^2 by a factor if gravity needs one."""
     windows = windows_of(signal)
     size, bias = usual_force(windows), np.zeros(3)
     if not size > 0.0:
-        return None, bias
+        return None, 1.0
     # A steady turn in the air looks like rest to an IMU, not to a receiver.
     if windows.at_rest.any() and _stood(track):
         bias = np.median(windows.gyro[windows.at_rest], axis=0)
     off = size / GRAVITY
     factor = 1.0 if 0.8 < off < 1.25 else 1.0 / off
-    return signal._replace(accel=signal.accel * factor, gyro=signal.gyro - bias), bias
+    return signal._replace(accel=signal.accel * factor, gyro=signal.gyro - bias), factor
 
 
 def _stood(track: Track) -> bool:
