@@ -57,7 +57,6 @@ class Verdict(NamedTuple):
     free: tuple[str, ...]  # "clock", "gyros", "forces", in the order of what they explain
     rival: str  # a block that explains nearly as much as the first, or ""
     factor: float  # by which specific forces were multiplied before, as gravity suggested
-    late_s: float  # age of the velocities that was taken off their stamps [s]
 
 
 def judge(
@@ -82,7 +81,7 @@ def judge(
     views = views_of(scaled, imu.kind, gnss, track.rows, when, track.r_n, track.v_n, noise)
     if views is None:
         return None
-    return Verdict(views, *choose(views), factor, late or 0.0)
+    return Verdict(views, *choose(views), factor)
 
 
 def _at_rest(signal: Signal, track: Track) -> tuple[Signal | None, float]:
