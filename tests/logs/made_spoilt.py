@@ -4,7 +4,7 @@ import dataclasses
 from functools import cache, partial
 
 import numpy as np
-from made_logs import GNSS_HZ, IMU_HZ, START_NS, TOTAL_S, make_drive, rows_of
+from made_logs import GNSS_HZ, IMU_HZ, START_NS, TOTAL_S, make_drive, motion, rows_of
 from made_nine_axis import tumble_dataset
 from made_pair import attitudes, make_by_hand, make_pair
 from scipy.spatial.transform import Rotation
@@ -87,6 +87,32 @@ def about_vertical(degrees):
     """Both triads turned about z."""
     c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     return turned([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def stretched(time_ns):
+    """Stamps of a clock that is fast by 1 % and right in the middle."""
+    middle = time_ns[len(time_ns) // 2]
+    return middle + ((time_ns - middle) * 1.01).astype(np.int64)
+
+
+def stood(column):
+    """A value that stays as it was first."""
+    return column * 0 + column[:1]
+
+
+def antenna(ahead_m):
+    """Velocities and positions of an antenna ahead of the IMU."""
+    t = np.arange(M) / GNSS_HZ
+    _, _, pitch, heading = motion(t)
+    level = np.cos(pitch)
+    arm = np.stack([level * np.cos(heading), level * np.sin(heading), -np.sin(pitch)], -1) * ahead_m
+    g = drive().gnss
+    return {
+        "v_n": g.v_n + np.gradient(arm, t, axis=0),
+        "lat_rad": g.lat_rad + arm[:, 0] / 6.37e6,
+        "lon_rad": g.lon_rad + arm[:, 1] / 6.39e6 / np.cos(0.82),
+        "alt_m": g.alt_m - arm[:, 2],
+    }
 
 
 def without(first, count, n):

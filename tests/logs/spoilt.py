@@ -14,6 +14,7 @@ from made_spoilt import (
     S,
     a_path,
     about_vertical,
+    antenna,
     attitude,
     by_hand,
     columns,
@@ -29,9 +30,12 @@ from made_spoilt import (
     pair,
     plus,
     put,
+    shift,
     since_start,
     slave,
     spoil,
+    stood,
+    stretched,
     times,
     tipped,
     tumble,
@@ -76,10 +80,10 @@ SPAN = {
     ],
     "leap_seconds": [
         (
-            with_gnss(time_ns=plus(18 * S), v_n=None, sigma_v=None),
-            "warning: begins +18.000 s and ends",
+            with_gnss(time_ns=plus(18 * S), **dict.fromkeys(("lat_rad", "lon_rad", "v_n"), stood)),
+            "note: begins +18.000 s and ends",
             near(18.0),
-            "leap_seconds",
+            "motion_not_checked",
         )
     ],
 }
@@ -143,8 +147,27 @@ MOTION = {
             180 / np.pi * 3600: "probably deg/h: multiply by pi/180/3600",
             np.pi / 180: "probably rad/s converted to radians once more",
             0.01: "probably increments where rates are expected: divide by 0.01 s",
+            1 / 1.87: "by 1.8 ... the gyros read 0.53 ... No usual unit",
         }.items()
     ],
+    "gyro_scale": [
+        (with_imu(gyro=times([1, 1, 0.5])), "error: about z reads 0.5", near(2.0, abs=0.05))
+    ],
+    "force_scale": [
+        (with_imu(accel=times([1.3, 1, 1])), "warning: along x reads 1.3 +- ", near(0.77, abs=0.02))
+    ],
+    "clock_rate": [
+        (with_imu(time_ns=stretched), "error: drift apart by +10", near(0.01, abs=5e-4))
+    ],
+    "time_jump": [
+        (
+            with_gnss(time_ns=shift(slice(220, None), 18 * S)),
+            "error: only if -18.0 ... between UTC and GPS",
+            near(-18.0, abs=0.1),
+            "time_jump",
+        )
+    ],
+    "lever_arm": [(with_gnss(**antenna(2.0)), "note: x +2.0", near(2.0, abs=0.3))],
     "left_handed": [
         (with_imu(**turned([[0, 1, 0], [1, 0, 0], [0, 0, 1]])), "error"),
         (with_imu(**turned(np.diag([1, -1, 1]))), "error"),
@@ -163,7 +186,7 @@ MOTION = {
     "accel_reversed": [(with_imu(accel=times(-1)), "error", None, "z_axis_reversed")],
     "forward_axis": [
         (with_imu(**about_vertical(angle)), "warning", near(angle, abs=3.0))
-        for angle in (90, 180, -50)
+        for angle in (90, 170, -50)
     ],
     "time_offset": [
         (with_imu(time_ns=plus(round(offset * S))), kind, near(offset, abs=0.06))
@@ -173,8 +196,6 @@ MOTION = {
         (
             with_imu(time_ns=plus(18 * S)),
             "error: only if +18.0 ... That is the leap seconds between UTC and GPS time",
-            None,
-            "leap_seconds",
         )
     ],
     "motion_disagrees": [
@@ -187,6 +208,7 @@ TURNING = {
     "gyro_unit": [
         (hand(gyro=np.rad2deg), "error: deg/s: multiply by pi/180"),
         (hand(gyro=np.deg2rad), "error: rad/s converted to radians once"),
+        (hand(gyro=times(0.4)), "error: read 0.4", near(2.5, abs=0.1)),
     ],
     "left_handed": [
         (hand(gyro=times(-1)), "error"),

@@ -238,9 +238,10 @@ def test_what_is_asked_beside_what():
     ):
         assert asked(whole, code) == asked("imu others", code) == ["span"]
     _, master, motion, turning, *_ = TOGETHER
-    for check in (motion, turning):
-        assert check.outdated({"gyro_unit"}) == {"gyro_unit"}
-        assert check.outdated({"left_handed"}) == set()
+    for check, judged in ((motion, {"leap_seconds"}), (turning, set())):
+        assert check.outdated({"gyro_unit"}) == {"gyro_unit"} | judged
+        assert check.outdated({"left_handed"}) == judged
+    assert motion.outdated({"motion_not_checked"}) == set()
     by_rest = {
         *("gravity_unit", "gravity_unknown", "gravity_bias", "gravity_not_seen", "not_level"),
         *("gravity_missing", "z_axis_reversed", "rates_as_increments", "increments_as_rates"),

@@ -4,12 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-from made_logs import rows_of, velocity_ned
+from made_logs import rows_of, velocity_ned, with_gnss, with_imu
 from pyins import transform
 from scipy.spatial.transform import Rotation
 
-from robins.logs import motion
+from robins.logs import motion, motion_fit
+from robins.logs.checks_motion import estimates
 from robins.logs.gnss_motion import lateness, lowest, steps_of, track_of, velocity_of
+from robins.logs.motion_fit import start_of, trimmed
+from robins.logs.motion_models import judge
 from robins.logs.quiet import signal_of, windows_of
 
 RNG = np.random.default_rng(6)
@@ -24,7 +27,7 @@ def test_rotations_against_scipy():
 def test_best_rotation_against_scipy():
     u = RNG.normal(size=(3, 12, 3))
     v = RNG.normal(size=(12, 3))
-    R, left, _ = motion._kabsch(u, v)
+    R, left, _ = motion.kabsch(u, v)
     for k in range(3):
         best, rssd = Rotation.align_vectors(v, u[k])
         np.testing.assert_allclose(R[k], best.as_matrix(), atol=1e-12)
@@ -34,23 +37,18 @@ def test_best_rotation_against_scipy():
 def test_best_reflection_undoes_a_mirror():
     u = RNG.normal(size=(1, 12, 3))
     mirror = Rotation.random(random_state=3).as_matrix() @ np.diag([1, 1, -1])
-    _, proper, mirrored = motion._kabsch(u, u[0] @ mirror.T)
+    _, proper, mirrored = motion.kabsch(u, u[0] @ mirror.T)
     assert mirrored[0] == pytest.approx(0.0, abs=1e-12)
     assert proper[0] > 1.0
 
 
-def test_sums_in_axes_that_do_not_turn_against_one_after_the_other():
-    n = motion.STRETCH_S * 20
-    turn, push = 0.05 * RNG.normal(size=(1, n, 3)), RNG.normal(size=(1, n, 3))
-    sums, attitudes = motion._sum_unturned(turn, push)
-    attitude, expected = Rotation.identity(), np.zeros((motion.STRETCH_S, 3))
-    for k in range(n):
-        if k % 20 == 0:
-            np.testing.assert_allclose(attitudes[0, k // 20], attitude.as_matrix(), atol=1e-12)
-        halfway = attitude * Rotation.from_rotvec(0.5 * turn[0, k])
-        expected[k // 20] += halfway.apply(push[0, k])
-        attitude = attitude * Rotation.from_rotvec(turn[0, k])
-    np.testing.assert_allclose(sums[0], expected, atol=1e-11)
+def test_attitudes_in_blocks_against_one_after_the_other():
+    turn = 0.05 * RNG.normal(size=(95, 3))
+    out, attitude = motion._attitudes(turn), Rotation.identity()
+    for k in range(95):
+        np.testing.assert_allclose(out[k], attitude.as_matrix(), atol=1e-13)
+        attitude = attitude * Rotation.from_rotvec(turn[k])
+    np.testing.assert_allclose(out[95], attitude.as_matrix(), atol=1e-13)
 
 
 def test_there_are_48_signed_permutations_the_identity_first():
@@ -62,17 +60,63 @@ def test_there_are_48_signed_permutations_the_identity_first():
     )
 
 
+def verdict_of(data):
+    return judge(data.imu, data.gnss, signal_of(data.imu), track_of(data.gnss))
+
+
 def test_a_healthy_drive_leaves_only_the_noise(drive):
-    signal, track = signal_of(drive.imu), track_of(drive.gnss)
-    pair = motion.pair_of(signal, track.time_s, *velocity_of(track))
-    assert pair.starts.tolist() == [0.0, 30.0]
-    assert np.all(motion.unexplained(pair, np.eye(3)[None]).proper < 0.1)
-    left = motion.unexplained_but_for_biases(pair, np.zeros(1))[:, 0]
-    # Two velocities of 0.03 m/s and a second of rest more or less: their share of the change.
-    for start, share in zip(pair.starts, left, strict=True):
-        change = np.diff(velocity_ned(start + np.arange(31.0)), axis=0)
-        noise = 6 * 0.03**2 * 30 / np.sum((change - change.mean(axis=0)) ** 2)
-        assert 0.4 * noise < share < 2.0 * noise
+    verdict = verdict_of(drive)
+    assert verdict.free == ()
+    # Two velocities of 0.03 m/s to each change, less what some thirty parameters take away.
+    assert 0.5 * 6 * 0.03**2 < trimmed(verdict.fit.squares) < 1.1 * 6 * 0.03**2
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+def test_derivatives_against_differences(drive, velocities):
+    data = drive if velocities else with_gnss(drive, v_n=None, sigma_v=None)
+    views = verdict_of(data).views
+    state = start_of(views)._replace(
+        b_g=np.array([0.01, 0.0, -0.02]), b_a=np.array([0.3, 0.1, 0.2]), offset=np.array([0.2])
+    )
+    u = motion_fit._sums(views, state)[0]
+    for k in range(u.shape[-1] - 1):
+        clock = k >= motion_fit.RATE
+        step = 1e-5 if not clock else 2e-3 if k == motion_fit.RATE else 0.1
+        ends = (
+            motion_fit._sums(views, motion_fit._moved(state, sign * step * np.eye(26)[k]))[0][
+                ..., 0
+            ]
+            for sign in (1, -1)
+        )
+        slope, column = np.subtract(*ends) / (2 * step), u[..., k + 1]
+        if clock:  # turns the first axes too, so only lengths compare; smoothed over 0.2 s
+            slope, column = (np.sum(u[..., 0] * x, axis=1) for x in (slope, column))
+        assert np.linalg.norm(column - slope) < (0.2 if clock else 1e-3) * np.linalg.norm(slope), k
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "value"),
+    [
+        ({}, "gyros", 1.0),
+        ({"gyro": lambda x: x / 1.87}, "gyros", 1.87),
+        ({"gyro": lambda x: x * [1, 1, 0.5]}, "gyro z", 2.0),
+        ({"gyro": lambda x: x @ about_z(20.0)}, "gyros turned", 20.0),
+        ({"time_ns": lambda ns: ns + 300_000_000}, "offset", 0.3),
+        ({"accel": lambda x: x * [1.3, 1, 1]}, "accel x", 1 / 1.3),
+    ],
+)
+def test_estimates_lie_within_three_sigmas(drive, changes, name, value):
+    verdict = verdict_of(
+        with_imu(drive, **{k: f(getattr(drive.imu, k)) for k, f in changes.items()})
+    )
+    found, sigma = estimates(verdict)[name]
+    assert abs(found - value) < 3.0 * sigma
+    assert sigma < 0.1 * max(abs(value), 0.5)
+
+
+def about_z(degrees):
+    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
 def test_metres_against_pyins(drive):

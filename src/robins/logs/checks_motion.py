@@ -1,4 +1,7 @@
-"""The doctor on IMU and GNSS together: gyro unit, axes, handedness, forward, time offset.
+"""The doctor on IMU and GNSS together: clocks, gyros, accelerometers, lever arm, forward axis.
+
+All are estimated, each with its sigma (`motion_models`). A unit, an order of axes or a leap second
+is named only where the estimate is that within three sigmas; else the number is stated.
 
 And on an IMU alone that was turned about, by gravity standing still. That is weaker, for the
 sensor's own acceleration disturbs it and a reflection of both triads looks like gyros of the
@@ -13,20 +16,12 @@ import numpy as np
 
 from robins.dataset import GnssTable, ImuTable
 from robins.logs.findings import Finding
-from robins.logs.gnss_motion import Track, lateness, lowest, track_of, velocity_of
-from robins.logs.motion import (
-    GRAVITY,
-    Fit,
-    Pair,
-    at_the_spot,
-    pair_of,
-    signed_permutations,
-    travel_in_body,
-    unexplained,
-    unexplained_but_for_biases,
-)
+from robins.logs.gnss_motion import lowest, track_of
+from robins.logs.motion import GRAVITY, at_the_spot, power_of, signed_permutations, squares_by_map
+from robins.logs.motion_fit import FORCE, LEVER, OFFSET, RATE, SCALE
+from robins.logs.motion_models import SCALES as STARTS
+from robins.logs.motion_models import Verdict, judge
 from robins.logs.quiet import (
-    Signal,
     error,
     finding,
     name_of,
@@ -37,17 +32,43 @@ from robins.logs.quiet import (
     windows_of,
 )
 
-_WELL = 0.05  # share left unexplained by data about which there is no question
-_GOOD = 0.5  # most that data which fit may leave
-_BETTER = 0.4  # a hypothesis must leave this share of what the data as they are leave
-_TURNED_WRONG, _TURNED_RIGHT, _TURNED_BETTER = 0.1, 0.1, 0.2  # likewise of gravity alone
-_OFFSET_S = 0.05
-_SMALL_LAG_S = 5.0
+_DEG = np.pi / 180
 SCALES = {
-    np.pi / 180: ("deg/s", "multiply by pi/180"),
-    np.pi / 180 / 3600: ("deg/h", "multiply by pi/180/3600"),
-    180 / np.pi: ("rad/s converted to radians once more", "take the conversion out"),
+    _DEG: ("deg/s", "multiply by pi/180"),
+    _DEG / 3600: ("deg/h", "multiply by pi/180/3600"),
+    1 / _DEG: ("rad/s converted to radians once more", "take the conversion out"),
 }
+_UNITS = (
+    SCALES
+    | {
+        _DEG / 1e3: ("mdeg/s", "multiply by pi/180/1000"),
+        1e-3: ("mrad/s", "divide by 1000"),
+        np.pi / 30: ("revolutions per minute", "multiply by pi/30"),
+        2 * np.pi: ("revolutions per second", "multiply by 2 pi"),
+    }
+    | {
+        _DEG / k: (f"counts of 1/{k:g} deg/s", f"multiply by pi/180/{k:g}")
+        for k in (131.0, 65.5, 32.8, 16.4)
+    }
+)
+_STEPS = {
+    1.0: "That is a leap second",
+    18.0: "That is the leap seconds between UTC and GPS time",
+    37.0: "That is the leap seconds between UTC and atomic time",
+    19.0: "That is the seconds between GPS time and atomic time",
+    86400.0: "That is a day",
+    604800.0: "That is a week",
+} | {3600.0 * k: f"That is {k} h: a time zone" for k in range(1, 13)}
+_SIGMAS, _NAMED = 5.0, 3.0  # sigmas of a finding, and of a name
+_OFFSET_S, _DRIFT_S = 0.05, 0.1  # below which a clock is good
+_OFF, _SURE = 0.1, 0.15  # relative errors that matter, and sigmas below which an axis is seen
+_TURNED_DEG, _FORWARD_DEG, _LEVER_M = 5.0, 10.0, 0.5
+_STEP_S = 5.0  # beyond which no buffer delays a fix
+_LEAST_S, _LEAST_SCALE = 0.01, 0.01  # sigmas that no clock and no gyro is better than
+_WELL, _CHI = 0.05, 3.0  # share left where causes are named, or times that of the stated noise
+_GOOD = 0.5  # most that data which fit may leave
+_TURNED_WRONG, _TURNED_RIGHT, _TURNED_BETTER = 0.1, 0.1, 0.2  # likewise of gravity alone
+_TURNED_SIGMA = 0.03  # of a factor of the gyros by gravity alone
 
 
 def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
@@ -55,187 +76,320 @@ def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
     signal, track = signal_of(imu), track_of(gnss)
     if signal is None or track is None:
         return
-    pair = pair_in_time(imu, gnss, signal, track)
-    if pair is None:
+    verdict = judge(imu, gnss, signal, track)
+    left = np.inf if verdict is None else verdict.fit.left(verdict.views)
+    if verdict is None or not np.isfinite(left):
         yield note(imu, "motion_not_checked", 0)(
             "gyro unit, axes and time offset could not be checked against GNSS: there are no "
-            "30 s of common data with enough acceleration for these fixes. Drive a figure of eight "
+            "15 s of common data with enough acceleration for these fixes. Drive a figure of eight "
             "to have them checked."
         )
         return
-    as_is = float(np.mean(unexplained(pair, np.eye(3)[None]).proper))
-    if as_is > _WELL:  # a large bias must not look like a wrong axis
-        as_is = min(as_is, float(np.mean(unexplained_but_for_biases(pair, np.zeros(1)))))
-    wrong = _diagnosis(imu, gnss, signal, pair, as_is) if as_is > _WELL else None
-    if wrong is not None:
-        yield wrong
-    else:
-        yield from _small_offset(imu, gnss, pair)
-        yield from _forward(imu, gnss, pair)
+    found = estimates(verdict)
+    if verdict.rival or (verdict.free and not explained(verdict)) or left > _GOOD:
+        yield from _unclear(imu, gnss, verdict, left, found)
+        return
+    before = verdict.nothing.left(verdict.views)
+    share = f"(then {left:.0%} of the change of velocity is left unexplained, now {_all(before)})"
+    wrong = []
+    if {"gyros", "scale"} & {*verdict.free}:
+        wrong += _gyros(imu, verdict, found, signal.step_s, share)
+    if "forces" in verdict.free:
+        wrong += _forces(imu, found, share)
+    yield from wrong
+    if "clock" in verdict.free:
+        yield from _clock(imu, gnss, verdict, found, share)
+    if not wrong:
+        yield from _lever(gnss, found)
+        yield from _forward(imu, gnss, found)
 
 
-def pair_in_time(
-    imu: ImuTable, gnss: GnssTable, signal: Signal, track: Track, late_s: float | None = None
-) -> Pair | None:
-    """Both on one time, specific force scaled to gravity, velocities without their delay.
+def estimates(verdict: Verdict) -> dict[str, tuple[float, float]]:
+    """Value and sigma of what was estimated, by name.
 
-    Args:
-        imu: the table of the signal.
-        gnss: the table of the track.
-        signal: usable samples.
-        track: complete fixes.
-        late_s: how much older velocities are than their stamps; by default as the positions say.
+    "gyros" and "gyro x" are factors that the gyros are to be multiplied by, "accel x" likewise,
+    "gyros turned" the angle between the triads [deg]. "offset" [s] and "rate" [s/s] are to be added
+    to the stamps of fixes, in the middle of the log; "step" is the largest step of the offset.
+    "lever x" [m] is along the axes of the IMU, and "forward" the direction of travel from x to y
+    [deg].
     """
-    windows = windows_of(signal)
-    size = usual_force(windows)
-    if not size > 0.0:
-        return None
-    # Half a minute of a cheap gyro's bias tilts gravity by more than the vehicle accelerates.
-    bias = (
-        np.median(windows.gyro[windows.at_rest], axis=0) if windows.at_rest.any() else np.zeros(3)
+    state, sigma = verdict.fit.state, verdict.fit.sigma
+    levers = verdict.fit if "clock" in verdict.free else verdict.clocked
+    P = _nearest(state.M_g)
+    relative = np.maximum(sigma[SCALE].reshape(3, 3), _LEAST_SCALE)
+    factors, own = np.abs(np.diag(state.M_g @ P.T)), np.diag(relative)
+    weight = own**-2 / np.sum(own**-2)
+    common = float(np.exp(np.sum(weight * np.log(factors))))
+    out = {"gyros": (common, common * float(np.sum(own**-2) ** -0.5))}
+    unit = state.M_g @ P.T / common
+    skewed = 0.5 * (unit - unit.T)[[2, 0, 1], [1, 2, 0]]
+    turned = (relative + relative.T)[[2, 0, 1], [1, 2, 0]] * 0.5
+    angle = max(float(np.linalg.norm(skewed)), 1e-9)
+    out["gyros turned"] = (
+        np.rad2deg(np.arcsin(min(angle, 1.0))),
+        float(np.rad2deg(np.linalg.norm(skewed * turned) / angle)),
     )
-    accel, gyro = signal.accel * (GRAVITY / size), signal.gyro - bias
-    scaled = signal._replace(accel=accel, gyro=gyro)
-    v_n, noise = velocity_of(track)
-    start = int(imu.time_ns[signal.rows[0]]) - int(gnss.time_ns[0])
-    late_s = lateness(track) if late_s is None else late_s
-    when = track.time_s - start * 1e-9 - (late_s or 0.0)
-    return pair_of(scaled, when, v_n, noise)
+    of_force = np.maximum(sigma[FORCE][[0, 3, 5]], _LEAST_SCALE)
+    for k, axis in enumerate("xyz"):
+        out[f"gyro {axis}"] = factors[k], factors[k] * own[k]
+        factor = verdict.factor * abs(state.M_a[k, k])
+        out[f"accel {axis}"] = factor, factor * of_force[k]
+        # an offset of the clock and an antenna ahead look alike at constant speed
+        out[f"lever {axis}"] = levers.state.lever[k], levers.sigma[LEVER][k]
+    out["rate"] = state.rate, sigma[RATE]
+    offset, of_offset = state.offset, np.maximum(sigma[OFFSET:], _LEAST_S)
+    out["offset"] = offset[0], of_offset[0]
+    if len(offset) > 1:
+        k = int(np.argmax(np.abs(np.diff(offset))))
+        out["step"] = offset[k + 1] - offset[k], float(np.hypot(*of_offset[k : k + 2]))
+    forward = travel(verdict)
+    if forward is not None:
+        out["forward"] = forward
+    return {name: (float(value), float(s)) for name, (value, s) in out.items()}
 
 
-def small_offset(pair: Pair) -> float | None:
-    """What is to be added to the stamps of GNSS for the motion to fit best [s]; None if it fits."""
-    lags = np.arange(-_SMALL_LAG_S, _SMALL_LAG_S + 0.05, 0.1)
-    left = _mean(unexplained(pair, np.eye(3)[None], lags))[0]
-    lags = lags[np.nanargmin(left)] + np.arange(-2, 3) * 0.1
-    each = [lowest(lags, left) for left in unexplained_but_for_biases(pair, lags)]
-    clear = np.array([lag for lag in each if lag is not None])
-    if len(clear) < max(1, len(each) // 2):
+def explained(verdict: Verdict) -> bool:
+    """Judge whether little is left but noise, so that the causes can be believed."""
+    views = verdict.views
+    noise = views.noise**2 / float(np.mean(power_of(views)))
+    return verdict.fit.left(views) < max(_WELL, _CHI * noise)
+
+
+def in_body(verdict: Verdict) -> np.ndarray:
+    """(k, 3) velocities faster than 0.5 m/s, along the axes of the IMU [m/s]."""
+    views, one = verdict.views, verdict.fit
+    seen = np.zeros(len(views.v), bool)
+    seen[views.node] = np.isfinite(one.squares)
+    C = one.R[views.node_of] @ one.turned
+    v_b = np.einsum("kji,kj->ki", C, views.v)
+    return v_b[seen & (np.linalg.norm(views.v, axis=-1) > 0.5)]
+
+
+def travel(verdict: Verdict) -> tuple[float, float] | None:
+    """Direction of travel from x to y [deg] and its sigma; None where there is none."""
+    v_b = in_body(verdict)
+    if len(v_b) <= 20:
         return None
-    lag = float(np.median(clear))
-    return lag if abs(lag) > max(_OFFSET_S, 2.0 * float(clear.std())) else None
+    ahead = (v_b[:, 0] + 1j * v_b[:, 1]) / np.hypot(v_b[:, 0], v_b[:, 1])
+    mean = np.mean(ahead)
+    if np.abs(mean) < 0.85:
+        return None
+    parts = np.array_split(np.angle(ahead / mean), min(len(verdict.views.start_s), 8))
+    each = np.array([np.mean(part) for part in parts])
+    spread = float(np.std(each)) / np.sqrt(max(len(each) - 1, 1))
+    return float(np.rad2deg(np.angle(mean))), float(np.rad2deg(max(spread, 0.005)))
 
 
-def _small_offset(imu: ImuTable, gnss: GnssTable, pair: Pair) -> Iterator[Finding]:
-    lag = small_offset(pair)
-    if lag is not None:
-        yield finding("error" if abs(lag) > 1.0 else "warning", gnss, "time_offset", lag)(
-            f"the motion fits {name_of(imu)} best if {lag:+.2f} s is added to the stamps of this "
-            "file. A buffer or a filter delays one of them; give the run that time offset, or have "
-            "`robins doctor --write unit.toml` write it."
-        )
+def _nearest(M: np.ndarray) -> np.ndarray:
+    """The signed permutation nearest to a matrix."""
+    maps = signed_permutations()
+    rows = M / np.linalg.norm(M, axis=1, keepdims=True)
+    return maps[int(np.argmax(np.sum(maps * rows, axis=(1, 2))))]
 
 
-def _forward(imu: ImuTable, gnss: GnssTable, pair: Pair) -> Iterator[Finding]:
-    """Whether the vehicle travels along its forward axis."""
-    v_b = travel_in_body(pair)
-    x, y = v_b[:, :2].T
-    mean = np.mean((x + 1j * y) / np.hypot(x, y)) if len(v_b) > 20 else 0.0
-    forward = 0.0 if imu.body == "FRD" else 90.0
-    angle = float(np.rad2deg(np.angle(mean)))
-    off = (angle - forward + 180.0) % 360.0 - 180.0
-    if np.abs(mean) > 0.85 and abs(off) > 30.0:
-        yield warning(imu, "forward_axis", off)(
-            f"by the velocities of {name_of(gnss)} the vehicle travels {angle:+.0f} deg from x "
-            f"towards y of the IMU, not along {'x' if imu.body == 'FRD' else 'y'}. The sensor is "
-            f"turned in the vehicle: give its mounting, {abs(off):.0f} deg more about the "
-            "vertical, else a heading begun from the velocity is wrong by as much."
-        )
-
-
-def _diagnosis(
-    imu: ImuTable, gnss: GnssTable, signal: Signal, pair: Pair, as_is: float
-) -> Finding | None:
-    """The hypothesis that explains the motion much better, or that none does what none should."""
-    scales = [*SCALES, signal.step_s, 1.0 / signal.step_s]
-    lags = np.arange(-120, 121) * 0.25
+def _unclear(
+    imu: ImuTable, gnss: GnssTable, verdict: Verdict, left: float, found: dict
+) -> Iterator[Finding]:
+    """A motion that is explained by two causes alike, or by none."""
+    if verdict.nothing.left(verdict.views) < _GOOD:
+        return
     tried = {
-        "scale": unexplained(pair, np.array(scales)[:, None, None] * np.eye(3)),
-        "axes": unexplained(pair, signed_permutations()),
-        "lag": unexplained(pair, np.eye(3)[None], lags),
+        "clock": "a shift of {0[0]:+.2f} +- {0[1]:.2f} s",
+        "scale": "a factor of {1[0]:.3g} +- {1[1]:.2g} of the gyros",
+        "gyros": "another gyro unit, exchanged or reversed axes",
+        "forces": "other accelerometers",
     }
-    left = {name: _least(_mean(fit)) for name, fit in tried.items()}
-    left["lag"] = _least(_mean(tried["lag"])[0])  # a reflection has no delay
-    left["scale"] = _least(_mean(tried["scale"])[0])
-    best = min(left, key=lambda name: left[name])
-    if left[best] > min(_GOOD, _BETTER * as_is):
-        if as_is < _GOOD:
-            return None
-        return warning(imu, "motion_disagrees", as_is)(
-            f"the IMU does not explain the velocities of {name_of(gnss)} ({_all(as_is)} of their "
+    if not verdict.rival:
+        yield warning(imu, "motion_disagrees", left)(
+            f"the IMU does not explain the velocities of {name_of(gnss)} ({_all(left)} of their "
             "change is left), and neither another gyro unit, exchanged or reversed axes, nor a "
-            "shift of up to 30 s mends it. Are the files of one recording, and is the IMU fixed to "
-            "the vehicle?"
+            "shift of the clock explains it. Are the files of one recording, and is the IMU fixed "
+            "to the vehicle?"
         )
-    share = (
-        f"(then {left[best]:.0%} of the change of velocity is left unexplained, now {_all(as_is)})"
-    )
-    if best == "lag":
-        late = _late(imu, gnss, lags, tried["lag"], share)
-        return late if abs(float(late.value)) > _SMALL_LAG_S else None
-    if best == "scale":
-        return _unit(imu, scales[int(np.nanargmin(_mean(tried["scale"])[0]))], signal.step_s, share)
-    return _axes(imu, tried["axes"], share)
-
-
-def _least(left: np.ndarray) -> float:
-    finite = left[np.isfinite(left)]
-    return float(finite.min()) if len(finite) else np.inf
+    else:
+        causes = [
+            tried[b].format(found["offset"], found["gyros"])
+            for b in (verdict.free[0], verdict.rival)
+        ]
+        yield warning(imu, "motion_disagrees", left)(
+            f"the IMU does not explain the velocities of {name_of(gnss)} as it is; {causes[0]} and "
+            f"{causes[1]} explain them about equally. Drive more turns and stops to tell which."
+        )
 
 
 def _all(share: float) -> str:
     return "all" if share > 0.95 else f"{share:.0%}"
 
 
-def _mean(fit: Fit) -> np.ndarray:
-    """(2, hypotheses): by rotation and by reflection, over all stretches that were recorded.
+def _gyros(
+    imu: ImuTable, verdict: Verdict, found: dict, step_s: float, share: str
+) -> list[Finding]:
+    """Findings about the matrix of the gyros."""
+    P, state = _nearest(verdict.fit.state.M_g), verdict.fit.state
+    mirrored, out = bool(np.linalg.det(state.M_a) < 0.0), []
+    value, sigma = found["gyros"]
+    each = [found[f"gyro {axis}"] for axis in "xyz"]
+    left = verdict.fit.left(verdict.views)
+    if mirrored or not np.array_equal(P, np.eye(3)):
+        changed = np.any(np.eye(3) != P, axis=1) | mirrored
+        if all(s < _SURE * v for (v, s), own in zip(each, changed, strict=True) if own):
+            code, cause = _meaning(P, mirrored)
+            out.append(
+                error(imu, code, left)(
+                    "gyros and accelerometers together do not explain the GNSS velocities, with "
+                    f"other axes they do {share}. {cause}."
+                )
+            )
+        else:
+            out.append(
+                warning(imu, "motion_disagrees", left)(
+                    "the gyros explain the velocities only with other axes "
+                    f"{share}, but it turned too little about each axis to tell which."
+                )
+            )
+    alike = all(abs(np.log(v / value)) < max(_NAMED * s / v, _OFF) for v, s in each)
+    if alike and abs(np.log(value)) > max(_OFF, _SIGMAS * sigma / value):
+        shown = (
+            "turns by the gyros fit those of the GNSS velocity only if the rates are multiplied by "
+            f"{value:.4g} +- {sigma:.2g} {share}"
+        )
+        out.append(_unit(imu, value, sigma, step_s, shown))
+    elif not alike:
+        out += [
+            error(imu, "gyro_scale", v)(
+                f"the gyro about {axis} reads {1 / v:.3g} +- {s / v**2:.2g} times what the course "
+                f"turns {share}. Multiply it by {v:.4g}, or check its scale factor."
+            )
+            for axis, (v, s) in zip("xyz", each, strict=True)
+            if abs(v - 1.0) > max(_OFF, _SIGMAS * s)
+        ]
+    angle, sigma = found["gyros turned"]
+    if not out and angle > max(_TURNED_DEG, _SIGMAS * sigma):
+        out.append(
+            error(imu, "gyro_axes", angle)(
+                f"the gyros are turned by {angle:.1f} +- {sigma:.1f} deg against the "
+                f"accelerometers {share}. Both triads must be given along the same axes."
+            )
+        )
+    return out
 
-    A hypothesis judged by less than half of them is left out (NaN).
-    """
-    few = np.mean(np.isfinite(fit.proper), axis=0) < 0.5
-    both = np.stack([fit.proper, fit.mirrored])
-    total, count = np.nansum(both, axis=1), np.sum(np.isfinite(both), axis=1)
-    return np.where(few, np.nan, total / np.maximum(count, 1))
+
+def _named(value: float, sigma: float, names: dict[float, tuple[str, str]]) -> tuple | None:
+    """The one name within three sigmas; None if there is none, or another."""
+    near = [k for k in names if abs(np.log(value / k)) < max(_NAMED * sigma / value, 0.03)]
+    return names[near[0]] if len(near) == 1 else None
 
 
-def _late(imu: ImuTable, gnss: GnssTable, lags: np.ndarray, fit: Fit, share: str) -> Finding:
-    left = _mean(fit)[0]
-    k = int(np.nanargmin(left))
-    near = slice(max(k - 1, 0), k + 2)
-    lag = lowest(lags[near], left[near]) or float(lags[k])
-    leap = abs(abs(lag) - 18.0) < 0.5
-    cause = (
-        "That is the leap seconds between UTC and GPS time"
-        if leap
-        else "The clocks were never set together"
+def _unit(imu: ImuTable, value: float, sigma: float, step_s: float, shown: str) -> Finding:
+    """A factor of all gyros, named where a usual unit is that."""
+    names = _UNITS | {
+        step_s: ("rates where increments are expected", f"multiply by {step_s:g} s"),
+        1 / step_s: ("increments where rates are expected", f"divide by {step_s:g} s"),
+    }
+    name = _named(value, sigma, names)
+    if name is None:
+        return error(imu, "gyro_unit", value)(
+            f"{shown}: the gyros read {1 / value:.3g} times what they should. No usual unit is "
+            "that; check the scale factor."
+        )
+    return error(imu, "gyro_unit", value)(
+        f"{shown}. The gyro columns are probably {name[0]}: {name[1]}."
     )
-    return error(gnss, "leap_seconds" if leap else "time_offset", lag)(
-        f"the motion fits {name_of(imu)} only if {lag:+.2f} s is added to the stamps of this file "
-        f"{share}. {cause}; shift one of the files."
+
+
+def _forces(imu: ImuTable, found: dict, share: str) -> list[Finding]:
+    """Findings about the scales of the accelerometers."""
+    return [
+        warning(imu, "force_scale", v)(
+            f"the accelerometer along {axis} reads {1 / v:.3g} +- {s / v**2:.2g} times the "
+            f"specific force of the course and gravity {share}. Check its scale factor."
+        )
+        for axis, (v, s) in ((axis, found[f"accel {axis}"]) for axis in "xyz")
+        if abs(v - 1.0) > max(_OFF, _SIGMAS * s)
+    ]
+
+
+def _clock(
+    imu: ImuTable, gnss: GnssTable, verdict: Verdict, found: dict, share: str
+) -> Iterator[Finding]:
+    """Findings about the clocks: steps, rate, offset."""
+    state, views = verdict.fit.state, verdict.views
+    sigma = np.maximum(verdict.fit.sigma[OFFSET:], _LEAST_S)
+    for k, size in enumerate(np.diff(state.offset)):
+        s = float(np.hypot(sigma[k], sigma[k + 1]))
+        if abs(size) > max(_OFFSET_S, _SIGMAS * s):
+            when = float(views.start_s[np.argmax(state.part == k + 1)])
+            yield error(gnss, "time_jump", float(size))(
+                f"the motion fits {name_of(imu)} only if {size:+.2f} +- {s:.2f} s is added to all "
+                f"stamps from about {when:.0f} s after the start of {name_of(imu)} on {share}. "
+                f"{_step_named(size, s) or 'A clock was set there'}; take the step off."
+            )
+    rate, s = found["rate"]
+    span = float(views.end_s[-1] - views.begin_s[0])
+    if abs(rate) > _SIGMAS * s and abs(rate) * span > _DRIFT_S:
+        yield error(gnss, "clock_rate", rate)(
+            f"its clock and that of {name_of(imu)} drift apart by {1e3 * rate:+.3g} +- "
+            f"{1e3 * s:.2g} ms in a second {share}. Stamp both by one clock, or stretch the stamps "
+            "of one of them."
+        )
+        return
+    offset, s = found["offset"]
+    if abs(offset) > max(_OFFSET_S, _SIGMAS * s):
+        yield _offset(imu, gnss, offset, s, share)
+
+
+def small_offset(verdict: Verdict) -> float | None:
+    """Seconds to be added to the stamps of fixes where that is certain and small; else None."""
+    offset, sigma = estimates(verdict)["offset"]
+    sound = "clock" in verdict.free and not verdict.rival and explained(verdict)
+    sound &= len(verdict.fit.state.offset) == 1
+    certain = max(_OFFSET_S, _SIGMAS * sigma) < abs(offset) <= _STEP_S
+    return offset if sound and certain else None
+
+
+def _step_named(size: float, sigma: float) -> str:
+    near = [k for k in _STEPS if abs(abs(size) - k) < max(_NAMED * sigma, 0.1)]
+    return _STEPS[near[0]] if len(near) == 1 else ""
+
+
+def _offset(imu: ImuTable, gnss: GnssTable, offset: float, sigma: float, share: str) -> Finding:
+    if abs(offset) <= _STEP_S:
+        return finding("error" if abs(offset) > 1.0 else "warning", gnss, "time_offset", offset)(
+            f"the motion fits {name_of(imu)} best if {offset:+.2f} +- {sigma:.2f} s is added to "
+            "the stamps of this file. A buffer or a filter delays one of them; give the run that "
+            "time offset, or have `robins doctor --write unit.toml` write it."
+        )
+    cause = _step_named(offset, sigma) or "The clocks were never set together"
+    code = "leap_seconds" if "leap seconds" in cause else "time_offset"
+    return error(gnss, code, offset)(
+        f"the motion fits {name_of(imu)} only if {offset:+.2f} +- {sigma:.2f} s is added to the "
+        f"stamps of this file {share}. {cause}; shift one of the files."
     )
 
 
-def _unit(imu: ImuTable, scale: float, step_s: float, share: str) -> Finding:
-    if scale in SCALES:
-        unit, mend = SCALES[scale]
-    elif scale == step_s:
-        unit, mend = "rates where increments are expected", f"multiply by {step_s:g} s"
-    else:
-        unit, mend = "increments where rates are expected", f"divide by {step_s:g} s"
-    return error(imu, "gyro_unit", scale)(
-        f"turns by the gyros fit those of the GNSS velocity only if the rates are multiplied by "
-        f"{scale:.4g} {share}. The gyro columns are probably {unit}: {mend}."
-    )
+def _lever(gnss: GnssTable, found: dict) -> Iterator[Finding]:
+    """Note an antenna far from the IMU."""
+    each = {axis: found[f"lever {axis}"] for axis in "xyz"}
+    if any(abs(v) > max(_LEVER_M, _SIGMAS * s) for v, s in each.values()):
+        words = ", ".join(f"{axis} {v:+.2f} +- {s:.2f} m" for axis, (v, s) in each.items())
+        yield note(gnss, "lever_arm", float(np.linalg.norm([v for v, _ in each.values()])))(
+            f"the antenna is away from the IMU: {words} along its axes. Measure the lever arm and "
+            "give it to the run."
+        )
 
 
-def _axes(imu: ImuTable, fit: Fit, share: str) -> Finding:
-    left = _mean(fit)
-    mirrored, k = np.unravel_index(int(np.nanargmin(left)), left.shape)
-    code, cause = _meaning(signed_permutations()[k], bool(mirrored))
-    return error(imu, code, _least(left))(
-        "gyros and accelerometers together do not explain the GNSS velocities, with other axes "
-        f"they do {share}. {cause}."
-    )
+def _forward(imu: ImuTable, gnss: GnssTable, found: dict) -> Iterator[Finding]:
+    """Warn of a vehicle that does not travel along its forward axis."""
+    angle, sigma = found.get("forward", (np.nan, np.nan))
+    ahead = 0.0 if imu.body == "FRD" else 90.0
+    off = (angle - ahead + 180.0) % 360.0 - 180.0
+    if abs(off) > max(_FORWARD_DEG, _SIGMAS * sigma):
+        yield warning(imu, "forward_axis", off)(
+            f"by the velocities of {name_of(gnss)} the vehicle travels {angle:+.0f} +- {sigma:.1f} "
+            f"deg from x towards y of the IMU, not along {'x' if imu.body == 'FRD' else 'y'}. "
+            f"The sensor is turned in the vehicle: give its mounting, {abs(off):.0f} deg more "
+            "about the vertical, else a heading begun from the velocity is wrong by as much."
+        )
 
 
 def _meaning(S: np.ndarray, mirrored: bool) -> tuple[str, str]:
@@ -286,35 +440,34 @@ def check_turning(imu: ImuTable) -> Iterator[Finding]:
     size = usual_force(windows_of(signal))
     if not size > 0.0:
         return
-    pair = at_the_spot(signal._replace(accel=signal.accel * (GRAVITY / size)))
-    if pair is None:
+    views = at_the_spot(signal._replace(accel=signal.accel * (GRAVITY / size)), imu.kind)
+    if views is None:
         return
-    as_is = float(np.mean(unexplained(pair, np.eye(3)[None]).proper))
-    if not as_is > _TURNED_WRONG:
-        return
-    scales = np.array([*SCALES, 0.0])  # the last: as if it had not turned at all
+    scales = np.array([*STARTS, 0.0])  # the last: as if it had not turned at all
     maps = np.concatenate([signed_permutations(), scales[:, None, None] * np.eye(3)])
-    left = np.mean(unexplained(pair, maps).proper, axis=0)
+    squares = squares_by_map(views, maps, np.zeros(len(views.start_s)))[:, 0]
+    left = squares / np.sum(power_of(views))
+    if not left[0] > _TURNED_WRONG:
+        return
     k = int(np.argmin(left))
     # A vehicle that only accelerates needs no turns to be explained, and tells nothing about them.
-    if left[k] > min(_TURNED_RIGHT, _TURNED_BETTER * as_is, 0.5 * left[-1]):
+    if left[k] > min(_TURNED_RIGHT, _TURNED_BETTER * left[0], 0.5 * left[-1]):
         return
+    shown = (
+        "turned about, the gyros do not turn gravity as the accelerometers see it turn "
+        f"({left[0]:.0%} of it is left over, with other gyro columns {left[k]:.0%})"
+    )
     if k >= 48:
-        unit, mend = SCALES[float(scales[k - 48])]
-        code, cause = "gyro_unit", f"The gyro columns are probably {unit}: {mend}"
+        near = lowest(np.log(scales[k - 49 : k - 46]), left[k - 1 : k + 2])
+        value = float(scales[k - 48] if near is None else np.exp(near))
+        yield _unit(imu, value, _TURNED_SIGMA * value, signal.step_s, shown)
     elif np.array_equal(maps[k], -np.eye(3)):
-        code, cause = (
-            "left_handed",
-            "The gyros have the opposite sense of rotation, or both triads are left-handed: two "
-            "axes exchanged or one reversed, alike in both",
+        yield error(imu, "left_handed", float(left[k]))(
+            f"{shown}. The gyros have the opposite sense of rotation, or both triads are "
+            "left-handed: two axes exchanged or one reversed, alike in both."
         )
     else:
-        code, cause = (
-            "gyro_axes",
-            f"The gyros fit as {words_of(maps[k], 'gyro')}; or the accelerometers' columns were "
-            "exchanged or reversed accordingly",
+        yield error(imu, "gyro_axes", float(left[k]))(
+            f"{shown}. The gyros fit as {words_of(maps[k], 'gyro')}; or the accelerometers' "
+            "columns were exchanged or reversed accordingly."
         )
-    yield error(imu, code, float(left[k]))(
-        "turned about, the gyros do not turn gravity as the accelerometers see it turn "
-        f"({as_is:.0%} of it is left over, with other gyro columns {left[k]:.0%}). {cause}."
-    )

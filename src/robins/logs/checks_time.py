@@ -297,10 +297,10 @@ def _span_of(imu: ImuTable, other: Table) -> Iterator[Finding]:
         )
         return
     if abs(abs(c - a) - _LEAP) < 1.0 and abs(abs(d - b) - _LEAP) < 1.0 and (c - a) * (d - b) > 0:
-        yield warning(other, "leap_seconds", c - a)(
-            f"begins {c - a:+.3f} s and ends {d - b:+.3f} s against {name_of(imu)}. Both were "
-            "probably recorded together, one stamped in UTC (Unix time) and one in GPS time, which "
-            "is 18 s ahead since 2017; shift one of them."
+        yield note(other, "leap_seconds", c - a)(
+            f"begins {c - a:+.3f} s and ends {d - b:+.3f} s against {name_of(imu)}. If both were "
+            "recorded together, one is stamped in UTC (Unix time) and one in GPS time, which is "
+            "18 s ahead since 2017; then shift one of them."
         )
     if overlap < 0.5 * (d - c):
         yield warning(other, "little_overlap", overlap)(

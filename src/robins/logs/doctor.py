@@ -182,13 +182,13 @@ _SPOILT = (
     "velocity_axes velocity_unit velocity_sign"
 )
 # With these, what is compared with the gyros would be blamed for them.
-_GYROS_WRONG = "gyro_unit gyro_axes gyro_reversed left_handed"
+_GYROS_WRONG = "gyro_unit gyro_scale gyro_axes gyro_reversed left_handed"
 
 # Asked about all tables of a log together.
 TOGETHER = (
     _check("In time", check_span, "imu others")(
         Code("no_overlap", "error", "the files share no time; names the offset that would fit"),
-        Code("leap_seconds", "warning", "one file is in UTC, one in GPS time"),
+        Code("leap_seconds", "note", "one file may be in UTC, one in GPS time"),
         Code("little_overlap", "warning", "the files share little of their time"),
     ),
     # An IMU alone is judged at rest or nearly so; a master tells more, in any motion.
@@ -224,17 +224,24 @@ TOGETHER = (
         silenced_by=_SPOILT,
         unless="master",
         proves="gyro_unit",
+        overrules="leap_seconds",
+        undecided="motion_not_checked",
     )(
         Code("motion_not_checked", "note", "too little motion to compare them"),
         Code("motion_disagrees", "warning", "they do not describe one motion in any way"),
         Code("time_offset", "error or warning", "they fit only if one file is shifted"),
         Code("leap_seconds", "error", "likewise, by the 18 s between UTC and GPS time"),
-        Code("gyro_unit", "error", "turns fit those of the velocities in another unit"),
+        Code("time_jump", "error", "they fit only if one file is shifted from there on"),
+        Code("clock_rate", "error", "the clocks of the two drift apart"),
+        Code("gyro_unit", "error", "turns fit those of the velocities in another unit or scale"),
+        Code("gyro_scale", "error", "they fit with another scale about one axis"),
+        Code("force_scale", "warning", "likewise specific forces along an axis"),
         Code("left_handed", "error", "axes or signs of both triads"),
         Code("accel_reversed", "error", "the accelerometers have the opposite sign"),
         Code("accel_axes", "error", "axes or signs of the accelerometers"),
         Code("gyro_reversed", "error", "the gyros have the opposite sense"),
         Code("gyro_axes", "error", "axes or signs of the gyros"),
+        Code("lever_arm", "note", "the antenna is away from the IMU"),
         Code("forward_axis", "warning", "the vehicle does not travel along its forward axis"),
     ),
     _check(
@@ -246,7 +253,9 @@ TOGETHER = (
         but_after="motion_not_checked",
         proves="gyro_unit",
     )(
-        Code("gyro_unit", "error", "the gyros turn gravity as it was seen in another unit"),
+        Code(
+            "gyro_unit", "error", "the gyros turn gravity as it was seen in another unit or scale"
+        ),
         Code("left_handed", "error", "they do with the opposite sense, or triads reflected"),
         Code("gyro_axes", "error", "they do with axes exchanged or reversed"),
     ),

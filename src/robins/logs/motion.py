@@ -1,4 +1,4 @@
-"""One motion, seen by the IMU and by GNSS: how well do they fit under a hypothesis about the axes?
+"""One motion, seen by the IMU and by GNSS: both cut into stretches, and the search for a start.
 
 Over a short stretch the gyros tell how the body turns, so the specific force can be added up in
 axes that do not turn. Up to one constant rotation R these sums must be what GNSS saw,
@@ -6,8 +6,8 @@ axes that do not turn. Up to one constant rotation R these sums must be what GNS
     R sum(C f dt) = change of v - g dt,
 
 whatever the attitude and the mounting. R is found in closed form (Kabsch 1976), as a rotation or as
-a reflection; the share of the GNSS accelerations left unexplained judges the hypothesis. Wrong
-units, exchanged or reversed axes and late clocks all leave about everything unexplained.
+a reflection; the squares left over judge a delay, or a matrix that the gyros are multiplied by.
+`motion_fit` goes on from the best of them.
 
 The sums are taken on a grid of 20 Hz, so vibration does not matter and an hour costs little.
 """
@@ -18,17 +18,22 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
+from robins.dataset import GnssTable
 from robins.logs.quiet import Signal
 from robins.rotation import skew
 
 GRAVITY = 9.8
-_RATE_HZ = 20
-STRETCH_S = 30  # long enough to turn, short enough for the drift of cheap gyros
-_STRETCHES = 4
-_NO_LAG = np.zeros(1)
-_BIAS_STEP = 1e-4  # rad/s, m/s^2
-_BIAS_SIGMA = np.repeat([0.01, 0.1], 3)  # what the unknowns are measured in
+RATE_HZ = 20
+EARTH_RATE = 7.292115e-5  # rad/s, WGS 84
+_STRETCH_S = 15.0  # long enough to turn, short enough for the drift of cheap gyros
+_CHANGES = 8  # of velocity in a stretch at least
+_MOST_STRETCHES, _MOST_OUTSIDE, _MOST_SEARCHED = 20, 6, 8
+_SPOT_S, _MOST_SPOTS = 30, 4  # likewise of an IMU that was turned about by hand
+_GAP_S = 0.5  # without IMU samples, across which nothing is added up
+_FIX_S, _LOST_S = 0.25, 1.2  # between fixes that are used, and without one in a stretch
+_NOISE = 0.5  # m/s, of a mean velocity between fixes that are far enough apart
 
 # Of steps by which something else that turned is compared with the gyros.
 _FINE_S, _PER_STEP = 0.01, 20  # rotations are composed of fine ones, and compared over 0.2 s
@@ -46,189 +51,341 @@ def signed_permutations() -> np.ndarray:
     return np.array(out)
 
 
-class Pair(NamedTuple):
-    """IMU sums on the fine grid and GNSS velocity, both from one zero of time."""
+class Views(NamedTuple):
+    """Integrals of the IMU and changes of velocity, both from one zero of time.
 
-    turn: np.ndarray  # (n + 1, 3) integral of the rate up to each grid time [rad]
+    Changes are between nodes of one stretch a second apart or more; they overlap. A node is a
+    velocity at a time, or the mean velocity between two positions.
+    """
+
+    turn: np.ndarray  # (n + 1, 3) integral of the rate up to each time of the grid [rad]
     push: np.ndarray  # (n + 1, 3) integral of the specific force [m/s]
-    gnss_s: np.ndarray  # (m,) times of the velocities
-    v_n: np.ndarray  # (m, 3) m/s, NED
-    starts: np.ndarray  # first second of each stretch that is judged
+    gaps: np.ndarray  # (gaps, 2) begin and end of times without samples [s]
+    begin_s: np.ndarray  # (nodes,) s
+    end_s: np.ndarray  # (nodes,) s, as `begin_s` where velocities are not means
+    means: bool  # nodes are mean velocities
+    node_of: np.ndarray  # (nodes,) stretch of each
+    v: np.ndarray  # (nodes, 3) m/s, in the axes of `gained`
+    node: np.ndarray  # (k,) first node of each change
+    of: np.ndarray  # (k,) stretch of each change
+    gained: np.ndarray  # (k, 3) change of v - g dt [m/s], in axes that do not turn
+    start_s: np.ndarray  # (stretches,) s, first node
+    length_s: float  # of the longest stretch
+    middle_s: float  # about which a rate of the clock counts
+    stride: int = 1  # nodes from the first of a change to its second
+    noise: float = 0.0  # m/s, one sigma of a change by the stated sigmas
     power: str = "change"  # what the share left is a share of: "change" of velocity, or "gravity"
 
 
-class Fit(NamedTuple):
-    """Results per stretch and hypothesis; NaN where the IMU was not recorded."""
-
-    proper: np.ndarray  # (stretches, hypotheses) share left unexplained by the best rotation
-    mirrored: np.ndarray  # (stretches, hypotheses) by the best reflection
-
-
-def pair_of(signal: Signal, gnss_s: np.ndarray, v_n: np.ndarray, noise: float) -> Pair | None:
+def views_of(
+    signal: Signal,
+    kind: str,
+    gnss: GnssTable,
+    rows: np.ndarray,
+    when_s: np.ndarray,
+    r_n: np.ndarray,
+    v_n: np.ndarray | None,
+    noise: tuple[float, float],
+) -> Views | None:
     """Put both on one time; None if no stretch has enough motion for a judgement.
 
     Args:
-        signal: the IMU, whose specific force is scaled to gravity at rest.
-        gnss_s: (m,) times of the velocities, from the zero of the signal.
-        v_n: (m, 3) finite velocities, north-east-down [m/s].
-        noise: standard deviation of a velocity's change over a second [m/s].
+        signal: the IMU.
+        kind: "rate" or "increment", of its table.
+        gnss: the table of the fixes, for their places.
+        rows: (m,) rows of it that are used.
+        when_s: (m,) times of the fixes, from the zero of the signal.
+        r_n: (m, 3) positions, north-east-down [m].
+        v_n: (m, 3) velocities, north-east-down [m/s], or None: then positions serve.
+        noise: standard deviations of a position [m] and of a velocity [m/s].
     """
-    turn, push, end = _sums_on_grid(signal)
-    first, last = max(0.0, gnss_s[0]), min(end, gnss_s[-1])
-    starts = np.arange(np.ceil(first), last - STRETCH_S, STRETCH_S)
-    lively = []
-    for start in starts:
-        if _has_gap(gnss_s, start) or _has_gap(signal.time_s, start):
-            continue
-        change = np.diff(at(start + np.arange(STRETCH_S + 1), gnss_s, v_n), axis=0)
-        power = float(np.mean(np.sum((change - change.mean(axis=0)) ** 2, axis=1)))
-        if np.sqrt(power) > max(0.2, 3.0 * noise):
-            lively.append((power, start))
-    if not lively:
+    spacing = min(max(1.0, np.sqrt(6.0) * noise[0] / _NOISE), 5.0) if v_n is None else 1.0
+    keep = np.arange(0, len(when_s), max(1, round(_FIX_S / float(np.median(np.diff(when_s))))))
+    step = float(np.median(np.diff(when_s[keep]))) if len(keep) > 1 else np.inf
+    stride = max(1, round(spacing / step))
+    if len(keep) < 4 * stride:
         return None
-    best = sorted(start for _, start in sorted(lively)[-_STRETCHES:])
-    return Pair(turn, push, gnss_s, v_n, np.array(best))
+    v, begin, end, joined = _velocities(when_s[keep], r_n[keep], v_n, keep, stride)
+    means = v_n is None
+    scatter = np.sqrt(12.0) * noise[0] / (stride * step) if means else np.sqrt(6.0) * noise[1]
+    length = max(_STRETCH_S, _CHANGES * stride * step)
+    end_s = float(signal.time_s[-1]) + 0.1
+    chosen = _lively(0.5 * (begin + end), v, joined, length, max(0.2, scatter), stride, end_s)
+    if not chosen:
+        return None
+    nodes = np.concatenate(chosen)
+    node_of = np.repeat(np.arange(len(chosen)), [len(k) for k in chosen])
+    start = np.array([begin[k[0]] for k in chosen])
+    since = 0.5 * (begin + end)[nodes] - start[node_of]
+    node = np.flatnonzero(node_of[stride:] == node_of[:-stride])
+    at_fix = rows[keep[nodes]]
+    C = axes_at(gnss.lat_rad[at_fix], gnss.lon_rad[at_fix])
+    g_e = C[:, :, 2] * normal_gravity(gnss.lat_rad[at_fix], gnss.alt_m[at_fix])[:, None]
+    v_e = np.einsum("nij,nj->ni", C, v[nodes])
+    v, gained = _inertial(since, v_e, g_e, node, node + stride)
+    turn, push = on_grid(signal, kind)
+    return Views(
+        *(turn, push, _gaps(signal), begin[nodes], end[nodes], means),
+        *(node_of, v, node, node_of[node], gained, start),
+        length_s=max(float(end[k[-1]] - begin[k[0]]) for k in chosen),
+        middle_s=0.5 * float(start[0] + start[-1]),
+        stride=stride,
+        noise=scatter,
+    )
 
 
-def at_the_spot(signal: Signal) -> Pair | None:
+def _velocities(
+    time_s: np.ndarray, r_n: np.ndarray, v_n: np.ndarray | None, keep: np.ndarray, stride: int
+) -> tuple[np.ndarray, ...]:
+    """Velocities (n, 3), times at which each begins and ends, and no gap up to the next (n - 1,).
+
+    They are means between positions a stride apart where the receiver gave none.
+    """
+    step = np.diff(time_s)
+    near = step < max(2.5 * float(np.median(step)), _LOST_S)
+    if v_n is not None:
+        return v_n[keep], time_s, time_s, near
+    begin, end = time_s[:-stride], time_s[stride:]
+    whole = np.logical_and.reduce(sliding_window_view(near, stride), axis=1)
+    v = (r_n[stride:] - r_n[:-stride]) / (end - begin)[:, None]
+    return v, begin, end, whole[:-1] & whole[1:]
+
+
+def _lively(
+    time_s: np.ndarray,
+    v: np.ndarray,
+    joined: np.ndarray,
+    length: float,
+    least: float,
+    stride: int,
+    end_s: float,
+) -> list[np.ndarray]:
+    """Nodes of each stretch with enough motion: of each part of the log the liveliest.
+
+    Most are while the IMU was recorded; the others show clocks that were set.
+    """
+    found = []
+    bounds = np.flatnonzero(~np.concatenate([[False], joined, [False]]))
+    for low, high in itertools.pairwise(bounds):
+        first = low
+        while first < high:
+            last = int(np.searchsorted(time_s[:high], time_s[first] + length + 1e-6, "right"))
+            nodes = np.arange(first, last)
+            first = max(last - 1, first + 1)
+            if len(nodes) > 4 * stride and time_s[nodes[-1]] - time_s[nodes[0]] > 0.6 * length:
+                change = v[nodes[stride:]] - v[nodes[:-stride]]
+                power = float(np.mean(np.sum((change - change.mean(axis=0)) ** 2, axis=1)))
+                if np.sqrt(power) > least:
+                    found.append((power, nodes))
+    chosen: list[np.ndarray] = []
+    for inside, most in ((True, _MOST_STRETCHES), (False, _MOST_OUTSIDE)):
+        some = [
+            x for x in found if (time_s[x[1][0]] >= 0.0 and time_s[x[1][-1]] <= end_s) == inside
+        ]
+        for part in np.array_split(np.arange(len(some)), min(len(some), most) or 1):
+            chosen += [some[max(part, key=lambda k: some[k][0])][1]] if len(part) else []
+    return sorted(chosen, key=lambda nodes: int(nodes[0]))
+
+
+def _inertial(
+    since_s: np.ndarray, v_e: np.ndarray, g_e: np.ndarray, first: np.ndarray, second: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities, and changes of them less gravity, in axes that do not turn with the Earth.
+
+    Args:
+        since_s: (nodes,) time since the axes were those of the Earth.
+        v_e: (nodes, 3) velocities over the Earth, along its axes [m/s].
+        g_e: (nodes, 3) gravity [m/s^2].
+        first: (k,) node at which a change begins.
+        second: (k,) node at which it ends.
+    """
+    rate = np.array([0.0, 0.0, EARTH_RATE])
+    dt = (since_s[second] - since_s[first])[:, None]
+    mean, g = 0.5 * (v_e[first] + v_e[second]), 0.5 * (g_e[first] + g_e[second])
+    gained = v_e[second] - v_e[first] + dt * (2.0 * np.cross(rate, mean) - g)
+    turned = rotations(since_s[:, None] * rate)
+    midway = rotations(0.5 * (since_s[first] + since_s[second])[:, None] * rate)
+    return np.einsum("nij,nj->ni", turned, v_e), np.einsum("kij,kj->ki", midway, gained)
+
+
+def axes_at(lat: np.ndarray, lon: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) from north-east-down to Earth-centred, Earth-fixed axes."""
+    sp, cp, sl, cl = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
+    rows = ((-sp * cl, -sl, -cp * cl), (-sp * sl, cl, -cp * sl), (cp, 0.0 * sp, -sp))
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def normal_gravity(lat: np.ndarray, alt: np.ndarray) -> np.ndarray:
+    """Gravity [m/s^2] by Somigliana's formula and the free-air gradient; 1e-4 below 30 km."""
+    s2 = np.sin(lat) ** 2
+    on_ellipsoid = 9.7803253359 * (1 + 0.00193185265241 * s2) / np.sqrt(1 - 0.00669437999 * s2)
+    return on_ellipsoid - 3.086e-6 * alt
+
+
+def at_the_spot(signal: Signal, kind: str) -> Views | None:
     """An IMU alone, taken to stay about where it is: then gravity must not turn.
 
     None unless it is turned about enough that the specific force points elsewhere by 10 deg or so.
     """
-    turn, push, end = _sums_on_grid(signal)
-    tilted = []
-    for start in np.arange(0.0, end - STRETCH_S, STRETCH_S):
-        if _has_gap(signal.time_s, start):
+    turn, push = on_grid(signal, kind)
+    gaps, count, tilted = _gaps(signal), _SPOT_S, []
+    for start in np.arange(1.0, len(turn) / RATE_HZ - _SPOT_S - 1.0, _SPOT_S):
+        if np.any((gaps[:, 0] < start + _SPOT_S) & (gaps[:, 1] > start)):
             continue
-        force = np.diff(push[round(start * _RATE_HZ) :: _RATE_HZ][: STRETCH_S + 1], axis=0)
+        force = np.diff(push[round(start * RATE_HZ) :: RATE_HZ][: count + 1], axis=0)
         direction = force / np.linalg.norm(force, axis=-1, keepdims=True)
         spread = 1.0 - float(np.linalg.norm(direction.mean(axis=0)))
         if spread > 0.015:
             tilted.append((spread, float(start)))
     if not tilted:
         return None
-    best = sorted(start for _, start in sorted(tilted)[-_STRETCHES:])
-    return Pair(turn, push, np.array([0.0, end]), np.zeros((2, 3)), np.array(best), "gravity")
-
-
-def _sums_on_grid(signal: Signal) -> tuple[np.ndarray, np.ndarray, float]:
-    """Integrals of rate and specific force up to each grid time, and the last of these times."""
-    grid = np.arange(0.0, signal.time_s[-1], 1.0 / _RATE_HZ)
-    turn, push = (
-        at(grid, signal.time_s, integral(signal.time_s, x)) for x in (signal.gyro, signal.accel)
+    starts = np.array(sorted(start for _, start in sorted(tilted)[-_MOST_SPOTS:]))
+    node_of = np.repeat(np.arange(len(starts)), count + 1)
+    when = (starts[:, None] + np.arange(count + 1.0)).ravel()
+    node = np.flatnonzero(node_of[1:] == node_of[:-1])
+    gained = np.tile([0.0, 0.0, -GRAVITY], (len(node), 1))
+    fields = (node_of, np.zeros((len(when), 3)), node, node_of[node], gained, starts)
+    middle = float(np.mean(starts))
+    return Views(
+        turn, push, gaps, when, when, False, *fields, float(count), middle, power="gravity"
     )
-    return turn, push, float(grid[-1])
 
 
-def _has_gap(time_s: np.ndarray, start: float) -> bool:
-    inside = time_s[(time_s >= start) & (time_s <= start + STRETCH_S)]
-    return len(inside) < 2 or bool(np.max(np.diff(inside)) > 1.5)
+def on_grid(signal: Signal, kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """Integrals of rate and specific force up to each time of the grid."""
+    grid = np.arange(0.0, signal.time_s[-1], 1.0 / RATE_HZ)
+    turn, push = (
+        at(grid, signal.time_s, integral(signal.time_s, x, kind))
+        for x in (signal.gyro, signal.accel)
+    )
+    return turn, push
 
 
-def unexplained(pair: Pair, gyro_maps: np.ndarray, lags_s: np.ndarray = _NO_LAG) -> Fit:
-    """Judge hypotheses.
+def _gaps(signal: Signal) -> np.ndarray:
+    """(gaps, 2) begin and end of times without samples."""
+    step = np.diff(signal.time_s)
+    k = np.flatnonzero(step > max(_GAP_S, 3.0 * signal.step_s))
+    return np.stack([signal.time_s[k], signal.time_s[k + 1]], axis=-1)
+
+
+def power_of(views: Views) -> np.ndarray:
+    """(stretches,) mean square of what the share left is a share of [m^2/s^2]."""
+    count = np.bincount(views.of)
+    squares = np.bincount(views.of, np.sum(views.gained**2, axis=1)) / count
+    if views.power == "gravity":
+        return squares
+    mean = np.stack([np.bincount(views.of, x) / count for x in views.gained.T])
+    return squares - np.sum(mean**2, axis=0)
+
+
+def squares_by_lag(views: Views, lags_s: np.ndarray) -> np.ndarray:
+    """(stretches, lags) means of the squares left by tables as they are, if fixes are later.
 
     Args:
-        pair: the two views.
-        gyro_maps: (h, 3, 3) applied to the angular rate: units, exchanges, reversals.
-        lags_s: (h) or (1,) what is added to the GNSS times to find the IMU samples that belong.
+        views: the tables.
+        lags_s: what is added to the stamps of fixes [s]. NaN results where no IMU was recorded.
     """
-    out = [_judge(pair, start, gyro_maps, lags_s) for start in pair.starts]
-    return Fit(*(np.stack(part) for part in zip(*out, strict=True)))
+    turn, push = np.diff(views.turn, axis=0), np.diff(views.push, axis=0)
+    C = _attitudes(turn)
+    dS = np.einsum("nij,nj->ni", C[:-1] @ rotations(0.5 * turn), push)
+    S = np.concatenate([np.zeros((1, 3)), np.cumsum(dS, axis=0)])
+    D = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (S[1:] + S[:-1]), axis=0)]) / RATE_HZ
+    out = np.full((len(views.start_s), len(lags_s)), np.nan)
+    for s in range(len(out)):
+        nodes = views.node_of == s
+        begin, end = views.begin_s[nodes], views.end_s[nodes]
+        inside = (begin[0] + lags_s > 0.0) & (end[-1] + lags_s < (len(S) - 1) / RATE_HZ)
+        for gap in views.gaps:
+            inside &= ~((begin[0] + lags_s < gap[1]) & (end[-1] + lags_s > gap[0]))
+        lags = lags_s[inside, None]
+        if not len(lags):
+            continue
+        if views.means:
+            ends = (between((t + lags) * RATE_HZ, D) for t in (end, begin))
+            v = np.subtract(*ends) / (end - begin)[:, None]
+        else:
+            v = between((end + lags) * RATE_HZ, S)
+        out[s, inside] = _compared(views, s, v)[0]
+    return out
 
 
-def unexplained_but_for_biases(pair: Pair, lags_s: np.ndarray) -> np.ndarray:
-    """(stretches, lags) share left by the data as they are, once constant biases are taken off.
+def squares_by_map(views: Views, maps: np.ndarray, shift_s: np.ndarray) -> np.ndarray:
+    """(maps, 2) means of the squares left by the best rotation and by the best reflection, summed.
 
-    A time offset and an accelerometer bias look alike where the motion is gentle, and a gyro bias
-    tilts gravity, so both are estimated with the rotation: two steps of Gauss-Newton on nine
-    parameters, differentiated numerically.
+    Args:
+        views: the tables.
+        maps: (h, 3, 3) that the gyros are multiplied by.
+        shift_s: (stretches,) what is added to the stamps of fixes.
     """
-    return np.stack([_judge_biased(pair, start, lags_s) for start in pair.starts])
+    count = int(np.ceil(views.length_s * RATE_HZ)) + 2
+    power = power_of(views)
+    left = np.zeros((len(maps), 2))
+    for s in np.argsort(power)[-_MOST_SEARCHED:].tolist():
+        first = views.start_s[s] + shift_s[s]
+        index = first * RATE_HZ + np.arange(count + 1)
+        turn, push = (np.diff(between(index, x), axis=0) for x in (views.turn, views.push))
+        turned = np.einsum("hij,kj->hki", maps, turn)
+        C = composed(rotations(turned))
+        dS = np.einsum("hkij,kj->hki", C[:, :-1] @ rotations(0.5 * turned), push)
+        S = np.concatenate([np.zeros_like(dS[:, :1]), np.cumsum(dS, axis=1)], axis=1)
+        nodes = views.node_of == s
+        begin, end = (
+            np.clip((t[nodes] - views.start_s[s]) * RATE_HZ, 0, count)
+            for t in (views.begin_s, views.end_s)
+        )
+        if views.means:
+            D = np.cumsum(S, axis=1) - 0.5 * S
+            v = (_along(end, D) - _along(begin, D)) / (end - begin)[:, None]
+        else:
+            v = _along(end, S)
+        left += np.stack(_compared(views, s, v), axis=-1)
+    return left
 
 
-def travel_in_body(pair: Pair) -> np.ndarray:
-    """(k, 3) velocities in body axes, where the pair fits as it is and moves: which way is forward.
+def _compared(views: Views, s: int, v: np.ndarray) -> list[np.ndarray]:
+    """Means of the squares left (h,) of velocities (h, nodes, 3) by a rotation, by a reflection."""
+    once = slice(None, None, views.stride)  # changes that do not overlap
+    u = (v[:, views.stride :] - v[:, : -views.stride])[:, once]
+    _, *both = kabsch(u, views.gained[views.of == s][once])
+    return [left / u.shape[1] for left in both]
 
-    Only seconds faster than 0.5 m/s; at most `STRETCH_S` of each stretch.
+
+def _along(index: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Linear interpolation of (h, n, 3) at real indices along the second axis."""
+    return (
+        between(index, values.swapaxes(0, 1).reshape(values.shape[1], -1))
+        .reshape(len(index), len(values), 3)
+        .swapaxes(0, 1)
+    )
+
+
+def _attitudes(turn: np.ndarray) -> np.ndarray:
+    """(n + 1, 3, 3) attitudes after each of n small turns, in blocks that are joined then."""
+    size = int(np.sqrt(len(turn))) + 1
+    count = -(-len(turn) // size)
+    padded = np.concatenate([turn, np.zeros((count * size - len(turn), 3))])
+    C = composed(rotations(padded.reshape(count, size, 3)))
+    before = composed(C[None, :, -1])[0]
+    joined = (before[:-1, None] @ C[:, :-1]).reshape(-1, 3, 3)
+    return np.concatenate([joined, before[-1:]])[: len(turn) + 1]
+
+
+def composed(steps: np.ndarray) -> np.ndarray:
+    """(b, n + 1, 3, 3) products of rotations (b, n, 3, 3) up to each."""
+    out = np.empty((steps.shape[0], steps.shape[1] + 1, 3, 3))
+    out[:, 0] = np.eye(3)
+    for k in range(steps.shape[1]):
+        np.matmul(out[:, k], steps[:, k], out=out[:, k + 1])
+    return out
+
+
+def integral(time_s: np.ndarray, rate: np.ndarray, kind: str = "rate") -> np.ndarray:
+    """(n, 3) sum of a rate (n, 3) from the first sample up to each.
+
+    By the trapezoidal rule, or of increments, whose rates are means since the sample before.
     """
-    out = []
-    for start in pair.starts:
-        view = _view(pair, start, _NO_LAG)
-        sums, C = _sum_unturned(view.turn, view.push)
-        R, _, _ = _kabsch(sums, view.wanted)
-        v_n = at(start + np.arange(STRETCH_S), pair.gnss_s, pair.v_n)
-        v_b = np.einsum("kji,lj,kl->ki", C[0], R[0], v_n)  # C^T R^T v
-        out.append(v_b[np.linalg.norm(v_n, axis=-1) > 0.5])
-    return np.concatenate(out)
-
-
-class _View(NamedTuple):
-    """One stretch, the IMU seen with several delays."""
-
-    turn: np.ndarray  # (lags, fine, 3) rad
-    push: np.ndarray  # (lags, fine, 3) m/s
-    wanted: np.ndarray  # (seconds, 3) change of v - g dt
-    power: float  # squares of its change
-    seen: np.ndarray  # (lags,) bool: all of it was recorded
-
-
-def _view(pair: Pair, start: float, lags_s: np.ndarray) -> _View:
-    seconds = start + np.arange(STRETCH_S + 1)
-    wanted = np.diff(at(seconds, pair.gnss_s, pair.v_n), axis=0) - [0.0, 0.0, GRAVITY]
-    middle = wanted.mean(axis=0) if pair.power == "change" else 0.0
-    power = float(np.sum((wanted - middle) ** 2))
-    fine = np.arange(STRETCH_S * _RATE_HZ + 1) / _RATE_HZ + start
-    index = (fine + lags_s[:, None]) * _RATE_HZ
-    turn, push = (np.diff(_between(index, x), axis=1) for x in (pair.turn, pair.push))
-    seen = (index[:, 0] >= 0.0) & (index[:, -1] <= len(pair.turn) - 1)
-    return _View(turn, push, wanted, power, seen)
-
-
-def _judge(
-    pair: Pair, start: float, gyro_maps: np.ndarray, lags_s: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    view = _view(pair, start, lags_s)
-    count = max(len(gyro_maps), len(lags_s))
-    turn, push = (np.broadcast_to(x, (count, *x.shape[1:])) for x in (view.turn, view.push))
-    turn = np.einsum("hij,hkj->hki", np.broadcast_to(gyro_maps, (count, 3, 3)), turn)
-    sums, _ = _sum_unturned(turn, push)
-    _, left, mirrored = _kabsch(sums, view.wanted)
-    left, mirrored = (np.where(view.seen, x / view.power, np.nan) for x in (left, mirrored))
-    return left, mirrored
-
-
-def _judge_biased(pair: Pair, start: float, lags_s: np.ndarray) -> np.ndarray:
-    view = _view(pair, start, lags_s)
-    bias = np.zeros((len(lags_s), 6))  # gyro rad/s, accelerometer m/s^2
-    trials = np.concatenate([np.zeros((1, 6)), _BIAS_STEP * np.eye(6)])
-    for _ in range(2):
-        sums = _sums_without(view, bias[:, None] + trials)
-        R, _, _ = _kabsch(sums[:, 0], view.wanted)
-        for h in range(len(lags_s)):
-            here = sums[h, 0] @ R[h].T
-            by_bias = (sums[h, 1:] - sums[h, :1]) @ R[h].T / _BIAS_STEP
-            by_turn = np.cross(np.eye(3)[:, None], here)
-            design = np.concatenate([by_bias * _BIAS_SIGMA[:, None, None], by_turn])
-            rest = (view.wanted - here).ravel()
-            solution = np.linalg.lstsq(design.reshape(9, -1).T, rest, rcond=1e-6)[0]
-            bias[h] += solution[:6] * _BIAS_SIGMA
-    _, left, _ = _kabsch(_sums_without(view, bias[:, None])[:, 0], view.wanted)
-    return np.where(view.seen, left / view.power, np.nan)
-
-
-def _sums_without(view: _View, bias: np.ndarray) -> np.ndarray:
-    """(lags, trials, seconds, 3) sums after biases (lags, trials, 6) are taken off."""
-    off = bias[:, :, None] / _RATE_HZ
-    turn, push = view.turn[:, None] - off[..., :3], view.push[:, None] - off[..., 3:]
-    shape = (-1, *turn.shape[2:])
-    sums, _ = _sum_unturned(turn.reshape(shape), push.reshape(shape))
-    return sums.reshape(*bias.shape[:2], STRETCH_S, 3)
-
-
-def integral(time_s: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """(n, 3) sum of a rate (n, 3) from the first sample up to each, by the trapezoidal rule."""
-    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time_s)[:, None]
+    mean = rate[1:] if kind == "increment" else 0.5 * (rate[1:] + rate[:-1])
+    steps = mean * np.diff(time_s)[:, None]
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
@@ -237,29 +394,12 @@ def at(when: np.ndarray, time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(when, time_s, column) for column in values.T], axis=-1)
 
 
-def _between(index: np.ndarray, values: np.ndarray) -> np.ndarray:
+def between(index: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Linear interpolation of rows at real indices, held at the ends."""
     index = np.clip(index, 0, len(values) - 1)
     low = np.minimum(index.astype(np.int64), len(values) - 2)
     share = (index - low)[..., None]
     return (1.0 - share) * values[low] + share * values[low + 1]
-
-
-def _sum_unturned(turn: np.ndarray, push: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity increments (h, seconds, 3) in the axes of the first moment, and C (h, seconds, 3, 3)
-    from the axes at the start of each second to those.
-    """
-    whole = rotations(turn)
-    push = np.einsum("hkij,hkj->hki", rotations(0.5 * turn), push)
-    C = np.broadcast_to(np.eye(3), (len(turn), 3, 3))
-    out = np.zeros((len(turn), STRETCH_S, 3))
-    attitudes = []
-    for k in range(turn.shape[1]):
-        if k % _RATE_HZ == 0:
-            attitudes.append(C)
-        out[:, k // _RATE_HZ] += np.einsum("hij,hj->hi", C, push[:, k])
-        C = C @ whole[:, k]
-    return out, np.stack(attitudes, axis=1)
 
 
 def rotations(phi: np.ndarray) -> np.ndarray:
@@ -270,7 +410,7 @@ def rotations(phi: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * half_sinc**2 * K @ K
 
 
-def _kabsch(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def kabsch(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Best rotation R of u (h, k, 3) onto v (k, 3), squares left by it and by a reflection."""
     U, s, Vt = np.linalg.svd(np.einsum("hki,kj->hij", u, v))
     sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))

@@ -119,18 +119,16 @@ def fit_turning(q: Rotation, shared: Shared, gyro_map: np.ndarray | None = None)
     return fit
 
 
-class _Pushes(NamedTuple):
-    """Windows with velocities at both ends."""
+def _pushes(v_n: np.ndarray, shared: Shared) -> tuple[np.ndarray, ...] | None:
+    """Windows with velocities at both ends; None if there are fewer than ten.
 
-    at: np.ndarray  # (k,) their numbers
-    length_s: np.ndarray  # (k,)
-    C: np.ndarray  # (k, 3, 3) from body to navigation axes in their middle
-    gained: np.ndarray  # (k, 3) m/s along navigation axes, by the master
-    pushed: np.ndarray  # (k, 3) m/s along body axes, by the IMU
-
-
-def _pushes(v_n: np.ndarray, shared: Shared) -> _Pushes | None:
-    """None if there are fewer than ten."""
+    Returns:
+        at: (k,) their numbers.
+        length_s: (k,) s.
+        C: (k, 3, 3) from body to navigation axes in their middle.
+        gained: (k, 3) m/s along navigation axes, by the master.
+        pushed: (k, 3) m/s along body axes, by the IMU.
+    """
     gained = np.diff(v_n, axis=0)
     at_ = np.flatnonzero(shared.inside & np.isfinite(gained).all(axis=1))
     if len(at_) < 10:
@@ -138,7 +136,7 @@ def _pushes(v_n: np.ndarray, shared: Shared) -> _Pushes | None:
     q = shared.q[:-1] * Rotation.from_rotvec(0.5 * (shared.q[:-1].inv() * shared.q[1:]).as_rotvec())
     pushed = np.diff(at(shared.time_s, shared.sample_s, shared.pushed), axis=0)
     length_s = np.diff(shared.time_s)
-    return _Pushes(at_, length_s[at_], q.as_matrix()[at_], gained[at_], pushed[at_])
+    return at_, length_s[at_], q.as_matrix()[at_], gained[at_], pushed[at_]
 
 
 def forces_of(shared: Shared) -> tuple[np.ndarray, np.ndarray] | None:
@@ -146,8 +144,9 @@ def forces_of(shared: Shared) -> tuple[np.ndarray, np.ndarray] | None:
     p = _pushes(shared.v_n, shared)
     if p is None:
         return None
-    f_n = p.gained / p.length_s[:, None] - [0.0, 0.0, GRAVITY]
-    return np.einsum("kji,kj->ki", p.C, f_n), p.pushed / p.length_s[:, None]
+    _, length_s, C, gained, pushed = p
+    f_n = gained / length_s[:, None] - [0.0, 0.0, GRAVITY]
+    return np.einsum("kji,kj->ki", C, f_n), pushed / length_s[:, None]
 
 
 def fit_velocity(v_n: np.ndarray, shared: Shared) -> np.ndarray | None:
@@ -163,11 +162,12 @@ def fit_velocity(v_n: np.ndarray, shared: Shared) -> np.ndarray | None:
     p = _pushes(v_n, shared)
     if p is None:
         return None
-    along = p.length_s[:, None, None]
-    missing = p.gained - np.einsum("kij,kj->ki", p.C, p.pushed) - along[:, 0] * [0, 0, GRAVITY]
+    at_, length_s, C, gained, pushed = p
+    along = length_s[:, None, None]
+    missing = gained - np.einsum("kij,kj->ki", C, pushed) - along[:, 0] * [0, 0, GRAVITY]
     early, late = (at(shared.time_s + k * _HALF_S, shared.sample_s, shared.angle) for k in (-1, 1))
-    swing = np.diff(shared.q.as_matrix() @ skew((late - early) / (2.0 * _HALF_S)), axis=0)[p.at]
-    design = np.concatenate([p.C * along, np.eye(3) * along, p.C @ skew(p.pushed), swing], axis=-1)
+    swing = np.diff(shared.q.as_matrix() @ skew((late - early) / (2.0 * _HALF_S)), axis=0)[at_]
+    design = np.concatenate([C * along, np.eye(3) * along, C @ skew(pushed), swing], axis=-1)
     left, _, _ = _least_squares(missing.ravel(), design.reshape(-1, 12))
     return np.sum(left.reshape(-1, 3) ** 2, axis=0)
 

@@ -14,10 +14,10 @@ import numpy as np
 
 from robins import rotation
 from robins.dataset import GnssTable, ImuTable
-from robins.logs.checks_motion import pair_in_time, small_offset
+from robins.logs.checks_motion import in_body, small_offset
 from robins.logs.gnss_motion import lateness, track_of
-from robins.logs.motion import travel_in_body, unexplained_but_for_biases
-from robins.logs.quiet import signal_of, windows_of
+from robins.logs.motion_models import Verdict, judge
+from robins.logs.quiet import Signal, signal_of, windows_of
 
 _STRAIGHT = 0.85  # mean of the directions of travel, below which there is no forward
 _LEAST = 20  # directions of travel
@@ -50,24 +50,22 @@ def find_unit(imu: ImuTable, gnss: GnssTable | None) -> Found:
     if gnss is None or track is None or track.v_n is None:
         return Found(**_noise(imu, None, None))
     epoch = float(np.median(np.diff(track.time_s)))
-    pair = pair_in_time(imu, gnss, signal, track)
-    if pair is None:
+    verdict = judge(imu, gnss, signal, track)
+    if verdict is None:
         return Found(**_noise(imu, gnss, None))
-    late, lag = lateness(track), small_offset(pair)
-    shift = np.array([lag or 0.0])
+    late, lag = lateness(track), small_offset(verdict)
     window = 2.0 * late if late is not None and late > _LATE_S else None
     if window is not None and abs(window - epoch) < 0.4 * epoch:
         window = epoch
     # The positions did not tell how old velocities are: half an epoch is no offset of a clock.
     if late is None and lag is not None and 0.3 * epoch < -lag < 0.7 * epoch:
         window, lag = epoch, None
-    orientation, C_bs = _orientation(imu, pair)
-    plain = pair_in_time(imu, gnss, signal, track, late_s=0.0)
+    orientation, C_bs = _orientation(signal, verdict)
     left = None
-    if plain is not None:
-        before = float(np.mean(unexplained_but_for_biases(plain, np.zeros(1))))
-        with_it = float(np.mean(unexplained_but_for_biases(pair, shift)))
-        left = before, with_it
+    if window is not None or lag is not None:
+        plain = verdict if late is None else judge(imu, gnss, signal, track, late_s=0.0)
+        if plain is not None:
+            left = plain.nothing.left(plain.views), verdict.fit.left(verdict.views)
     return Found(
         orientation_deg=orientation,
         latency_s=None if lag is None else -lag,
@@ -78,12 +76,11 @@ def find_unit(imu: ImuTable, gnss: GnssTable | None) -> Found:
 
 
 def _orientation(
-    imu: ImuTable, pair
+    signal: Signal, verdict: Verdict
 ) -> tuple[tuple[float, float, float] | None, np.ndarray | None]:
     """Roll, pitch, yaw [deg] of the vehicle seen from the sensor, and C_bs."""
-    signal = signal_of(imu)
-    v_b = travel_in_body(pair)
-    if signal is None or len(v_b) < _LEAST:
+    v_b = in_body(verdict)
+    if len(v_b) < _LEAST:
         return None, None
     windows = windows_of(signal)
     down = -np.mean(windows.accel[windows.calm], axis=0)

@@ -1,0 +1,301 @@
+"""One least-squares problem for an IMU and a receiver as views of one motion.
+
+Over a stretch of time the gyros give the turn C of the body since its first moment, so the gained
+velocity of the antenna in axes that do not turn is, up to one rotation R of the stretch,
+
+    R (sum C (M_a f - b_a) dt + C (w x l)) = change of v - g dt,   w = M_g w_m - b_g,
+
+at the times t + offset + rate t of the clock of the IMU. Unknown are the matrices M_g and M_a (up
+to a common rotation, so M_a is upper triangular), the biases, the lever arm l, the clock, and R.
+All but the clock, and M_g, M_a beyond a few percent, are nuisances of every model: a model is a
+set of standard deviations of what may differ from its start, and a wide one frees a block.
+
+Residuals of a stretch are correlated, so a sigma is the larger of that by white residuals and that
+by the scores of the stretches (Liang and Zeger 1986). R is in closed form (Kabsch 1976). Velocities
+are turned into axes that are inertial during a stretch, so the turns of the Earth cost nothing.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from robins.logs.motion import RATE_HZ, Views, between, composed, kabsch, power_of, rotations
+from robins.rotation import skew
+
+SCALE, GYRO_BIAS, FORCE, FORCE_BIAS = slice(0, 9), slice(9, 12), slice(12, 18), slice(18, 21)
+LEVER, RATE, OFFSET = slice(21, 24), 24, 25  # an offset for each part of the log
+_UPPER = np.triu_indices(3)
+_PAD_S, _SMOOTH_S, _EDGE_S = 0.5, 0.1, 0.1
+_MOST, _MOST_BIAS, _MOST_LEVER_M = 0.3, 1.0, 5.0  # of a step of Gauss and Newton
+_STILL = 0.03  # sigmas of a step that ends the search
+_TRIMMED = 0.95  # share of the residuals that judges a fit, the smallest
+_ROBUST = 3.0  # typical residuals, beyond which one counts less
+
+
+class State(NamedTuple):
+    """Estimated or assumed parameters."""
+
+    M_g: np.ndarray  # (3, 3) angular rates are multiplied by it
+    b_g: np.ndarray  # (3,) rad/s, taken off then
+    M_a: np.ndarray  # (3, 3) specific forces are multiplied by it
+    b_a: np.ndarray  # (3,) m/s^2, taken off then
+    lever: np.ndarray  # (3,) m from the IMU to the antenna, body axes
+    rate: float  # s/s, added to the stamps of fixes for each second from the middle
+    offset: np.ndarray  # (parts,) s, added to the stamps of fixes
+    part: np.ndarray  # (stretches,) part of the log in which each lies
+
+    def shift(self, stretch: np.ndarray, time_s: np.ndarray, middle_s: float) -> np.ndarray:
+        """Seconds to be added to stamps of fixes."""
+        return self.offset[self.part[stretch]] + self.rate * (time_s - middle_s)
+
+
+class Fit(NamedTuple):
+    """A model fitted."""
+
+    state: State
+    sigma: np.ndarray  # (parameters,) one sigma, relative ones of the matrices
+    R: np.ndarray  # (stretches, 3, 3) from the first axes of each to those of its velocities
+    squares: np.ndarray  # (k,) squares left of each change of velocity; NaN where no IMU was
+    turned: np.ndarray  # (nodes, 3, 3) attitude C at each node
+    strain: float = 0.0  # chi-square of the parameters against what they were expected to be
+
+    def left(self, views: Views) -> float:
+        """Share of the change of velocity that is left unexplained; infinite where no IMU was."""
+        seen = np.isfinite(self.squares)
+        if not seen.any():
+            return np.inf
+        return trimmed(self.squares[seen]) / float(np.mean(power_of(views)[views.of[seen]]))
+
+    def by_stretch(self, views: Views) -> np.ndarray:
+        """(stretches,) mean of the squares left; all of the change where no IMU was."""
+        power, out = power_of(views), np.empty(len(views.start_s))
+        for s in range(len(out)):
+            mine = self.squares[views.of == s]
+            out[s] = trimmed(mine) if np.isfinite(mine).all() else power[s]
+        return out
+
+
+def trimmed(squares: np.ndarray) -> float:
+    """Mean of squares without the largest twentieth."""
+    return float(np.mean(np.sort(squares)[: max(1, round(_TRIMMED * len(squares)))]))
+
+
+def start_of(views: Views, M_g: np.ndarray | None = None, mirror: float = 1.0) -> State:
+    """State in which tables are what they claim to be, or the gyros need a map."""
+    zero, eye = np.zeros(3), np.eye(3)
+    part = np.zeros(len(views.start_s), int)
+    M_g = eye if M_g is None else M_g
+    return State(M_g, zero, mirror * eye, zero, zero, 0.0, np.zeros(1), part)
+
+
+def _sums(views: Views, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gained velocity and its derivatives.
+
+    Returns:
+        u: (k, 3, 1 + parameters) in the first axes of the stretch.
+        C: (nodes, 3, 3) attitudes.
+        seen: (k,) bool, changes for which the IMU was recorded.
+    """
+    n_fine = int(np.ceil((views.length_s * (1 + abs(state.rate)) + 2 * _PAD_S) * RATE_HZ))
+    all_ = np.arange(len(views.start_s))
+    first = views.start_s + state.shift(all_, views.start_s, views.middle_s) - _PAD_S
+    index = first[:, None] * RATE_HZ + np.arange(n_fine + 1)
+    turn, push = (np.diff(between(index, x), axis=1) for x in (views.turn, views.push))
+    whole = turn @ state.M_g.T, push @ state.M_a.T
+    dphi = whole[0] - state.b_g / RATE_HZ
+    S, C = _grown(*whole, dphi, whole[1] - state.b_a / RATE_HZ)
+    begin, end = (
+        (t + state.shift(views.node_of, t, views.middle_s) - first[views.node_of]) * RATE_HZ
+        for t in (views.begin_s, views.end_s)
+    )
+
+    def at(index: np.ndarray, values: np.ndarray) -> np.ndarray:
+        index = np.clip(index, 0, n_fine) + views.node_of * (n_fine + 1)
+        low = np.minimum(index.astype(np.int64), values.shape[0] * values.shape[1] - 2)
+        flat, share = values.reshape(-1, *values.shape[2:]), index - low
+        share = share.reshape(-1, *([1] * (flat.ndim - 1)))
+        return (1.0 - share) * flat[low] + share * flat[low + 1]
+
+    C_end = at(end, C)
+    if views.means:
+        over = ((end - begin) / RATE_HZ)[:, None, None]
+        D = _cumulative((S[:, 1:] + S[:, :-1]) * (0.5 / RATE_HZ))
+        u = (at(end, D) - at(begin, D)) / over
+        force = (at(end, S[..., :1]) - at(begin, S[..., :1])) / over
+        swing = (C_end - at(begin, C)) / over
+    else:
+        u = at(end, S)
+        near = [at(end + k * _SMOOTH_S * RATE_HZ, S[..., :1]) for k in (-1, 1)]
+        force = (near[1] - near[0]) / (2 * _SMOOTH_S)
+        angle = _cumulative(dphi)
+        # by two differences (Richardson), for a mean over 0.2 s would lose the swing of a step
+        ends = [at(end + k, angle) for k in (-2, -1, 1, 2)]
+        omega = (8.0 * (ends[2] - ends[1]) - (ends[3] - ends[0])) * (RATE_HZ / 12.0)
+        swing = C_end @ skew(omega)
+    u[..., 0] += swing @ state.lever
+    middle = 0.5 * (views.begin_s + views.end_s) - views.middle_s
+    in_part = state.part[views.node_of][:, None] == np.arange(len(state.offset))
+    u = np.concatenate(
+        [u, swing, force * middle[:, None, None], force * in_part[:, None, :]], axis=-1
+    )
+    last = np.zeros(len(all_))
+    np.maximum.at(last, views.node_of, end)
+    seen = _recorded(views, first + _PAD_S, first + last / RATE_HZ)[views.of]
+    return u[views.node + views.stride] - u[views.node], C_end, seen
+
+
+def _grown(
+    turn: np.ndarray, push: np.ndarray, dphi: np.ndarray, dp: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity with its derivatives by the parameters of the triads, and attitude.
+
+    Args:
+        turn: (stretches, fine, 3) small turns, biases not yet taken off [rad].
+        push: (stretches, fine, 3) small gains of velocity in body axes, likewise [m/s].
+        dphi: (stretches, fine, 3) small turns [rad].
+        dp: (stretches, fine, 3) small gains of velocity in body axes [m/s].
+
+    Returns:
+        (stretches, fine + 1, 3, 22) and (stretches, fine + 1, 3, 3).
+    """
+    C = composed(rotations(dphi))
+    Cm = C[:, :-1] @ rotations(0.5 * dphi)
+    dS = np.einsum("skij,skj->ski", Cm, dp)
+    bias = -Cm / RATE_HZ
+    of_rate = np.einsum("skij,skl->skijl", Cm, turn).reshape(*Cm.shape[:2], 3, 9)
+    psi = np.concatenate([of_rate, bias], axis=-1)
+    psi = np.cumsum(psi, axis=1) - 0.5 * psi
+    by_turn = -skew(dS) @ psi
+    by_force = np.einsum("skij,skl->skijl", Cm, push)[..., _UPPER[0], _UPPER[1]]
+    columns = np.concatenate([dS[..., None], by_turn, by_force, bias], axis=-1)
+    return _cumulative(columns), C
+
+
+def _cumulative(steps: np.ndarray) -> np.ndarray:
+    """Sums up to each of the fine times, along the second axis."""
+    return np.concatenate([np.zeros_like(steps[:, :1]), np.cumsum(steps, axis=1)], axis=1)
+
+
+def _recorded(views: Views, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """(stretches,) whether the IMU was recorded without a gap from first to last."""
+    inside = (first > -_EDGE_S) & (last < (len(views.turn) - 1) / RATE_HZ + _EDGE_S)
+    begin, end = views.gaps.T
+    return inside & ~np.any((begin < last[:, None]) & (end > first[:, None]), axis=1)
+
+
+def fit(views: Views, start: State, prior: np.ndarray, rounds: int = 8) -> Fit:
+    """Fit all parameters by Gauss and Newton.
+
+    Args:
+        views: the tables.
+        start: where to start; also what the parameters are expected to be.
+        prior: (parameters, parameters) covariance of what they differ from that by.
+        rounds: steps at most.
+    """
+    state, cost = start, np.inf
+    result, step = _step(views, state, start, prior)
+    best = result
+    for _ in range(rounds):
+        seen = result.squares[np.isfinite(result.squares)]
+        if not len(seen):
+            break
+        now = 3 * len(seen) * np.log(trimmed(seen) + 1e-12) + result.strain
+        if now < cost:
+            best, cost = result, now
+        if np.max(np.abs(step / result.sigma)) < _STILL:
+            break
+        most = np.full(len(step), _MOST)
+        most[FORCE_BIAS], most[LEVER] = _MOST_BIAS, _MOST_LEVER_M
+        state = _moved(state, np.clip(step, -most, most))
+        result, step = _step(views, state, start, prior)
+    return best
+
+
+def _moved(state: State, step: np.ndarray) -> State:
+    E_a = np.zeros((3, 3))
+    E_a[_UPPER] = step[FORCE]
+    return state._replace(
+        M_g=(np.eye(3) + step[SCALE].reshape(3, 3)) @ state.M_g,
+        b_g=state.b_g + step[GYRO_BIAS],
+        M_a=(np.eye(3) + E_a) @ state.M_a,
+        b_a=state.b_a + step[FORCE_BIAS],
+        lever=state.lever + step[LEVER],
+        rate=state.rate + float(step[RATE]),
+        offset=state.offset + step[OFFSET:],
+    )
+
+
+def _moved_by(state: State, start: State) -> np.ndarray:
+    """Parameters by which a state differs from a start."""
+    E_g = state.M_g @ np.linalg.inv(start.M_g) - np.eye(3)
+    E_a = state.M_a @ np.linalg.inv(start.M_a) - np.eye(3)
+    return np.concatenate(
+        [
+            E_g.ravel(),
+            *(state.b_g - start.b_g, E_a[_UPPER], state.b_a - start.b_a),
+            *(state.lever - start.lever, [state.rate - start.rate], state.offset - start.offset),
+        ]
+    )
+
+
+def _step(views: Views, state: State, start: State, prior: np.ndarray) -> tuple[Fit, np.ndarray]:
+    """Judgement of a state, and the step from it."""
+    u, C, recorded = _sums(views, state)
+    count, stretches = u.shape[2] - 1, len(views.start_s)
+    R = np.tile(np.eye(3), (stretches, 1, 1))
+    rest = np.full(views.gained.shape, np.nan)
+    rows = [np.flatnonzero((views.of == s) & recorded) for s in range(stretches)]
+    for s, k in enumerate(rows):
+        if len(k):
+            R[s] = kabsch(u[k, :, 0][None], views.gained[k])[0][0]
+            rest[k] = views.gained[k] - u[k, :, 0] @ R[s].T
+    squares = np.sum(rest**2, axis=1)
+    usual = max(np.sqrt(np.nanmedian(squares) / 2.37), 1e-6) if recorded.any() else np.nan
+    weight = 1.0 / (1.0 + squares / (3.0 * (_ROBUST * usual) ** 2))
+    H, g, scores = np.zeros((count, count)), np.zeros(count), []
+    for s, k in enumerate(rows):
+        if len(k):
+            A = (R[s] @ u[k, :, 1:]).reshape(-1, count)
+            B = -skew(u[k, :, 0] @ R[s].T).reshape(-1, 3)
+            w, r = np.repeat(weight[k], 3), rest[k].ravel()
+            # what a turn of the stretch would explain is no evidence for the others
+            inside = B.T @ (w[:, None] * B) + 1e-9 * np.eye(3)
+            A = A - B @ np.linalg.solve(inside, B.T @ (w[:, None] * A))
+            r = r - B @ np.linalg.solve(inside, B.T @ (w * r))
+            H += A.T @ (w[:, None] * A)
+            scores.append(A.T @ (w * r))
+            g += scores[-1]
+    free = 3.0 * np.sum(recorded) - min(count, np.sum(recorded)) - 3.0 * stretches
+    free = max(free, 0.5 * np.sum(recorded), 1.0)
+    variance = max(float(np.nansum(weight * squares)) / free, 1e-10)
+    expected = np.linalg.inv(prior)
+    inverse = np.linalg.inv(H / variance + expected)
+    moved = _moved_by(state, start)
+    step = inverse @ (g / variance - expected @ moved)
+    meat = np.array(scores).T @ np.array(scores) if scores else np.zeros_like(H)
+    meat *= len(scores) / max(len(scores) - 1, 1) / variance**2
+    spread = np.maximum(np.diag(inverse), np.diag(inverse @ meat @ inverse))
+    strain = float(moved @ expected @ moved)
+    return Fit(state, np.sqrt(spread), R, squares, C, strain), step
+
+
+def prior_of(parts: int = 1, *free: str) -> np.ndarray:
+    """Covariance of what sound tables differ by from what they claim, wide where blocks are free.
+
+    Args:
+        parts: parts of the log with a clock of their own.
+        free: among "offset", "rate", "scale" (one of all gyros), "gyros", "forces".
+    """
+    sigma = np.empty(OFFSET + parts)
+    sigma[SCALE] = 0.3 if "gyros" in free else 0.02
+    sigma[FORCE] = 0.3 if "forces" in free else 0.01
+    sigma[GYRO_BIAS], sigma[FORCE_BIAS], sigma[LEVER] = 0.01, 0.3, 2.0
+    sigma[RATE] = 0.02 if "rate" in free else 2e-5
+    sigma[OFFSET:] = 1.0 if "offset" in free else 0.01
+    out = np.diag(sigma**2)
+    if "scale" in free:
+        alike = np.eye(3).ravel()
+        out[SCALE, SCALE] += 0.3**2 * np.outer(alike, alike)
+    return out
