@@ -1,9 +1,9 @@
 """Velocity and course from positions, where a receiver states no velocity.
 
-A weighted line goes through the positions of a window that ends with a fix. Of windows from 1 to
-32 s the one counts that leaves the least uncertainty: a short one has little to average, and over a
-long one an error of the tilt passes for a change of velocity. Nothing after the fix is used, so
-that a live filter begins as a replay does.
+A weighted line goes through the positions of a window that ends with a fix. Of windows from 0.25
+to 32 s the one counts that leaves the least uncertainty: a short one has little to average, and
+over a long one an error of the tilt passes for a change of velocity. Nothing after the fix is used,
+so that a live filter begins as a replay does.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from robins.systems.ins_gnss.parameters import Gnss, Start
 from robins.systems.ins_gnss.recording import Log
 from robins.systems.ins_gnss.rest import WAYS_S, ways
 
+WINDOWS_S = (0.25, 0.5, *WAYS_S)
 MOST = 9  # positions of a window, evenly spaced: of a fast receiver the next ones are alike
 LEAST = 3  # two leave nothing by which to see that one is wrong
 SURE = 5.0  # sigmas of a speed that gives a course: by chance once in 3e5 fixes at rest
@@ -83,7 +84,7 @@ def best_lines(
         where no window has enough positions.
     """
     found = np.full((len(ends), 3), np.nan), np.full(len(ends), np.inf), np.zeros(len(ends))
-    for window_s in WAYS_S:
+    for window_s in WINDOWS_S:
         time_s, place, sigma = _gathered(log, ends, window_s)
         _, v, spread = _lines(time_s, place, sigma)
         size = np.sqrt(np.max(spread[:, :2, 0, 0], axis=1))
