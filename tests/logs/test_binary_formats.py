@@ -145,7 +145,7 @@ def test_parts_of_a_folder_follow_their_list_or_numbers(tmp_path):
     with pytest.raises(LogError, match=r"lacks drive_0.db3, which its metadata.yaml names; copy"):
         open_log(one)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(LogError, match="a folder with nothing; give files, or a folder of ROS"):
+    with pytest.raises(LogError, match="a folder with nothing; give files, or the"):
         open_log(tmp_path / "empty")
 
 

@@ -70,7 +70,7 @@ def test_of_a_log_that_begins_in_motion_it_navigates(robins, tmp_path):
     assert out.startswith(("Consistent: robust", "With care: robust"))
     found = re.search(r"heading ([0-9.]+) deg from the course of positions", out)
     assert float(found[1]) == pytest.approx(36.87, abs=5.0)
-    assert "the usual one of their kind is assumed" in out
+    assert "that of the kind is assumed" in out
     assert "[gnss] sigma" in told
 
 

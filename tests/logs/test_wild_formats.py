@@ -371,7 +371,8 @@ def test_gnss_ins_sim(tmp_path):
 def test_a_folder_that_is_no_recording_says_what_it_holds(tmp_path):
     (tmp_path / "photo.jpg").write_text("")
     with pytest.raises(
-        LogError, match=r"is a folder with photo.jpg; give files, or a folder of ROS or with imu0/"
+        LogError,
+        match=r"is a folder with photo.jpg; give files, or the folder of a",
     ):
         open_log(tmp_path)
 

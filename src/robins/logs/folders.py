@@ -70,8 +70,7 @@ def read_folder(path: str | os.PathLike[str], findings: Findings = None) -> Tabl
         why = error.strerror or str(error)
         raise LogError(str(path), f"cannot be read: {why}", "check its permissions") from error
     held = ", ".join(names[:5]) or "nothing"
-    marks = ", ".join(_FOLDERS)
-    mend = f"give files, or a folder of ROS or with {marks}"
+    mend = "give files, or the folder of a recording (ROS, EuRoC, KITTI, phones)"
     raise LogError(str(path), f"is a folder with {held}", mend)
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from robins.bench.rig import Aboard, RigError
 from robins.bench.rigs.ins_gnss import SUSPECTS
 from robins.bench.rigs.ins_gnss.navigating import Kit
+from robins.dataset import Dataset
 from robins.ins.blocks import reach_of_rate, usual_width
 from robins.ins.increments import Increments
 from robins.systems.ins_gnss import model
@@ -56,18 +57,10 @@ def aboard(flight: Any) -> Aboard:
     given, dataset = kit.given, kit.dataset
     if dataset is None or dataset.gnss is None:
         raise RigError("the filter is tried on a drive or a log, and there is none", "--board")
-    if given.start.known_heading is not None:
-        what = "start.known_heading is given, and the loop in C takes the heading from the course"
-        raise RigError(what, "--board", "leave it out")
-    if dataset.gnss.v_n is None:
-        what = "the loop in C begins by velocities, and the receiver of this log states none"
-        raise RigError(what, "--board", "take a log with velocities")
-    if given.gnss.sigma is not None or given.gnss.velocity_sigma is not None:
-        what = "gnss.sigma or gnss.velocity_sigma is set, and the loop in C has those of the fixes"
-        raise RigError(what, "--board", "leave them out")
-    if given.aids.non_holonomic:
-        what = "aids.non_holonomic is set, and the loop in C knows no road"
-        raise RigError(what, "--board", "--set aids.non_holonomic=false, here and on the bench")
+    _refuse_what_c_lacks(given, dataset)
+    # as a live filter, which has not seen the log
+    gnss = given.gnss.model_copy(update={"lasting_share": 0.0})
+    given = given.model_copy(update={"gnss": gnss})
     try:
         pieces, contender = recorded(dataset, given)
     except ValueError as error:
@@ -94,6 +87,45 @@ def aboard(flight: Any) -> Aboard:
     here = resources.files("robins.bench.rigs.ins_gnss")
     files = {name: (here / name).read_text("utf-8") for name in _FILES}
     return Aboard(problem, "filter", {**files, "navigation_given.h": told})
+
+
+def _refuse_what_c_lacks(given: Replay, dataset: Dataset) -> None:
+    """Refuse parameters and logs that the loop in C cannot follow.
+
+    Raises:
+        RigError: there is such a one.
+    """
+    g = given.gnss
+    lacks = (
+        (
+            given.start.known_heading is not None,
+            "start.known_heading is given, and the loop in C takes the heading from the course",
+            "leave it out",
+        ),
+        (
+            dataset.gnss is not None and dataset.gnss.v_n is None,
+            "the loop in C begins by velocities, and the receiver of this log states none",
+            "take a log with velocities",
+        ),
+        (
+            g.sigma is not None or g.velocity_sigma is not None,
+            "gnss.sigma or gnss.velocity_sigma is set, and the loop in C has those of the fixes",
+            "leave them out",
+        ),
+        (
+            bool(g.lasting_share),
+            "gnss.lasting_share is set, and the start in C has no errors that last",
+            "leave it out",
+        ),
+        (
+            given.aids.non_holonomic,
+            "aids.non_holonomic is set, and the loop in C knows no road",
+            "--set aids.non_holonomic=false, here and on the bench",
+        ),
+    )
+    for there, what, mend in lacks:
+        if there:
+            raise RigError(what, "--board", mend)
 
 
 _FILES = tuple(f"navigation_{name}" for name in ("blocks.h", "board.c", "rest.h", "start.h"))
@@ -145,6 +177,7 @@ def _given_h(
         "LEAST_SIGMA": g.least_sigma,
         "LEAST_VELOCITY_SIGMA": g.least_velocity_sigma,
         "TILT": given.start.tilt,
+        "START_POSITION": given.start.position,
         "COURSE_SPEED": given.start.course_speed,
         "MOVING_SPEED": aids.moving_speed,
         "QUIET_RATE": aids.quiet_rate,

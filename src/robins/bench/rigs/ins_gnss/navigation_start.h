@@ -95,6 +95,7 @@ static inline const row *find_start(filter_state *x) {
   for (int i = 0; i < 3; i++) {
     double v = VELOCITIES && isfinite(fixes[begins].v_n[i]) ? fixes[begins].v_n[i] : 0.0;
     belief.MEAN(v_n)[i] = v;
+    belief.factor[6 + i][6 + i] = hypot(START_POSITION, fixes[begins].sigma_m[i]);
     arm[i] = v * LATENCY_S - arm[i];
   }
   const double *p = fixes[begins].place, E2 = 0.0066943799901413165, A = 6378137.0;
