@@ -194,12 +194,11 @@ def _given_h(
         "REST": int(model.STANDSTILL in world.y),
         **macros,
     }
-    axes = axes_of(given.imu.orientation).tolist()
-    rows = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in axes)
+    axes = (", ".join(map(repr, row)) for row in axes_of(given.imu.orientation).tolist())
+    rows = ", ".join(f"{{{row}}}" for row in axes)
     lines = [
         "/* What the part was told when it was exported: s, m, m/s; sizes of what it keeps. */",
-        "#ifndef NAVIGATION_GIVEN_H",
-        "#define NAVIGATION_GIVEN_H",
+        "#ifndef NAVIGATION_GIVEN_H\n#define NAVIGATION_GIVEN_H",
         *(f"#define {name} {value}" for name, value in defined.items()),
         "/* from the axes of the unit to forward-right-down */",
         f"static const double C_BS[3][3] = {{{rows}}};",
@@ -208,9 +207,6 @@ def _given_h(
         "  switch (quality) {",
         *(f"    case {int(k)}: return {v!r};" for k, v in sorted(g.sigma_factor.items())),
         "    default: return 1.0;",
-        "  }",
-        "}",
-        "#endif",
-        "",
+        "  }\n}\n#endif\n",
     ]
     return "\n".join(lines)
