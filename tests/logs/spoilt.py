@@ -164,7 +164,7 @@ MOTION = {
             with_gnss(time_ns=shift(slice(220, None), 18 * S)),
             "error: only if -18.0 ... between UTC and GPS",
             near(-18.0, abs=0.1),
-            "time_jump",
+            "gap_long",
         )
     ],
     "lever_arm": [(with_gnss(**antenna(2.0)), "note: x +2.0", near(2.0, abs=0.3))],

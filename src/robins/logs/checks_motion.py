@@ -86,7 +86,8 @@ def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
         )
         return
     found = estimates(verdict)
-    if verdict.rival or (verdict.free and not explained(verdict)) or left > _GOOD:
+    both = "forces" in verdict.free and bool({"gyros", "scale"} & {*verdict.free})
+    if verdict.rival or both or (verdict.free and not explained(verdict)) or left > _GOOD:
         yield from _unclear(imu, gnss, verdict, left, found)
         return
     before = verdict.nothing.left(verdict.views)
@@ -199,7 +200,14 @@ def _unclear(
         "gyros": "another gyro unit, exchanged or reversed axes",
         "forces": "other accelerometers",
     }
-    if not verdict.rival:
+    if not verdict.rival and explained(verdict):
+        yield warning(imu, "motion_disagrees", left)(
+            f"the IMU does not explain the velocities of {name_of(gnss)} as it is "
+            f"({_all(verdict.nothing.left(verdict.views))} of their change is left); only other "
+            "gyros together with other accelerometers do. Compare units and axes of both triads "
+            "with the data sheet."
+        )
+    elif not verdict.rival:
         yield warning(imu, "motion_disagrees", left)(
             f"the IMU does not explain the velocities of {name_of(gnss)} ({_all(left)} of their "
             "change is left), and neither another gyro unit, exchanged or reversed axes, nor a "
@@ -261,7 +269,7 @@ def _gyros(
                 f"turns {share}. Multiply it by {v:.4g}, or check its scale factor."
             )
             for axis, (v, s) in zip("xyz", each, strict=True)
-            if abs(v - 1.0) > max(_OFF, _SIGMAS * s)
+            if abs(v - 1.0) > max(_OFF, _SIGMAS * s) and s < _SURE * v
         ]
     angle, sigma = found["gyros turned"]
     if not out and angle > max(_TURNED_DEG, _SIGMAS * sigma):
@@ -305,7 +313,7 @@ def _forces(imu: ImuTable, found: dict, share: str) -> list[Finding]:
             f"specific force of the course and gravity {share}. Check its scale factor."
         )
         for axis, (v, s) in ((axis, found[f"accel {axis}"]) for axis in "xyz")
-        if abs(v - 1.0) > max(_OFF, _SIGMAS * s)
+        if abs(v - 1.0) > max(_OFF, _SIGMAS * s) and s < _SURE * v
     ]
 
 
