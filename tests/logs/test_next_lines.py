@@ -65,9 +65,9 @@ def test_of_a_log_that_begins_in_motion_it_navigates(robins, tmp_path):
     assert status == 0
     command, *words = shlex.split(line.removeprefix("Next:"))
     assert command == "robins"
-    status, out, told = robins(*words)
+    status, out, told = robins(*words, "--filters", "ekf")
     assert status == 0
-    assert out.startswith(("Consistent: robust", "With care: robust"))
+    assert out.startswith(("Consistent: ekf", "With care: ekf"))
     found = re.search(r"heading ([0-9.]+) deg from the course of positions", out)
     assert float(found[1]) == pytest.approx(36.87, abs=5.0)
     assert "that of the kind is assumed" in out

@@ -164,7 +164,9 @@ def _starts(views: Views, block: str, best: Fit, free: tuple[str, ...]) -> list[
     state = _known(views, best.state, free)
     out, power = [state], power_of(views)
     share, noise = best.by_stretch(views) / power, views.noise**2 / power
-    usual = max(_SUSPICIOUS[0], _NOISY * views.noise**2 / float(np.mean(power)))
+    usual = _NOISY * views.noise**2 / float(np.mean(power))
+    if block != "clock":  # a step of a second explains less than that
+        usual = max(_SUSPICIOUS[0], usual)
     if best.left(views) < usual and np.all(share < np.maximum(_SUSPICIOUS[1], 4.0 * noise)):
         return out
     if block == "clock" and not {"gyros", "scale"} & {*free}:
