@@ -34,7 +34,7 @@ _TRIMMED = 0.95  # share of the residuals that judges a fit, the smallest
 _ROBUST = 3.0  # typical residuals, beyond which one counts less
 
 
-class State(NamedTuple):
+class PairState(NamedTuple):
     """Estimated or assumed parameters."""
 
     M_g: np.ndarray  # (3, 3) angular rates are multiplied by it
@@ -54,7 +54,7 @@ class State(NamedTuple):
 class Fit(NamedTuple):
     """A model fitted."""
 
-    state: State
+    state: PairState
     sigma: np.ndarray  # (parameters,) one sigma, relative ones of the matrices
     R: np.ndarray  # (stretches, 3, 3) from the first axes of each to those of its velocities
     squares: np.ndarray  # (k,) squares left of each change of velocity; NaN where no IMU was
@@ -82,15 +82,15 @@ def trimmed(squares: np.ndarray) -> float:
     return float(np.mean(np.sort(squares)[: max(1, round(_TRIMMED * len(squares)))]))
 
 
-def start_of(views: Views, M_g: np.ndarray | None = None, mirror: float = 1.0) -> State:
-    """State in which tables are what they claim to be, or the gyros need a map."""
+def start_of(views: Views, M_g: np.ndarray | None = None, mirror: float = 1.0) -> PairState:
+    """PairState in which tables are what they claim to be, or the gyros need a map."""
     zero, eye = np.zeros(3), np.eye(3)
     part = np.zeros(len(views.start_s), int)
     M_g = eye if M_g is None else M_g
-    return State(M_g, zero, mirror * eye, zero, zero, 0.0, np.zeros(1), part)
+    return PairState(M_g, zero, mirror * eye, zero, zero, 0.0, np.zeros(1), part)
 
 
-def _sums(views: Views, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _sums(views: Views, state: PairState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gained velocity and its derivatives.
 
     Returns:
@@ -185,7 +185,7 @@ def _recorded(views: Views, first: np.ndarray, last: np.ndarray) -> np.ndarray:
     return inside & ~np.any((begin < last[:, None]) & (end > first[:, None]), axis=1)
 
 
-def fit(views: Views, start: State, prior: np.ndarray, rounds: int = 8) -> Fit:
+def fit(views: Views, start: PairState, prior: np.ndarray, rounds: int = 8) -> Fit:
     """Fit all parameters by Gauss and Newton.
 
     Args:
@@ -213,7 +213,7 @@ def fit(views: Views, start: State, prior: np.ndarray, rounds: int = 8) -> Fit:
     return best
 
 
-def _moved(state: State, step: np.ndarray) -> State:
+def _moved(state: PairState, step: np.ndarray) -> PairState:
     E_a = np.zeros((3, 3))
     E_a[_UPPER] = step[FORCE]
     return state._replace(
@@ -227,7 +227,7 @@ def _moved(state: State, step: np.ndarray) -> State:
     )
 
 
-def _moved_by(state: State, start: State) -> np.ndarray:
+def _moved_by(state: PairState, start: PairState) -> np.ndarray:
     """Parameters by which a state differs from a start."""
     E_g = state.M_g @ np.linalg.inv(start.M_g) - np.eye(3)
     E_a = state.M_a @ np.linalg.inv(start.M_a) - np.eye(3)
@@ -240,7 +240,9 @@ def _moved_by(state: State, start: State) -> np.ndarray:
     )
 
 
-def _step(views: Views, state: State, start: State, prior: np.ndarray) -> tuple[Fit, np.ndarray]:
+def _step(
+    views: Views, state: PairState, start: PairState, prior: np.ndarray
+) -> tuple[Fit, np.ndarray]:
     """Judgement of a state, and the step from it."""
     u, C, recorded = _sums(views, state)
     count, stretches = u.shape[2] - 1, len(views.start_s)

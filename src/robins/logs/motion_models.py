@@ -24,7 +24,7 @@ from robins.logs.motion import (
     squares_by_map,
     views_of,
 )
-from robins.logs.motion_fit import Fit, State, fit, prior_of, start_of
+from robins.logs.motion_fit import Fit, PairState, fit, prior_of, start_of
 from robins.logs.quiet import Signal, usual_force, windows_of
 
 SCALES = np.exp(np.arange(np.log(1e-6), np.log(1e3), 0.2))  # of gyros, where a fit may start
@@ -159,7 +159,7 @@ def _gain(views: Views, before: Fit, after: Fit) -> float:
     return 0.5 * (float(np.bincount(views.of) @ (one - other)) / np.sqrt(views.stride) + strain)
 
 
-def _starts(views: Views, block: str, best: Fit, free: tuple[str, ...]) -> list[State]:
+def _starts(views: Views, block: str, best: Fit, free: tuple[str, ...]) -> list[PairState]:
     """States from which a model with one more free block is fitted."""
     state = _known(views, best.state, free)
     out, power = [state], power_of(views)
@@ -178,7 +178,7 @@ def _starts(views: Views, block: str, best: Fit, free: tuple[str, ...]) -> list[
     return out
 
 
-def _known(views: Views, state: State, free: tuple[str, ...]) -> State:
+def _known(views: Views, state: PairState, free: tuple[str, ...]) -> PairState:
     """What the free blocks have shown; nuisances start again from what tables claim."""
     out = start_of(views, mirror=float(np.sign(np.linalg.det(state.M_a))))
     if "clock" in free:
@@ -188,7 +188,7 @@ def _known(views: Views, state: State, free: tuple[str, ...]) -> State:
     return out._replace(M_a=state.M_a) if "forces" in free else out
 
 
-def _clocks(views: Views) -> list[State]:
+def _clocks(views: Views) -> list[PairState]:
     """Offset and rate, and offsets of parts, that explain most."""
     last = (len(views.turn) - 1) / RATE_HZ
     far = min(max(last, float(views.end_s[-1])), _FAR_S)
@@ -207,7 +207,7 @@ def _clocks(views: Views) -> list[State]:
     return [_line(views, start, lags, cost), *(_steps(start, lags, cost, s) for s in _SWITCH)]
 
 
-def _line(views: Views, start: State, lags: np.ndarray, cost: np.ndarray) -> State:
+def _line(views: Views, start: PairState, lags: np.ndarray, cost: np.ndarray) -> PairState:
     """The best offset and rate."""
     near = np.abs(lags) <= _NEAR_S
     lags, cost = lags[near], cost[:, near]
@@ -230,7 +230,7 @@ def _line(views: Views, start: State, lags: np.ndarray, cost: np.ndarray) -> Sta
     return start._replace(offset=np.array([best[1]]), rate=best[2])
 
 
-def _steps(start: State, lags: np.ndarray, cost: np.ndarray, switch: float) -> State:
+def _steps(start: PairState, lags: np.ndarray, cost: np.ndarray, switch: float) -> PairState:
     """Offsets of parts: the path of least cost, which pays for each step (Viterbi 1967)."""
     total, before = cost[0], []
     for row in cost[1:]:
@@ -247,7 +247,7 @@ def _steps(start: State, lags: np.ndarray, cost: np.ndarray, switch: float) -> S
     return start._replace(offset=offset, part=part)
 
 
-def _maps(views: Views, state: State, axes: np.ndarray) -> list[State]:
+def _maps(views: Views, state: PairState, axes: np.ndarray) -> list[PairState]:
     """Maps of the gyros that explain most: one of some orders and signs of axes, and a factor."""
     shift = state.shift(np.arange(len(views.start_s)), views.start_s, views.middle_s)
     scale, out = 1.0, []
