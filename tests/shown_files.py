@@ -23,12 +23,13 @@ from robins.workbench import campaign_work, plan_campaign, publish
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def write_nine_axes(path, seconds=40.0, hz=50.0):
-    """A unit that is turned about all its axes, in CSV of x-io."""
+def write_nine_axes(path, seconds=40.0, hz=50.0, level=False):
+    """A unit that is turned about all its axes, or level about its vertical one, in CSV of x-io."""
     rng = np.random.default_rng(3)
     t = np.arange(round(seconds * hz)) / hz
     s = np.maximum(t - 5.0, 0.0)
-    roll, pitch, yaw = 1.3 * s, 1.2 * np.sin(0.6 * s), 0.9 * s
+    tilts = not level
+    roll, pitch, yaw = 1.3 * tilts * s, 1.2 * tilts * np.sin(0.6 * s), 0.9 * s
     rate = np.gradient(np.stack([roll, pitch, yaw]), 1.0 / hz, axis=1)
     sr, cr, sp, cp, sy, cy = (f(a) for a in (roll, pitch, yaw) for f in (np.sin, np.cos))
     gyro = [
@@ -70,6 +71,7 @@ def write_files(here):
     unit = car[car.index("[imu]") : car.index("[gnss]")]
     (here / "unit.toml").write_text(f'system = "ins-gnss"\n{unit}[gnss]\n{lever_arm}\n')
     write_nine_axes(here / "turned.csv")
+    write_nine_axes(here / "circle.csv", level=True)
     for name in ("nine_axes.csv", "flight.csv"):
         (here / name).write_bytes((here / "turned.csv").read_bytes())
     page = (ROOT / "docs" / "logs.md").read_text("utf-8").split("### A format of your own")[1]

@@ -480,7 +480,7 @@ class Session:
                 death, by_itself = again.death, True
                 continue
             told = "all" if since < 0 else f"all since step {since}"
-            return self.event("restarted", f"'{part}' was restarted and sent {told} again")
+            return self.event("restarted", f"'{part}' was restarted and told {told} again")
 
     def _still_lives(self, part: str) -> None:
         """Check that a restarted part has not died at once; others wait for their turn.
