@@ -100,6 +100,8 @@ def test_what_numbers_do_not_tell_is_marked(tmp_path):
         ("gx [deg/h]", 'gyro_x = { name = "gx [deg/h]", unit = "deg/h" }'),
         ("gx [LSB]", '# gyro_x = { name = "gx [LSB]", unit = "" }   # UNIT NOT KNOWN: the '),
         ("alt_baro [m]", "#   alt_baro [m]: its heading states baro"),
+        ("Altitude (MSL)", "#   Altitude (MSL): its heading states msl"),
+        ("t (UTC)", 'time = { name = "t (UTC)", unit = "s" }'),
         ("relative altitude (m)", "#   relative altitude (m): its heading states relative"),
     ],
 )  # fmt: skip

@@ -74,6 +74,7 @@ _NOT_RAW = {"user", "free", "gravity", "bias", "ref", "std", "sigma", "cov", "co
 _NOT_RAW |= {"filtered", "accuracy", "error", "dop", "msl"}
 _NO_HEIGHT = {"baro", "barometer", "barometric", "pressure", "rel", "relative", "agl", "amsl"}
 _NO_HEIGHT |= {"ground", "terrain", "takeoff", "home", "geoid", "orthometric"}
+_NO_UNIT = {"", "utc", "gps", "gpst", "unix", "epoch", "iso8601", "wgs84", "wgs-84", "hae", "raw"}
 _SINGLE = {
     "time": "time timestamp t ts stamp times datetime seconds elapsed timeus timems unixtime epoch",
     "lat": "lat latitude",
@@ -204,7 +205,8 @@ def _named(name: str) -> tuple[str, str, str]:
         stated = re.sub(r"[\s*·]", "", bracketed[2].lower())
         if not re.fullmatch(r":,\d+", stated):
             base, unit = bracketed[1], _UNIT_OF.get(stated, "") or _symbol(bracketed[2])
-            doubt = f"UNIT NOT KNOWN: the heading states [{bracketed[2]}]" if stated else ""
+            if stated not in _NO_UNIT:
+                doubt = f"UNIT NOT KNOWN: the heading states [{bracketed[2]}]"
     else:
         cuts = (m.start() for m in re.finditer("_", name))
         ends = [(name[:at], _UNIT_OF.get(name[at + 1 :].lower(), "")) for at in cuts]
@@ -217,7 +219,8 @@ def _named(name: str) -> tuple[str, str, str]:
         joined = "".join(w for w in words if w not in ("gps", "gnss"))
     for word in (joined, *words):
         if quantity := _QUANTITY_OF.get(word):
-            if barred := set(words) & (_NOT_RAW | (_NO_HEIGHT if quantity == "height" else set())):
+            refused = _NOT_RAW | (_NO_HEIGHT if quantity == "height" else set())
+            if barred := {*words, *re.findall("[a-z]+", name[len(base) :].lower())} & refused:
                 return "", "", f"its heading states {', '.join(sorted(barred))}"
             return quantity, *_of_kind(quantity, unit, doubt)
     axis = joined[-1:]
