@@ -1,5 +1,6 @@
 """Columns guessed from headings: what is proved is right, what is not is marked or left out."""
 
+import re
 import tomllib
 
 import numpy as np
@@ -85,6 +86,46 @@ def test_what_numbers_do_not_tell_is_marked(tmp_path):
     (tmp_path / "d.csv").write_text("1,2,3\n4,5,6\n")
     with pytest.raises(InputError, match="no line of names stands above rows of numbers"):
         guess(tmp_path / "d.csv")
+    (tmp_path / "e.db3").write_bytes(b"SQLite format 3\0" + bytes(300))
+    with pytest.raises(InputError, match=r"format is known: ROS 2.*no columns are needed"):
+        guess(tmp_path / "e.db3")
+
+
+@pytest.mark.parametrize(
+    ("heading", "line"),
+    [
+        ("alt [ft]", 'height = { name = "alt [ft]", unit = "ft" }   # unit by its heading'),
+        ("alt (Fuss)", '# height = { name = "alt (Fuss)", unit = "" }   # UNIT NOT KNOWN'),
+        ("ve [km/h]", 'v_east = { name = "ve [km/h]", unit = "km/h" }'),
+        ("gx [deg/h]", 'gyro_x = { name = "gx [deg/h]", unit = "deg/h" }'),
+        ("gx [LSB]", '# gyro_x = { name = "gx [LSB]", unit = "" }   # UNIT NOT KNOWN: the '),
+        ("alt_baro [m]", "#   alt_baro [m]: its heading states baro"),
+        ("Altitude (MSL)", "#   Altitude (MSL): its heading states msl"),
+        ("t (UTC)", 'time = { name = "t (UTC)", unit = "s" }'),
+        ("relative altitude (m)", "#   relative altitude (m): its heading states relative"),
+    ],
+)  # fmt: skip
+def test_a_unit_or_a_word_in_a_heading_is_obeyed(tmp_path, heading, line):
+    names = ["t", "alt", "lat", "lon", "vn", "ve", "vd", "ax", "ay", "az", "gx", "gy", "gz"]
+    plain = re.sub(r" [\[(].*", "", heading)
+    names = [heading if name == plain else name for name in names]
+    names += [heading] if heading not in names else []
+    down = [0.0] * (names.index("az") - 1) + [9.8] + [0.0] * (len(names) - names.index("az") - 1)
+    rows = np.tile(down, (30, 1))
+    sheet(tmp_path / "a.csv", names, [np.arange(30) / HZ, rows])
+    text = guess(tmp_path / "a.csv")
+    assert any(found.startswith(line) for found in text.splitlines()), text
+
+
+@pytest.mark.parametrize("rate", [0.1, 1.0, 2.0, 4.0, 20.0])
+@pytest.mark.parametrize(("unit", "leap"), [("s", 18), ("ms", 18_000), ("us", 18_000_000)])
+def test_fixes_alone_are_slow_and_the_offset_is_in_the_unit_of_the_column(
+    tmp_path, rate, unit, leap
+):
+    for start, why in ((0.0, "GUESSED: "), (1.7e9, f"counts from 1970; offset = {leap} would")):
+        t = (start + np.arange(30) / rate) / to_si(1.0, unit)
+        sheet(tmp_path / "a.csv", ["t", "lat", "lon", "alt"], [t, np.ones((30, 3))])
+        assert f'"t", unit = "{unit}" }}   # {why}' in guess(tmp_path / "a.csv")
 
 
 def test_an_archive_and_fixes_are_declared_too(tmp_path):
@@ -94,6 +135,11 @@ def test_an_archive_and_fixes_are_declared_too(tmp_path):
     (tmp_path / "own.toml").write_text(text)
     imu = open_log(tmp_path / "a.npz", columns_from(tmp_path / "own.toml"))
     np.testing.assert_allclose(imu.gyro, gyro, rtol=1e-12)
+    fixes = {f"gnss/{name}": np.ones(3000) for name in ("spectrum", "noise")}  # of another length
+    np.savez(tmp_path / "b.npz", t=t, gyr=gyro, acc=accel, **fixes)
+    text = guess(tmp_path / "b.npz")
+    assert "accel_x = " in text
+    assert "#   gnss/noise: has 3000 rows, not 2000" in text
     names = [
         "UTC time",
         "Latitude",

@@ -21,12 +21,14 @@ import numpy as np
 
 from robins import logs
 from robins.dataset import ImuTable
-from robins.logs.archives import head_of
+from robins.logs.archives import head_of, kind_of_archive
 from robins.logs.declared import format_of
-from robins.logs.quantities import GROUPS, QUANTITIES, parts
+from robins.logs.opening import beginning
+from robins.logs.quantities import CLOCKS, GROUPS, QUANTITIES, parts
 from robins.logs.tables import Table, tables_of
 from robins.logs.text import Head
-from robins.units import KINDS, to_si
+from robins.units import KINDS, UnitError, to_si
+from robins.units import unit as unit_of
 from robins.workbench.errors import InputError
 
 _G = 9.80665
@@ -36,6 +38,7 @@ _SPELLINGS = {
     "mg": "mg",
     "rad/s": "rad/s rads rad/sec rps rad_s rads-1 rads^-1",
     "deg/s": "deg/s dps °/s deg/sec degs deg_s degs^-1 degrees/s deg_per_s",
+    "deg/h": "deg/h °/h deg/hr deg/hour dph deg_h",
     "mrad/s": "mrad/s",
     "mdeg/s": "mdps mdeg/s",
     "uT": "ut µt μt microtesla",
@@ -50,7 +53,15 @@ _SPELLINGS = {
     "deg": "deg ° degrees degree",
     "rad": "rad radians",
     "m": "m metres meters",
+    "cm": "cm",
+    "mm": "mm",
+    "ft": "ft feet",
     "m/s": "m/s mps ms-1 m_s",
+    "cm/s": "cm/s cm_s",
+    "mm/s": "mm/s mm_s",
+    "km/h": "km/h kmh kph km/hr km_h",
+    "kn": "kn kt kts knots",
+    "ft/s": "ft/s fps ft_s",
 }
 _UNIT_OF = {spelling: unit for unit, line in _SPELLINGS.items() for spelling in line.split()}
 _MILLI = {"mdeg/s": ("deg/s", 1e-3)}  # spelt by loggers, unknown to `robins.units`
@@ -61,6 +72,9 @@ _SENSORS = {
 }
 _NOT_RAW = {"user", "free", "gravity", "bias", "ref", "std", "sigma", "cov", "covariance"}
 _NOT_RAW |= {"filtered", "accuracy", "error", "dop", "msl"}
+_NO_HEIGHT = {"baro", "barometer", "barometric", "pressure", "rel", "relative", "agl", "amsl"}
+_NO_HEIGHT |= {"ground", "terrain", "takeoff", "home", "geoid", "orthometric"}
+_NO_UNIT = {"", "utc", "gps", "gpst", "unix", "epoch", "iso8601", "wgs84", "wgs-84", "hae", "raw"}
 _SINGLE = {
     "time": "time timestamp t ts stamp times datetime seconds elapsed timeus timems unixtime epoch",
     "lat": "lat latitude",
@@ -87,17 +101,25 @@ def guess(path: str | os.PathLike[str]) -> str:
         path: text with headings, or an archive of arrays.
 
     Raises:
-        InputError: there are no headings, or none that is known.
+        InputError: there are no headings, or none that is known; it is a recording, not a table.
         robins.logs.LogError: the file cannot be read.
     """
+    start = Head(os.fspath(path), [], beginning(path))
+    for row in logs.FORMATS if not kind_of_archive(start.start) else ():
+        if row.binary and row.recognise(start):
+            mend = "give it to the commands as it is; no columns are needed."
+            raise InputError(f"is a recording whose format is known: {row.about}", start.file, mend)
     head = head_of(path)
     names, separator, decimal, cells = _sheet(head)
     found, aside = _known(names)
     used = _whole(set(found))
     aside |= {found[q][0]: "its table is not whole" for q in set(found) - used - {"time"}}
     columns = {q: found[q] for q in QUANTITIES if q in used | {"time"} and q in found}
+    sizes = dict(zip(head.names, map(len, head.arrays), strict=True))
+    others = [name for name in sizes if name not in names]
+    aside |= {name: f"has {sizes[name]} rows, not {sizes[names[0]]}" for name in others}
     if not used:
-        held = ", ".join(names[:30])
+        held = ", ".join([*names, *others][:30])
         mend = 'write the columns yourself, as "A format of your own" of docs/logs.md shows.'
         raise InputError(f"no headings of a whole table; there are {held}", os.fspath(path), mend)
     texts = {q: [row[names.index(name)] for row in cells] for q, (name, _, _) in columns.items()}
@@ -108,7 +130,8 @@ def guess(path: str | os.PathLike[str]) -> str:
         settings, notes = _settings(separator, decimal, numbers, columns)
         _prove_gyros(path, settings, columns, numbers)
     taken = {name for name, _, _ in columns.values()}
-    unused = [f"  {name}: {aside.get(name, 'not known')}" for name in names if name not in taken]
+    rest = [name for name in [*names, *others] if name not in taken]
+    unused = [f"  {name}: {aside.get(name, 'not known')}" for name in rest]
     notes += ["not used:", *unused] if unused else []
     title = f"# {os.path.basename(path)}, by `robins guess`"
     comments = (f"# {note}" for note in notes)
@@ -134,14 +157,13 @@ def _sheet(head: Head) -> tuple[list[str], str, str, list[list[str]]]:
         InputError: no line of names stands above rows of numbers.
     """
     if head.names:
-        longest = max(map(len, head.arrays))
-        columns = [
-            (name, array[:5000].astype("S40").astype(str))
-            for name, array in zip(head.names, head.arrays, strict=True)
-            if len(array) == longest
-        ]
-        rows = np.stack([column for _, column in columns], axis=-1)
-        return [name for name, _ in columns], "", ".", rows.tolist()
+        by_size: dict[int, dict[str, np.ndarray]] = {}
+        for name, array in zip(head.names, head.arrays, strict=True):
+            by_size.setdefault(len(array), {})[name] = array[:5000]
+        groups = [by_size[size] for size in sorted(by_size, reverse=True)]
+        columns = next((g for g in groups if _whole(set(_known([*g])[0]))), groups[0])
+        cells = [array.astype("S40").astype(str) for array in columns.values()]
+        return [*columns], "", ".", np.stack(cells, axis=-1).tolist()
     best: tuple[list[str], str, str, list[list[str]]] = ([], "", ".", [])
     lines = [text.lstrip("#% ") for text in head.lines if text.strip()]
     for separator in (",", ";", "\t", "|", " "):
@@ -178,11 +200,13 @@ def _known(names: Sequence[str]) -> tuple[Columns, dict[str, str]]:
 
 def _named(name: str) -> tuple[str, str, str]:
     """Quantity and unit that a name states, "" where it states none, and a doubt."""
-    base, unit = name, ""
+    base, unit, doubt = name, "", ""
     if bracketed := re.fullmatch(r"(.*?)\s*[\[(]([^\])]*)[\])]", name):
         stated = re.sub(r"[\s*·]", "", bracketed[2].lower())
         if not re.fullmatch(r":,\d+", stated):
-            base, unit = bracketed[1], _UNIT_OF.get(stated, "")
+            base, unit = bracketed[1], _UNIT_OF.get(stated, "") or _symbol(bracketed[2])
+            if stated not in _NO_UNIT:
+                doubt = f"UNIT NOT KNOWN: the heading states [{bracketed[2]}]"
     else:
         cuts = (m.start() for m in re.finditer("_", name))
         ends = [(name[:at], _UNIT_OF.get(name[at + 1 :].lower(), "")) for at in cuts]
@@ -194,8 +218,11 @@ def _named(name: str) -> tuple[str, str, str]:
     if len(words) > 1 and words[-1] in ("n", "e", "d", "north", "east", "down"):
         joined = "".join(w for w in words if w not in ("gps", "gnss"))
     for word in (joined, *words):
-        if word in _QUANTITY_OF and not set(words) & _NOT_RAW:
-            return _QUANTITY_OF[word], unit, ""
+        if quantity := _QUANTITY_OF.get(word):
+            refused = _NOT_RAW | (_NO_HEIGHT if quantity == "height" else set())
+            if barred := {*words, *re.findall("[a-z]+", name[len(base) :].lower())} & refused:
+                return "", "", f"its heading states {', '.join(sorted(barred))}"
+            return quantity, *_of_kind(quantity, unit, doubt)
     axis = joined[-1:]
     stem = {*words[:-1]} if words and words[-1] == axis else {joined[:-1]}
     if axis not in ("x", "y", "z"):
@@ -208,7 +235,21 @@ def _named(name: str) -> tuple[str, str, str]:
     if sensors[0] == "mag":
         unit = {"g": "G", "mg": "mG"}.get(unit, unit)
     quantity = f"{sensors[0]}_{axis}"
-    return quantity, unit if unit in {*KINDS[QUANTITIES[quantity]], *_MILLI} else "", ""
+    return quantity, *_of_kind(quantity, unit, doubt)
+
+
+def _of_kind(quantity: str, unit: str, doubt: str) -> tuple[str, str]:
+    """A unit that the quantity can have, or "" and the doubt."""
+    known = {"time": CLOCKS, "angle rate": (*KINDS["angle rate"], *_MILLI)}
+    kind = QUANTITIES[quantity]
+    return (unit, "") if unit in known.get(kind, KINDS[kind]) else ("", doubt)
+
+
+def _symbol(text: str) -> str:
+    try:
+        return unit_of(text).symbol
+    except UnitError:
+        return ""
 
 
 # --------------------------------------------------------------------------------------- units
@@ -224,7 +265,10 @@ def _number(text: str, decimal: str) -> float:
 def _fill(columns: Columns, numbers: dict[str, np.ndarray], stamps: Sequence[str]) -> None:
     """State the units that numbers tell."""
     if "time" in columns and not columns["time"][1]:
-        columns["time"] = (columns["time"][0], *_clock(numbers["time"], stamps))
+        name, _, doubt = columns["time"]
+        unit, why = _clock(numbers["time"], stamps, "lat" in columns and "accel_x" not in columns)
+        sure = not doubt or unit.startswith("iso") or "1970" in why
+        columns["time"] = (name, unit, why) if sure else (name, "", doubt)
     sized: list[tuple[str, Callable[[float], Iterator[tuple[str, str]]]]] = [
         ("accel", _gravity),
         ("mag", _field),
@@ -233,25 +277,30 @@ def _fill(columns: Columns, numbers: dict[str, np.ndarray], stamps: Sequence[str
         group = parts(sensor)
         if group[0] not in columns or columns[group[0]][1]:
             continue
+        doubt = columns[group[0]][2]
+        if doubt and sensor == "mag":
+            continue  # counts may have the size of a field by chance
         size = float(np.nanmedian(np.linalg.norm([numbers[q] for q in group], axis=0)))
-        unit, why = next(candidates(size), ("", f"UNIT NOT KNOWN: median size {size:.4g}"))
+        unit, why = next(candidates(size), ("", doubt or f"UNIT NOT KNOWN: median size {size:.4g}"))
         columns |= {q: (columns[q][0], unit, why) for q in group}
-    for quantity, (name, unit, _) in list(columns.items()):
+    for quantity, (name, unit, doubt) in list(columns.items()):
         kind = QUANTITIES[quantity]
-        if not unit and kind in ("angle", "length", "speed"):
+        if not unit and not doubt and kind in ("angle", "length", "speed"):
             guessed = {"angle": "deg", "length": "m", "speed": "m/s"}[kind]
             columns[quantity] = (name, guessed, "GUESSED: no heading states the unit")
 
 
-def _clock(values: np.ndarray, stamps: Sequence[str]) -> tuple[str, str]:
+def _clock(values: np.ndarray, stamps: Sequence[str], fixes: bool) -> tuple[str, str]:
+    """Unit of stamps and why; fixes alone are slower than an IMU."""
     if stamps and (date := _ISO.fullmatch(stamps[0].strip())):
         return ("iso", "dates") if date[1] else ("iso UTC", "GUESSED: dates without offset, in UTC")
     typical, step = float(np.nanmedian(values)), np.diff(values)
     for unit, size in _EPOCHS.items():
         if 0.2 * size < typical < 4.0 * size:
-            return unit, "counts from 1970; offset = 18 s would turn UTC into GPS time of today"
+            leap = round(18.0 / to_si(1.0, unit))
+            return unit, f"counts from 1970; offset = {leap} would turn UTC into GPS time of today"
     step_s = float(np.nanmedian(step[step > 0.0])) if (step > 0.0).any() else np.nan
-    for low, high in ((20.0, 4000.0), (0.5, 20e3)):
+    for low, high in (*([(0.1, 20.0)] if fixes else []), (20.0, 4000.0), (0.5, 20e3)):
         for unit in ("s", "ms", "us", "ns"):
             rate = 1.0 / to_si(step_s, unit) if step_s > 0.0 else 0.0
             if low <= rate <= high:
@@ -289,7 +338,9 @@ def _prove_gyros(
 
     fastest = float(np.nanmax(np.abs([numbers[q] for q in parts("gyro")])))
     unit, why = "rad/s", f"GUESSED: it may be deg/s; largest number {fastest:.4g}"
-    if fastest > _FASTEST:
+    if doubt := columns["gyro_x"][2]:
+        unit, why = "", doubt
+    elif fastest > _FASTEST:
         unit, why = "deg/s", f"GUESSED: {fastest:.4g} rad/s is beyond the range of gyros"
     text = "\n".join([*settings, *_lines(tried("rad/s", ""))])
     try:
@@ -310,7 +361,7 @@ def _prove_gyros(
             )
         elif trust:
             unit, why = "", f"UNIT NOT KNOWN: by gravity one is {scale:.4g} rad/s"
-        elif len(sound) == 1:
+        elif len(sound) == 1 and not doubt:
             unit, why = sound[0], "proved by the doctor: in the other unit it would be wrong"
     columns |= tried(unit, why)
 
