@@ -77,7 +77,8 @@ _FOREIGN: tuple[tuple[int, bytes, str, str], ...] = (  # place, bytes there, kin
 
 def foreign(start: bytes) -> tuple[str, str] | None:
     """Kind of a file that is no text, by its first bytes, and the way in."""
-    return next((tuple(way) for at, magic, *way in _FOREIGN if start.startswith(magic, at)), None)
+    found = ((what, fix) for at, magic, what, fix in _FOREIGN if start.startswith(magic, at))
+    return next(found, None)
 
 
 class _Gunzip:
