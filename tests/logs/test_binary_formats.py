@@ -341,6 +341,8 @@ def test_a_log_of_ardupilot(tmp_path):
     data, found = read(tmp_path, made.dataflash(geoid=False))
     np.testing.assert_allclose(data.gnss.alt_m, MADE.place[:, 2] - MADE.geoid_m, atol=6e-3)
     assert "height_above_geoid" in found
+    data, _ = read(tmp_path, made.dataflash(receiver=1))
+    assert_fixes(data.gnss, quality=1, atol=5.1e-8)
 
 
 def test_pymavlink_reads_the_same_log(tmp_path):
