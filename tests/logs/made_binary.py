@@ -241,8 +241,13 @@ SIZES = {"Q": "Q", "B": "B", "f": "f", "I": "I", "h": "h", "H": "H", "c": "h", "
 SIZES |= {"L": "i", "e": "i", "E": "I"}
 
 
-def dataflash(boot_us=50_000_000, geoid=True, late_us=(120_000, 130_000, 150_000, 125_000)):
-    """A log on board; the second instance of each sensor is to be left alone."""
+def dataflash(
+    boot_us=50_000_000, geoid=True, late_us=(120_000, 130_000, 150_000, 125_000), receiver=0
+):
+    """A log on board; the second instance of each sensor is to be left alone.
+
+    Receivers before the given one never have a fix.
+    """
     out = [
         b"\xa3\x95\x80" + FMT.pack(0x80, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
     ]
@@ -277,9 +282,10 @@ def dataflash(boot_us=50_000_000, geoid=True, late_us=(120_000, 130_000, 150_000
             place = (round(lat * 1e7), round(lon * 1e7), round((height - MADE.geoid_m) * 100))
             moved = (np.hypot(north, east), course, down, 0.0)
             when = (TOW_MS + int(MADE.fix_ns[fix] // 10**6), WEEK)
-            log("GPS", arrived, 0, 6, *when, 20, 80, *place, *moved, 1)
-            spread = (100, 50, 150, 25)
-            log("GPA", arrived, 0, *spread, 0.0, 1, arrived // 1000, 5, -MADE.geoid_m, 0, 0)
+            for n in range(receiver + 1):
+                status, spread = (6, (100, 50, 150, 25)) if n == receiver else (1, (9999,) * 4)
+                log("GPS", arrived, n, status, *when, 20, 80, *place, *moved, 1)
+                log("GPA", arrived, n, *spread, 0.0, 1, arrived // 1000, 5, -MADE.geoid_m, 0, 0)
     return b"".join(out)
 
 

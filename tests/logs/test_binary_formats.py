@@ -5,6 +5,7 @@ import shutil
 import sqlite3
 import struct
 import sys
+from itertools import islice
 
 import made_binary as made
 import numpy as np
@@ -187,6 +188,15 @@ def test_fixes_and_samples_of_a_receiver(tmp_path):
     assert data.gnss.sigma_v.tolist() == [[0.25] * 3] * 4
     # each fix arrives with the sample that is 0.45 s later
     first = GPS_NS - 450_000_000
+    later, _ = read(tmp_path, made.ubx()[17:40] + made.nmea() + made.ubx())  # begins midway
+    np.testing.assert_array_equal(later.imu.time_ns, data.imu.time_ns)
+    sentences = iter(made.nmea().splitlines(True))  # three of each fix, in place of NAV-PVT
+    parts = made.ubx().split(b"$GNTXT,01*00\r\n")[:4]
+    parts = [p.split(b"\xb5\x62\x01\x07")[0] + b"".join(islice(sentences, 3)) for p in parts]
+    mixed, found_nmea = read(tmp_path, b"".join(parts))
+    assert_fixes(mixed.gnss, down=False, atol=2e-9)
+    np.testing.assert_array_equal(mixed.imu.time_ns, data.imu.time_ns)
+    assert found_nmea.keys() == {"clock_aligned", "sigma_assumed"}
     assert_samples(data.imu, offset_ns=first, gyro=np.deg2rad(2**-13) * 1.01, accel=2**-11 * 1.01)
     assert found.keys() == {"clock_aligned"}
     alone, found = read(tmp_path, made.ubx(inertial=False, carrSoln=1))
@@ -221,7 +231,9 @@ def test_a_receiver_without_a_date_and_with_more_digits(tmp_path):
     more = struct.pack("<B3xIiiiibbbbII", 0, made.TOW_MS, 112 * 10**6, 481 * 10**6, 500_000, 0,
         -32, 41, 7, 0, 141, 210)  # fmt: skip
     more = made.UBXMessage("NAV", "NAV-HPPOSLLH", made.GET, payload=more)
-    gnss, _ = read(tmp_path, made.ubx(inertial=False) + more.serialize())
+    fixes = made.ubx(inertial=False)  # of which the last is repeated
+    again = fixes[fixes.rindex(b"\xb5\x62\x01\x07") :]
+    gnss, _ = read(tmp_path, fixes + again + more.serialize())
     found = np.rad2deg([gnss.lat_rad[0], gnss.lon_rad[0]])
     np.testing.assert_allclose(found, [more.lat, more.lon], rtol=0, atol=1e-12)
     found = [gnss.alt_m[0], *gnss.sigma_m[0]]
@@ -255,6 +267,10 @@ def test_midnight_and_a_missing_date(tmp_path):
     gnss, found = read(tmp_path, made.nmea(late, date=False))
     assert_fixes(gnss, (86_400 - 1) * NS, down=False, atol=2e-9)  # velocities by VTG
     assert "undated" in found
+    pairs = made.nmea(late, date=False, gst=False).splitlines(True)
+    swapped = b"".join(b + a for a, b in zip(pairs[::2], pairs[1::2], strict=True))
+    gnss, _ = read(tmp_path, swapped)  # VTG begins each burst
+    np.testing.assert_allclose(gnss.v_n[:, :2], MADE.v_n[:, :2], rtol=0, atol=6e-3)
 
 
 def test_sentences_without_a_right_checksum_are_counted(tmp_path):
@@ -325,6 +341,8 @@ def test_a_log_of_ardupilot(tmp_path):
     data, found = read(tmp_path, made.dataflash(geoid=False))
     np.testing.assert_allclose(data.gnss.alt_m, MADE.place[:, 2] - MADE.geoid_m, atol=6e-3)
     assert "height_above_geoid" in found
+    data, _ = read(tmp_path, made.dataflash(receiver=1))
+    assert_fixes(data.gnss, quality=1, atol=5.1e-8)
 
 
 def test_pymavlink_reads_the_same_log(tmp_path):

@@ -1,6 +1,6 @@
 """Flight logs of ArduPilot (dataflash, ``.BIN``), which describe their own messages.
 
-Read are, of the lowest instance of each:
+Read are, of the lowest instance of each (of ``GPS`` and ``GPA`` the lowest that had fixes):
 
 - ``IMU``: rates [rad/s] and specific force [m/s^2], forward-right-down;
 - ``MAG``: magnetic field [mG], less the offsets that the autopilot believes;
@@ -48,6 +48,7 @@ _TYPES = {pair[0]: pair[2:] for pair in _CODES.split()}  # of fields, as NumPy n
 _NO_FILL = re.compile(rb"[^\x00\xff]")  # with which blocks of a chip are filled up
 _FACTORS = {**dict.fromkeys("cCeE", 0.01), "L": 1e-7}
 _LAST_WEEK = 6000  # in 2095
+_FIX = 2  # least status of a fix
 
 
 def read_dataflash(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
@@ -62,10 +63,13 @@ def read_dataflash(path: str | os.PathLike[str], findings: list[Finding] | None 
     """
     file = str(path)
     topics = _topics(file, mapped(path, findings), findings)
-    imu, mag, gps, gpa = map(topics.get, _WANTED)
+    imu, mag, gps, gpa = (_instance(file, topics, name, findings) for name in _WANTED)
     if imu is None:
         held = ", ".join(sorted(topics)) or "nothing that robins reads"
         raise LogError(file, f"has no samples IMU; it holds {held}", "set LOG_BITMASK to log them")
+    if "TimeMS" in imu.fields:
+        cause = "counts milliseconds (TimeMS), as ArduPilot did before 3.3"
+        raise LogError(file, cause, "export its messages to CSV: mavlogdump.py --format csv")
     imu_ns, mag_ns, gnss = stamps(file, imu), mag and stamps(file, mag), None
     if gps is not None:
         gnss, arrived = _fixes(file, gps, gpa, findings)
@@ -134,8 +138,7 @@ def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[str,
         if found[number]:
             rows = np.frombuffer(b"".join(found[number]), layout)
             fields = zip(layout.names or (), factors, strict=True)
-            topic = Topic(name, {n: rows[n] * f if f != 1 else rows[n] for n, f in fields})
-            topics[name] = _lowest(file, topic, findings)
+            topics[name] = Topic(name, {n: rows[n] * f if f != 1 else rows[n] for n, f in fields})
     return topics
 
 
@@ -158,18 +161,26 @@ def _definition(file: str, data: Bytes, at: int) -> tuple[int, int, str, np.dtyp
     return number, size, name, kind, [_FACTORS.get(c, 1.0) for c in codes]
 
 
-def _lowest(file: str, topic: Topic, findings: list[Finding] | None) -> Topic:
-    """The rows of the lowest instance."""
-    if "I" not in topic.fields:
+def _instance(
+    file: str, topics: dict[str, Topic], name: str, findings: list[Finding] | None
+) -> Topic | None:
+    """The rows of the lowest instance; of GPS the lowest that had fixes, of GPA the same one."""
+    topic, gps = topics.get(name), topics.get("GPS")
+    if topic is None or "I" not in topic.fields:
         return topic
-    numbers = np.unique(topic.fields["I"])
-    if len(numbers) > 1 and topic.name != "GPA":
+    of = column(file, topic, "I")
+    numbers, number = np.unique(of), of.min()
+    if name in ("GPS", "GPA") and gps is not None and "I" in gps.fields:
+        receivers, fixed = column(file, gps, "I"), column(file, gps, "Status") >= _FIX
+        number = receivers[fixed if fixed.any() else slice(None)].min()
+    if len(numbers) > 1 and name != "GPA":
         telling(findings, "note", "several_instances", file, value=len(numbers))(
-            f"{topic.name} was logged of {len(numbers)} sensors; number {numbers[0]} is read and "
+            f"{name} was logged of {len(numbers)} sensors; number {number:g} is read and "
             "the others are left alone."
         )
-    mine = topic.fields["I"] == numbers[0]
-    return Topic(topic.name, {name: values[mine] for name, values in topic.fields.items()})
+    mine = of == number
+    fields = {key: values[mine] for key, values in topic.fields.items()}
+    return Topic(name, fields) if mine.any() else None
 
 
 def _fixes(

@@ -13,8 +13,10 @@ import numpy as np
 from robins.dataset import GnssTable
 from robins.logs.findings import Finding, telling
 
-MAVLINK = {6: 1, 5: 2, 4: 4, 3: 5, 2: 5}
-"""GPS_FIX_TYPE of MAVLink, PX4 and ArduPilot -> kind; less is no fix, and 2 has no height."""
+PX4 = {6: 1, 5: 2, 4: 4, 3: 5, 2: 5}
+"""Type of a fix in PX4 -> kind; less is no fix, 2 has no height, and 8 is extrapolated: none."""
+MAVLINK = PX4 | {7: 1, 8: 6}
+"""GPS_FIX_TYPE of MAVLink and ArduPilot, where 7 is a static base and 8 a precise point."""
 
 _USUAL = {1: (0.02, 0.05), 2: (0.3, 0.1), 3: (1.0, 0.2), 4: (1.0, 0.2), 5: (3.0, 0.3)}
 _USUAL[6] = (0.1, 0.1)

@@ -1,6 +1,7 @@
 """Sentences of NMEA 0183 that a receiver wrote, whatever else stands between them.
 
 - ``GGA``: fixes; the height above the ellipsoid is the altitude plus the separation of the geoid.
+  Where a fix lacks that, all heights are altitudes above the geoid, with a warning.
 - ``RMC``, else ``VTG``: velocity over ground; there is none down. Without GGA also the place.
 - ``GST``: sigmas of the place. Others are the usual ones of the kind of a fix, see `fix_kinds`.
 - ``RMC`` and ``ZDA``: the date. Stamps are UTC and become GPS time.
@@ -15,6 +16,7 @@ import datetime
 import math
 import os
 import re
+from collections.abc import Iterator
 from functools import reduce
 from operator import xor
 
@@ -22,7 +24,7 @@ import numpy as np
 
 from robins.dataset import GnssTable
 from robins.gps_time import gps_of
-from robins.logs.findings import Finding, LogError, breaks_off, left_out, telling
+from robins.logs.findings import Finding, LogError, above_geoid, breaks_off, left_out, telling
 from robins.logs.fix_kinds import fixes, over_ground
 from robins.logs.opening import Bytes, mapped
 from robins.logs.text import Head
@@ -34,13 +36,14 @@ _SENTENCE = re.compile(
 )
 _CLOCK = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d(?:\.\d*)?|60(?:\.\d*)?)", re.ASCII)
 _DAY_NS, _EPOCH = 86_400_000_000_000, datetime.date(1970, 1, 1).toordinal()
-_KIND = {"1": 5.0, "2": 4.0, "3": 5.0, "4": 1.0, "5": 2.0}  # of GGA -> RTKLIB's Q
+_KIND = {"1": 5.0, "2": 4.0, "3": 5.0, "4": 1.0, "5": 2.0, "8": 5.0}  # of GGA -> Q
+_NO_FIX = {6: "estimated by dead reckoning", 7: "entered by hand"}
 _SLOW = 0.05  # m/s, below which receivers leave out the course
 
 
 def is_nmea(head: Head) -> bool:
-    """Has a line with any sentence among the first bytes, and no message of UBX."""
-    return _BEGINS.search(head.start) is not None and b"\xb5\x62" not in head.start
+    """Has a line with any sentence among the first bytes; see `ubx.is_ubx` for mixed ones."""
+    return _BEGINS.search(head.start) is not None
 
 
 def read_nmea(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> GnssTable:
@@ -53,8 +56,14 @@ def read_nmea(path: str | os.PathLike[str], findings: list[Finding] | None = Non
     Raises:
         LogError: there is no sentence GGA or RMC with a right checksum.
     """
-    file = str(path)
-    epochs = _epochs(file, mapped(path, findings), findings)
+    return fixes_of(str(path), mapped(path, findings), findings)[0]
+
+
+def fixes_of(
+    file: str, data: Bytes, findings: list[Finding] | None
+) -> tuple[GnssTable, np.ndarray]:
+    """Fixes, and where in the bytes the first sentence of each lies; errors as `read_nmea`."""
+    epochs = _epochs(file, data, findings)
     days = _days(file, epochs, findings)
     end = "1" if any("lat1" in epoch for epoch in epochs) else "2"
     kept = [k for k, epoch in enumerate(epochs) if f"lat{end}" in epoch]
@@ -66,13 +75,19 @@ def read_nmea(path: str | os.PathLike[str], findings: list[Finding] | None = Non
         return np.array([epochs[k].get(name, math.nan) for k in kept])
 
     utc_ns = np.array([days[k] * _DAY_NS + int(epochs[k]["time"]) for k in kept], np.int64)
-    speed, course = to_si(column("speed"), "kn"), column("course")
+    _report_unread(file, epochs, findings) if end == "1" else None
+    stated = np.isfinite(column("speed"))
+    speed, course = (np.where(stated, column(x), column(f"{x}1")) for x in ("speed", "course"))
+    speed = to_si(speed, "kn")
     course = np.where(np.isnan(course) & (speed < _SLOW), 0.0, course)
-    nothing = np.full(len(kept), np.nan)
-    return fixes(
+    nothing, height = np.full(len(kept), np.nan), column("height")
+    if (np.isnan(height) & np.isfinite(column("altitude"))).any():
+        above_geoid(findings, file, "Set the receiver to state the separation of the geoid in GGA.")
+        height = column("altitude")
+    table = fixes(
         file,
         gps_of(utc_ns) if days[0] >= 0 else utc_ns + _DAY_NS,
-        (column(f"lat{end}"), column(f"lon{end}"), column("height")),
+        (column(f"lat{end}"), column(f"lon{end}"), height),
         (column("north"), column("east"), column("up")),
         over_ground(speed, course),
         nothing,
@@ -80,14 +95,31 @@ def read_nmea(path: str | os.PathLike[str], findings: list[Finding] | None = Non
         np.zeros(len(kept), bool),
         findings,
     )
+    return table, column("at")
+
+
+def _report_unread(
+    file: str, epochs: list[dict[str, float]], findings: list[Finding] | None
+) -> None:
+    """Report places that are in RMC only, and qualities of GGA that count as no fix."""
+    if count := sum("lat2" in epoch and "lat1" not in epoch for epoch in epochs):
+        telling(findings, "note", "other_kinds", file, value=count)(
+            f"{count} of {len(epochs)} epochs have RMC and no GGA; they are left out. Switch on "
+            "GGA at the rate of RMC, or switch off GGA to read the places of RMC."
+        )
+    for quality, what in _NO_FIX.items():
+        if count := sum(epoch.get("quality") == quality for epoch in epochs):
+            telling(findings, "note", "other_kinds", file, value=count)(
+                f"{count} sentences GGA have the quality {quality} ({what}); they count as no fix."
+            )
 
 
 def _epochs(file: str, data: Bytes, findings: list[Finding] | None) -> list[dict[str, float]]:
-    """Numbers of the sentences of each time of day; those without a time belong to the last."""
+    """Numbers of the sentences of each time of day; see `_in_order` for those without one."""
     epochs: list[dict[str, float]] = []
     talkers = {one[1] for one in _SENTENCE.finditer(data) if one[4]}
     wrong, left = 0, set[bytes]()
-    for one in _SENTENCE.finditer(data):
+    for one in _in_order(data):
         talker, kind, body, given = one.groups()
         if given is None and one.end() == len(data):
             breaks_off(findings, file, one.start())
@@ -102,7 +134,7 @@ def _epochs(file: str, data: Bytes, findings: list[Finding] | None) -> list[dict
         near = (epoch for epoch in epochs[:-4:-1] if epoch["time"] == found.get("time"))
         epoch = epochs[-1] if kind == b"VTG" and epochs else next(near, None)
         if epoch is None and "time" in found:
-            epochs.append(epoch := {})
+            epochs.append(epoch := {"at": float(one.start())})
         if epoch is not None:
             if epoch.keys() >= found.keys():
                 left.add(talker)
@@ -115,6 +147,26 @@ def _epochs(file: str, data: Bytes, findings: list[Finding] | None) -> list[dict
             "GN is read where it is among them, else the first."
         )
     return epochs
+
+
+def _in_order(data: Bytes) -> Iterator[re.Match[bytes]]:
+    """Sentences, a VTG behind one with the time of its epoch.
+
+    Where the first sentence is a VTG and the last is none, a VTG begins each burst and belongs to
+    the time that follows; else to the time before it.
+    """
+    first = last = None
+    for last in _SENTENCE.finditer(data):
+        first = first or last
+    leads = first is not None and last is not None and first[2] == b"VTG" != last[2]
+    held: list[re.Match[bytes]] = []
+    for one in _SENTENCE.finditer(data):
+        if leads and one[2] == b"VTG":
+            held.append(one)
+            continue
+        yield one
+        yield from held
+        held.clear()
 
 
 def _numbers(kind: str, fields: list[str]) -> dict[str, float]:
@@ -134,7 +186,7 @@ def _numbers(kind: str, fields: list[str]) -> dict[str, float]:
         return -value if fields[k + 1] in ("S", "W") else value
 
     if kind == "VTG":
-        return {"speed": number(4), "course": number(0)}
+        return {"speed1": number(4), "course1": number(0)}
     if not fields[0]:
         return {}  # the receiver does not know the time yet
     if (clock := _CLOCK.fullmatch(fields[0])) is None:
@@ -143,6 +195,7 @@ def _numbers(kind: str, fields: list[str]) -> dict[str, float]:
     found: dict[str, float] = {"time": 6e10 * minutes + round(float(clock[3]) * 1e9)}
     if kind == "GGA":
         found |= {"kind1": _KIND.get(fields[5], 0.0), "height": number(8) + number(10)}
+        found |= {"altitude": number(8), "quality": float(fields[5] or 0)}
         return found | {"lat1": degrees(1), "lon1": degrees(3)}
     if kind == "GST":
         return found | {"north": number(5), "east": number(6), "up": number(7)}

@@ -29,6 +29,7 @@ RECORDING = re.compile(r".+\.(mcap|db3|bag)(\.(xz|gz|zstd))?")
 _LISTED = re.compile(r"^\s*-\s+(\S+\.(?:mcap|db3)(?:\.zstd)?)\s*$", re.MULTILINE)
 _NUMBER = re.compile(r"_(\d+)\.(?:mcap|db3|bag)")
 _XZ, _GZIP = b"\xfd7zXZ\x00", b"\x1f\x8b"
+UNZSTD = "zstd -d FILE, and give the file that it writes"
 _NATIVE = "leave the format to be recognised"
 _CSV, _UNPACK = "export the columns to CSV", "unpack it first"
 _RTKLIB = "solve its positions with RTKLIB (convbin, rnx2rtkp) and give the .pos"
@@ -37,7 +38,7 @@ _FOREIGN: tuple[tuple[int, bytes, str, str], ...] = (  # place, bytes there, kin
     (0, _GZIP, "a gzip file in another compressed file", _UNPACK),
     (0, _XZ, "an xz file in another compressed file", _UNPACK),
     (0, b"BZh", "a bzip2 file", _UNPACK),
-    (0, b"\x28\xb5\x2f\xfd", "a zstd file", _UNPACK),
+    (0, b"\x28\xb5\x2f\xfd", "a zstd file", f"unpack it: {UNZSTD}"),
     (0, b"7z\xbc\xaf\x27\x1c", "a 7z archive", _UNPACK),
     (0, b"Rar!", "a RAR archive", _UNPACK),
     (257, b"ustar", "a tar archive", _UNPACK),
@@ -72,6 +73,12 @@ _FOREIGN: tuple[tuple[int, bytes, str, str], ...] = (  # place, bytes there, kin
     (0, b"%PDF", "a PDF document", "give the log"),
     (0, b"\x7fELF", "a program (ELF)", "give the log"),
 )
+
+
+def foreign(start: bytes) -> tuple[str, str] | None:
+    """Kind of a file that is no text, by its first bytes, and the way in."""
+    found = ((what, fix) for at, magic, what, fix in _FOREIGN if start.startswith(magic, at))
+    return next(found, None)
 
 
 class _Gunzip:
@@ -165,9 +172,8 @@ class Source:
             yield block
 
     def _refuse_foreign(self, start: bytes) -> None:
-        for at, magic, what, mend in _FOREIGN:
-            if start.startswith(magic, at):
-                raise LogError(str(self.path), f"is {what}, not a text log", mend)
+        if found := foreign(start):
+            raise LogError(str(self.path), f"is {found[0]}, not a text log", found[1])
 
     def _expand(self, file, xz: bool) -> Iterator[bytes]:
         new = partial(lzma.LZMADecompressor, memlimit=2 * FREE) if xz else _Gunzip

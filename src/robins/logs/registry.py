@@ -162,7 +162,7 @@ FORMATS: tuple[Format, ...] = (
         "nmea",
         ("gnss",),
         "NMEA 0183: sentences GGA, RMC, VTG, GST, ZDA of any receiver",
-        nmea.is_nmea,
+        lambda head: nmea.is_nmea(head) and not ubx.is_ubx(head),
         nmea.read_nmea,
         binary=True,
     ),

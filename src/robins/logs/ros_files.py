@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, cast
 
 from robins.foreign import decoding, largest, unpacked, within
 from robins.logs.findings import Finding, LogError, breaks_off, damaged, telling
-from robins.logs.opening import Bytes, mapped
+from robins.logs.opening import UNZSTD, Bytes, mapped
 
 if TYPE_CHECKING:
     from mcap.records import McapRecord
@@ -56,6 +56,8 @@ def raw_messages(
         if data[: len(magic)] == magic:
             yield from found(path, data, wanted, findings)
             return
+    if data[: len(_ZSTD)] == _ZSTD:
+        raise LogError(str(path), "is packed by zstd as a whole", f"unpack it: {UNZSTD}")
     raise LogError(str(path), "is no recording of ROS", "leave the format to be recognised")
 
 

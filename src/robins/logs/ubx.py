@@ -1,7 +1,7 @@
 """Recordings of u-blox receivers (UBX), also between sentences of NMEA and corrections.
 
 - ``NAV-PVT``: fixes with velocity and sigmas; ``NAV-HPPOSLLH`` adds the digits behind 1e-7 deg.
-- the sentences of NMEA where there is no ``NAV-PVT``: see `robins.logs.nmea`;
+- the sentences of NMEA where there is no ``NAV-PVT``, see `robins.logs.nmea`;
 - ``ESF-MEAS``: rates and specific forces of a receiver with inertial sensors, along its own axes.
 
 GPS time is the time of week of a fix, in the week of its date. Inertial stamps count milliseconds
@@ -25,14 +25,15 @@ from robins.gps_time import gps_of
 from robins.logs.findings import Finding, LogError, breaks_off, left_out, telling, undated
 from robins.logs.fix_kinds import fixes
 from robins.logs.merging import gps_clock, merged
-from robins.logs.nmea import read_nmea
-from robins.logs.opening import Bytes, mapped
+from robins.logs.nmea import fixes_of
+from robins.logs.opening import Bytes, beginning, foreign, mapped
 from robins.logs.tables import Table
 from robins.logs.text import Head
 from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS
 from robins.units import to_si
 
-_SYNC = b"\xb5\x62"
+_SYNC, _RTCM = b"\xb5\x62", b"\xd3\x00"
+_FAR = 1 << 16  # bytes in which a message is looked for
 _HEAD = struct.Struct("<2sBBH")
 _TAG = struct.Struct("<IHH")  # of ESF-MEAS: time [ms], flags, provider
 _PVT, _HIGH, _MEAS, _RAW = 0x0107, 0x0114, 0x1002, 0x1003  # class and number
@@ -53,9 +54,17 @@ Frames: TypeAlias = dict[int, list[tuple[int, int]]]
 
 
 def is_ubx(head: Head) -> bool:
-    """Begins with a message of UBX, or has one behind a sentence of NMEA or a correction."""
-    begins = head.start.lstrip(b"\r\n").startswith((_SYNC, b"$", b"\xd3\x00"))
-    return begins and _SYNC in head.start
+    """Begins with a message of UBX, or has one with a right checksum in its first 64 KiB.
+
+    A capture may begin with sentences of NMEA, corrections or half a message.
+    """
+    if head.start.startswith(_SYNC):
+        return True
+    if foreign(head.start) and not head.start.startswith(_RTCM):
+        return False
+    start = beginning(head.file, _FAR)
+    places = (at.start() for at in re.finditer(re.escape(_SYNC), start))
+    return any(start[at + 2 : at + 3] != b"\0" and _end(start, at) for at in places)
 
 
 def read_ubx(
@@ -80,15 +89,16 @@ def read_ubx(
         telling(findings, "note", "other_kinds", file, value=len(frames[_RAW]))(
             f"{len(frames[_RAW])} messages ESF-RAW are left out; switch on ESF-MEAS for samples."
         )
-    if not frames[_PVT] and re.search(rb"\$..(GGA|RMC),", data):
-        return read_nmea(path, findings)
     measured = [place for place in frames[_MEAS] if place[1] >= _TAG.size]
     imu = _inertial(file, data, measured, findings)
-    if not frames[_PVT]:
-        if imu is not None:
-            return imu
+    if frames[_PVT]:
+        gnss, arrived = _fixes(file, data, frames, findings)
+    elif re.search(rb"\$..(GGA|RMC),", data):
+        gnss, arrived = fixes_of(file, data, findings)
+    elif imu is not None:
+        return imu
+    else:
         raise LogError(file, "has no messages NAV-PVT or ESF-MEAS", "switch on UBX-NAV-PVT")
-    gnss, arrived = _fixes(file, data, frames, findings)
     if imu is None:
         return gnss
     tags = np.array([_TAG.unpack_from(data, at)[0] for at, _ in measured], np.int64) * 1_000_000
@@ -109,7 +119,7 @@ def _frames(file: str, data: Bytes, findings: list[Finding] | None) -> Frames:
         end = at + _HEAD.size + size
         if end + 2 > len(data):
             open_at = at if open_at < 0 else open_at
-        elif _checksum(data[at + 2 : end]) == data[end : end + 2]:
+        elif _end(data, at):
             found.get(group << 8 | number, []).append((at + 6, size))
             wrong, open_at = wrong + (open_at >= 0), -1
             at = data.find(_SYNC, end + 2)
@@ -121,6 +131,13 @@ def _frames(file: str, data: Bytes, findings: list[Finding] | None) -> Frames:
     if open_at >= 0:
         breaks_off(findings, file, open_at)
     return found
+
+
+def _end(data: Bytes, at: int) -> int:
+    """End of the message there; 0 where it is not whole or its checksum is wrong."""
+    end = at + _HEAD.size + int.from_bytes(data[at + 4 : at + 6], "little")
+    whole = end + 2 <= len(data) and _checksum(data[at + 2 : end]) == data[end : end + 2]
+    return end + 2 if whole else 0
 
 
 def _checksum(content: bytes) -> bytes:
@@ -159,8 +176,11 @@ def _fixes(
     horizontal, vertical = pvt["acc"].T * 1e-3
     high, _ = _rows(data, frames[_HIGH], _NAV_HIGH)
     _, mine, more = np.intersect1d(pvt["tow"], high["tow"], return_indices=True)
-    if len(more) and len(np.unique(pvt["tow"])) == len(pvt):
-        mine, more = (x[(high["invalid"][more] & 1) == 0] for x in (mine, more))
+    tows, counts = np.unique(pvt["tow"], return_counts=True)
+    if len(more):
+        once = np.isin(pvt["tow"][mine], tows[counts == 1])  # a repeated one may be of another week
+        once &= (high["invalid"][more] & 1) == 0
+        mine, more = mine[once], more[once]
         place, digits = high["place"][more], high["more"][more]
         lon[mine], lat[mine] = (place * 1e-7 + digits[:, :2] * 1e-9).T
         height_m[mine] = high["h_m"][more] * 1e-3 + digits[:, 2] * 1e-4
@@ -186,7 +206,8 @@ def _inertial(
     halves: dict[tuple[int, ...], dict[int, list[int]]] = {_GYRO: {}, _ACCEL: {}}
     for at, size in frames:
         tag, flags, _ = _TAG.unpack_from(data, at)
-        count = min(flags >> 11, (size - _TAG.size) // 4)
+        room = max((size - _TAG.size) // 4 - (flags >> 3 & 1), 0)  # a calibrated time may follow
+        count = min(flags >> 11 or room, room)  # older ones state no number
         words = struct.unpack_from(f"<{count}I", data, at + _TAG.size)
         read = {word >> 24 & 63: (word & 0xFFFFFF ^ 0x800000) - 0x800000 for word in words}
         for axes, rows in halves.items():

@@ -26,7 +26,7 @@ import numpy as np
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.foreign import decoding
 from robins.logs.findings import Finding, LogError, damaged, refused, report, telling
-from robins.logs.fix_kinds import MAVLINK
+from robins.logs.fix_kinds import PX4
 from robins.logs.opening import whole
 from robins.logs.timebase import LIMIT_NS
 from robins.units import to_si
@@ -39,6 +39,7 @@ _TYPES = frozenset(b"BFIMPQARDLCSO")
 _LARGEST = 1 << 30  # bytes of a file
 _IMU, _MAG = ("sensor_combined",), ("vehicle_magnetometer", "sensor_mag")
 _GNSS = ("vehicle_gps_position", "sensor_gps")
+_TO_CSV = "this version of the autopilot is not known; export the topic to CSV"
 _NO_FIX, _FLAT_FIX = 2, 3  # below these there is no fix, or none of the height
 
 
@@ -185,14 +186,17 @@ def column(file: str, topic: Topic, name: str) -> np.ndarray:
     """Numbers of a field.
 
     Raises:
-        LogError: there is none of this name.
+        LogError: there is none of this name, or it holds text.
     """
     if name in topic.fields:
+        values = np.asarray(topic.fields[name])
+        if values.dtype.kind not in "biuf":
+            raise refused(file, field=f"{topic.name}.{name}")("holds text, no numbers", _TO_CSV)
         with np.errstate(invalid="ignore"):  # a NaN that signals stays a NaN
-            return np.asarray(topic.fields[name], np.float64)
+            return values.astype(np.float64)
     raise refused(file, field=topic.name)(
         f"has no field {name}; it has {', '.join(sorted(topic.fields))}",
-        "this version of the autopilot is not known; export the topic to CSV",
+        _TO_CSV,
     )
 
 
@@ -243,6 +247,6 @@ def _fixes(file: str, topic: Topic) -> GnssTable:
         sigma_m=np.stack([eph, eph, epv], axis=-1),
         v_n=v_n,
         sigma_v=np.repeat(speed[:, None], 3, axis=1),
-        quality=np.array([MAVLINK.get(int(k), 0) for k in fix], np.int64),
+        quality=np.array([PX4.get(int(k), 0) for k in fix], np.int64),
         source=file,
     )
