@@ -76,7 +76,7 @@ def examine(
     try:
         by_kind(files, opened, [])
     except logs.LogError as error:
-        findings.append(logs.Finding("error", "second_of_kind", error.file, "", "", str(error)))
+        findings.append(logs.Finding("error", "second_of_kind", error.file, "", "", f"{error}."))
     return Examined([str(path) for path in paths], tables, by_severity(findings))
 
 
