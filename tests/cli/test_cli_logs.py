@@ -94,6 +94,9 @@ def test_a_healthy_log_is_fit_to_navigate(robins, still_log):
     assert answer.status == 0
     assert "0 errors" in answer.out
     assert f"robins replay {still_log}" in answer.out
+    answer = robins("doctor", still_log, still_log)
+    assert answer.status == 2
+    assert "is a second file of the kind of" in answer.out
 
 
 def test_a_wrong_log_is_bad_input_and_the_reason_is_told(robins, in_g):

@@ -42,7 +42,8 @@ def judge(
         found = examine(log, columns)
     say(found.data if as_json else None, _text(found, log, columns), as_json)
     if write is not None:  # after the findings, which explain why nothing may be found
-        write.write_text(unit_file(log, columns))
+        with only_json(as_json):
+            write.write_text(unit_file(log, columns))
     return Status.BAD_INPUT if found.counts["error"] else Status.DONE
 
 
