@@ -94,6 +94,9 @@ def test_a_healthy_log_is_fit_to_navigate(robins, still_log):
     assert answer.status == 0
     assert "0 errors" in answer.out
     assert f"robins replay {still_log}" in answer.out
+    answer = robins("doctor", still_log, still_log)
+    assert answer.status == 2
+    assert "is a second file of the kind of" in answer.out
 
 
 def test_a_wrong_log_is_bad_input_and_the_reason_is_told(robins, in_g):
@@ -397,7 +400,7 @@ def test_a_table_is_guessed_declared_and_examined_and_a_path_named(robins, tmp_p
     answer = robins("doctor", path, "--format", "orbslam-euroc")
     assert answer.status == Status.DONE, answer.err
     assert "30 rows" in answer.out
-    assert f"robins replay {path} --format orbslam-euroc" in answer.out
+    assert "Next:   give the log of an IMU too" in answer.out  # no replay of a path alone
     answer = robins("doctor", path, "--format", "orbslam")
     assert answer.status == Status.BAD_INPUT
     assert "no format is called 'orbslam'; choose one of gnss-imu" in answer.err.replace("\n", " ")

@@ -343,6 +343,8 @@ def test_a_row_of_a_path_is_refused_whole():
     got = cleaned(truth=put(DATA.truth, "q_nb", (3, 0), np.nan))
     assert_same(got.truth, rows_of(DATA.truth, np.arange(M) != 3))
     assert refused(got.counts) == {"truth_nan": 1}
+    without = put(DATA.truth, "v_n", (3, 0), np.nan)
+    assert_same(cleaned(truth=without).truth, without)
 
 
 @pytest.mark.parametrize(

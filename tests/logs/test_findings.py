@@ -103,7 +103,11 @@ FILES = (
         "note: 4 messages NAV-PVT have no date yet",
         made_binary.ubx(inertial=False, validDate=0),
     ),
-    ("sigma_assumed", "note: 4 of 4 fixes state no sigma", made_binary.nmea()),
+    (
+        "sigma_assumed",
+        "note velocity: 4 of 4 fixes state no sigma of velocity",
+        made_binary.nmea(),
+    ),
     ("clock_aligned", "note: stamps of the samples are put on GPS time", made_binary.ubx()),
     (
         "sensors_merged",

@@ -179,12 +179,19 @@ def test_a_missing_component_of_a_velocity_comes_from_positions():
 @pytest.mark.parametrize(
     ("settings", "assumed", "sigmas"),
     [
-        ({}, False, [0.5, 1.5, 1.5, 0.5]),
-        ({}, True, [0.5, 0.5, 0.5, 0.5]),
-        ({"sigma": "2 m"}, True, [2.0, 6.0, 6.0, 2.0]),
-        ({"sigma": "2 m", "sigma_factor": {}}, False, [2.0, 2.0, 2.0, 2.0]),
+        ({}, "", [0.5, 1.5, 1.5, 0.5]),
+        ({}, "velocity", [0.5, 1.5, 1.5, 0.5]),
+        ({}, "place, velocity", [0.5, 0.5, 0.5, 0.5]),
+        ({"sigma": "2 m"}, "place", [2.0, 6.0, 6.0, 2.0]),
+        ({"sigma": "2 m", "sigma_factor": {}}, "", [2.0, 2.0, 2.0, 2.0]),
     ],
-    ids=["stated, by quality", "assumed, by quality already", "given", "given, no factor"],
+    ids=[
+        "stated, by quality",
+        "stated, velocity assumed",
+        "assumed, by quality already",
+        "given",
+        "given, no factor",
+    ],
 )
 def test_sigmas_are_stated_assumed_or_given(settings, assumed, sigmas):
     time = np.arange(4) * 10**9
@@ -192,7 +199,7 @@ def test_sigmas_are_stated_assumed_or_given(settings, assumed, sigmas):
         time, *np.full((3, 4), 0.5), np.full((4, 3), 0.5), quality=np.array([1, 2, 5, 0])
     )
     imu = ImuTable(np.arange(400) * 10**7, np.zeros((400, 3)), np.zeros((400, 3)), "rate")
-    note = [Finding("note", "sigma_assumed", "f", "", 4, "f: 4 of 4 assumed.")] * assumed
+    note = [Finding("note", "sigma_assumed", "f", assumed, 4, "f: 4 of 4 assumed.")] * bool(assumed)
     log = on_one_clock(
         Dataset("f", imu, gnss, findings=note), Replay.model_validate({"gnss": settings})
     )

@@ -30,7 +30,6 @@ from robins.cli.options import (
     folder_name,
     log_name,
     publishes,
-    typed,
 )
 from robins.cli.sensitivity import sensitivity
 from robins.cli.tell import carry_out, say
@@ -134,7 +133,9 @@ def run(
     """
     if master is None and slave is None:
         if columns:
-            where = " ".join(typed(columns[:1]))
+            from robins.workbench.examination import typed
+
+            where = typed((), columns[:1])
             raise InputError("the option is for logs", where, "give --master and --slave too.")
         carry_out("run", scenario, out=out or RESULTS / folder_name(scenario), **options)
         return

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ from typing import Any
 import click
 
 from robins.cli.frame import Status, only_json
-from robins.cli.options import typed
 from robins.cli.tell import say
 
 _COLOURS = {"error": "red", "warning": "yellow", "note": "cyan"}
@@ -41,15 +39,17 @@ def judge(
         from robins.workbench import examine
         from robins.workbench.examination import unit_file
 
-        text = None if write is None else unit_file(log, columns)
         found = examine(log, columns)
-        if write is not None and text is not None:
-            write.write_text(text)
     say(found.data if as_json else None, _text(found, log, columns), as_json)
+    if write is not None:  # after the findings, which explain why nothing may be found
+        with only_json(as_json):
+            write.write_text(unit_file(log, columns))
     return Status.BAD_INPUT if found.counts["error"] else Status.DONE
 
 
 def _text(found: Any, log: Sequence[Path], columns: Sequence[Path | str]) -> str:
+    from robins.workbench.examination import typed
+
     lines = []
     for table in found.tables:
         rate = f" at {table['rate_hz']:.4g} Hz" if table["rate_hz"] else ""
@@ -64,8 +64,9 @@ def _text(found: Any, log: Sequence[Path], columns: Sequence[Path | str]) -> str
         return "\n".join(
             [*lines, "Next:   mend the errors; a run on this log would be wrong or meaningless"]
         )
-    # Without fixes there is no position, but an attitude.
     kinds = {table["kind"] for table in found.tables}
+    if "imu" not in kinds:
+        return "\n".join([*lines, "Next:   give the log of an IMU too; a replay needs its samples"])
+    # Without fixes there is no position, but an attitude.
     system = "" if "gnss" in kinds else " --system marg"
-    words = shlex.join(map(str, [*log, *typed(columns)]))
-    return "\n".join([*lines, f"Next:   robins replay {words}{system}"])
+    return "\n".join([*lines, f"Next:   robins replay {typed(log, columns)}{system}"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -61,15 +62,6 @@ def COLUMNS(command: Callable) -> Callable:
     ):
         command = one(command)
     return command
-
-
-def typed(columns: Sequence[Path | str]) -> list[str]:
-    """Words of a command line that give these declarations and names again."""
-    words: list[str] = []
-    for one in columns:
-        named = isinstance(one, str)
-        words += ("--format", one.removeprefix("format:")) if named else ("--columns", str(one))
-    return words
 
 
 def _confirm(
@@ -164,4 +156,4 @@ def folder_name(scenario: str) -> str:
 def log_name(log: Sequence[Path]) -> str:
     """Name of the result folder of a log, after its first file that is no configuration."""
     first = next((path for path in log if path.suffix != ".toml"), log[0])
-    return first.name.split(".")[0]
+    return os.path.basename(os.path.abspath(first)).split(".")[0] or "log"

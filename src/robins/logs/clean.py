@@ -98,9 +98,10 @@ def clean_imu(imu: ImuTable) -> tuple[ImuTable, dict[str, int], list[tuple[int, 
 
 
 def clean_truth(truth: Trajectory) -> tuple[Trajectory, dict[str, int]]:
-    """Clean a trajectory: whole rows only."""
+    """Clean a trajectory: rows with place and attitude; a velocity may be missing (NaN)."""
     truth = checked(truth)
-    values = np.hstack([place_of(truth), truth.v_n, truth.q_nb])
+    v_n = np.where(np.isnan(truth.v_n), 0.0, truth.v_n)
+    values = np.hstack([place_of(truth), v_n, truth.q_nb])
     limit = np.array([*_PLACE_LIMIT, *[SPEED_LIMIT] * 3, *[QUATERNION_LIMIT] * 4])
     keep, counts = refusals("truth", truth.time_ns, *_whole_rows(values, limit))
     return rows_where(truth, keep), counts

@@ -7,11 +7,12 @@ precise point position; 0 is none of them.
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 
 from robins.dataset import GnssTable
-from robins.logs.findings import Finding, telling
+from robins.logs.findings import Finding, report
 
 PX4 = {6: 1, 5: 2, 4: 4, 3: 5, 2: 5}
 """Type of a fix in PX4 -> kind; less is no fix, 2 has no height, and 8 is extrapolated: none."""
@@ -21,6 +22,10 @@ MAVLINK = PX4 | {7: 1, 8: 6}
 _USUAL = {1: (0.02, 0.05), 2: (0.3, 0.1), 3: (1.0, 0.2), 4: (1.0, 0.2), 5: (3.0, 0.3)}
 _USUAL[6] = (0.1, 0.1)
 """Usual sigma of a horizontal place [m] and of a velocity [m/s] of each kind, in the open."""
+_ASSUMED = {
+    "place": "0.02 m for fixed, 0.3 m for float, 3 m for single ones",
+    "velocity": "0.05 m/s for fixed, 0.1 m/s for float, 0.3 m/s for single ones",
+}
 
 
 def fixes(
@@ -79,6 +84,8 @@ def with_usual_sigmas(
 ) -> GnssTable:
     """The same fixes, with the usual sigmas of their kind where none is stated, and a note.
 
+    The `where` of the note is "place", "velocity" or both: the sigmas that are assumed.
+
     Vertical sigmas are twice the horizontal ones. What is missing itself gets no sigma.
     """
     kinds = np.zeros(len(table), np.int64) if table.quality is None else table.quality
@@ -87,13 +94,18 @@ def with_usual_sigmas(
     lacking = np.isnan(table.sigma_m) & np.isfinite(table.lat_rad)[:, None] & places
     sigma_m = np.where(lacking, usual[:, :1] * shape, table.sigma_m)
     sigma_v, count = table.sigma_v, lacking.any(axis=1)
+    assumed = ["place"] if count.any() else []
     if table.v_n is not None and sigma_v is not None:
         unstated = np.isnan(sigma_v) & np.isfinite(table.v_n)
         sigma_v = np.where(unstated, usual[:, 1:] * shape, sigma_v)
         count = count | unstated.any(axis=1)
+        assumed += ["velocity"] if unstated.any() else []
     if count.any():
-        telling(findings, "note", "sigma_assumed", table.source, value=int(count.sum()))(
-            f"{count.sum()} of {len(table)} fixes state no sigma of place or velocity; that of the "
-            "kind is assumed: 0.02 m for fixed, 0.3 m for float, 3 m for single ones."
+        value, usually = int(count.sum()), "; ".join(_ASSUMED[one] for one in assumed)
+        sentence = (
+            f"{Path(table.source).name}: {value} of {len(table)} fixes state no sigma of "
+            f"{' or '.join(assumed)}; that of the kind is assumed: {usually}."
         )
+        where = ", ".join(assumed)
+        report(findings, Finding("note", "sigma_assumed", table.source, where, value, sentence))
     return dataclasses.replace(table, sigma_m=sigma_m, sigma_v=sigma_v)

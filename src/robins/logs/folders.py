@@ -26,7 +26,9 @@ from robins import rotation
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.gps_time import gps_of
 from robins.logs.findings import Finding, LogError, refused, telling
+from robins.logs.fix_kinds import with_usual_sigmas
 from robins.logs.merging import interpolated
+from robins.logs.mounting import Origin
 from robins.logs.opening import RECORDING, whole
 from robins.logs.phone import fixes_of
 from robins.logs.read_text import read_text
@@ -39,6 +41,7 @@ from robins.units import to_si
 
 Findings = list[Finding] | None
 _XYZ = ("x", "y", "z")
+_TRUTH = "state_groundtruth_estimate0/data.csv"
 _ROWS = {row.name: row for row in TEXT_FORMATS}
 _OXTS = 30  # numbers of a record
 _LARGEST = 1 << 26  # bytes of a file of OXTS
@@ -46,32 +49,45 @@ _FLU = np.array([1.0, -1.0, -1.0])
 _SEPARATORS = (",", ";", "\t")
 
 
-def read_folder(path: str | os.PathLike[str], findings: Findings = None) -> Table | Dataset:
+def read_folder(
+    path: str | os.PathLike[str], findings: Findings = None, origin: Origin | None = None
+) -> Table | Dataset:
     """Read a folder that is a recording.
 
     Args:
         path: the folder.
         findings: receives what was left out or is doubted; without it that is issued as
             `LogWarning`.
+        origin: where a path in local metres, that of EuRoC, is put on the Earth.
 
     Raises:
-        LogError: it is of no known kind; a file of it is missing or cannot be read.
+        LogError: it is of no known kind; a file of it is missing or cannot be read; there is an
+            origin, and nothing in local metres.
     """
     folder = Path(path)
     try:
         for mark, read in _FOLDERS.items():
             for place in (folder, folder / "mav0", folder / "oxts"):
                 if (place / mark).exists():
-                    return read(place, findings)
+                    if read is _euroc and (place / _TRUTH).exists():
+                        return _euroc(place, findings, origin)
+                    return _without(origin, folder, read(place, findings))
         names = sorted(p.name for p in folder.iterdir())
         if "metadata.yaml" in names or any(map(RECORDING.fullmatch, names)):
-            return read_rosbag(folder, findings)
+            return _without(origin, folder, read_rosbag(folder, findings))
     except OSError as error:
         why = error.strerror or str(error)
         raise LogError(str(path), f"cannot be read: {why}", "check its permissions") from error
     held = ", ".join(names[:5]) or "nothing"
     mend = "give files, or the folder of a recording (ROS, EuRoC, KITTI, phones)"
     raise LogError(str(path), f"is a folder with {held}", mend)
+
+
+def _without(origin: Origin | None, folder: Path, read: Table | Dataset) -> Table | Dataset:
+    if origin is not None:
+        cause = "this folder has no local metres to put at an origin"
+        raise LogError(str(folder), cause, "give no origin")
+    return read
 
 
 def _table(
@@ -113,11 +129,11 @@ def _table(
 # ----------------------------------------------------------------------------- EuRoC and KITTI
 
 
-def _euroc(folder: Path, findings: Findings) -> Dataset:
+def _euroc(folder: Path, findings: Findings, origin: Origin | None = None) -> Dataset:
     imu = read_text(_ROWS["euroc-imu"], folder / "imu0" / "data.csv", findings)
-    truth, path = None, folder / "state_groundtruth_estimate0" / "data.csv"
+    truth, path = None, folder / _TRUTH
     if path.exists():
-        truth = read_text(_ROWS["euroc-truth"], path, findings)
+        truth = read_text(_ROWS["euroc-truth"], path, findings, origin)
     assert isinstance(imu, ImuTable)
     assert isinstance(truth, Trajectory | None)
     name = folder.resolve().parent.name if folder.name == "mav0" else folder.resolve().name
@@ -200,8 +216,10 @@ def _phone(folder: Path, findings: Findings) -> Dataset:
         fix_ns, v, fix_rows = samples("Location", _LOCATION, 2)
         for k in range(3, 9):
             v[v[:, k] < 0.0, k] = np.nan  # what is not known
-        gnss = fixes_of(str(path), fix_ns, v[:, :5], v[:, 5:], fix_rows)
-        if gnss.sigma_v is None or np.isnan(gnss.sigma_v).all():
+        gnss = with_usual_sigmas(
+            fixes_of(str(path), fix_ns, v[:, :5], v[:, 5:], fix_rows), findings
+        )
+        if gnss.v_n is None or np.isnan(gnss.v_n).all():
             gnss = replace(gnss, v_n=None, sigma_v=None)
     name = folder.resolve().name
     return Dataset(name, imu, gnss, mag=mag, time_unit_known=(str(gyro_file),))

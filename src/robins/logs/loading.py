@@ -47,20 +47,9 @@ def load_dataset(
         given = ", ".join(sorted(unknown))
         raise LogError(given, "a format is given, but not the file", "check its path")
     findings: list[Finding] = []
-    held: dict[str, Any] = {}
-    known: list[str] = []
-    for path in paths:
-        opened = open_log(path, (formats or {}).get(path), findings)
-        if isinstance(opened, Dataset):
-            known += opened.time_unit_known
-        for table in tables_of(opened):
-            kind = kind_of(table)
-            if isinstance(table, ImuTable) and kind in held and are_halves(held[kind], table):
-                table = merged(held.pop(kind), table, findings)
-            if kind in held:
-                cause = f"is a second file of the kind of {held[kind].source} ({kind})"
-                raise LogError(path, cause, "give one of the two")
-            held[kind] = table
+    opened = [open_log(path, (formats or {}).get(path), findings) for path in paths]
+    known = [file for one in opened if isinstance(one, Dataset) for file in one.time_unit_known]
+    held = by_kind(paths, opened, findings)
     if "imu" not in held:
         given = ", ".join(paths) or "(no file)"
         raise LogError(given, "no IMU log among the files", "give one IMU log")
@@ -71,6 +60,34 @@ def load_dataset(
         time_unit_known=tuple(known),
     )
     return turned(dataset, mounting)
+
+
+def by_kind(
+    paths: Iterable[str | os.PathLike[str]],
+    opened: Iterable[Table | Dataset],
+    findings: list[Finding],
+) -> dict[str, Any]:
+    """One table of each kind; gyros and accelerometers that were recorded apart become one.
+
+    Args:
+        paths: the files.
+        opened: their contents.
+        findings: receives a note where two tables become one.
+
+    Raises:
+        LogError: two tables are of one kind.
+    """
+    held: dict[str, Any] = {}
+    for path, one in zip(paths, opened, strict=True):
+        for table in tables_of(one):
+            kind = kind_of(table)
+            if isinstance(table, ImuTable) and kind in held and are_halves(held[kind], table):
+                table = merged(held.pop(kind), table, findings)
+            if kind in held:
+                cause = f"is a second file of the kind of {held[kind].source} ({kind})"
+                raise LogError(os.fspath(path), cause, "give one of the two")
+            held[kind] = table
+    return held
 
 
 def load_pair(

@@ -253,6 +253,7 @@ def open_log(
     Args:
         path: the file, plain or compressed (.xz, .gz); or a folder that is a recording.
         format: a name in `FORMATS`, or a row of your own; by default it is recognised by content.
+            Of a folder only a format of ROS can be given.
         findings: receives what the reader left out or doubts; without it that is issued as
             `LogWarning`.
         origin: where a path in local metres is put on the Earth.
@@ -266,10 +267,13 @@ def open_log(
     """
     if isinstance(format, TextFormat):
         known = _of_text(format)
-    elif os.path.isdir(path):
-        return read_folder(path, findings)
+    elif os.path.isdir(path) and format is None:
+        return read_folder(path, findings, origin)
     else:
         known = recognise(path) if format is None else called(format, path)
+    if os.path.isdir(path) and known.read is not rosbag.read_rosbag:
+        cause = f"is a folder, and {known.name} is a format of files"
+        raise LogError(str(path), cause, "omit the format, or give a file")
     if origin is None:
         return known.read(path, findings)
     if known.text is None or not known.text.local:

@@ -88,11 +88,11 @@ def _kfgins_nav(rows: Rows) -> bool:
     )
 
 
-def _poses(first: int, stamps: tuple[float, float], width: int) -> Looks:
-    """Stamps within these, and from place `first` on a unit quaternion, which turns."""
+def _poses(first: int, stamps: tuple[float, float], widths: range) -> Looks:
+    """So many numbers, a stamp within these, and from place `first` on a unit quaternion."""
 
     def looks(rows: Rows) -> bool:
-        return len(rows[0]) >= width and all(
+        return len(rows[0]) in widths and all(
             stamps[0] <= row[0] < stamps[1]
             and abs(sum(q * q for q in row[first : first + 4]) - 1.0) < 5e-3
             for row in rows
@@ -206,7 +206,7 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
         separator=" ",
         nav="ENU",
         commented=True,
-        rows=_poses(4, (-1e9, 1e11), 8),
+        rows=_poses(4, (-1e9, 1e11), range(8, 9)),
     )(
         _columns("timestamp | timestamp(s)", "time", "s"),
         *_POSE,
@@ -216,7 +216,7 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
         "ORB-SLAM3 SaveTrajectoryEuRoC, Basalt: as tum, in nanoseconds and without a header",
         separator=" ",
         nav="ENU",
-        looks=_poses(4, (1e14, 1e19), 8),
+        looks=_poses(4, (1e14, 1e19), range(8, 9)),
     )(
         _columns("timestamp [ns]", "time", "ns"),
         *_POSE,
@@ -226,7 +226,7 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
         "OpenVINS save_total_state: time, rotation with the scalar last, place, velocity",
         separator=" ",
         nav="ENU",
-        looks=_poses(1, (-1e9, 1e11), 11),
+        looks=_poses(1, (-1e9, 1e11), range(11, 1000)),
     )(
         _columns("timestamp(s)", "time", "s"),
         _columns("q_x, q_y, q_z, q_w", "q_x q_y q_z q_w"),

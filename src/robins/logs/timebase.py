@@ -124,13 +124,14 @@ def ns_to_decimal(time_ns: int, exponent: int = 9) -> str:
     return f"{sign}{whole}.{decimals}"
 
 
-def calendar_to_ns(date: str, clock: str, *, utc: bool = False) -> int:
+def calendar_to_ns(date: str, clock: str, *, utc: bool = False, ahead_s: int = 0) -> int:
     """``2025/08/28`` and ``17:30:39.749`` as nanoseconds since 1970 in GPS time.
 
     Args:
         date: year/month/day.
         clock: hour:minute:second with any decimals.
         utc: the stamp is UTC; the leap seconds since 1980 are added.
+        ahead_s: offset of the local clock from UTC, which is subtracted before.
 
     Raises:
         ValueError: no date or time of that form, or one 146 years or more from 1970.
@@ -144,9 +145,9 @@ def calendar_to_ns(date: str, clock: str, *, utc: bool = False) -> int:
     if not (hour < 24 and minute < 60 and seconds < 61):
         raise ValueError(f"{clock} is no time of day")
     days = today.toordinal() - _EPOCH_DAY
-    whole = (days * 24 + hour) * 3600 + minute * 60
+    whole = (days * 24 + hour) * 3600 + minute * 60 - ahead_s
     if utc:
-        whole += leap_seconds(today)
+        whole += leap_seconds(datetime.date.fromordinal(_EPOCH_DAY + whole // 86400))
     if abs(whole) * _NS >= LIMIT_NS - _NS:
         raise ValueError(f"the year {today.year} is not one from which anyone has a log")
     return whole * _NS + int((seconds * _NS).to_integral_value())
@@ -176,16 +177,15 @@ def dates_to_ns(
                 raise ValueError("not of that form")
             year, month, day, clock, _, sign, hours, minutes = match.groups()
             date, clock = f"{year}/{month}/{day}", clock.replace(",", ".")
-            out[k] = calendar_to_ns(date, clock, utc=zone != "GPS")
+            ahead_s = 3600 * int(hours) + 60 * int(minutes) if sign else 0
+            ahead_s = -ahead_s if sign == "-" else ahead_s
+            out[k] = calendar_to_ns(date, clock, utc=zone != "GPS", ahead_s=ahead_s)
         except ValueError as error:
             form = "a date and time" if zone else "a date and time with its offset from UTC"
             raise refused(file, f"line {rows[k]}", field, shown)(
                 f"is not {form} ({error})",
                 f"write it like 2025-06-11 20:34:27{'' if zone else '+00:00'}",
             ) from error
-        if sign:
-            ahead_s = 3600 * int(hours) + 60 * int(minutes)
-            out[k] -= (-ahead_s if sign == "-" else ahead_s) * _NS
     return out
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,6 +15,7 @@ from robins import logs, scenario, systems
 from robins.ins.frames import to_ned_frd
 from robins.logs.batches import spread
 from robins.logs.findings import by_severity
+from robins.logs.loading import by_kind
 from robins.logs.mounting import turned
 from robins.logs.quiet import usual_step_s
 from robins.logs.tables import kind_of, tables_of
@@ -70,9 +72,12 @@ def examine(
         log = logs.open_log(path, formats.get(str(path)), findings)
         opened.append(turned(log, mounting) if mounting else log)
     tables = [_described(table) for log in opened for table in tables_of(log)]
-    return Examined(
-        [str(path) for path in paths], tables, by_severity(findings + logs.examine(opened))
-    )
+    findings += logs.examine(opened)
+    try:
+        by_kind(files, opened, [])
+    except logs.LogError as error:
+        findings.append(logs.Finding("error", "second_of_kind", error.file, "", "", f"{error}."))
+    return Examined([str(path) for path in paths], tables, by_severity(findings))
 
 
 def unit_file(
@@ -113,6 +118,17 @@ def _described(table: Any) -> dict[str, Any]:
         "span_s": float(table.time_ns.max() - table.time_ns.min()) * 1e-9 if len(table) else 0.0,
         "rate_hz": 1.0 / step_s if step_s > 0.0 else None,
     }
+
+
+def typed(
+    paths: Sequence[str | os.PathLike[str]], columns: Sequence[str | os.PathLike[str]] = ()
+) -> str:
+    """Words of a command line that give these files, declarations and names again."""
+    words = [str(path) for path in paths]
+    for one in map(str, columns):
+        named = one.startswith("format:")
+        words += ("--format", one.removeprefix("format:")) if named else ("--columns", one)
+    return shlex.join(words)
 
 
 def parted(paths: Sequence[str | os.PathLike[str]]) -> tuple[list[Path], Path | None]:

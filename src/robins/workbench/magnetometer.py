@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from robins.dataset import MagTable
+from robins.dataset import ImuTable, MagTable
 from robins.ins.frames import to_ned_frd
 from robins.ins.magnetometer_calibration import Calibration, calibrated
 from robins.ins.magnetometer_calibration import calibrate as fitted
@@ -20,7 +20,7 @@ from robins.logs.tables import tables_of
 from robins.results import Outcome, Progress, array, silent, variable
 from robins.units import parse
 from robins.workbench.errors import InputError, refusing
-from robins.workbench.examination import mounting_of, parted
+from robins.workbench.examination import mounting_of, parted, typed
 
 FILE = "calibration.toml"
 _AXES = ("x", "y", "z")
@@ -40,6 +40,7 @@ class Turned(NamedTuple):
     field_t: np.ndarray  # (N, 3)
     counts: dict[str, int]  # refused samples
     notes: list[str]
+    inertial: bool  # the log also has samples that a replay needs
 
 
 def samples(
@@ -58,16 +59,16 @@ def samples(
     mounting = mounting_of(configuration)
     formats = formats_of(files, columns)
     findings: list[Any] = []
-    tables = [
+    held = [
         table
         for path in files
         for table in tables_of(open_log(path, formats.get(str(path)), findings))
-        if isinstance(table, MagTable)
     ]
+    tables = [table for table in held if isinstance(table, MagTable)]
     names = ", ".join(map(str, log))
     if len(tables) != 1:
-        held = "hold magnetic field more than once" if tables else "holds no magnetic field"
-        raise InputError(held, names, "give the log of one magnetometer.")
+        cause = "hold magnetic field more than once" if tables else "holds no magnetic field"
+        raise InputError(cause, names, "give the log of one magnetometer.")
     table, counts = clean_mag(tables[0])
     table = to_ned_frd(turned(table, mounting) if mounting else table)
     time_s = (table.time_ns - table.time_ns[:1]) * 1e-9
@@ -78,8 +79,9 @@ def samples(
         raise InputError(
             f"no sample from {begin_s:g} s {until}; the log ends at {last:g} s.", names
         )
+    inertial = any(isinstance(table, ImuTable) for table in held)
     told = {reason: count for reason, count in counts.items() if count}
-    return Turned(time_s[inside], table.field_t[inside], told, [str(f) for f in findings])
+    return Turned(time_s[inside], table.field_t[inside], told, [str(f) for f in findings], inertial)
 
 
 def advice(found: Calibration) -> list[str]:
@@ -201,7 +203,8 @@ def calibrate(
     begin_s = 0.0 if begin is None else parse(begin, "time")
     end_s = np.inf if end is None else parse(end, "time")
     progress(0.1, "reading")
-    first = parted(log)[0][0]
+    files = parted(log)[0]
+    first, shown = files[0], typed(files, columns)
     given = samples(log, begin_s, end_s, columns)
     progress(0.5, "fitting the ellipsoid")
     with refusing(first):
@@ -214,6 +217,7 @@ def calibrate(
         notes=given.notes + advice(found),
         scenario=f"calibrate/{first.name.split('.')[0]}",
         last_lines=[
-            f"Next:   robins replay {first} {{out}}/{FILE} --system marg   navigates with it"
-        ],
+            f"Next:   robins replay {shown} {{out}}/{FILE} --system marg   navigates with it"
+        ]
+        * given.inertial,
     )

@@ -27,7 +27,7 @@ _THIRD = np.sqrt(20.0)  # sigma of a third difference of white noise, over its o
 
 
 def scatter(log: Log) -> np.ndarray | None:
-    """Scatter (3,) of positions about the motion over their stated sigmas, north, east, down.
+    """Scatter (3,) of positions about the motion over their sigmas, north, east, down.
 
     Third differences of positions, or differences less what velocities say where these are known,
     whichever scatter less: a bound from above, as both contain some motion. None where there are
@@ -77,9 +77,9 @@ def with_lasting(parameters: Replay, log: Log) -> tuple[Replay, list[str]]:
     if found is None or not share:
         return parameters, []
     return parameters, [
-        f"Positions scatter from fix to fix by {np.max(found):.2g} of their stated sigma. So "
-        f"{share:.0%} of the variance is taken to last (gnss.lasting_share; first-order "
-        f"Gauss-Markov of {gnss.lasting_time:g} s, gnss.lasting_time), and the stated sigma of the "
-        "estimate does not fall below that of the fixes. With gnss.lasting_share = 0 all of it is "
-        "taken for white."
+        f"Positions scatter from fix to fix by {np.max(found):.2g} of their sigma, stated or "
+        f"assumed. So {share:.0%} of the variance is taken to last (gnss.lasting_share; "
+        f"first-order Gauss-Markov of {gnss.lasting_time:g} s, gnss.lasting_time), and the "
+        "stated sigma of the estimate does not fall below that of the fixes. With "
+        "gnss.lasting_share = 0 all of it is taken for white."
     ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -69,28 +69,32 @@ def axes_of(orientation: Sequence[float]) -> np.ndarray:
 
 
 def believed_sigmas(
-    gnss: GnssTable, parameters: Rover, stated: bool = True
+    gnss: GnssTable, parameters: Rover, assumed: Collection[str] = ()
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """(M, 3) m and m/s, sigmas of fixes as the filter shall believe them; None where not used.
 
     Args:
         gnss: with sigmas.
         parameters: of the receiver; its own sigmas stand in the place of those of the log.
-        stated: by the receiver, whose factors by quality apply; else assumed, by quality.
+        assumed: "place" or "velocity" where its sigma is that of a kind of fix; factors by quality
+            apply only to sigmas that the receiver states or that the parameters give.
     """
     g, factor = parameters, np.ones(len(gnss))
     if gnss.quality is not None:
-        for quality, value in g.sigma_factor.items() if stated or g.sigma is not None else ():
+        for quality, value in g.sigma_factor.items():
             factor[gnss.quality == int(quality)] = value
 
-    def of(sigma: np.ndarray, own: tuple[float, ...] | None, least: float) -> np.ndarray:
-        sigma = sigma if own is None else np.tile(own, (len(sigma), 1))
+    def of(kind: str, sigma: np.ndarray, own: tuple[float, ...] | None, least: float) -> np.ndarray:
+        if own is not None:
+            sigma = np.tile(own, (len(sigma), 1))
+        elif kind in assumed:
+            return np.maximum(sigma, least)
         return np.maximum(sigma * factor[:, None], least)
 
     sigma_v = gnss.sigma_v if g.use_velocity else None
     if sigma_v is not None:
-        sigma_v = of(sigma_v, g.velocity_sigma, g.least_velocity_sigma)
-    return of(gnss.sigma_m, g.sigma, g.least_sigma), sigma_v
+        sigma_v = of("velocity", sigma_v, g.velocity_sigma, g.least_velocity_sigma)
+    return of("place", gnss.sigma_m, g.sigma, g.least_sigma), sigma_v
 
 
 def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
@@ -110,8 +114,8 @@ def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
             f"no GNSS fix lies within the IMU log: the IMU spans 0 to {time_s[-1]:.1f} s, the "
             f"fixes {gnss_s[0]:.1f} to {gnss_s[-1]:.1f} s; do both use the same time scale?"
         )
-    stated = not any(finding.code == "sigma_assumed" for finding in dataset.findings)
-    sigma_m, sigma_v = believed_sigmas(gnss, g, stated)
+    notes = (one.where for one in dataset.findings if one.code == "sigma_assumed")
+    sigma_m, sigma_v = believed_sigmas(gnss, g, ", ".join(notes))
     return Log(
         Increments(*(np.asarray(a, dtype=float) for a in increments[:3])),
         time_s,

@@ -26,6 +26,11 @@ from robins.systems.tables import place_arrays
 
 DIVERGED = "the estimate was off and took the word of positions that stayed away"
 NIS_MOST, FAR = 4.0, 6.0  # beyond which a replay is not to be trusted
+_OTHERS = {
+    "velocity": "gnss.velocity_sigma",
+    "place, velocity": "gnss.sigma, gnss.velocity_sigma",
+}
+_RANK = {1: 0, 6: 1, 2: 2, 3: 3, 4: 3, 5: 4}  # of a quality, by its usual sigma
 RTK_QUALITY = {1: "fix", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp"}
 
 
@@ -34,8 +39,8 @@ def sigma_notes(dataset: Dataset, parameters: Replay) -> list[str]:
     if parameters.gnss.sigma is not None:
         shown = " ".join(f"{x:g}" for x in parameters.gnss.sigma)
         return [f"Sigmas of positions: {shown} m north, east, down, from gnss.sigma."]
-    assumed = [f.sentence for f in dataset.findings if f.code == "sigma_assumed"]
-    return [f"{one} Another: gnss.sigma." for one in assumed]
+    assumed = [f for f in dataset.findings if f.code == "sigma_assumed"]
+    return [f"{one.sentence} Another: {_OTHERS.get(one.where, 'gnss.sigma')}." for one in assumed]
 
 
 def antenna_of(mount: model.Mount, mean: InsState, rate_b: Array | np.ndarray) -> Geodetic:
@@ -55,12 +60,14 @@ def _between(places: tuple[Geodetic, Geodetic]) -> Array:
 def distances(log: Log, used: np.ndarray, epoch_s: np.ndarray, antenna: Geodetic) -> dict[str, Any]:
     """Distances of the antenna from the best fixes, with aids and in outages.
 
-    The best fixes are those of quality 1 where the receiver states a quality, else all.
+    The best fixes are those of the quality whose usual sigma is the smallest of the fixes used;
+    all where the receiver states no quality.
     """
     g = log.gnss
     use = used & np.isfinite(g.lat_rad) & np.isfinite(g.alt_m)
     if g.quality is not None and np.any(use):
-        use = use & (g.quality == np.min(g.quality[use]))
+        rank = np.array([_RANK.get(int(q), len(_RANK)) for q in g.quality])
+        use = use & (rank == np.min(rank[use]))
     epoch = np.searchsorted(epoch_s, log.gnss_s[use] - 1e-9)
     at = jax.tree_util.tree_map(lambda x: np.asarray(x)[epoch], antenna)
     fix = Geodetic(*(v[use] for v in (g.lat_rad, g.lon_rad, g.alt_m)))
