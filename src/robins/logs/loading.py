@@ -49,7 +49,7 @@ def load_dataset(
     findings: list[Finding] = []
     opened = [open_log(path, (formats or {}).get(path), findings) for path in paths]
     known = [file for one in opened if isinstance(one, Dataset) for file in one.time_unit_known]
-    held = by_kind(paths, opened, findings)
+    held: dict[str, Any] = by_kind(paths, opened, findings)
     if "imu" not in held:
         given = ", ".join(paths) or "(no file)"
         raise LogError(given, "no IMU log among the files", "give one IMU log")
@@ -66,7 +66,7 @@ def by_kind(
     paths: Iterable[str | os.PathLike[str]],
     opened: Iterable[Table | Dataset],
     findings: list[Finding],
-) -> dict[str, Any]:
+) -> dict[str, Table]:
     """One table of each kind; gyros and accelerometers that were recorded apart become one.
 
     Args:

@@ -89,7 +89,7 @@ def _kfgins_nav(rows: Rows) -> bool:
 
 
 def _poses(first: int, stamps: tuple[float, float], widths: range) -> Looks:
-    """So many numbers, a stamp within these, and from place `first` on a unit quaternion."""
+    """Rows of such a width, with a stamp within these and a unit quaternion from `first` on."""
 
     def looks(rows: Rows) -> bool:
         return len(rows[0]) in widths and all(
