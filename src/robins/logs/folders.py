@@ -21,8 +21,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from robins import rotation
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.gps_time import gps_of
 from robins.logs.findings import Finding, LogError, refused, telling
@@ -153,7 +153,7 @@ def _oxts(folder: Path, findings: Findings) -> Dataset:
     v = np.concatenate([_record(record) for record in records])
     lat, lon, roll, pitch = np.deg2rad(v[:, 0]), np.deg2rad(v[:, 1]), v[:, 3], -v[:, 4]
     place, v_n = (lat, lon, v[:, 2].copy()), np.stack([v[:, 6], v[:, 7], -v[:, 10]], axis=-1)
-    q_nb = np.asarray(rotation.from_euler(roll, pitch, np.pi / 2.0 - v[:, 5]))
+    q_nb = _turning(roll, pitch, np.pi / 2.0 - v[:, 5])
     sigma, sigma_v = (np.repeat(v[:, k, None], 3, axis=1) for k in (23, 24))
     telling(findings, "note", "fixes_of_truth", file)(
         "fixes and path are both the solution of the OXTS unit, so errors against the path are "
@@ -166,6 +166,12 @@ def _oxts(folder: Path, findings: Findings) -> Dataset:
         truth=Trajectory(time_ns, *place, v_n, q_nb, source=file, rows=rows),
         time_unit_known=(file,),
     )
+
+
+def _turning(roll: np.ndarray, pitch: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    """Quaternions (n, 4), scalar first, body to navigation, of Euler angles [rad]."""
+    turns = Rotation.from_euler("ZYX", np.stack([heading, pitch, roll], axis=-1))
+    return turns.as_quat(canonical=True, scalar_first=True)
 
 
 def _record(path: Path) -> np.ndarray:
@@ -280,7 +286,7 @@ def _simulated(folder: Path, findings: Findings) -> Dataset:
         place = of("ref_pos", *(rf"ref_pos_{n} \(.*\)" for n in ("lat", "lon", "alt"))).T.copy()
         v_n = of("ref_vel", *(rf"ref_vel_{n} \(.*\)" for n in _XYZ))
         euler = of("ref_att_euler", *(rf"ref_{n} \(.*\)" for n in ("Roll", "Pitch", "Yaw")))
-        q_nb = np.asarray(rotation.from_euler(*np.deg2rad(euler).T))
+        q_nb = _turning(*np.deg2rad(euler).T)
         place[:2] = np.deg2rad(place[:2])
         lat, lon, alt = place
         truth = Trajectory(time_ns, lat, lon, alt, v_n, q_nb, source=str(folder / "ref_pos.csv"))
