@@ -25,7 +25,7 @@ def test_an_unknown_file_is_refused_with_the_candidates(tmp_path):
     first, *rows = text.splitlines()
     assert first == (
         f"{path} line 1: no known format fits ('dear diary'); "
-        "name the format, or declare your columns (--columns); these are known:"
+        "give --format, or --columns (`robins guess` writes them); these are known:"
     )
     assert [row.split(maxsplit=1) for row in rows] == [[f.name, f.about] for f in FORMATS]
     assert max(map(len, rows)) < 120

@@ -98,7 +98,7 @@ def _left_over(
 def _upright(
     attitude: AttitudeTable, signal: Signal, time_s: np.ndarray, q: np.ndarray
 ) -> Iterator[Finding]:
-    """At rest the specific force points up, by these attitudes too."""
+    """Judge by the specific force at rest whether these attitudes are upright."""
     windows = windows_of(signal)
     middle = signal.time_s[windows.first] + 0.5
     known = windows.at_rest & (middle > time_s[0]) & (middle < time_s[-1])

@@ -256,7 +256,7 @@ def _late(gnss: GnssTable, track: Track, late: float) -> Finding:
 
 
 def _horizontal(p: np.ndarray, v: np.ndarray) -> tuple[str | None, float]:
-    """How v must be changed to fit p: words (empty: not at all; None: nothing fits) and scale."""
+    """Change of v that fits p: words (empty: none needed; None: nothing fits) and scale."""
     best = ("", 0.0, np.inf)
     as_is = np.inf
     for exchange in (False, True):
@@ -288,7 +288,7 @@ def _vertical_reversed(steps: Steps, track: Track) -> bool:
 
 
 def _place_exchanged(gnss: GnssTable) -> bool:
-    """Whether exchanging latitude and longitude explains more than exchanging velocities."""
+    """True if exchanging latitude and longitude explains more than exchanging velocities."""
     tracks = track_of(gnss, swap=True), track_of(gnss)
     swapped, as_is = (steps_of(track) if track else None for track in tracks)
     if swapped is None or as_is is None:

@@ -74,7 +74,7 @@ def check_master(imu: ImuTable, master: Trajectory, delay_s: float = 0.0) -> Ite
 
 
 def _as_fixes(master: Trajectory) -> GnssTable:
-    """With the scatter of the positions, by their second differences, as their sigma."""
+    """Records as fixes whose sigma is the scatter of positions, by their second differences."""
     north_m, east_m = 6.4e6 * master.lat_rad, 6.4e6 * np.cos(master.lat_rad) * master.lon_rad
     bends = np.abs(np.diff(np.stack([north_m, east_m, master.alt_m], -1), 2, axis=0))
     bends = bends[np.isfinite(bends).all(axis=1)]

@@ -201,7 +201,7 @@ def _components(
 
 
 def _gaps(imu: ImuTable, keep: np.ndarray) -> list[tuple[int, int]]:
-    """Where samples are missing between two kept ones.
+    """Spans between kept samples in which others are missing.
 
     A step longer than usual: for increments 1.5 times, for each one lost takes its motion with it;
     for rates 2.5 times, since one lost sample is bridged by its neighbours. Also where more than

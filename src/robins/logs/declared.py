@@ -181,7 +181,7 @@ def formats_of(files: Paths, columns: Paths) -> dict[str, str | TextFormat]:
 
 
 def _head(path: str | os.PathLike[str]) -> Head | None:
-    """How a text file begins; one of another kind cannot be in a declared format."""
+    """Beginning of a text file; one of another kind cannot be in a declared format."""
     try:
         return head_of(path)
     except LogError:

@@ -30,7 +30,7 @@ from robins.logs.tables import KINDS, Table, checked, kind_of, tables_of
 
 
 class Code(NamedTuple):
-    """What one finding says."""
+    """Meaning of one finding."""
 
     name: str
     severity: str  # "error", or several, "error or warning"
@@ -53,13 +53,13 @@ class Check:
     undecided: str = ""  # ... unless by this code it could not
 
     def is_asked(self, things: Mapping[str, Any], found: set[str]) -> bool:
-        """Whether it is, about these things and after these codes."""
+        """True if the check runs on these things and after these codes."""
         there = things.keys() >= set(self.needs.split())
         kept_out = set(self.unless.split()) & things.keys() and self.but_after not in found
         return there and not kept_out and not set(self.silenced_by.split()) & found
 
     def ask(self, things: Mapping[str, Any]) -> list[Finding]:
-        """What it finds."""
+        """Findings of the check."""
         return list(self.find(*(things[need] for need in self.needs.split())))
 
     def outdated(self, found: set[str]) -> set[str]:
@@ -369,7 +369,7 @@ def _in_vehicle(tables: list[Table]) -> bool:
 
 
 def _stamped_as(table: Table, imu: ImuTable | None) -> bool:
-    """Whether a table out of the file of the IMU has the same stamps."""
+    """True if a table from the file of the IMU has the same stamps."""
     if imu is None or table.source != imu.source:
         return False
     return bool(np.array_equal(table.time_ns, imu.time_ns))

@@ -1,4 +1,4 @@
-"""What a GNSS table says about its own motion: positions in metres against velocities."""
+"""Motion of a GNSS table by itself: positions in metres against velocities."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def steps_of(track: Track, late_s: float = 0.0) -> Steps | None:
 
 
 def lateness(track: Track) -> float | None:
-    """How much older velocities are than their stamps [s], by the positions; None if unclear.
+    """Age of velocities at their stamps [s], by the positions; None if unclear.
 
     Many receivers give the mean velocity of the last epoch, half an epoch late.
     """
@@ -129,7 +129,7 @@ def lateness(track: Track) -> float | None:
 
 
 def lowest(x: np.ndarray, y: np.ndarray) -> float | None:
-    """Where a sampled curve is lowest, by the parabola through three points.
+    """Abscissa of the minimum of a sampled curve, by the parabola through three points.
 
     None at an end, or beside a sample that is missing (NaN).
     """

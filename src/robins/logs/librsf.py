@@ -39,7 +39,7 @@ class _Lines:
 
 
 def _lines_of(path: str | os.PathLike[str]) -> tuple[dict[str, _Lines], dict[str, int]]:
-    """What a file holds by its kind, and how many lines of other kinds there are."""
+    """Lines of a file by kind, and counts of lines of other kinds."""
     file, kinds, others = str(path), {name: _Lines() for name in WIDTH}, {}
     data = b"".join(Source(path))
     for row, line in enumerate(data.splitlines(), start=1):

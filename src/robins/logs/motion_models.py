@@ -179,7 +179,7 @@ def _starts(views: Views, block: str, best: Fit, free: tuple[str, ...]) -> list[
 
 
 def _known(views: Views, state: PairState, free: tuple[str, ...]) -> PairState:
-    """What the free blocks have shown; nuisances start again from what tables claim."""
+    """State of the free blocks; nuisances start again from the claims of the tables."""
     out = start_of(views, mirror=float(np.sign(np.linalg.det(state.M_a))))
     if "clock" in free:
         out = out._replace(offset=state.offset, rate=state.rate, part=state.part)

@@ -1,4 +1,4 @@
-"""How the IMU sits in the vehicle: sensor axes into forward-right-down, and the antenna's place.
+"""Mounting of the IMU: sensor axes into forward-right-down, and the antenna's place.
 
 A trajectory in local metres is one in east, north, up about an origin; there and back without
 drift.
@@ -33,7 +33,7 @@ class LocalPath(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """Where the local axes sit."""
+    """Origin of the local axes on the Earth."""
 
     lat_deg: float
     lon_deg: float
@@ -198,7 +198,7 @@ def _lever_arm(dataset: Dataset, mounting: Mounting) -> tuple[float, float, floa
 
 
 def _relabelled(table: OnBoard) -> OnBoard:
-    """In forward-right-down, the navigation axes of an attitude as they are."""
+    """Table in forward-right-down; the navigation axes of an attitude stay."""
     if isinstance(table, AttitudeTable) and table.nav == "ENU":
         return dataclasses.replace(to_ned_frd(dataclasses.replace(table, nav="NED")), nav="ENU")
     return to_ned_frd(table)

@@ -170,7 +170,7 @@ def _in_order(data: Bytes) -> Iterator[re.Match[bytes]]:
 
 
 def _numbers(kind: str, fields: list[str]) -> dict[str, float]:
-    """What a sentence states.
+    """Numbers of a sentence by name.
 
     Raises:
         ValueError: a field is no number, time or date.

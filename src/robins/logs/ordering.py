@@ -60,7 +60,7 @@ def _longest(times: list[int]) -> list[bool]:
 
 
 def reasons(time_ns: np.ndarray, keep: np.ndarray) -> dict[str, int]:
-    """How many rows were refused as duplicate, as backward and as ahead of what follows."""
+    """Counts of rows refused as duplicate, as backward and as ahead of what follows."""
     refused = np.flatnonzero(~keep)
     kept = np.flatnonzero(keep)
     at = np.searchsorted(kept, refused) - 1  # the last row kept before each; -1: none

@@ -82,7 +82,7 @@ def turned(q: Rotation, shared: Shared) -> np.ndarray:
 
 
 class Turning(NamedTuple):
-    """How attitudes turn, against the gyros."""
+    """Turning of attitudes against the gyros."""
 
     share: float  # of the turning that is left over
     late_s: float  # by how much attitudes are older than their stamps

@@ -42,7 +42,7 @@ def _header(head: Head) -> tuple[int, list[str]]:
 
 
 def is_phone(head: Head) -> bool:
-    """Whether a header names the columns of such a drive."""
+    """True if a header names the columns of such a drive."""
     names = _header(head)[1]
     return names[0] == "time" and {"acc_x", "gyro_x", "horizontalAccuracy"} <= set(names)
 

@@ -1,4 +1,4 @@
-"""What a column of a log may hold, and which of them make a table.
+"""Quantities of the columns of a log, and the sets of them that make a table.
 
 A column holds one quantity; those that belong together, such as three axes, are a group. A table
 of `robins.dataset` needs one of several sets of groups and may have more.

@@ -1,4 +1,4 @@
-"""What the doctor examines: a table without its bad rows, its usual step, its quiet stretches."""
+"""Material of the doctor: a table without its bad rows, its usual step, its quiet stretches."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _STEADY = 0.003  # relative change of the specific force from one window at rest
 
 
 def name_of(table: Table) -> str:
-    """How sentences call a table: its file without the folder, or its type.
+    """Name of a table in sentences: its file without the folder, or its type.
 
     A magnetometer comes out of the file of its IMU, so the part of the file is said too.
     """
@@ -33,7 +33,7 @@ def name_of(table: Table) -> str:
 
 
 def place(table: Table, row: int) -> str:
-    """Where a row is: its line in the file if known, else its time since the first row."""
+    """Place of a row: its line in the file if known, else its time since the first row."""
     rows = getattr(table, "rows", None)
     if rows is not None:
         return f"line {rows[row]}"

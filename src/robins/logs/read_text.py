@@ -60,7 +60,7 @@ _ORIGIN = re.compile(rf"\borigin: {_NUMBER} deg,? {_NUMBER} deg,? {_NUMBER} m\b"
 
 
 class Read(NamedTuple):
-    """What the columns of a file hold."""
+    """Contents of the columns of a file."""
 
     file: str
     columns: dict[str, Found]
@@ -72,7 +72,7 @@ class Read(NamedTuple):
     findings: list[Finding] | None
 
     def has(self, group: str) -> bool:
-        """Whether there is such a group of columns."""
+        """True if there is such a group of columns."""
         return parts(group)[0] in self.values
 
     def stack(self, group: str) -> np.ndarray:
@@ -82,7 +82,7 @@ class Read(NamedTuple):
 
     @property
     def origin(self) -> dict[str, Any]:
-        """Where its numbers come from, for a table."""
+        """Source of the numbers, for a table."""
         return {"source": self.file, "rows": self.rows}
 
     def of(self, rows: np.ndarray) -> Read:
@@ -213,7 +213,7 @@ def _times(
 
 
 def _frames(format: TextFormat, head: Head) -> tuple[NavFrame, BodyFrame]:
-    """Those of the format, or what a comment above the rows says.
+    """Frames of the format, or those that a comment above the rows states.
 
     Raises:
         LogError: it says something else than NED FRD or ENU RFU.
@@ -241,7 +241,7 @@ def _origin(head: Head) -> Origin | None:
 
 
 def _comments(head: Head) -> list[tuple[int, str]]:
-    """Those before the first line of data."""
+    """Comments before the first line of data."""
     first = (head.data(1) or [(len(head.lines) + 1, "")])[0][0]
     lines = enumerate(head.lines[: first - 1], start=1)
     return [(k, text) for k, text in lines if text.lstrip().startswith(COMMENTS)]

@@ -204,7 +204,7 @@ def _of_names(path: str | os.PathLike[str]) -> Callable[..., Table | Dataset]:
 
 
 def fitting(path: str | os.PathLike[str]) -> tuple[Head, list[Format]]:
-    """How a file begins, and the formats that its beginning fits.
+    """Beginning of a file, and the formats that it fits.
 
     Raises:
         LogError: the file is empty, cannot be opened, or is neither text nor of a known kind.
@@ -230,7 +230,7 @@ def recognise(path: str | os.PathLike[str]) -> Format:
     mend = (
         "write numbers with a decimal point, not a comma"
         if commas
-        else "name the format, or declare your columns (--columns); these are known"
+        else "give --format, or --columns (`robins guess` writes them); these are known"
     )
     candidates = found or FORMATS
     width = max(len(f.name) for f in candidates)

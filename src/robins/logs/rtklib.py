@@ -32,7 +32,7 @@ _UNSUPPORTED = {
 
 
 def is_rtklib(head: Head) -> bool:
-    """Whether a header names the columns of a solution, or a line begins with a date."""
+    """True if a header names the columns of a solution, or a line begins with a date."""
     header = any(line.startswith("%") and " ns " in line for line in head.lines)
     stamp = re.compile(r"\d{4}/\d\d/\d\d[ ,]+\d\d:\d\d:\d\d")
     return header or any(stamp.match(text) for _, text in head.data(1))

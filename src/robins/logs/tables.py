@@ -44,7 +44,7 @@ def kind_in_text(table: Table) -> str:
 
 
 def tables_of(opened: Table | Dataset) -> list[Table]:
-    """What a reader returned, as a list; of a dataset all tables but the master's."""
+    """Tables that a reader returned; of a dataset all but the master's."""
     if not isinstance(opened, Dataset):
         return [opened]
     tables = [getattr(opened, kind) for kind in KINDS.values()]

@@ -35,7 +35,7 @@ COMMENTS = ("#", "%")
 
 
 class Layout(NamedTuple):
-    """How to read the lines of a file.
+    """Layout of the lines of a file.
 
     Columns at the places `texts`, at least one, are kept as text (time stamps are read from their
     digits), those at the places `numbers` are numbers, others may hold anything. Further columns
@@ -51,14 +51,14 @@ class Layout(NamedTuple):
     decimal: str = "."
 
     def number(self, place: int) -> int:
-        """Where in `Columns.values` the column at this place lies."""
+        """Index into `Columns.values` of the column at this place."""
         if self.numbers is not None:
             return self.numbers.index(place)
         return place - sum(text < place for text in self.texts)
 
 
 class Columns(NamedTuple):
-    """What was read: n rows of text columns and number columns, and their line numbers."""
+    """Text columns and number columns of n rows, and their line numbers."""
 
     texts: np.ndarray  # (n, texts) bytes
     values: np.ndarray  # (n, numbers) float64

@@ -44,7 +44,7 @@ class Axes(NamedTuple):
 
     @classmethod
     def of(cls, ways: str) -> Axes:
-        """Of three letters.
+        """Make axes of three letters.
 
         Raises:
             ValueError: they are not three axes at right angles, or left-handed.
@@ -165,7 +165,7 @@ class TextFormat:
 
     @cached_property
     def quantities(self) -> set[str]:
-        """What its columns hold."""
+        """Quantities of the columns."""
         return {column.holds for column in self.columns}
 
     @cached_property
@@ -175,7 +175,7 @@ class TextFormat:
 
     @property
     def named(self) -> bool:
-        """Whether columns are found by their names."""
+        """True if columns are found by their names."""
         return not any(column.place for column in self.columns)
 
     @property
@@ -185,7 +185,7 @@ class TextFormat:
 
     @property
     def local(self) -> bool:
-        """Whether places are metres from an origin."""
+        """True if places are metres from an origin."""
         return "east" in self.quantities
 
     @property
@@ -194,7 +194,7 @@ class TextFormat:
         return None if self.separator == " " else self.separator
 
     def recognise(self, head: Head) -> bool:
-        """Whether a file begins like this.
+        """True if a file begins like this format.
 
         One column beside the time is enough, so that what lacks is told; all are needed where the
         time may have any name. A format whose header is a comment may lack it, where its rows tell.
@@ -238,7 +238,7 @@ class Found(NamedTuple):
 
     @property
     def sure(self) -> bool:
-        """Whether the file itself says the unit."""
+        """True if the file itself states the unit."""
         return "{unit" in self.column.name
 
 
@@ -318,7 +318,7 @@ def sort_out(format: TextFormat, found: set[str]) -> tuple[set[str], set[str]]:
 def whole_sets(
     kinds: tuple[str, ...], offered: set[str], found: set[str]
 ) -> tuple[set[str], set[str]]:
-    """Of each table the set of columns that is nearest to whole; the first table must be there."""
+    """Set of columns of each table that is nearest to whole; the first table must be there."""
     used, lacking = found & {"time", "time_of_week", "week"}, set()
     for k, kind in enumerate(kinds):
         sets = [set(parts(groups)) for groups in TABLES[kind].needs]
@@ -368,7 +368,7 @@ def columns_of(format: TextFormat, file: str, header: Header) -> dict[str, Found
 
 
 def _dated(column: Column) -> bool:
-    """Whether a column holds times as dates."""
+    """True if a column holds times as dates."""
     return column.holds == "time" and column.unit in DATES
 
 
@@ -451,7 +451,7 @@ def _check(format: TextFormat) -> None:
 
 
 def one_of(name: str, allowed: Iterable[str]) -> str:
-    """How to mend a name that is not among those allowed."""
+    """Fix for a name that is not among those allowed."""
     allowed = list(allowed)
     near = get_close_matches(name, allowed, n=1)
     choose = f"hoose one of {', '.join(allowed)}"
@@ -459,7 +459,7 @@ def one_of(name: str, allowed: Iterable[str]) -> str:
 
 
 def _needs(kind: str) -> str:
-    """What a table needs, in words."""
+    """Columns that a table needs, in words."""
     sets = (", ".join(parts(groups)) for groups in TABLES[kind].needs)
     return f"the {kind} table needs {', or '.join(sets)}"
 

@@ -50,7 +50,7 @@ _EARLY = (
 
 
 class Topic(NamedTuple):
-    """What was logged of one topic."""
+    """Fields logged of one topic."""
 
     name: str
     fields: dict[str, np.ndarray]

@@ -1,4 +1,4 @@
-"""What the doctor can find of a unit and its receiver, as a configuration for a replay.
+"""Configuration of a replay from what the doctor finds of a unit and its receiver.
 
 The clock offset and the window of the velocities are found together: a velocity that is a mean over
 the last epoch and a receiver whose stamps are late look alike to the IMU, and only the positions
@@ -27,7 +27,7 @@ _LATE_S = 0.03
 
 
 class Found(NamedTuple):
-    """What was found; None where the log does not tell it."""
+    """Properties found in a log; None where it does not show them."""
 
     orientation_deg: tuple[float, float, float] | None = None  # roll, pitch, yaw of the mounting
     latency_s: float | None = None  # a fix stamped t is of t - latency

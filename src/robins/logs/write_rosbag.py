@@ -30,7 +30,7 @@ _STATUS = {3: 1, 4: 2, 1: 2, 2: 2}  # RTKLIB's Q -> status of a NavSatFix; else 
 
 
 class _Topic(NamedTuple):
-    """How rows of a table are written."""
+    """Writer of the rows of a table."""
 
     name: str
     frame_id: str
@@ -98,7 +98,7 @@ def _check(file: str, table: Table) -> None:
 
 
 class _Sink:
-    """What the writer of MCAP takes for a file; gives what was written, in pieces."""
+    """File object for the writer of MCAP; returns the bytes written, in pieces."""
 
     def __init__(self) -> None:
         self._waiting = bytearray()

@@ -219,7 +219,7 @@ def _refuse_missing(
 def _cells(
     columns: list[Column], time_ns: np.ndarray, values: Values, week: int | None
 ) -> dict[int, Cells]:
-    """By place from 0: what is written as it is, integers of a week or nanoseconds, floats."""
+    """Columns by place from 0: texts as they are, integers of a week or nanoseconds, floats."""
     absolute = len(time_ns) > 0 and bool(time_ns[0] >= GPS_EPOCH_NS)
     since_ns = time_ns - GPS_EPOCH_NS if absolute else time_ns
     weeks = since_ns // WEEK_NS + (0 if absolute else week or 0)

@@ -79,7 +79,7 @@ def with_lasting(parameters: Replay, log: Log) -> tuple[Replay, list[str]]:
     return parameters, [
         f"Positions scatter from fix to fix by {np.max(found):.2g} of their sigma, stated or "
         f"assumed. So {share:.0%} of the variance is taken to last (gnss.lasting_share; "
-        f"first-order Gauss-Markov of {gnss.lasting_time:g} s, gnss.lasting_time), and the "
-        "stated sigma of the estimate does not fall below that of the fixes. With "
-        "gnss.lasting_share = 0 all of it is taken for white."
+        f"first-order Gauss-Markov of {gnss.lasting_time:g} s, gnss.lasting_time): the more of it, "
+        "the less the sigma of `robust` falls below that of the fixes. gnss.lasting_share = 0 "
+        "takes all of it for white."
     ]

@@ -1,4 +1,4 @@
-"""What a live navigation answers, and the vector of numbers that it is made of."""
+"""Answers of a live navigation, and the vector of numbers that they are made of."""
 
 from __future__ import annotations
 

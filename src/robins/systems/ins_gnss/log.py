@@ -429,7 +429,7 @@ def replay(
         variables=variables,
         counts=dict(dataset.counts) | counts,
         notes=[f"Start: {piece.start.sentence}." for piece in pieces]
-        + notes
+        + notes * any(name.startswith(ROBUST) for name in wanted)
         + sigma_notes(dataset, parameters)
         + found
         + [f"Not navigated, {problem}." for problem in problems],

@@ -71,21 +71,21 @@ def state_blocks(scale_states: bool) -> tuple[StateBlock, ...]:
 
 
 class Fix(NamedTuple):
-    """What a GNSS position needs besides the state."""
+    """Inputs of a GNSS position besides the state."""
 
     sigma: ArrayLike  # (3,) m, north east down
     omega_b: ArrayLike  # (3,) rad/s mean raw gyro rate about the fix
 
 
 class Wheel(NamedTuple):
-    """What a speed of the wheels needs besides the state."""
+    """Inputs of a speed of the wheels besides the state."""
 
     sigma: ArrayLike  # (1,) m/s
     omega_b: ArrayLike  # (3,) rad/s mean raw gyro rate about the time
 
 
 class Velocity(NamedTuple):
-    """What a GNSS velocity needs besides the state.
+    """Inputs of a GNSS velocity besides the state.
 
     A receiver that differences positions states the mean velocity over a window up to the fix. It
     is older than the fix by what the vehicle gained since, on average over the window.
@@ -98,7 +98,7 @@ class Velocity(NamedTuple):
 
 
 class Mount(NamedTuple):
-    """Where things are on the vehicle."""
+    """Places of antenna and axle on the vehicle, and the latency of fixes."""
 
     lever_b: Array  # (3,) m, IMU to antenna, body axes
     latency_s: Array  # () s, a fix stamped t is of t - latency
@@ -125,7 +125,7 @@ def antenna_velocity(x: InsState, mount: Mount, omega_b: Array) -> Array:
 
 
 def read_position(mount: Mount, x: InsState, omega_b: Array) -> Geodetic:
-    """Where the antenna was when the fix that comes now was true."""
+    """Position of the antenna at the time for which the present fix is valid."""
     arm = x.q_nb.apply(mount.lever_b)
     return x.position.retract(arm - antenna_velocity(x, mount, omega_b) * mount.latency_s)
 

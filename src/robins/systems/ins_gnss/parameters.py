@@ -54,7 +54,7 @@ class Gnss(Parameters):
 
 
 class Start(Parameters):
-    """How well the start is known, and how the heading is found."""
+    """Uncertainty of the start, and the source of the heading."""
 
     tilt: q.Spread = default("2 deg")
     heading: q.Spread = default("20 deg")
@@ -110,7 +110,7 @@ class Outages(Parameters):
 
 
 class Update(Cutting):
-    """How the filter steps."""
+    """Steps of the filter."""
 
     longest_gap: q.Duration = default("1 s")
     # of the other filters than `robust`; 0: no gate
@@ -179,7 +179,7 @@ class Receiver(Gnss):
 
 
 class Believed(Parameters):
-    """What the filters believe, over what is true; 1 is right, and anything else a test."""
+    """Ratios of what the filters assume to what is true; 1 is right, anything else is a test."""
 
     q_factor: Positive = 1.0  # of the process noise covariance
     r_factor: Positive = 1.0  # of the fixes' covariance

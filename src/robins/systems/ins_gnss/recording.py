@@ -104,7 +104,10 @@ def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
         ValueError: there is no GNSS, or no fix lies within the IMU's time.
     """
     if dataset.gnss is None or len(dataset.gnss) == 0:
-        raise ValueError("a replay of INS/GNSS needs GNSS fixes; this log has none")
+        raise ValueError(
+            "a replay of INS/GNSS needs GNSS fixes; this log has none: give their file too, or "
+            "--system marg for the attitude alone"
+        )
     gnss, g = to_ned_frd(dataset.gnss), parameters.gnss
     increments, end_ns = from_imu(dataset.imu)
     origin = int(dataset.imu.time_ns[0])

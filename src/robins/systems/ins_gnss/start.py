@@ -1,4 +1,4 @@
-"""Where a replay begins: at rest or not, level, and with which heading and velocity."""
+"""Start of a replay: rest or motion, tilt, heading and velocity."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ UNKNOWN_SPEED = 10.0  # m/s, sigma of a velocity of which nothing is known
 
 
 class StartPoint(NamedTuple):
-    """Where and how the filter begins."""
+    """First fix of the filter, with attitude and velocity there."""
 
     fix: int  # row of the whole fix that it begins at
     q_nb: np.ndarray  # (4,)

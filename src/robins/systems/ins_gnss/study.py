@@ -83,7 +83,7 @@ def contender(drive: Drive, course: Course, name: str) -> Contender:
 
 
 def view(drive: Drive, course: Course) -> View:
-    """What is reported: all states, the true path, the track of each filter in the first run.
+    """Arrays of the report: all states, the true path, the track of each filter in the first run.
 
     Raises:
         ValueError: `settle` leaves nothing to count.

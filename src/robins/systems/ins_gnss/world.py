@@ -37,7 +37,7 @@ from robins.systems.study import Case
 
 
 class Course(NamedTuple):
-    """What all runs share."""
+    """Data that all runs share."""
 
     motion: Motion
     ideal: Increments  # (N,), (N, 3), (N, 3) the samples of an ideal unit
@@ -209,14 +209,14 @@ def simulate(drive: Drive, course: Course, seed: int, index: Array) -> Case:
 
 
 class DriveBelief(NamedTuple):
-    """What filters are told of a drive, whatever it is like."""
+    """Assumptions of filters about any drive."""
 
     factor: Array  # of the covariance at the start
     sigma: dict[str, Any]  # by sensor
 
 
 def belief_of(drive: Drive, course: Course) -> DriveBelief:
-    """What the parameters tell them."""
+    """Assumptions of the filters, by the parameters."""
     begin = drive.start
     known = start_belief(course.start, drive.imu, begin, begin.tilt, begin.heading)
     r, g = np.sqrt(drive.believed.r_factor), drive.gnss
