@@ -369,7 +369,7 @@ def main():
     print(f"motion in {above}, others in {others}; {each:.2f} s of processor time each")
     print(f"{'fault':<22}{'found':>6}{'in 3 s':>8}{'wrong':>8}  codes above a note")
     for name, fault in FAULTS.items():
-        if args.only in name:
+        if good and args.only in name:
             quoted(name, fault, good, why)
     if args.why:
         print(*why, sep="\n")

@@ -88,6 +88,8 @@ def _gravity(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Findin
             f"{shown}. Gravity was taken off: these are 'linear accelerations' of a phone or of "
             "another filter. Log the raw accelerometers; gravity cannot be put back."
         )
+    elif size.min() < G * (1.0 + BIASED) and size.max() > G * (1.0 - BIASED):
+        return  # a vehicle that turns or climbs feels more and less than gravity, in the right unit
     elif windows.at_rest.any():
         yield error(imu, "gravity_unknown", measured, row)(
             f"{shown}, and no usual unit makes it that. A scale factor is missing (counts of the "

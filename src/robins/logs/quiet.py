@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from robins.dataset import AttitudeTable, ImuTable, MagTable
 from robins.ins.increments import own_intervals
@@ -18,6 +19,7 @@ from robins.logs.tables import Table
 _WINDOW_S = 1.0
 _NONSENSE = 1e9
 _REST = 0.01  # relative scatter of |specific force| in a window at rest
+_LEAST_REST_S = 3.0
 _STEADY = 0.003  # relative change of the specific force from one window at rest to the next
 
 
@@ -118,6 +120,15 @@ def usual_force(windows: Windows) -> float:
     return float(np.median(np.linalg.norm(windows.accel[windows.calm], axis=-1)))
 
 
+def _long_enough(low: np.ndarray, change: np.ndarray, least: int) -> np.ndarray:
+    """(w,) bool: windows of low scatter in a row of at least so many without a change."""
+    if len(low) < least:
+        return np.zeros_like(low)
+    joined = np.where(change & low[1:] & low[:-1], 1, 0)
+    row = sliding_window_view(joined, least - 1).all(axis=1)  # begins at each window
+    return np.convolve(row, np.ones(least)) > 0
+
+
 def windows_of(signal: Signal) -> Windows:
     """Cut a signal into windows of one second, or of ten samples if that is longer."""
     n = min(max(round(_WINDOW_S / signal.step_s), 10), len(signal.rows))
@@ -129,11 +140,12 @@ def windows_of(signal: Signal) -> Windows:
     gyro, accel = cut(signal.gyro), cut(signal.accel)
     force, size = accel.mean(axis=1), np.linalg.norm(accel, axis=-1)
     mean = size.mean(axis=1)
-    # A smooth drive scatters as little as rest does, but its force changes with every turn.
+    # A smooth drive scatters as little as rest does, but its force changes with every turn, if not
+    # within a second or two.
     change = np.linalg.norm(np.diff(force, axis=0), axis=-1) < _STEADY * mean[1:]
-    steady = np.concatenate([change, [False]]) | np.concatenate([[False], change])
     scatter = size.std(axis=1)
-    at_rest = steady & (scatter < _REST * mean)
+    low = scatter < _REST * mean
+    at_rest = _long_enough(low, change, max(2, round(_LEAST_REST_S / (n * signal.step_s))))
     return Windows(
         np.arange(count) * n,
         gyro.mean(axis=1),
