@@ -204,6 +204,28 @@ def bump(field_t):
     return field_t + near_by[:, None] * [40e-6, 0.0, 0.0]
 
 
+def walked():
+    """Fixes of a slow walk that scatter by a third of its way in a second."""
+    rng, t = np.random.default_rng(3), np.arange(M) / GNSS_HZ
+    course = 0.8 * np.sin(0.3 * t)
+    v = 1.4 * np.stack([np.cos(course), np.sin(course), 0.0 * t], axis=-1)
+    r = np.cumsum(v, axis=0) / GNSS_HZ + 0.5 * rng.standard_normal(v.shape)
+    place = {"lat_rad": 0.8 + r[:, 0] / 6.37e6, "lon_rad": 0.1 + r[:, 1] / (6.39e6 * np.cos(0.8))}
+    sigmas = {"sigma_m": np.full(v.shape, 0.5), "sigma_v": np.full(v.shape, 0.05)}
+    return gnss(**place, alt_m=100.0 - r[:, 2], v_n=v, **sigmas)()
+
+
+def banked():
+    """An aircraft that turns to the left and right, and never flies straight for a second."""
+    rng, t = np.random.default_rng(3), np.arange(N) / IMU_HZ
+    roll = 0.7 * np.sin(2 * np.pi * t / 40.0)  # steepest between two whole seconds
+    down = -9.81 / np.cos(roll)
+    force = np.stack([0.0 * t, 0.0 * t, down], axis=-1) + 0.01 * rng.standard_normal((N, 3))
+    turn = 9.81 / 50.0 * np.tan(roll)
+    gyro = np.stack([np.gradient(roll, t), turn * np.sin(roll), turn * np.cos(roll)], axis=-1)
+    return imu(accel=force, gyro=gyro + 1e-3 * rng.standard_normal((N, 3)))()
+
+
 def tipped(q_nb):
     """Attitudes to a frame that lies on its side: (1, 0, 1, 0) times each."""
     w, x, y, z = q_nb.T

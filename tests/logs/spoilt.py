@@ -16,6 +16,7 @@ from made_spoilt import (
     about_vertical,
     antenna,
     attitude,
+    banked,
     by_hand,
     columns,
     drive,
@@ -41,6 +42,7 @@ from made_spoilt import (
     tumble,
     turned,
     two,
+    walked,
     with_gnss,
     with_imu,
     with_signs,
@@ -273,4 +275,6 @@ HEALTHY = {
     "stated delay": late(0.1, stated_s=0.1),
     "small delay": late(0.004),
     "turned by hand": by_hand,
+    "walked": walked,
+    "banked": banked,
 }

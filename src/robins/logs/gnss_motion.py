@@ -13,6 +13,7 @@ from robins.logs.motion import at, integral
 from robins.logs.ordering import increasing
 
 _BASE_S = 1.0
+_BASES_S = (_BASE_S, 2.0, 4.0, 8.0)  # the shortest is taken that moves a receiver enough
 _SPEED = 0.3  # m/s; below it a receiver at rest
 _KEPT = 0.9  # share of the steps that tell how late velocities are, those that fit best
 
@@ -73,7 +74,7 @@ def velocity_of(track: Track) -> tuple[np.ndarray, float]:
 
 
 class Steps(NamedTuple):
-    """Change of position over about a second, seen by positions and by velocities [m]."""
+    """Change of position over one to eight seconds, seen by positions and by velocities [m]."""
 
     of_position: np.ndarray  # (k, 3)
     of_velocity: np.ndarray  # (k, 3)
@@ -88,23 +89,42 @@ def steps_of(track: Track, late_s: float = 0.0) -> Steps | None:
     """
     if track.v_n is None:
         return None
+    of_position, of_velocity, duration = _steps_over(track, _BASE_S, late_s)
+    # By either view, so that positions or velocities in a wrong unit do not pass for rest.
+    by_either = _moves(of_velocity, duration, track.sigma_m)
+    by_either |= _moves(of_position, duration, track.sigma_m)
+    if np.count_nonzero(by_either) < 10:
+        return None
+    either = Steps(of_position[by_either], of_velocity[by_either])
+    # Of steps chosen by noisy positions, noise has made the ways longer.
+    for base_s in _BASES_S:
+        of_position, of_velocity, duration = _steps_over(track, base_s, late_s)
+        moving = _moves(of_velocity, duration, track.sigma_m)
+        if np.count_nonzero(moving) >= 10:
+            return Steps(of_position[moving], of_velocity[moving])
+    return either
+
+
+def _moves(way: np.ndarray, duration: np.ndarray, sigma_m: float) -> np.ndarray:
+    """(k,) bool: ways that are longer than a receiver at rest shows."""
+    return np.linalg.norm(way[:, :2], axis=-1) > np.maximum(_SPEED * duration, 5.0 * sigma_m)
+
+
+def _steps_over(
+    track: Track, base_s: float, late_s: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Change of position by positions and by velocities (k, 3) [m], and over what time (k,) [s]."""
     time_s = track.time_s
-    stride = max(1, round(_BASE_S / float(np.median(np.diff(time_s)))))
+    stride = max(1, round(base_s / float(np.median(np.diff(time_s)))))
     first = np.arange(0, len(time_s) - stride, max(1, stride // 2))
     last = first + stride
+    if not len(first):
+        return np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
     near = time_s[last] - time_s[first] < 1.5 * np.median(time_s[last] - time_s[first])
     first, last = first[near], last[near]
-    path = integral(time_s, track.v_n)
-    by_position = track.r_n[last] - track.r_n[first]
+    path = integral(time_s, velocity_of(track)[0])
     ends = (at(time_s[rows] + late_s, time_s, path) for rows in (last, first))
-    by_velocity = np.subtract(*ends)
-    duration = time_s[last] - time_s[first]
-    # By either view, so that positions in a wrong unit do not pass for rest.
-    by_both = np.maximum(*(np.linalg.norm(x[:, :2], axis=-1) for x in (by_position, by_velocity)))
-    moving = by_both > np.maximum(_SPEED * duration, 5.0 * track.sigma_m)
-    if np.count_nonzero(moving) < 10:
-        return None
-    return Steps(by_position[moving], by_velocity[moving])
+    return track.r_n[last] - track.r_n[first], np.subtract(*ends), time_s[last] - time_s[first]
 
 
 def lateness(track: Track) -> float | None:
