@@ -71,7 +71,7 @@ def kit(scenario):
 
 def sensed(kit, steps):
     """What reaches the part in each step, by message."""
-    parts, found = [RIG.build[name](kit) for name in ("imu", "gnss")], []
+    parts, found = [RIG.part(name, kit) for name in ("imu", "gnss")], []
     states = [part.begin() for part in parts]
     for k in range(steps):
         found.append({})

@@ -16,7 +16,7 @@ from robins.bench.broker.revive import Told as Told_
 from robins.bench.parts import station as memory
 from robins.bench.parts.idle import idleness
 from robins.bench.parts.station import Station
-from robins.bench.rigs.satellite import BUILD, RIG
+from robins.bench.rigs.satellite import RIG
 from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.wire import Header, Receiver, encode_frame
 
@@ -28,7 +28,7 @@ class Told(Loop):
     """Remembers what each part was told since its memory, as the bench does."""
 
     def __init__(self, *given):
-        self.histories = {name: History(LAST.__ge__) for name in BUILD}
+        self.histories = {name: History(LAST.__ge__) for name in RIG.parts}
         super().__init__(*given)
 
     def to(self, part, name, payload, time_ns):

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import pydantic
 
+from robins.bench.wire.fields import Values
 from robins.bench.wire.schema import BARE, PROTOCOL, Wire
 from robins.scenario import Parameters, Quantity, default
 
@@ -49,7 +50,7 @@ class Said(NamedTuple):
     link: str
     message: str
     stage: Stage
-    act: Callable[[dict[str, Any], Any, int], Mapping[str, Any]] = lambda said, fault, now: said
+    act: Callable[[Values, Any, int], Values] = lambda said, fault, now: said
     takes: tuple[str, ...] = ()
     needs: str = ""
 

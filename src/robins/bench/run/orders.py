@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 from robins.bench.broker.faults import LinkFault
 from robins.bench.broker.injector import Injector
-from robins.bench.rig import Spoken
-from robins.bench.run.setup import Flight
+from robins.bench.evaluation import Spoken
+from robins.bench.rig import Flight
+from robins.bench.wire.fields import Values
 
 
 class Due(NamedTuple):
@@ -63,7 +64,7 @@ class Orders:
 
     # ---------------------------------------------------------------------------------- messages
 
-    def say(self, message: str, values: Mapping[str, Any]) -> None:
+    def say(self, message: str, values: Values) -> None:
         """Queue a message for the next step; before the first one, it waits for its end.
 
         Raises:
@@ -84,7 +85,7 @@ class Orders:
         return found
 
 
-def in_words(message: str, values: Mapping[str, Any]) -> str:
+def in_words(message: str, values: Values) -> str:
     """Text of an operator message for the user."""
     told = ((name, [float(x) for x in _flat(value)]) for name, value in values.items())
     return f"'{message}': " + "; ".join(

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from robins.bench.live import Live, Signal
-from robins.bench.rig import Rig
+from robins.bench.rig import Flight, Rig
 from robins.bench.run.session import Session
-from robins.bench.run.setup import Flight, steps_of
+from robins.bench.run.setup import steps_of
 from robins.bench.run.spans import FaultSpans
 from robins.bench.status import STARTING, Status
 

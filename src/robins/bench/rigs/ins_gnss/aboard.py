@@ -12,12 +12,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from importlib import resources
-from typing import Any
 
 import jax
 import numpy as np
 
-from robins.bench.rig import Aboard, RigError
+from robins.bench.rig import Aboard, Flight, RigError
 from robins.bench.rigs.ins_gnss import SUSPECTS
 from robins.bench.rigs.ins_gnss.navigating import Kit
 from robins.dataset import Dataset
@@ -45,7 +44,7 @@ _FIELDS = {
 }
 
 
-def aboard(flight: Any) -> Aboard:
+def aboard(flight: Flight) -> Aboard:
     """Filter, problem and C files of the part `navigation`, for the drive or the log of a flight.
 
     Raises:

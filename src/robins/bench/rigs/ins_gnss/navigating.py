@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins import logs, manifold
+from robins.bench.evaluation import Flown, Judged, Ran, View, figures_of, latest
 from robins.bench.live.feed import Signal
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.recording.topics import JSON, Topic, as_json, nav_sat_fix
 from robins.bench.recording.topics import imu as imu_of_ros
-from robins.bench.rig import Judged, RigError, Timing, View
+from robins.bench.rig import Flight, RigError, Timing
 from robins.bench.rigs.ins_gnss import FLAGS, SUSPECTS
-from robins.bench.run.numbers import figures_of, latest
-from robins.bench.run.telemetry import Flown
+from robins.bench.wire.fields import Values
 from robins.dataset import Dataset
 from robins.earth import Geodetic
 from robins.ins.blocks import rate_about
@@ -180,11 +180,9 @@ def gnss(kit: Kit) -> Part:
     return Part("gnss", {}, lambda: int(np.searchsorted(since_s, 0.0, side="right")), act)
 
 
-class Navigating(NamedTuple):
-    """State of the navigation computer; the object in it is always the same, and changes."""
-
-    live: LiveInsGnss
-    waiting: tuple[Navigation, ...]  # epochs that have not been sent: one is sent a step
+Navigating = tuple[LiveInsGnss, tuple[Navigation, ...]]
+"""State of the navigation computer: an object that is always the same, and changes; and epochs that
+have not been sent: one is sent a step."""
 
 
 def navigation(kit: Kit) -> Part:
@@ -195,7 +193,7 @@ def navigation(kit: Kit) -> Part:
         if not made:  # which compiles, and is not needed where only its inputs are queried
             made.append(LiveInsGnss(kit.given, *kit.rates_hz, kit.filter, machine=kit.machine))
         made[0].start_over()
-        return Navigating(made[0], ())
+        return made[0], ()
 
     def act(state: Navigating, k: int, inputs: Inputs):
         live, waiting = state
@@ -210,18 +208,18 @@ def navigation(kit: Kit) -> Part:
                 fix["time"], *place, fix["sigma"], *moves, quality=fix["quality"]
             )
             flags, waiting = flags | answer.flags, (*waiting, *live.passed)
-        said: list[tuple[str, dict[str, Any]]] = []
+        said: list[tuple[str, Values]] = []
         if answer is not None:
             said.append(("state", {**_told(answer), "flags": int(flags)}))
         if waiting:
             said.append(("epoch", _told(waiting[0])))
-        return Navigating(live, waiting[1:]), said
+        return (live, waiting[1:]), said
 
     nothing = {"sample": None, "fix": None}
     return Part("navigation", {"sample": 0, "fix": 0}, begin, act, nothing)
 
 
-def _told(n: Navigation) -> dict[str, Any]:
+def _told(n: Navigation) -> Values:
     place = {"lat": n.lat_rad, "lon": n.lon_rad, "alt": n.alt_m}
     wrong = np.array([n.wrong.get(name, np.nan) for name in SUSPECTS])
     state = {"time": n.time_ns, "q_nb": n.q_nb, "v_n": n.v_n, **place}
@@ -231,11 +229,11 @@ def _told(n: Navigation) -> dict[str, Any]:
 def topics(kit: Kit) -> tuple[Topic, ...]:
     """Samples and fixes as ROS 2 has them, so that `robins replay` reads a record; states."""
 
-    def fix(v: Any) -> Any:
+    def fix(v: Values) -> Any:
         covariance = np.diag(np.square(v["sigma"]))
         return nav_sat_fix(v["lat"], v["lon"], v["alt"], covariance=covariance)
 
-    def sample(v: Any) -> Any:
+    def sample(v: Values) -> Any:
         return imu_of_ros(v["omega_s"], v["f_s"], body="FRD")
 
     return (
@@ -245,7 +243,7 @@ def topics(kit: Kit) -> tuple[Topic, ...]:
     )
 
 
-def judge(flight: Any, ran: Any) -> Judged:
+def judge(flight: Flight, ran: Ran) -> Judged:
     """Figures of a replay of the log, and errors where the truth is known."""
     flown, kit, blocks = ran.flown, ran.kit, model.state_blocks(False)[:3]
     arrays = track_arrays([_nav(flown, "state").position], "{} of the unit")

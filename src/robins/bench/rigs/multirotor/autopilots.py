@@ -5,7 +5,7 @@ Another program is waited for in `Part.rare`: once, in the process of the part, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ from robins.bench.parts.station import Inputs, Part
 from robins.bench.rigs.multirotor import craft
 from robins.bench.rigs.multirotor.craft import DOWN, INERTIA_KG_M2, MASS_KG
 from robins.bench.rigs.multirotor.flight import Kit
+from robins.bench.wire.fields import Values
 from robins.earth.atmosphere import G0
 from robins.rotation import conjugate, from_dcm, from_rotvec, multiply, rotate, to_rotvec
 
@@ -34,7 +35,7 @@ def autopilot(kit: Kit) -> Part:
     return {"own": own, "px4": px4, "ardupilot": ardupilot}[kit.autopilot](kit)
 
 
-def _motors(shares: Any = (0.0,) * 4, answered: bool = True) -> dict[str, Any]:
+def _motors(shares: Any = (0.0,) * 4, answered: bool = True) -> Values:
     return {"control": np.clip(np.asarray(shares, float), 0.0, 1.0), "answered": int(answered)}
 
 
@@ -157,7 +158,7 @@ def px4(kit: Kit) -> Part:
         with _until_lost(lines[0]):
             lines[0].accept(CONNECT_S)
 
-    def act(last: dict[str, Any], k: int, inputs: Inputs):
+    def act(last: Values, k: int, inputs: Inputs):
         time_us, sample, fix = (k + 1) * kit.step_ns // 1000, inputs["sample"], inputs["fix"]
         with _until_lost(lines[0]):
             if fix is not None and np.isfinite([fix["lat"], *fix["v_n"]]).all():
@@ -172,7 +173,7 @@ def px4(kit: Kit) -> Part:
     return Part("autopilot", takes, lambda: _motors(answered=False), act, rare=connect)
 
 
-def _sensors(time_us: int, sample: Mapping[str, Any]) -> Sensors:
+def _sensors(time_us: int, sample: Values) -> Sensors:
     now = np.isfinite([sample["pressure"], *sample["field_b"]]).all()
     return Sensors(
         time_us=time_us,
@@ -200,7 +201,7 @@ def ardupilot(kit: Kit) -> Part:
         with _until_lost(lines[0]):
             asked(CONNECT_S, "start ArduPilot's SITL")
 
-    def act(last: dict[str, Any], k: int, inputs: Inputs):
+    def act(last: Values, k: int, inputs: Inputs):
         if (motion := inputs["motion"]) is not None:
             state = of_ardupilot.BodyState(
                 time_s=(k + 1) * kit.step_ns * 1e-9,

@@ -33,6 +33,7 @@ from robins.bench.rigs.satellite.messages import (
 )
 from robins.bench.rigs.satellite.reference import Plan, rehearse, told, wanted
 from robins.bench.rigs.satellite.vehicle import Held, padded, renew, rest, stale, trusted
+from robins.bench.wire.fields import Values
 from robins.filters import Belief, Code, OnlineFilter
 from robins.filters.chi_square import chi_square
 from robins.filters.kalman import FilterState
@@ -45,7 +46,7 @@ SILENT_PERIODS = 4  # of the star sensor without a frame, after which it is flag
 _LIMIT = float(chi_square(GATE, 3))
 
 
-def sample_of(gyro: Any) -> np.ndarray | None:
+def sample_of(gyro: Values | None) -> np.ndarray | None:
     """The turn that a gyro reports; None if it did not come, or not of all axes."""
     if gyro is None or not np.all(np.isfinite(gyro["theta_b"])):
         return None
@@ -171,12 +172,12 @@ def adm(kit: Kit) -> Part:
     return late(part, lambda state: state._replace(lost=True))
 
 
-def _factor(kit: Kit, frame: Any) -> Any:
+def _factor(kit: Kit, frame: Values) -> Any:
     """Factor of the covariance of a frame, where frames bring theirs."""
     return None if kit.given.lens is None else frame["factor"].reshape(3, 3)
 
 
-def _innovation(innovation: Any, sigma: Any, nis: Any) -> dict[str, Any]:
+def _innovation(innovation: Any, sigma: Any, nis: Any) -> Values:
     ratio = float(nis) / _LIMIT
     return {
         "innovation": np.asarray(innovation),
