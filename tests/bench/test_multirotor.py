@@ -196,7 +196,7 @@ def test_noise_is_that_of_the_seed_and_the_step(run):
     motion = {name: of[f"motion.{name}"][40] for name in ("q_nb", "omega_b", "p_n", "v_n", "f_b")}
     _, [(_, said)] = part.act(None, 40, {"motion": motion})
     np.testing.assert_array_equal(said["omega_b"], of["sample.omega_b"][40])
-    _, [(_, other)] = RIG.build["imu"](kit._replace(seed=6)).act(None, 40, {"motion": motion})
+    _, [(_, other)] = RIG.part("imu", kit._replace(seed=6)).act(None, 40, {"motion": motion})
     assert np.all(other["omega_b"] != said["omega_b"])
     assert part.act(None, 40, {"motion": None}) == (None, [])
 
@@ -415,7 +415,7 @@ def test_an_ardupilot_that_is_started_anew_is_told():
     from ardupilot_peer import Peer, packet
 
     port = free(socket.SOCK_DGRAM)
-    part = RIG.build["autopilot"](kit_of(autopilot="ardupilot", port=port)[1])
+    part = RIG.part("autopilot", kit_of(autopilot="ardupilot", port=port)[1])
     motion = {name: getattr(at_rest(), name) for name in ("q_nb", "omega_b", "p_n", "v_n", "f_b")}
     with Peer(port) as peer:
         other = beside(lambda: [peer.put(packet(n)) or time.sleep(0.05) for n in (7, 7, 7, 7)])

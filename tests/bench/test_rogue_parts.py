@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from clockwork import CLOCKWORK, adder, inside
+from clockwork import CLOCKWORK, adder
 from stations import Threads, kit, on_threads
 
 from robins.bench.broker import Broker
@@ -168,7 +168,7 @@ def test_neither_past_nor_future_can_be_written(monkeypatch, lag, after, steps, 
     later_ns = round(steps * STEP_NS)
     ran, told = clockwork(monkeypatch, lag, Untimely, after=after, later_ns=later_ns)
     assert told == {counted: 1}
-    wanted = inside(None, STEPS)
+    wanted = CLOCK.rig.inside(None, STEPS)
     np.testing.assert_array_equal(ran.flown["count.n"], wanted["count.n"])
     wanted = np.r_[np.zeros(lag), wanted["sum.total"][: STEPS - lag]]
     np.testing.assert_array_equal(ran.flown["sum.total"], wanted)

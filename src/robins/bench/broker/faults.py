@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
+import numpy as np
 import pydantic
 
 from robins.bench.wire.fields import Values
@@ -53,6 +54,11 @@ class Said(NamedTuple):
     act: Callable[[Values, Any, int], Values] = lambda said, fault, now: said
     takes: tuple[str, ...] = ()
     needs: str = ""
+
+
+def nothing(said: Values, fault: Any, now_ns: int) -> Values:
+    """Values of a sensor that sees nothing: NaN for every number."""
+    return {name: np.full(np.shape(x), np.nan) for name, x in said.items()}
 
 
 class Table(NamedTuple):

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from robins.bench.broker.faults import Said
+from robins.bench.broker.faults import Said, nothing
 from robins.bench.rig import Rig, later, named
 from robins.bench.wire.fields import Field, Values, f64, message, size
 from robins.bench.wire.schema import Wire
@@ -76,13 +76,9 @@ def _shifted(said: Values, fault: Any, _: int) -> Values:
     return {**said, "place": said["place"] + np.array([fault.shift, 0.0])}
 
 
-def _blind(said: Values, *_: Any) -> Values:
-    return {name: np.full(np.shape(x), np.nan) for name, x in said.items()}
-
-
 _SAID = {
     "shifted": Said("radar", "fix", "sensed", _shifted, ("shift",)),
-    "blind": Said("star", "attitude", "blind", _blind),
+    "blind": Said("star", "attitude", "blind", nothing),
     "stuck": Said("air", "wind", "repeated"),
 }
 _SHIFT = Annotated[float, Quantity("length", least="-100 km", most="100 km")]

@@ -2,7 +2,7 @@
 
 The plant is a simulated drive or a recorded log, or there is none: boards send the samples. The
 computer runs `robins.systems.ins_gnss.LiveInsGnss`, whose epochs are those of `robins replay`. The
-computer can also be a program: `aboard`, and the C in its folder.
+computer can also be a program: `robins.systems.ins_gnss.aboard`, and the C in this folder.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class InsGnssRig(Rig):
     view = later(f"{code}:view")
     topics = later(f"{code}:topics")
     judge = later(f"{code}:judge")
-    aboard = later(f"{__name__}.aboard:aboard")
+    aboard = later(f"{code}:aboard")
 
     def flies(self) -> dict[str, Path]:
         """Simulated drives."""

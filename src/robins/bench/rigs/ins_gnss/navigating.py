@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -17,7 +18,7 @@ from robins.bench.live.feed import Signal
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.recording.topics import JSON, Topic, as_json, nav_sat_fix
 from robins.bench.recording.topics import imu as imu_of_ros
-from robins.bench.rig import Flight, RigError, Timing
+from robins.bench.rig import Aboard, Flight, RigError, Timing
 from robins.bench.rigs.ins_gnss import FLAGS, SUSPECTS
 from robins.bench.wire.fields import Values
 from robins.dataset import Dataset
@@ -29,6 +30,7 @@ from robins.ins.mechanise import Nav
 from robins.ins.state import InsState
 from robins.rotation import Rotation
 from robins.scenario import Quantity, default
+from robins.systems.ins_gnss import aboard as program
 from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.live import LiveInsGnss
 from robins.systems.ins_gnss.live_answers import Navigation
@@ -224,6 +226,24 @@ def _told(n: Navigation) -> Values:
     wrong = np.array([n.wrong.get(name, np.nan) for name in SUSPECTS])
     state = {"time": n.time_ns, "q_nb": n.q_nb, "v_n": n.v_n, **place}
     return {**state, "sigma": n.sigma, "wrong": wrong}
+
+
+def aboard(flight: Flight) -> Aboard:
+    """Filter and loop of the navigation computer as a program, for the drive or log of a flight.
+
+    Raises:
+        RobinsError: nothing sends as imu or gnss, the log cannot be read or navigated, or the part
+            needs what the loop does not do.
+    """
+    kit = prepare(flight.setup, flight.given)
+    if kit.dataset is None or kit.dataset.gnss is None:
+        raise RigError("the filter is tried on a drive or a log, and there is none", "--board")
+    problem, constants = program.aboard(
+        kit.given, kit.dataset, kit.rates_hz, flight.setup.filter, SUSPECTS, flight.name
+    )
+    here = sorted(Path(__file__).parent.glob("navigation_*.[ch]"))
+    files = {path.name: path.read_text("utf-8") for path in here}
+    return Aboard(problem, "filter", {**files, "navigation_given.h": constants})
 
 
 def topics(kit: Kit) -> tuple[Topic, ...]:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 import pydantic
 
-from robins.bench.broker.faults import Said
+from robins.bench.broker.faults import Said, nothing
 from robins.bench.rig import later, named
 from robins.bench.rigs.satellite import SatelliteRig, messages
 from robins.bench.wire.fields import Values, f64, message
@@ -66,10 +66,6 @@ TAKES = {part: taken for part, taken in messages.TAKES.items() if part != "plant
 }
 
 
-def _dark(said: Values, *_: Any) -> Values:
-    return {name: np.full_like(x, np.nan) for name, x in said.items()}
-
-
 def _hidden(said: Values, fault: Any, _: int) -> Values:
     """Stars without the brightest."""
     said["vectors_s"][: 3 * fault.stars] = np.nan
@@ -78,7 +74,7 @@ def _hidden(said: Values, fault: Any, _: int) -> Values:
 
 
 _SAID: dict[str, Said] = {
-    "dark": Said("sky", "stars", "blind", _dark),
+    "dark": Said("sky", "stars", "blind", nothing),
     "hidden": Said("sky", "stars", "said", _hidden, ("stars",)),
 }
 """A star simulator that shows nothing, or all but its brightest ``stars``."""

@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 import pydantic
 
-from robins.bench.broker.faults import Said
+from robins.bench.broker.faults import Said, nothing
 from robins.bench.rig import Rig, later
 from robins.bench.wire.fields import Field, Values, f64, message
 from robins.bench.wire.schema import Wire
@@ -74,11 +74,6 @@ def _magnet(said: Values, fault: Any, _: int) -> Values:
     return {**said, "field_b": said["field_b"] + np.array([0.0, fault.field, 0.0])}
 
 
-def _blind(said: Values, *_: Any) -> Values:
-    """No satellites."""
-    return {name: np.full(np.shape(x), np.nan) for name, x in said.items()}
-
-
 def _motor(said: Values, fault: Any, _: int) -> Values:
     """A motor that gives a share of its command, or nothing."""
     share = np.ones(len(MOTORS))
@@ -88,7 +83,7 @@ def _motor(said: Values, fault: Any, _: int) -> Values:
 
 _SAID = {
     "magnet": Said("imu", "sample", "sensed", _magnet, ("field",)),
-    "blind": Said("gnss", "fix", "blind", _blind),
+    "blind": Said("gnss", "fix", "blind", nothing),
     "motor": Said("autopilot", "motors", "said", _motor, ("motor", "left"), needs="motor"),
 }
 _MOTOR: Any = Annotated[int, pydantic.Field(ge=0, lt=len(MOTORS))]
