@@ -89,9 +89,9 @@ def test_a_scenario_says_with_units_and_at_boundaries_of_steps(tmp_path):
     orders.say("reference", {"rate": 0.5})
     out = {k: orders.due(k) for k in range(20)}
     assert [len(found) for found in out.values()] == [0, 2, *[0] * 11, 2, *[0] * 6]
-    assert [one.planned for one in out[1]] == [True, False]
+    assert [planned for *_, planned in out[1]] == [True, False]
     assert [one.step for one in orders.said] == [1, 1, 13, 13]
-    last = [WIRE.decode("reference", out[k][-1].payload) for k in (1, 13)]
+    last = [WIRE.decode("reference", out[k][-1][1]) for k in (1, 13)]
     assert last[0]["rate"] == 0.5
     assert np.all(np.isnan(last[1]["q_ib"]))
     words = "'reference': q_ib nan nan nan nan; rate 0.5"

@@ -266,10 +266,10 @@ class Session:
 
     def _say(self, step: int) -> None:
         """Send the operator's messages that are due before a step."""
-        for one in self._orders.due(step):
-            self.broker.say(one.message, one.payload)
-            values = self.rig.wire.decode(one.message, one.payload)
-            self.event("said", in_words(one.message, values), one.planned)
+        for message, payload, planned in self._orders.due(step):
+            self.broker.say(message, payload)
+            values = self.rig.wire.decode(message, payload)
+            self.event("said", in_words(message, values), planned)
 
     def active_faults(self) -> list[tuple[str, LinkFault]]:
         """Faults that are active now, with their labels."""

@@ -14,7 +14,7 @@ from robins import manifold
 from robins.bench.evaluation import Flown, Judged, Ran, figures_of
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.rig import Flight, Timing
-from robins.bench.run.setup import counted_from
+from robins.bench.run.setup import Setup, counted_from
 from robins.bench.wire.fields import Values
 from robins.earth import Geodetic
 from robins.filters import Belief, Model, OnlineFilter, run
@@ -64,7 +64,7 @@ def timing(given: Airship) -> Timing:
     return Timing(given.epoch, round(given.duration / given.epoch), first)
 
 
-def prepare(setup: Any, given: Airship) -> Kit:
+def prepare(setup: Setup, given: Airship) -> Kit:
     """Kit of run 0 of a campaign of this seed."""
     (study,) = SYSTEM.studies.values()
     problem = study.problem(given, (setup.filter,), setup.seed)

@@ -5,13 +5,15 @@ Another program is waited for in `Part.rare`: once, in the process of the part, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array
 
 from robins.bench.bridges import ardupilot as of_ardupilot
 from robins.bench.bridges import px4 as of_px4
@@ -35,7 +37,7 @@ def autopilot(kit: Kit) -> Part:
     return {"own": own, "px4": px4, "ardupilot": ardupilot}[kit.autopilot](kit)
 
 
-def _motors(shares: Any = (0.0,) * 4, answered: bool = True) -> Values:
+def _motors(shares: ArrayLike | Sequence[float] = (0.0,) * 4, answered: bool = True) -> Values:
     return {"control": np.clip(np.asarray(shares, float), 0.0, 1.0), "answered": int(answered)}
 
 
@@ -61,7 +63,7 @@ class Mind(NamedTuple):
 
 @jax.jit
 def believed(
-    s: Mind, omega_b: Any, f_b: Any, field_b: Any, fix: Any, field_n: Any, dt: Any
+    s: Mind, omega_b: Array, f_b: Array, field_b: Array, fix: Array, field_n: Array, dt: Array
 ) -> Mind:
     """A step of strapdown, held to the vertical of a hover, to the compass and to the fixes.
 
@@ -86,7 +88,7 @@ def believed(
 
 
 @jax.jit
-def controlled(s: Mind, omega_b: Any, height_m: Any, dt: Any) -> tuple[Mind, Any]:
+def controlled(s: Mind, omega_b: Array, height_m: Array, dt: Array) -> tuple[Mind, Array]:
     """Position over velocity over attitude over rate; the motors' shares (4,), not yet limited."""
     down = jnp.asarray(DOWN)
     off = HOLD_1_S * (-height_m * down - s.p_n)
@@ -112,7 +114,7 @@ def own(kit: Kit) -> Part:
     rest = {"omega_b": none, "f_b": -G0 * DOWN, "field_b": nothing[:3], "pressure": np.nan}
     begin = (Mind(np.array([1.0, 0.0, 0.0, 0.0]), none, none, none), rest)
 
-    def act(state: tuple[Mind, Any], k: int, inputs: Inputs):
+    def act(state: tuple[Mind, Values], k: int, inputs: Inputs):
         mind, sample = state[0], inputs["sample"] or state[1]
         fix = nothing
         if (found := inputs["fix"]) is not None:

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from robins.bench.evaluation import Flown, Judged, Ran, Spoken, Told, View, latest
 from robins.bench.live.feed import Signal
@@ -33,11 +34,13 @@ from robins.bench.rigs.satellite.reference import Said, followed, reference_q_ib
 from robins.bench.rigs.satellite.vehicle import padded
 from robins.bench.run.setup import counted_from
 from robins.bench.wire.fields import Values
-from robins.filters import Loop, run_closed
+from robins.filters import Belief, Loop, run_closed
 from robins.filters.run import Step
 from robins.results import array, variable
 from robins.rotation import conjugate, from_rotvec, multiply, to_rotvec
+from robins.systems.satellite.model import AttitudeState, QuaternionState
 from robins.systems.satellite.nodes import STAR, Row, StateForm, react
+from robins.systems.satellite.parameters import AttitudeLoop
 
 ARCSEC = np.pi / 648000.0
 Arrays = Mapping[str, np.ndarray]
@@ -188,12 +191,12 @@ def _reacts(react: Callable, form: StateForm) -> Callable:
     return partial(react, form)
 
 
-def _posterior(step: Step) -> Any:
+def _posterior(step: Step) -> Belief:
     return step.posterior
 
 
 @partial(jax.jit, static_argnames="form")
-def _attitudes(form: StateForm, mean: Any) -> Any:
+def _attitudes(form: StateForm, mean: AttitudeState | QuaternionState) -> Array:
     return jax.vmap(form.attitude)(mean)
 
 
@@ -247,7 +250,7 @@ _XYZ = ("x", "y", "z")
 _OF_FRAMES = USED | REFUSED | SHORT  # flags of a star frame, so none between two frames
 
 
-def signals(given: Any) -> list[Signal]:
+def signals(given: AttitudeLoop) -> list[Signal]:
     """Signals on the page, by the parameters of an attitude loop."""
 
     def three(plot: str, unit: str, sigma: bool = False) -> list[Signal]:
