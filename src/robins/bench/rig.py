@@ -26,7 +26,7 @@ from typing import (
 from robins.bench.parts.station import Part
 from robins.bench.wire.fields import Message, Values
 from robins.bench.wire.schema import Wire
-from robins.errors import RobinsError, hint
+from robins.errors import RobinsError, hint, moved
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from robins.bench.broker.says import Desk, Saying
     from robins.bench.evaluation import Judged, Ran, View
     from robins.bench.recording.topics import Topic
+
+
+__getattr__ = moved(__name__)
 
 
 class RigError(RobinsError, ValueError):
