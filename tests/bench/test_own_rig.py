@@ -169,8 +169,10 @@ def test_a_rig_is_given_by_its_class_or_in_one_call():
     assert made.part("camera", kit).takes == {"swing": 0}
     with pytest.raises(RigError, match="the rig Rig has no parameters and no prepare; define it"):
         Rig(name="pendulum", **{name: tables[name] for name in ("wire", "sends", "takes")})
+    with pytest.raises(RigError, match="no function makes the part 'camera'; define one of its"):
+        made.varied(build={"pendulum": build["pendulum"]})
     with pytest.raises(RigError, match=r"there is no 'camera' in the module robins\.bench\.rig"):
-        made.varied(build={}).part("camera", kit)
+        made.varied(build={}, code="robins.bench.rig").part("camera", kit)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ From the ground up:
 - `recording`: traffic of the lines: written, read, replayed, compared.
 - `live`: a running bench in a browser.
 - `bridges`: autopilots and ROS 2, by their protocols; independent of the rest.
+- `evaluation`: figures and page of a run. `accounting`: its latencies.
 - `run`: setup, execution and outcome of a run. `status`: the benches of this machine.
 
 Needs the extra "bench"; the page needs "live", bridges "autopilot" and "ros".

@@ -177,6 +177,11 @@ class Rig(Generic[GivenT, KitT]):
         parts = self.parts
         if strange := sorted(set(self.build) - set(parts)):
             raise RigError(f"build is of {', '.join(strange)}, the wire has {', '.join(parts)}")
+        home = sys.modules.get(type(self).__module__)
+        lost = [part for part in parts if not (part in self.build or hasattr(home, part))]
+        if lost and not self.code:
+            what = f"no function makes the part '{lost[0]}'"
+            raise RigError(what, type(self).__module__, "define one of its name before the rig")
         for what, table in (("sends", self.sends), ("takes", self.takes)):
             if set(table) != set(parts):
                 raise RigError(f"{what} is of {', '.join(table)}, the wire has {', '.join(parts)}")
