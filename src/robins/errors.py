@@ -83,14 +83,14 @@ def require_known(kind: str, name: str, among: Iterable[str], where: str = "this
 
 # By package, what it had: the package that has it now, and its name there.
 MOVED: dict[str, dict[str, tuple[str, str]]] = {
-    "robins.bench.rig": {
-        name: ("robins.bench.evaluation", name)
-        for name in ("Alarms", "Judged", "Offer", "Spoken", "Told", "View")
-    },
     "robins.linalg": {"steady_state": ("robins.filters", "steady_kalman")},
     "robins.filters": {
         "constrain": ("robins.filters.limits", "constrain"),
         "information_sum": ("robins.filters", "fuse"),
+    },
+    "robins.bench.rig": {
+        name: ("robins.bench.evaluation", name)
+        for name in ("Alarms", "Judged", "Offer", "Spoken", "Told", "View")
     },
     "robins.systems.marg": {
         "marg_filter": ("robins.systems.marg.filters", "marg_filter"),
