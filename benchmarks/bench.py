@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from robins.bench.rigs.satellite.errors import inside
+from robins.bench.rigs.satellite.judging import inside
 from robins.bench.run.session import Session
 from robins.bench.run.setup import changed, read
 from robins.bench.run.telemetry import difference

@@ -22,6 +22,7 @@ from plain_docstrings import plain
 
 from robins import scenario
 from robins.bench.rigs import rig_of
+from robins.bench.run.setup import setup_of
 from robins.cli import Status, app
 from robins.filters import Filter
 from robins.filters.rule import Hooks
@@ -264,7 +265,7 @@ def test_the_configurations_shown_can_be_read(tmp_path):
             columns_from(tmp_path / "shown.toml")
             continue
         if "bench" in mapping:
-            scenario.validate(rig_of(mapping["bench"]).setup, mapping)
+            scenario.validate(setup_of(rig_of(mapping["bench"])), mapping)
             continue
         if "project" in mapping:  # of a package of the user's
             continue

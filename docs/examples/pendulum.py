@@ -4,7 +4,7 @@ The pendulum has an angle phi [rad] from straight down and a rate [rad/s]: phi''
 The camera measures the angle and runs an extended Kalman filter that believes the same equation.
 """
 
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -60,11 +60,6 @@ class Kit(NamedTuple):
     frames: tuple[int, ...] = (0,)  # all steps are computed alike
 
 
-def prepare(setup: Any, given: Pendulum) -> Kit:
-    noise = np.random.default_rng(setup.seed).normal(size=round(given.duration / given.step))
-    return Kit(round(given.step * 1e9), given, given.camera * noise)
-
-
 @jax.jit
 def swing(w2, T, x, u):
     """A step by the midpoint rule; w2 is g/l."""
@@ -108,28 +103,30 @@ def camera(kit: Kit) -> Part:
     return Part("camera", {"swing": 0}, lambda: first, act, {"swing": {"angle": 0.1, "rate": 0.0}})
 
 
-def judge(flight, ran) -> Judged:
-    flown, first = ran.flown, counted_from(flight, ran.steps)
-    error = np.degrees(flown["swing.angle"] - flown["estimate.angle"])[:, None]
-    sigma = np.degrees(flown["estimate.sigma"][:, :1])
-    rms = float(np.sqrt(np.nanmean(error[first:] ** 2)))
-    about = {"unit": "deg", "frame": "pendulum", "axes": ("angle",)}
-    return Judged(
-        metrics={"angle_rms_deg": rms},
-        arrays=array("error", error[None], "angle", **about)
-        | array("sigma", sigma[None], "angle", **about),
-        lines=[f"angle rms       {rms:10.3f} deg"],
-    )
+class PendulumRig(Rig[Pendulum, Kit]):
+    name = "pendulum"
+    wire = WIRE
+    sends = {"pendulum": ("swing",), "camera": ("estimate",)}
+    takes = {"pendulum": (), "camera": ("swing",)}
+    parameters = Pendulum
+    truth = "swing"
+
+    def prepare(self, setup, given):
+        noise = np.random.default_rng(setup.seed).normal(size=round(given.duration / given.step))
+        return Kit(round(given.step * 1e9), given, given.camera * noise)
+
+    def judge(self, flight, ran):
+        flown, first = ran.flown, counted_from(flight, ran.steps)
+        error = np.degrees(flown["swing.angle"] - flown["estimate.angle"])[:, None]
+        sigma = np.degrees(flown["estimate.sigma"][:, :1])
+        rms = float(np.sqrt(np.nanmean(error[first:] ** 2)))
+        about = {"unit": "deg", "frame": "pendulum", "axes": ("angle",)}
+        return Judged(
+            metrics={"angle_rms_deg": rms},
+            arrays=array("error", error[None], "angle", **about)
+            | array("sigma", sigma[None], "angle", **about),
+            lines=[f"angle rms       {rms:10.3f} deg"],
+        )
 
 
-rig = Rig(
-    name="pendulum",
-    wire=WIRE,
-    build={"pendulum": pendulum, "camera": camera},
-    sends={"pendulum": ("swing",), "camera": ("estimate",)},
-    takes={"pendulum": (), "camera": ("swing",)},
-    parameters=lambda: Pendulum,
-    prepare=prepare,
-    truth="swing",
-    judge=judge,
-)
+rig = PendulumRig()

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from robins.bench.rigs.satellite import RIG, errors
+from robins.bench.rigs.satellite import RIG, judging
 from robins.bench.rigs.satellite.reference import reference_q_ib
 from robins.bench.run import Session
 from robins.bench.run.outcome import figures, judged
@@ -40,13 +40,13 @@ def flown(case: str, filter_: str, seed: int, seconds: float) -> dict:
     told = figures(flight, ran, judged(flight, ran), None)
     # As in the specification: peaks and figures of the time from the fault on.
     after = slice(round(600.0 / flight.given.step), None)
-    error = errors.attitude_error(ran.flown)
+    error = judging.attitude_error(ran.flown)
     wanted = reference_q_ib(ran.kit, ran.flown, ran.steps)
-    pointing = errors.turn(wanted, ran.flown["motion.q_ib"])
+    pointing = judging.turn(wanted, ran.flown["motion.q_ib"])
     return told | {
-        "attitude_peak": errors.peak_arcsec(error, after),
+        "attitude_peak": judging.peak_arcsec(error, after),
         "attitude_end": told["attitude_end_arcsec"],
-        "pointing_peak": errors.peak_arcsec(pointing, after),
+        "pointing_peak": judging.peak_arcsec(pointing, after),
     }
 
 

@@ -88,6 +88,10 @@ MOVED: dict[str, dict[str, tuple[str, str]]] = {
         "constrain": ("robins.filters.limits", "constrain"),
         "information_sum": ("robins.filters", "fuse"),
     },
+    "robins.bench.rig": {
+        name: ("robins.bench.evaluation", name)
+        for name in ("Alarms", "Judged", "Offer", "Spoken", "Told", "View")
+    },
     "robins.systems.marg": {
         "marg_filter": ("robins.systems.marg.filters", "marg_filter"),
         "causal_attitudes": ("robins.systems.marg.model", "causal_attitudes"),

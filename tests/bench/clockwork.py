@@ -3,7 +3,7 @@
 import time
 from functools import partial
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -46,27 +46,32 @@ def adder(kit):
     return Part("adder", {"count": 0}, lambda: 0.0, act, {"count": None}, wait)
 
 
-def inside(kit, steps):
-    """Numbers of a run, in closed form."""
-    n = np.arange(float(steps))
-    return {"count.n": n, "sum.total": n * (n + 1.0) / 2.0}
+class ClockworkRig(Rig):
+    """The clockwork."""
 
-
-rig = Rig(
-    name="clockwork",
-    wire=Wire(
+    name = "clockwork"
+    wire = Wire(
         ("counter", "adder"),
         (
             message(16, "count", "A number.", f64("n", 1, "1", "of the step", 1e9)),
             message(17, "sum", "Their sum.", f64("total", 1, "1", "so far", 1e18)),
         ),
-    ),
-    build={"counter": counter, "adder": adder},
-    sends={"counter": ("count",), "adder": ("sum",)},
-    takes={"counter": (), "adder": ("count",)},
-    parameters=lambda: Clockwork,
-    prepare=lambda setup, given: Kit(round(1e9 * given.step), given.wait),
-    filters=lambda: ("exact",),
-    truth="count",
-    inside=inside,
-)
+    )
+    sends: ClassVar = {"counter": ("count",), "adder": ("sum",)}
+    takes: ClassVar = {"counter": (), "adder": ("count",)}
+    parameters = Clockwork
+    truth = "count"
+
+    def prepare(self, setup, given):
+        return Kit(round(1e9 * given.step), given.wait)
+
+    def filters(self):
+        return ("exact",)
+
+    def inside(self, kit, steps):
+        """Numbers of a run, in closed form."""
+        n = np.arange(float(steps))
+        return {"count.n": n, "sum.total": n * (n + 1.0) / 2.0}
+
+
+rig = ClockworkRig()

@@ -2,7 +2,14 @@
 
 from stations import parts
 
+from robins.bench.accounting import Latencies
+from robins.bench.evaluation import Ran
 from robins.bench.run.telemetry import Telemetry
+
+
+def ran_of(flown, kit=None):
+    """The result of a run in which nothing else happened."""
+    return Ran(flown, kit, len(flown.time_s), 0.0, Latencies(), {}, {}, {}, [], 0, "", False)
 
 
 def in_order(rig, made):

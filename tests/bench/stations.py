@@ -21,10 +21,10 @@ from robins.bench.parts.station import HELLO_EACH_S, Part, Station, path_of, put
 from robins.bench.ports.port import address, open_port
 from robins.bench.recording.replay import Start
 from robins.bench.rig import Rig
-from robins.bench.rigs.satellite import BUILD, RIG, Kit
-from robins.bench.rigs.satellite.errors import inside
+from robins.bench.rigs.satellite import RIG
+from robins.bench.rigs.satellite.judging import inside
+from robins.bench.rigs.satellite.kit import Kit, kit_for
 from robins.bench.rigs.satellite.messages import WIRE
-from robins.bench.rigs.satellite.preparing import kit_for
 from robins.bench.run.crew import Crew
 from robins.bench.run.setup import Flight, kit_of, read
 from robins.bench.wire import Frame, Header, Receiver, encode_frame
@@ -68,7 +68,7 @@ class Parts(dict[str, Part]):
         self.rig, self.kit = rig, of
 
     def __missing__(self, name: str) -> Part:
-        return self.setdefault(name, ready(self.rig.build[name](self.kit), self.kit.frames))
+        return self.setdefault(name, ready(self.rig.part(name, self.kit), self.kit.frames))
 
 
 def parts(of: Any, rig: Rig = RIG) -> Mapping[str, Part]:
@@ -197,13 +197,13 @@ class Loop:
 
     def __init__(self, of: Kit, meddle: Meddle | None = None):
         self.kit, self.meddle = of, meddle
-        self.stations = {name: Station(parts(of)[name], WIRE) for name in BUILD}
-        self.sent = dict.fromkeys(BUILD, 0)
-        self.receivers = {name: Receiver() for name in BUILD}
+        self.stations = {name: Station(parts(of)[name], WIRE) for name in RIG.parts}
+        self.sent = dict.fromkeys(RIG.parts, 0)
+        self.receivers = {name: Receiver() for name in RIG.parts}
         self.heard: dict[str, list[dict[str, Any]]] = {}
         self.said: list[tuple[str, Frame]] = []
         self.step = 0
-        for name in BUILD:
+        for name in RIG.parts:
             self.to(name, "begin", WIRE.encode("begin", {"step": of.step_ns}), 0)
 
     def to(self, part: str, name: str, payload: bytes, time_ns: int) -> bytes:

@@ -5,22 +5,22 @@ And of whole runs: reasons, warnings.
 
 import json
 import re
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import flights
 import numpy as np
 import pytest
 from clockwork import CLOCKWORK
 
+from robins.bench.accounting import EDGES_US, RECENT, Histogram, Latencies
 from robins.bench.broker.link import BenchError
+from robins.bench.evaluation import Ran
 from robins.bench.recording import Event
 from robins.bench.rigs import RIGS
-from robins.bench.run.accounting import EDGES_US, RECENT, Histogram, Latencies
 from robins.bench.run.outcome import outcome
-from robins.bench.run.session import Ran
 from robins.bench.run.setup import Flight, built_in, changed, kit_of, read, steps_of
 from robins.bench.run.telemetry import Telemetry
 from robins.bench.run.untested import doubts
@@ -180,8 +180,7 @@ def ran_of(of: Flight, steps: int, **more: Any) -> Ran:
     """A run of so many steps in which nothing was heard."""
     step_ns = round(1e9 * of.timing.step_s)
     flown, kit = Telemetry(of.rig, 1 + steps, step_ns).flown, SimpleNamespace(step_ns=step_ns)
-    ran = Ran(flown.until(steps), kit, steps, 0.0, Latencies(), {}, {}, {}, [], 0, "", False)
-    return ran._replace(**more)
+    return flights.ran_of(flown.until(steps), kit)._replace(**more)
 
 
 @pytest.mark.parametrize("name", [*RIGS, CLOCKWORK, PENDULUM])
@@ -199,7 +198,7 @@ def test_a_run_without_a_step_has_its_reason_and_no_figures(name, tmp_path):
 @pytest.mark.parametrize("wrong", ["judge", "inside"])
 def test_what_a_judge_cannot_judge_is_a_result_all_the_same(wrong):
     of = read(CLOCKWORK)
-    of = of._replace(rig=replace(of.rig, **{wrong: lambda given, ran, *said: [][-1]}))
+    of = of._replace(rig=of.rig.varied(**{wrong: lambda given, ran, *said: [][-1]}))
     for failure in ("", "'adder' died"):
         found = outcome(of, ran_of(of, 3, failure=failure), None)
         said = rf"the {wrong} of the rig 'clockwork' fails \(IndexError: "
@@ -211,7 +210,7 @@ def test_what_a_judge_cannot_judge_is_a_result_all_the_same(wrong):
 
 def test_what_a_rig_cannot_prepare_is_named():
     of = read(CLOCKWORK)
-    of = of._replace(rig=replace(of.rig, prepare=lambda setup, given: given["length"]))
+    of = of._replace(rig=of.rig.varied(prepare=lambda setup, given: given["length"]))
     with pytest.raises(BenchError, match=r"line \d+: the prepare of the rig 'clockwork' fails"):
         kit_of(of)
 

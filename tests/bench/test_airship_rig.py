@@ -1,10 +1,8 @@
 """The airship on the bench: instruments that fail, and what is made of a flight."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
-from flights import flown
+from flights import flown, ran_of
 
 from robins.bench.broker.faults import LinkFault
 from robins.bench.rigs import rig_of
@@ -23,7 +21,7 @@ def run():
 
 
 def judged(flight, kit, of):
-    return RIG.judge(flight, SimpleNamespace(flown=of, kit=kit, steps=len(of.time_s)))
+    return RIG.judge(flight, ran_of(of, kit))
 
 
 def test_it_is_right_about_the_flight(run):

@@ -2,8 +2,8 @@
 
 import pytest
 
+from robins.bench.rigs.satellite.judging import Alarms
 from robins.bench.rigs.satellite.messages import HELD, REFUSED, SAFE, SHORT, SILENT, USED
-from robins.bench.rigs.satellite.view import Alarms
 
 BETWEEN = [0] * 4  # estimates without a star frame
 

@@ -21,14 +21,15 @@ from clockwork import CLOCKWORK
 from stations import Station, alive, kit, on_threads, one_program
 
 from robins.bench.broker import BenchError
+from robins.bench.evaluation import Ran
 from robins.bench.ports.cable import cable
 from robins.bench.recording import read_record
 from robins.bench.rigs.satellite import RIG
-from robins.bench.rigs.satellite.errors import flag
+from robins.bench.rigs.satellite.judging import flag
 from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.run import Flight
-from robins.bench.run.session import Ran, Session
-from robins.bench.run.setup import built_in, changed, kit_of, read
+from robins.bench.run.session import Session
+from robins.bench.run.setup import built_in, changed, kit_of, read, setup_of
 from robins.bench.run.telemetry import difference
 from robins.bench.wire.frames import Frame
 from robins.bench.wire.receiver import Receiver
@@ -415,4 +416,4 @@ def test_a_board_that_says_nothing_is_named(monkeypatch, threads):
     assert "gyro" in ran.failure
     assert ran.steps == 0
     assert isinstance(BenchError("x"), RuntimeError)
-    assert RIG.setup().clock == "lockstep"
+    assert setup_of(RIG)().clock == "lockstep"

@@ -13,13 +13,13 @@ from test_firmware import SANITISERS, Board, sanitised
 
 from robins.bench.ports.port import open_pair
 from robins.bench.recording import read_record
-from robins.bench.rig import RigError
 from robins.bench.rigs import rig_of
 from robins.bench.rigs.ins_gnss import WIRE
 from robins.bench.rigs.ins_gnss.navigating import epochs_of
 from robins.bench.run.setup import changed, read
 from robins.bench.wire import Receiver
 from robins.cli import main
+from robins.errors import RobinsError
 from robins.systems import trust
 from robins.systems.ins_gnss import SYSTEM
 from robins.systems.streaming import Flag
@@ -71,7 +71,7 @@ def kit(scenario):
 
 def sensed(kit, steps):
     """What reaches the part in each step, by message."""
-    parts, found = [RIG.build[name](kit) for name in ("imu", "gnss")], []
+    parts, found = [RIG.part(name, kit) for name in ("imu", "gnss")], []
     states = [part.begin() for part in parts]
     for k in range(steps):
         found.append({})
@@ -269,10 +269,11 @@ def replayed_epochs(record):
 def test_what_the_loop_does_not_do_is_refused(scenario, tmp_path, capsys):
     to = tmp_path / "c"
     rest = {"settings": ["aids.non_holonomic=true"], "filter_name": "ekf", "board": True}
-    with pytest.raises(RigError, match=r"aids.non_holonomic is set, .* --set aids"):
+    with pytest.raises(RobinsError, match=r"aids.non_holonomic is set, .* --set aids"):
         export_filter(scenario, to, **rest)
     given = {**rest, "settings": ["start.known_heading=10 deg"]}
-    with pytest.raises(RigError, match=r"known_heading is given, .* from the course; leave it out"):
+    told = r"known_heading is given, .* from the course; leave it out"
+    with pytest.raises(RobinsError, match=told):
         export_filter(scenario, to, **given)
     with pytest.raises(InputError, match=r"--float32: .* single precision; leave it out"):
         export_filter(scenario, to, filter_name="ekf", float32=True, board=True)

@@ -1,11 +1,10 @@
 """INS/GNSS on the bench: what the navigation computer says is what a replay of the log says."""
 
 import pickle
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from flights import flown
+from flights import flown, ran_of
 from short_drive import DRIVE
 
 from robins.bench.rig import RigError
@@ -41,7 +40,7 @@ def run(scenario):
 
 
 def judged(flight, kit, of):
-    return RIG.judge(flight, SimpleNamespace(flown=of, kit=kit, steps=len(of.time_s)))
+    return RIG.judge(flight, ran_of(of, kit))
 
 
 def as_replayed(kit):

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from robins.bench.rigs import rig_of, satellite
 from robins.bench.rigs.laboratory import RIG, TAKES, WIRE
 from robins.bench.rigs.laboratory.parts import MARGIN_RAD, STARS
-from robins.bench.rigs.satellite import errors, messages
+from robins.bench.rigs.satellite import judging, messages
 from robins.bench.run.session import Session
 from robins.bench.run.setup import changed, read
 from robins.bench.wire.c_header import firmware
@@ -83,7 +83,7 @@ def rows(flown, message, field):
 
 
 def error_arcsec(flown):
-    off = errors.turn(rows(flown, "estimate", "q_ib"), rows(flown, "motion", "q_ib"))
+    off = judging.turn(rows(flown, "estimate", "q_ib"), rows(flown, "motion", "q_ib"))
     return np.linalg.norm(off, axis=1) / ARCSEC
 
 
@@ -180,7 +180,7 @@ def test_an_error_of_all_stars_is_the_sensors():
     of = read("laboratory/stars", settings)
     kit = RIG.prepare(of.setup, of.given)
     ours, theirs = RIG.inside(kit), satellite.RIG.inside(kit)
-    error = errors.turn(ours["estimate.q_ib"], ours["motion.q_ib"])
+    error = judging.turn(ours["estimate.q_ib"], ours["motion.q_ib"])
     assert np.max(np.linalg.norm(error, axis=1)) > 50.0 * ARCSEC
     for name, values in ours.items():
         np.testing.assert_allclose(values, theirs[name], rtol=0.0, atol=1e-12, err_msg=name)
@@ -217,7 +217,7 @@ def test_parts_go_on_without_a_message(fly):
     lost = {"turn": 50, "motion": 120, "stars": 134}
     gone = fly(200, lambda name, k, said: None if lost.get(name) == k else said)
     q = rows(gone, "motion", "q_ib")
-    turns = np.linalg.norm(errors.turn(q[:-1], q[1:]), axis=1)
+    turns = np.linalg.norm(judging.turn(q[:-1], q[1:]), axis=1)
     assert np.max(np.abs(np.diff(turns[20:]))) < 1e-5  # rad: it keeps its rate
     assert len([said for said in gone["star"] if said is not None]) == 39
     assert error_arcsec(gone)[-1] < 60.0
@@ -235,11 +235,11 @@ def test_a_determination_that_lost_its_state_comes_back_with_the_next_star_frame
     torque = rows(gone, "command", "wheel_torque")
     assert np.all(torque[104:175] == 0.0)
     assert np.all(np.any(torque[175:] != 0.0, axis=1))
-    moved = errors.turn(gone["motion"][0]["q_ib"], gone["motion"][174]["q_ib"])
+    moved = judging.turn(gone["motion"][0]["q_ib"], gone["motion"][174]["q_ib"])
     assert np.linalg.norm(moved) > 1000.0 * ARCSEC  # from where the lost state would have it
     for k in range(174, 250):
         q_ib = gone["estimate"][k]["q_ib"]
-        assert np.linalg.norm(errors.turn(q_ib, gone["motion"][k]["q_ib"])) < 120.0 * ARCSEC
+        assert np.linalg.norm(judging.turn(q_ib, gone["motion"][k]["q_ib"])) < 120.0 * ARCSEC
 
 
 def test_a_control_that_lost_its_state_rests_until_it_hears_an_estimate(fly):

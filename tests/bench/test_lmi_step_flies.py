@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from stations import Loop, kit
 
-from robins.bench.rigs.satellite.errors import inside
+from robins.bench.rigs.satellite.judging import Alarms, inside
 from robins.bench.rigs.satellite.messages import FLAGS
-from robins.bench.rigs.satellite.view import Alarms
 from robins.filters import StepWarning
 from robins.filters.synthesis import EveryStep, NotCertified
 

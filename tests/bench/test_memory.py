@@ -12,11 +12,10 @@ from stations import RUN, Loop, kit
 
 from robins.bench.broker import BenchError, Injector, Link
 from robins.bench.broker.revive import History, beginning, catch_up
-from robins.bench.broker.revive import Told as Told_
 from robins.bench.parts import station as memory
 from robins.bench.parts.idle import idleness
 from robins.bench.parts.station import Station
-from robins.bench.rigs.satellite import BUILD, RIG
+from robins.bench.rigs.satellite import RIG
 from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.wire import Header, Receiver, encode_frame
 
@@ -28,7 +27,7 @@ class Told(Loop):
     """Remembers what each part was told since its memory, as the bench does."""
 
     def __init__(self, *given):
-        self.histories = {name: History(LAST.__ge__) for name in BUILD}
+        self.histories = {name: History(LAST.__ge__) for name in RIG.parts}
         super().__init__(*given)
 
     def to(self, part, name, payload, time_ns):
@@ -57,7 +56,7 @@ def test_every_part_goes_on_from_its_memory_to_the_last_bit(monkeypatch, tmp_pat
         assert new.feed(beginning(RUN, loop.kit.step_ns)) == b""
         assert new.begun
         assert history.since == LAST
-        again = [f for one in history.told for f in receiver.feed(new.feed(one.raw))]
+        again = [f for _, raw in history.told for f in receiver.feed(new.feed(raw))]
         end_ns = (LAST + 1) * loop.kit.step_ns
         said = [f for who, f in loop.said if who == name and f.header.time_ns > end_ns]
         assert [f.header for f in again] == [f.header for f in said]
@@ -81,7 +80,7 @@ def test_a_part_that_computes_is_waited_for(idle_s):
         ]
         for timer in late:
             timer.start()
-        wait = partial(catch_up, link, [Told_(3, b"tick")], b"", 3, 0.1, lambda: None)
+        wait = partial(catch_up, link, [(3, b"tick")], b"", 3, 0.1, lambda: None)
         if idle_s:
             with pytest.raises(BenchError, match=r"there is no hello from it in 0.1 s"):
                 wait(lambda: idle_s)
@@ -116,9 +115,12 @@ def test_what_is_kept_for_a_part_is_bounded():
         history.answered(step)
         most = max(most, len(history.told))
         if step == 255:
-            assert (history.since, [t.raw for t in history.told]) == (255, [b"late", b"tick again"])
+            assert (history.since, [raw for _, raw in history.told]) == (
+                255,
+                [b"late", b"tick again"],
+            )
         if step == 511:  # its memory could not be written
             assert history.since == 255
     assert history.since == 767
     assert most <= 3 * 2 * memory.EVERY + 2
-    assert [t.step for t in history.told if t.step is not None] == list(range(768, 1000))
+    assert [at for at, _ in history.told if at is not None] == list(range(768, 1000))

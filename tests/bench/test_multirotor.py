@@ -6,11 +6,10 @@ import math
 import socket
 import threading
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from flights import flown
+from flights import flown, ran_of
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from stations import on_threads
@@ -51,7 +50,7 @@ def kit_of(*settings, **options):
 
 
 def judged(flight, of):
-    return RIG.judge(flight, SimpleNamespace(flown=of, steps=len(of.time_s)))
+    return RIG.judge(flight, ran_of(of))
 
 
 @pytest.fixture(scope="module")
@@ -193,11 +192,11 @@ def test_instruments_measure_what_is_true(run):
 
 def test_noise_is_that_of_the_seed_and_the_step(run):
     _, kit, of = run
-    part = RIG.build["imu"](kit)
+    part = RIG.part("imu", kit)
     motion = {name: of[f"motion.{name}"][40] for name in ("q_nb", "omega_b", "p_n", "v_n", "f_b")}
     _, [(_, said)] = part.act(None, 40, {"motion": motion})
     np.testing.assert_array_equal(said["omega_b"], of["sample.omega_b"][40])
-    _, [(_, other)] = RIG.build["imu"](kit._replace(seed=6)).act(None, 40, {"motion": motion})
+    _, [(_, other)] = RIG.part("imu", kit._replace(seed=6)).act(None, 40, {"motion": motion})
     assert np.all(other["omega_b"] != said["omega_b"])
     assert part.act(None, 40, {"motion": None}) == (None, [])
 
@@ -405,7 +404,7 @@ def test_nobody_at_the_other_end_is_told(monkeypatch):
         if name == "px4":
             pytest.importorskip("pymavlink")
         _, kit = kit_of(autopilot=name, port=port)
-        part = RIG.build["autopilot"](kit)
+        part = RIG.part("autopilot", kit)
         with pytest.raises(
             BridgeTimeout, match=rf"{program} at port {port}: .*; start {program}'s SITL"
         ):
@@ -416,7 +415,7 @@ def test_an_ardupilot_that_is_started_anew_is_told():
     from ardupilot_peer import Peer, packet
 
     port = free(socket.SOCK_DGRAM)
-    part = RIG.build["autopilot"](kit_of(autopilot="ardupilot", port=port)[1])
+    part = RIG.part("autopilot", kit_of(autopilot="ardupilot", port=port)[1])
     motion = {name: getattr(at_rest(), name) for name in ("q_nb", "omega_b", "p_n", "v_n", "f_b")}
     with Peer(port) as peer:
         other = beside(lambda: [peer.put(packet(n)) or time.sleep(0.05) for n in (7, 7, 7, 7)])

@@ -8,11 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from stations import Loop, kit, on_threads
 
+from robins.bench.evaluation import Spoken
 from robins.bench.recording import read_record
-from robins.bench.rig import Spoken
 from robins.bench.rigs.satellite import RIG
-from robins.bench.rigs.satellite.errors import inside
-from robins.bench.rigs.satellite.judging import judge
+from robins.bench.rigs.satellite.judging import SAYS, inside, judge, sample
 from robins.bench.rigs.satellite.messages import SAFE, USED, WIRE
 from robins.bench.rigs.satellite.reference import (
     followed,
@@ -22,7 +21,6 @@ from robins.bench.rigs.satellite.reference import (
     wanted,
     wanted_after,
 )
-from robins.bench.rigs.satellite.view import SAYS, sample
 from robins.bench.run.session import Session
 from robins.bench.run.setup import changed, read
 from robins.bench.run.telemetry import Telemetry, difference

@@ -12,10 +12,10 @@ from flights import flown
 from short_drive import DRIVE
 from stations import on_threads
 
+from robins.bench.evaluation import Ran
 from robins.bench.recording import read_record
 from robins.bench.rig import Rig
 from robins.bench.run import outcome
-from robins.bench.run.session import Ran
 from robins.bench.run.setup import Flight
 from robins.bench.run.telemetry import difference
 from robins.logs import load_dataset
@@ -128,7 +128,7 @@ def test_it_flies_as_its_parts_do_in_a_row_and_inside_one_program(fly, name):
         np.testing.assert_array_equal(values[sound], wanted[field][sound], err_msg=field)
     faulty = (not np.array_equal(x, wanted[of], True) for of, x in flight.ran.flown.items())
     assert any(faulty) == (row.faulty_from is not None)
-    assert (flight.inside is None) == (flight.rig.inside is None)
+    assert (flight.inside is None) == (type(flight.rig).inside is Rig.inside)
     if flight.inside is not None:
         off = difference(flight.ran.flown, flight.inside)
         assert off <= row.off

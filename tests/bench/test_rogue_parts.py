@@ -2,18 +2,17 @@
 
 import math
 import time
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
-from clockwork import CLOCKWORK, adder, inside
+from clockwork import CLOCKWORK, adder
 from stations import Threads, kit, on_threads
 
 from robins.bench.broker import Broker
 from robins.bench.parts.station import Part, Station
 from robins.bench.recording import Event
-from robins.bench.rigs.satellite import BUILD
+from robins.bench.rigs.satellite import RIG
 from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.run import outcome
 from robins.bench.run.crew import Death
@@ -141,8 +140,8 @@ class Untimely(Station):
 
 def clockwork(monkeypatch, lag: int = 0, counter=Station, **more):
     """A run of the clockwork whose counter is odd, its health, and what is counted in its lines."""
-    build = {**CLOCK.rig.build, "adder": lambda of: adder(of)._replace(takes={"count": lag})}
-    of = CLOCK._replace(rig=replace(CLOCK.rig, name=f"clockwork {lag}", build=build))
+    build = {"adder": lambda of: adder(of)._replace(takes={"count": lag})}
+    of = CLOCK._replace(rig=CLOCK.rig.varied(name=f"clockwork {lag}", build=build))
     on_threads(monkeypatch, counter=partial(counter, **more) if more else counter)
     ran = Session(of).run()
     assert (ran.failure, ran.steps) == ("", STEPS)
@@ -169,7 +168,7 @@ def test_neither_past_nor_future_can_be_written(monkeypatch, lag, after, steps, 
     later_ns = round(steps * STEP_NS)
     ran, told = clockwork(monkeypatch, lag, Untimely, after=after, later_ns=later_ns)
     assert told == {counted: 1}
-    wanted = inside(None, STEPS)
+    wanted = CLOCK.rig.inside(None, STEPS)
     np.testing.assert_array_equal(ran.flown["count.n"], wanted["count.n"])
     wanted = np.r_[np.zeros(lag), wanted["sum.total"][: STEPS - lag]]
     np.testing.assert_array_equal(ran.flown["sum.total"], wanted)
@@ -257,7 +256,7 @@ def test_a_part_that_dies_again_and_again_fails_the_run(monkeypatch, restarts, w
             return [Death("adm", -9, "")]
 
         def start(self, name, port, since=-1):
-            if len(self._running) < len(BUILD):  # nobody comes in the place of the dead
+            if len(self._running) < len(RIG.parts):  # nobody comes in the place of the dead
                 super().start(name, port, since)
 
     on_threads(monkeypatch, Mortal)

@@ -7,11 +7,10 @@ import stations
 from stations import Loop, kit, one_program
 
 from robins.bench.parts.station import Station
-from robins.bench.rigs.satellite import BUILD, RIG
-from robins.bench.rigs.satellite.errors import turn
+from robins.bench.rigs.satellite import RIG, Carrier
+from robins.bench.rigs.satellite.judging import turn
+from robins.bench.rigs.satellite.kit import kit_for
 from robins.bench.rigs.satellite.messages import FLAGS, WIRE
-from robins.bench.rigs.satellite.preparing import kit_for
-from robins.bench.rigs.satellite.setup import Carrier
 from robins.bench.run.setup import changed, read
 from robins.bench.wire import Header, encode_frame
 from robins.scenario import ScenarioError
@@ -84,8 +83,8 @@ def test_messages_are_of_the_schema_and_of_the_end_of_their_step(of):
 
 
 def test_what_parts_take_is_what_the_links_carry(of):
-    for name, build in BUILD.items():
-        assert set(build(of).takes) <= set(RIG.takes[name])
+    for name in RIG.parts:
+        assert set(RIG.part(name, of).takes) <= set(RIG.takes[name])
 
 
 # ------------------------------------------------------------------------------- what goes wrong
@@ -176,7 +175,7 @@ def test_a_camera_is_played_by_jax_when_the_rest_is_interpreted():
 def test_whatever_is_lost_nothing_is_compiled_while_it_runs():
     # In real time a step that waits for the compiler misses its deadline, and some after it.
     of = kit("satellite/s1", "mekf-gate", *SHORT)
-    carried = [name for part in BUILD.values() for name in part(of).takes]
+    carried = [name for part in RIG.parts for name in RIG.part(part, of).takes]
     lost_at = {name: range(10 * k, 10 * k + 6) for k, name in enumerate(dict.fromkeys(carried), 2)}
 
     def meddle(step, message, to, payload):
@@ -282,7 +281,7 @@ def test_more_wheels_than_the_wire_has_are_refused():
 
 
 def test_a_part_of_another_run_hears_nothing(of):
-    station = Station(BUILD["adm"](of), WIRE)
+    station = Station(RIG.part("adm", of), WIRE)
     begin = WIRE.encode("begin", {"step": of.step_ns})
     station.feed(encode_frame(Header(WIRE.message("begin").number, 5, 0, 0), begin))
     tick = encode_frame(

@@ -1,7 +1,5 @@
 """What the operator says through the bench: what can be said, when it goes out, and by whom."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -91,9 +89,9 @@ def test_a_scenario_says_with_units_and_at_boundaries_of_steps(tmp_path):
     orders.say("reference", {"rate": 0.5})
     out = {k: orders.due(k) for k in range(20)}
     assert [len(found) for found in out.values()] == [0, 2, *[0] * 11, 2, *[0] * 6]
-    assert [one.planned for one in out[1]] == [True, False]
+    assert [planned for *_, planned in out[1]] == [True, False]
     assert [one.step for one in orders.said] == [1, 1, 13, 13]
-    last = [WIRE.decode("reference", out[k][-1].payload) for k in (1, 13)]
+    last = [WIRE.decode("reference", out[k][-1][1]) for k in (1, 13)]
     assert last[0]["rate"] == 0.5
     assert np.all(np.isnan(last[1]["q_ib"]))
     words = "'reference': q_ib nan nan nan nan; rate 0.5"
@@ -115,7 +113,7 @@ def test_a_rig_without_a_console_says_nothing():
 )
 def test_a_rig_that_contradicts_itself_is_refused(change, words):
     with pytest.raises(RigError, match=words):
-        dataclasses.replace(RIG, **change)
+        RIG.varied(**change)
 
 
 def test_fields_are_typed_by_the_wire():

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from robins.bench.live.feed import check, latest
-from robins.bench.rigs.satellite.view import signals
+from robins.bench.rigs.satellite.judging import signals
 from robins.bench.run import watching
 from robins.bench.run.spans import FaultSpans
 from robins.bench.run.watching import Looking

@@ -1,34 +1,43 @@
-"""A vehicle on the bench, as data: its parts, messages and wiring, its faults, its page.
+"""A vehicle on the bench: its parts, messages and wiring, its faults, its page.
 
-A rig needs a wire, parts, who sends what, and how a run of it is prepared; all else has a default
-that follows from its messages.
+A rig is a class of a few tables and one function: its messages, who sends and takes them, its
+parameters, and how a run of it is prepared. All else has a default that follows from its messages.
 """
 
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    ClassVar,
+    Generic,
+    NamedTuple,
+    Protocol,
+    TypeVar,
+    cast,
+    runtime_checkable,
+)
 
 from robins.bench.parts.station import Part
+from robins.bench.wire.fields import Message, Values
 from robins.bench.wire.schema import Wire
-from robins.errors import RobinsError
+from robins.errors import RobinsError, hint, moved
 
 if TYPE_CHECKING:
     import numpy as np
 
     from robins.bench.broker.faults import LinkFault, Said, Table
     from robins.bench.broker.says import Desk, Saying
-    from robins.bench.live.feed import Signal
+    from robins.bench.evaluation import Judged, Ran, View
     from robins.bench.recording.topics import Topic
-    from robins.bench.run.session import Ran
-    from robins.bench.run.setup import Flight, Setup
-    from robins.bench.run.telemetry import Flown
-    from robins.scenario import Parameters
+
+
+__getattr__ = moved(__name__)
 
 
 class RigError(RobinsError, ValueError):
@@ -38,21 +47,23 @@ class RigError(RobinsError, ValueError):
 def named(where: str) -> Any:
     """Object with a name in a module: "package.module:name".
 
-    So processes of parts import what they need alone, and start sooner.
+    Raises:
+        RigError: the module has no such name.
     """
     module, _, name = where.partition(":")
-    return getattr(importlib.import_module(module), name)
+    try:
+        return getattr(importlib.import_module(module), name)
+    except AttributeError:
+        raise RigError(f"there is no '{name}' in the module {module}") from None
 
 
-def later(where: str) -> Callable[..., Any]:
-    """A function that is imported when it is called; as of `named`."""
-    return lambda *args: named(where)(*args)
+def later(where: str) -> Any:
+    """Method of a rig that is a function of another module, imported when it is called.
 
-
-def packaged(file: str) -> Callable[[], dict[str, Path]]:
-    """The scenarios of the bench in the folder next to a file, by name."""
-    found = sorted((Path(file).parent / "scenarios").glob("*.toml"))
-    return lambda: {path.stem: path for path in found}
+    So processes of parts import what they need alone, and start sooner. The function does not take
+    the rig.
+    """
+    return staticmethod(lambda *args: named(where)(*args))
 
 
 @runtime_checkable
@@ -78,74 +89,6 @@ class Timing(NamedTuple):
     counted_from: int  # first step that counts in figures of merit
 
 
-def timing(given: Any) -> Timing:
-    """Steps by parameters with ``duration``, ``step`` and perhaps ``counted_from``, in seconds."""
-    steps = round(given.duration / given.step)
-    return Timing(given.step, steps, round(getattr(given, "counted_from", 0.0) / given.step))
-
-
-class Judged(NamedTuple):
-    """Evaluation of a run by its rig.
-
-    Attributes:
-        metrics: figures of merit by name, which ends in the unit.
-        counts: of what was odd.
-        warnings: why a reader should doubt the figures.
-        arrays: of the solution, as `robins.results.array` makes them.
-        lines: figures for a terminal.
-    """
-
-    metrics: Mapping[str, float | None] = MappingProxyType({})
-    counts: Mapping[str, int] = MappingProxyType({})
-    warnings: Sequence[str] = ()
-    arrays: Mapping[str, Any] = MappingProxyType({})
-    lines: Sequence[str] = ()
-
-
-class Told(NamedTuple):
-    """A notice for the user; levels are those of the page."""
-
-    level: Any
-    text: str
-
-
-@runtime_checkable
-class Alarms(Protocol):
-    """Listens to one step after another."""
-
-    def hear(self, flown: Flown, step: int) -> list[Told]:
-        """Notices of a step."""
-        ...
-
-
-Offer = dict[str, Any]
-"""A fault on the page: its ``label``, and the ``fault`` as a scenario gives it, without a time."""
-
-
-class View(NamedTuple):
-    """Contents of the page of a rig.
-
-    Attributes:
-        signals: plotted signals, by the parameters of the vehicle.
-        sample: (arrays, kit, first step since the last sample, step) -> their values.
-        alarms: a listener for a run.
-        counts: (arrays, steps done) -> what was counted, by name.
-        offered: faults that can be injected, each with its label; left out: those of every line,
-            and those of sensors and actuators that need no parameter.
-        says: operator messages, by label: (arrays, kit, last step that was done) -> the
-            message and its values.
-    """
-
-    signals: Callable[[Any], list[Signal]]
-    sample: Callable[[Flown, Any, int, int], Sequence[float]]
-    alarms: Callable[[], Alarms | None] = lambda: None
-    counts: Callable[[Flown, int], dict[str, int]] = lambda flown, done: {}
-    offered: tuple[Offer, ...] = ()
-    says: Mapping[str, Callable[[Flown, Any, int], tuple[str, Mapping[str, Any]]]] = (
-        MappingProxyType({})
-    )
-
-
 class Aboard(NamedTuple):
     """Sources of a program that replaces the exported part.
 
@@ -160,47 +103,30 @@ class Aboard(NamedTuple):
     files: Mapping[str, str]
 
 
-class Spoken(NamedTuple):
-    """A message that the operator sent through the bench."""
-
-    step: int  # the first whose parts received it
-    message: str
-    values: Mapping[str, Any]
+GivenT = TypeVar("GivenT")  # parameters of what flies
+KitT = TypeVar("KitT", bound=Kit)
+_NEEDED = ("name", "wire", "sends", "takes", "parameters")
 
 
-@dataclass(frozen=True)
-class Rig:
+class Rig(Generic[GivenT, KitT]):
     """A vehicle on the bench.
+
+    Subclasses give the first five attributes and `prepare`; the others have defaults. Parts are
+    named as data, so that a process imports the code of its own part alone.
 
     Attributes:
         name: of it.
         wire: its parts and messages.
-        build: how a part is made of a kit, by part.
         sends: messages by part, each of one part alone.
         takes: messages by part.
+        parameters: the class of what flies, or its place, "package.module:Name".
+        code: module whose functions, named as the parts, make them of a kit; left out: that of the
+            class.
+        build: by part, another function that makes it, or its place, "package.module:name".
         console: messages that no part sends: the operator sends them through the bench, and parts
             take them, if they do, with a lag of one.
-        refuses: (message, values) -> why the operator cannot send this, though each number is
-            within its limits; "": it can be sent.
-        parameters: () -> the class of what flies.
-        prepare: (setup, parameters) -> the kit of a run; the same for the same.
         truth: the message without which nothing can be judged; "": there is none.
         kept: messages that are noted for figures and page; left out: all.
-        timing: of the parameters.
-        flies: scenarios of its system, by name; the first is flown where none is named.
-        filters: that its parameters can be flown with; the first where none is named.
-        scenarios: of the bench, by name.
-        options: parameters of a run besides those of all rigs, each with type and default.
-        said: faults of its sensors and actuators, by kind, and their parameters.
-        view: of the page; left out: all numbers of its messages.
-        topics: (kit) -> what viewers and ROS 2 get of its messages, in the record; JSON of those
-            that it leaves out.
-        inside: (kit, steps) -> arrays of so many first steps of the same run inside one program,
-            named as `Flown` names them. With a console: (kit, steps, messages sent) -> the same, or
-            None where it cannot be compared.
-        judge: figures of merit of a run; left out: none, and all numbers in its arrays.
-        once: (setup, part) -> why the input of the part cannot be sent to it again, from a record
-            or after its death; "": it can.
         example: the part with which commands are shown; left out: its last.
         exported: the part that an exported filter can be, by the loop of that name among the files
             of `robins.bench.wire.c_header.firmware` or of `aboard`; "": none.
@@ -211,43 +137,54 @@ class Rig:
 
     name: str
     wire: Wire
-    build: Mapping[str, Callable[[Any], Part]]
-    sends: Mapping[str, tuple[str, ...]]
-    takes: Mapping[str, tuple[str, ...]]
-    parameters: Callable[[], type[Parameters]]
-    prepare: Callable[[Any, Any], Kit]
+    sends: ClassVar[Mapping[str, tuple[str, ...]]]
+    takes: ClassVar[Mapping[str, tuple[str, ...]]]
+    parameters: type[GivenT] | str | Callable[[], type[GivenT]]
+    code: str = ""
+    build: ClassVar[Mapping[str, Callable[[Any], Part] | str]] = {}
     console: tuple[str, ...] = ()
-    refuses: Callable[[str, Mapping[str, Any]], str] = lambda message, values: ""
     truth: str = ""
     kept: tuple[str, ...] = ()
-    timing: Callable[[Any], Timing] = timing
-    flies: Callable[[], Mapping[str, Path]] = dict
-    filters: Callable[[], Sequence[str]] = lambda: ("",)
-    scenarios: Callable[[], Mapping[str, Path]] = dict
-    options: Callable[[], Mapping[str, Any]] = dict
-    said: Callable[[], tuple[Mapping[str, Said], Mapping[str, Any]]] = lambda: ({}, {})
-    view: Callable[[], View] | None = None
-    topics: Callable[[Any], Sequence[Topic]] = lambda kit: ()
-    inside: Callable[..., Mapping[str, np.ndarray] | None] | None = None
-    judge: Callable[[Flight, Ran], Judged] | None = None
-    once: Callable[[Any, str], str] = lambda setup, part: ""
     example: str = ""
     exported: str = ""
     aboard: Callable[[Flight], Aboard] | None = None
     address: str = ""
 
-    def __post_init__(self) -> None:
+    def __init__(self, **changed: Any):
         """Check that its tables agree.
+
+        Args:
+            changed: attributes and functions that take the place of those of the class.
 
         Raises:
             RigError: they do not; names the contradiction.
         """
+        known = [name for name in (*Rig.__annotations__, *vars(Rig)) if not name.startswith("_")]
+        if strange := sorted(set(changed) - set(known)):
+            raise RigError(f"a rig has no '{strange[0]}'{hint(strange[0], known)}")
+        self._changed = changed
+        vars(self).update(changed)
+        missing = [name for name in _NEEDED if not hasattr(self, name)]
+        if getattr(self.prepare, "__func__", None) is Rig.prepare:
+            missing.append("prepare")
+        if missing:
+            what = f"the rig {type(self).__name__} has no {' and no '.join(missing)}"
+            raise RigError(what, fix="define it in the subclass of robins.bench.Rig")
+        self._check()
+        self.example = self.example or self.parts[-1]
+
+    def _check(self) -> None:
         parts = self.parts
-        for what, table in (("build", self.build), ("sends", self.sends), ("takes", self.takes)):
+        if strange := sorted(set(self.build) - set(parts)):
+            raise RigError(f"build is of {', '.join(strange)}, the wire has {', '.join(parts)}")
+        home = sys.modules.get(type(self).__module__)
+        lost = [part for part in parts if not (part in self.build or hasattr(home, part))]
+        if lost and not self.code:
+            what = f"no function makes the part '{lost[0]}'"
+            raise RigError(what, type(self).__module__, "define one of its name before the rig")
+        for what, table in (("sends", self.sends), ("takes", self.takes)):
             if set(table) != set(parts):
                 raise RigError(f"{what} is of {', '.join(table)}, the wire has {', '.join(parts)}")
-        if not self.example:
-            object.__setattr__(self, "example", parts[-1])
         named = {m.name for m in self.wire.data}
         said = [name for sent in (*self.sends.values(), self.console) for name in sent]
         if sorted(said) != sorted(named):
@@ -261,10 +198,110 @@ class Rig:
         if unknown := sorted((heard | ({self.truth} - {""})) - named):
             raise RigError(f"there is no message '{unknown[0]}', only {', '.join(sorted(named))}")
 
+    def varied(self, **changed: Any) -> Rig[GivenT, KitT]:
+        """The same rig with other attributes or functions.
+
+        Raises:
+            RigError: they contradict the others.
+        """
+        return type(self)(**{**self._changed, **changed})
+
+    # ------------------------------------------------------------------------ of a run: defaults
+
+    def prepare(self, setup: Any, given: GivenT) -> KitT:
+        """Kit of a run: plain numbers, the same for the same setup and parameters."""
+        raise NotImplementedError
+
+    def timing(self, given: Any) -> Timing:
+        """Steps by parameters with ``duration``, ``step``, perhaps ``counted_from``, in seconds."""
+        steps = round(given.duration / given.step)
+        return Timing(given.step, steps, round(getattr(given, "counted_from", 0.0) / given.step))
+
+    def once(self, setup: Any, part: str) -> str:
+        """Reason why the input of a part cannot be sent to it again, from a record or after its
+        death; "": it can.
+        """
+        return ""
+
+    def refuses(self, message: str, values: Values) -> str:
+        """Reason why the operator cannot send this, though each number is within its limits; "":
+        it can be sent.
+        """
+        return ""
+
+    def inside(self, kit: KitT, steps: int) -> Mapping[str, np.ndarray] | None:
+        """First steps of the same run inside one program, named as `Flown` names them.
+
+        That of a rig with a console takes the messages sent, too. None: it cannot be compared.
+        """
+        return None
+
+    def judge(self, flight: Flight, ran: Ran) -> Judged:
+        """Figures of merit of a run; by default none, and all numbers as arrays."""
+        from robins.bench.evaluation import Judged, arrays_of
+
+        return Judged(arrays=arrays_of(self.noted, ran.flown))
+
+    def view(self) -> View:
+        """Contents of its page; by default all numbers of its messages."""
+        from robins.bench.evaluation import view_of
+
+        return view_of(self.noted)
+
+    def topics(self, kit: KitT) -> Sequence[Topic]:
+        """Rows for viewers and ROS 2 of its messages, in the record; others are JSON."""
+        return ()
+
+    # ------------------------------------------------------------------ of what there is: defaults
+
+    def flies(self) -> Mapping[str, Path]:
+        """Scenarios of its system, by name; the first is flown where none is named."""
+        return {}
+
+    def filters(self) -> Sequence[str]:
+        """Filters that its parameters can be flown with; the first where none is named."""
+        return ("",)
+
+    def scenarios(self) -> Mapping[str, Path]:
+        """Scenarios of the bench, by name: those in the folder next to the file of its class."""
+        file = getattr(sys.modules[type(self).__module__], "__file__", None)
+        found = sorted((Path(file).parent / "scenarios").glob("*.toml")) if file else []
+        return {path.stem: path for path in found}
+
+    def options(self) -> Mapping[str, Any]:
+        """Parameters of a run besides those of all rigs, each with type and default."""
+        return {}
+
+    def said(self) -> tuple[Mapping[str, Said], Mapping[str, Any]]:
+        """Faults of its sensors and actuators, by kind, and their parameters."""
+        return {}, {}
+
+    # -------------------------------------------------------------------------------- what follows
+
     @property
     def parts(self) -> tuple[str, ...]:
         """Names of its parts, without the bench."""
         return self.wire.parts[1:]
+
+    @property
+    def noted(self) -> list[Message]:
+        """Messages that are noted for figures and page."""
+        return [m for m in self.wire.data if m.name in self.kept or not self.kept]
+
+    def part(self, name: str, kit: KitT) -> Part:
+        """Part of a run.
+
+        Raises:
+            RigError: no function makes it.
+        """
+        make = self.build.get(name, f"{self.code or type(self).__module__}:{name}")
+        return (named(make) if isinstance(make, str) else make)(kit)
+
+    @cached_property
+    def given(self) -> type[GivenT]:
+        """Class of the parameters of what flies."""
+        made: Any = named(self.parameters) if isinstance(self.parameters, str) else self.parameters
+        return cast("type[GivenT]", made if isinstance(made, type) else made())
 
     @cached_property
     def table(self) -> Table:
@@ -295,16 +332,24 @@ class Rig:
         return sayings_of(self.desk)
 
     @cached_property
-    def setup(self) -> type[Setup]:
-        """The parameters of a run."""
-        from robins.bench.run.setup import setup_of
-
-        return setup_of(self)
-
-    @cached_property
     def shown(self) -> View:
-        """Contents of its page."""
-        from robins.bench.run.numbers import faults_of, view_of
+        """Contents of its page, with the faults that it offers."""
+        from robins.bench.evaluation import offers_of
 
-        view = self.view() if self.view is not None else view_of(self)
-        return view if view.offered else view._replace(offered=faults_of(self))
+        view = self.view()
+        return view if view.offered else view._replace(offered=offers_of(self.table))
+
+
+class Flight(NamedTuple):
+    """A run that has been read."""
+
+    name: str
+    rig: Rig
+    setup: Any  # of the class of the rig
+    given: Any  # parameters of what flies
+    text: str  # of the scenario of the bench, for the record
+
+    @property
+    def timing(self) -> Timing:
+        """Steps of a complete run."""
+        return self.rig.timing(self.given)

@@ -282,7 +282,7 @@ def bench_node(
         raise InputError(f"no part '{name}', only {', '.join(rig.parts)}")
     at = address(port)
     kit = kit_of(flight)
-    made = Station(ready(rig.build[name](kit), kit.frames), rig.wire)
+    made = Station(ready(rig.part(name, kit), kit.frames), rig.wire)
     with open_port(at, timeout_s=None) as line:
         opened()
         serve(line, made)

@@ -52,13 +52,6 @@ class Wiring(NamedTuple):
         return max((taken.get(message, 0) for taken in self.takes.values()), default=0)
 
 
-class Ticked(NamedTuple):
-    """A tick that has been sent."""
-
-    at_ns: int  # of the wall clock
-    last_ns: int  # when it was sent last
-
-
 class Broker:
     """Hub of the star of links.
 
@@ -120,7 +113,7 @@ class Broker:
         self._sends = {p: frozenset(wiring.sends[p]) for p in links}
         self._kept = dict(keep or {})
         self._routed: dict[int, set[str]] = {}  # messages by their time, of the last steps
-        self._ticked: dict[str, Ticked] = {}
+        self._ticked: dict[str, tuple[int, int]] = {}  # first and last sent [ns of the wall clock]
         self._done: set[str] = set()
         self._by_fd = {link.fd: link for link in links.values()}
         self._fds = list(self._by_fd)
@@ -219,10 +212,10 @@ class Broker:
     def _wait(self, patience_ns: int | None, again_ns: int, most_ns: int) -> None:
         """Look after parts that have not answered yet."""
         now = _CLOCK_NS()
-        for name, ticked in list(self._ticked.items()):
+        for name, (at_ns, last_ns) in list(self._ticked.items()):
             if name in self._done:
                 continue
-            waited = now - ticked.at_ns
+            waited = now - at_ns
             if patience_ns is not None and waited > patience_ns:
                 self.silent[name] += 1
                 self._end(name)
@@ -231,8 +224,8 @@ class Broker:
                     f"'{name}' does not answer the tick of step {self._step} "
                     f"(for {most_ns * 1e-9:g} s)"
                 )
-            elif now - ticked.last_ns > again_ns:
-                self._ticked[name] = ticked._replace(last_ns=now)
+            elif now - last_ns > again_ns:
+                self._ticked[name] = at_ns, now
                 self._tick(name)
 
     def _advance(self) -> None:
@@ -240,7 +233,7 @@ class Broker:
         for name, sources in self._sources.items():
             if name not in self._ticked and name not in self.off and sources <= self._done:
                 now = _CLOCK_NS()
-                self._ticked[name] = Ticked(now, now)
+                self._ticked[name] = now, now
                 self._tick(name)
 
     def _tick(self, name: str) -> None:
@@ -377,7 +370,7 @@ class Broker:
             self._kept[name].answered(said["step"])
         if said["step"] != self._step or name not in self._ticked or name in self._done:
             return
-        at = self._ticked[name].at_ns
+        at = self._ticked[name][0]
         self._tell(name, self._step, at, _CLOCK_NS(), said["compute"])
         self._end(name)
 

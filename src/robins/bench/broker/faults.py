@@ -6,8 +6,10 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
+import numpy as np
 import pydantic
 
+from robins.bench.wire.fields import Values
 from robins.bench.wire.schema import BARE, PROTOCOL, Wire
 from robins.scenario import Parameters, Quantity, default
 
@@ -49,9 +51,14 @@ class Said(NamedTuple):
     link: str
     message: str
     stage: Stage
-    act: Callable[[dict[str, Any], Any, int], Mapping[str, Any]] = lambda said, fault, now: said
+    act: Callable[[Values, Any, int], Values] = lambda said, fault, now: said
     takes: tuple[str, ...] = ()
     needs: str = ""
+
+
+def nothing(said: Values, fault: Any, now_ns: int) -> Values:
+    """Values of a sensor that sees nothing: NaN for every number."""
+    return {name: np.full(np.shape(x), np.nan) for name, x in said.items()}
 
 
 class Table(NamedTuple):

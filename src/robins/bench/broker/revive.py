@@ -11,7 +11,6 @@ import os
 import select
 import time
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 from robins.bench.broker.link import BenchError, Link
 from robins.bench.parts.station import is_due
@@ -19,12 +18,8 @@ from robins.bench.wire.frames import Header, encode_frame
 from robins.bench.wire.receiver import Receiver
 from robins.bench.wire.schema import BARE, NUMBERS
 
-
-class Told(NamedTuple):
-    """Bytes that went out to a part."""
-
-    step: int | None  # of the tick that they are; None: other frames
-    raw: bytes
+Told = tuple[int | None, bytes]
+"""Bytes that went out to a part, after the step of the tick that they are; None: other frames."""
 
 
 class History:
@@ -47,7 +42,7 @@ class History:
 
     def add(self, step: int | None, raw: bytes) -> None:
         """Remember what goes out, as `Told`."""
-        self.told.append(Told(step, raw))
+        self.told.append((step, raw))
 
     def forget(self) -> None:
         """Start again: the part has lost its memory and has received nothing."""
@@ -57,7 +52,7 @@ class History:
     def answered(self, step: int) -> None:
         """Drop frames up to a step whose memory the part has saved."""
         if is_due(step) and step > self.since and self._is_there(step):
-            first = next(k for k, one in enumerate(self.told) if one.step == step)
+            first = next(k for k, (of, _) in enumerate(self.told) if of == step)
             del self.told[: first + 1]
             self.since = step
 
@@ -90,10 +85,10 @@ def catch_up(
     talk = _Talk(link, patience_s, glance, idle_s)
     talk.until("hello", None)
     talk.say(begin)
-    for one in told:
-        talk.say(one.raw)
-        if one.step is not None and one.step <= answered:
-            talk.until("done", one.step)
+    for step, raw in told:
+        talk.say(raw)
+        if step is not None and step <= answered:
+            talk.until("done", step)
 
 
 def beginning(run: int, step_ns: int) -> bytes:

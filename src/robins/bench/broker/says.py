@@ -7,13 +7,13 @@ next step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import pydantic
 
 from robins import units
-from robins.bench.wire.fields import SIZES, Field
+from robins.bench.wire.fields import SIZES, Field, Values
 from robins.bench.wire.records import RecordError
 from robins.bench.wire.schema import BARE, Wire
 from robins.errors import RobinsError, hint
@@ -37,9 +37,9 @@ class Desk(NamedTuple):
 
     wire: Wire = BARE
     console: tuple[str, ...] = ()
-    refuses: Callable[[str, Mapping[str, Any]], str] = lambda message, values: ""
+    refuses: Callable[[str, Values], str] = lambda message, values: ""
 
-    def payload(self, message: str, values: Mapping[str, Any]) -> bytes:
+    def payload(self, message: str, values: Values) -> bytes:
         """Encode an operator message.
 
         Args:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
+from robins.bench.live.feed import JsonObject
 from robins.errors import RobinsError
 
 PLAIN = ("start", "pause", "stop")
@@ -18,10 +19,10 @@ class CommandError(RobinsError, ValueError):
 
 def read(
     text: str | bytes,
-    faults: Sequence[Mapping[str, Any]],
-    alarms: Sequence[Mapping[str, Any]] = (),
+    faults: Sequence[JsonObject],
+    alarms: Sequence[JsonObject] = (),
     says: Sequence[str] = (),
-) -> dict[str, Any]:
+) -> JsonObject:
     """Command sent by a page.
 
     Args:
@@ -75,7 +76,7 @@ def read(
     raise CommandError(f"no command {_short(do)}; there are: {known}")
 
 
-def _acknowledged(ids: Any, alarms: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _acknowledged(ids: Any, alarms: Sequence[JsonObject]) -> JsonObject:
     """Numbers of those alarms that wait, and a label that names them in a record."""
     if not isinstance(ids, list) or not all(type(one) is int for one in ids):
         raise CommandError(f"alarms are acknowledged by a list of their numbers: {_short(ids)}")
@@ -88,7 +89,7 @@ def _acknowledged(ids: Any, alarms: Sequence[Mapping[str, Any]]) -> dict[str, An
     return {"alarms": [one["id"] for one in found], "label": label}
 
 
-def _only(asked: Mapping[str, Any], allowed: set[str]) -> None:
+def _only(asked: JsonObject, allowed: set[str]) -> None:
     if extra := set(asked) - allowed:
         raise CommandError(f"'{asked['do']}' takes no {', '.join(map(_short, sorted(extra)))}")
 

@@ -7,19 +7,18 @@ once in a row; `acknowledged` of an alarm.
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Any
 
-from robins.bench.live.feed import EVENTS, latest
+from robins.bench.live.feed import EVENTS, JsonObject, latest
 
 
 class Events:
     """The latest events; a frequent level does not push out a rare one."""
 
     def __init__(self) -> None:
-        self.kept: list[dict[str, Any]] = []
+        self.kept: list[JsonObject] = []
         self._next = 0
 
-    def happened(self, level: str, time_s: float, text: str) -> dict[str, Any]:
+    def happened(self, level: str, time_s: float, text: str) -> JsonObject:
         """Note an event; one like the last is the last once more, unless that is acknowledged."""
         last = self.kept[-1] if self.kept else {}
         if (last.get("level"), last.get("text")) == (level, text) and "acknowledged" not in last:
@@ -30,14 +29,14 @@ class Events:
         self.keep(again)
         return again
 
-    def keep(self, event: dict[str, Any]) -> None:
+    def keep(self, event: JsonObject) -> None:
         """Keep an event in the place of its former state."""
         if self.kept and self.kept[-1]["id"] == event["id"]:
             self.kept[-1] = event
         else:
             self.kept = latest([*self.kept, event], lambda one: one["level"], EVENTS)
 
-    def waiting(self) -> list[dict[str, Any]]:
+    def waiting(self) -> list[JsonObject]:
         """Alarms that are not acknowledged."""
         alarms = (one for one in self.kept if one["level"] == "alarm")
         return [one for one in alarms if "acknowledged" not in one]

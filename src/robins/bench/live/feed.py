@@ -22,6 +22,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+JsonObject = dict[str, Any]
 Role = Literal["value", "sigma", "limit", "attitude"]
 
 
@@ -95,7 +96,7 @@ def _check_attitudes(signals: Sequence[Signal]) -> None:
             )
 
 
-def as_json(signals: Sequence[Signal]) -> list[dict[str, Any]]:
+def as_json(signals: Sequence[Signal]) -> list[JsonObject]:
     """Signals as the page gets them."""
     return [s._asdict() for s in signals]
 

@@ -12,14 +12,14 @@ import sys
 import time
 import warnings
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from robins.bench.live import feed
 from robins.bench.live.events import Events
-from robins.bench.live.feed import Kind, Signal, as_json, check
+from robins.bench.live.feed import JsonObject, Kind, Signal, as_json, check
 from robins.bench.live.history import History
 
 START_S = 20.0  # most that a server may take to listen
@@ -52,7 +52,7 @@ class Live:
         run: int,
         host: str = "127.0.0.1",
         port: int = 0,
-        faults: Sequence[Mapping[str, Any]] = (),
+        faults: Sequence[JsonObject] = (),
         says: Sequence[str] = (),
     ) -> None:
         """Start the server and wait until it listens.
@@ -127,7 +127,7 @@ class Live:
         self._samples.append(sample)
         self._pump()
 
-    def status(self, status: Mapping[str, Any]) -> None:
+    def status(self, status: JsonObject) -> None:
         """Show the state of the bench; the latest counts. The keys are those of docs/live.md.
 
         Raises:
@@ -169,7 +169,7 @@ class Live:
 
     # ---------------------------------------------------------------------- from page to bench
 
-    def commands(self) -> list[dict[str, Any]]:
+    def commands(self) -> list[JsonObject]:
         """Commands of the page since the last call, oldest first.
 
         Each has "do": "start", "pause", "stop", "inject", "clear", "say" or "acknowledge". "inject"
@@ -357,7 +357,7 @@ class Live:
         return None
 
 
-def _check_faults(faults: Sequence[Mapping[str, Any]]) -> None:
+def _check_faults(faults: Sequence[JsonObject]) -> None:
     labels = set()
     for f in faults:
         if set(f) != {"label", "fault"} or not isinstance(f["label"], str):

@@ -10,10 +10,9 @@ import asyncio
 import json
 from collections import deque
 from collections.abc import Awaitable, Callable
-from typing import Any
 
 from robins.bench.live.events import Events
-from robins.bench.live.feed import EVENTS, MARK, RECENT, Kind, sequence_of, to_json
+from robins.bench.live.feed import EVENTS, MARK, RECENT, JsonObject, Kind, sequence_of, to_json
 from robins.bench.live.history import History
 
 QUEUE = 2 * RECENT  # samples that wait for a page
@@ -94,13 +93,13 @@ class Hub:
 
     def __init__(self) -> None:
         self.clients: set[Client] = set()
-        self.faults: list[dict[str, Any]] = []
+        self.faults: list[JsonObject] = []
         self.says: list[str] = []
-        self._hello: dict[str, Any] | None = None
+        self._hello: JsonObject | None = None
         self.events = Events()
         self._history = History(0)
         self._recent: deque[bytes] = deque()
-        self._status: dict[str, Any] | None = None
+        self._status: JsonObject | None = None
         self._expected: int | None = None  # number of the next sample
         self._dropped = 0  # on the way from the bench
 
@@ -152,7 +151,7 @@ class Hub:
         """Notify each page that the bench is gone."""
         self._tell({"kind": "ended"})
 
-    def _take_hello(self, said: dict[str, Any]) -> None:
+    def _take_hello(self, said: JsonObject) -> None:
         self._hello = said
         self.faults, self.says = said["faults"], said["says"]
         self._dropped = said["dropped"]
@@ -193,12 +192,12 @@ class Hub:
         )
         return text, self._history.pack(hello["run"]), self._recent
 
-    def _tell(self, message: dict[str, Any]) -> None:
+    def _tell(self, message: JsonObject) -> None:
         text = to_json(message)
         for client in self.clients:
             client.line(text)
 
-    def _tell_latest(self, key: str, message: dict[str, Any]) -> None:
+    def _tell_latest(self, key: str, message: JsonObject) -> None:
         text = to_json(message)
         for client in self.clients:
             client.latest(key, text)

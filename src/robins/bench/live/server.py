@@ -24,7 +24,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from robins.bench.live import commands
-from robins.bench.live.feed import HEAD, to_json
+from robins.bench.live.feed import HEAD, JsonObject, to_json
 from robins.bench.live.guard import Guard
 from robins.bench.live.hub import Client, Hub
 
@@ -104,7 +104,7 @@ async def serve(at: socket.socket, pipe: socket.socket | None) -> None:
     if pipe is not None:
         reader, writer = await asyncio.open_connection(sock=pipe)
 
-    def pass_on(command: dict[str, Any]) -> bool:
+    def pass_on(command: JsonObject) -> bool:
         if writer is None or writer.transport.get_write_buffer_size() > MOST_UNREAD:
             return False
         writer.write(to_json(command).encode() + b"\n")

@@ -77,7 +77,7 @@ def _be(arguments: Sequence[str]) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     rig = rig_of(rig_name)
     kit = take(Path(kit_path))
-    part = ready(rig.build[name](kit), kit.frames)
+    part = ready(rig.part(name, kit), kit.frames)
     station = Station(part, rig.wire)
     if more:
         folder, since = Path(more[0]), int(more[1])

@@ -22,6 +22,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from robins.bench.wire.fields import Values
 from robins.bench.wire.frames import Frame, Header, encode_frame
 from robins.bench.wire.receiver import Receiver, Sequence
 from robins.bench.wire.records import RecordError
@@ -58,7 +59,7 @@ _MOST = 65536  # bytes read at once
 _MEMORY = ("_run", "_step_ns", "_sequence", "_sent", "_state", "_inbox", "_done")
 
 Inputs = Mapping[str, Any]  # values by field, by message; None where it did not come
-Sent = Iterable[tuple[str, Mapping[str, Any]]]  # messages with their values
+Sent = Iterable[tuple[str, Values]]  # messages with their values
 
 
 class Part(NamedTuple):
@@ -200,7 +201,7 @@ class Station:
         answer.append(("done", self._wire.encode("done", {"step": step, "compute": took})))
         self._done = step, time_ns, answer
 
-    def _input(self, name: str, time_ns: int) -> dict[str, Any] | None:
+    def _input(self, name: str, time_ns: int) -> Values | None:
         payload = self._inbox.get((name, time_ns - self.part.takes[name] * self._step_ns))
         if payload is None:
             return None

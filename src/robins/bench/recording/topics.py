@@ -25,7 +25,7 @@ from mcap.records import Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from robins.bench.recording.layout import EVENTS, Entry, RecordingError
-from robins.bench.wire.fields import Message
+from robins.bench.wire.fields import Message, Values
 from robins.bench.wire.frames import FrameError, decode_frame
 from robins.bench.wire.schema import Wire
 from robins.gps_time import dated, utc_of
@@ -37,8 +37,6 @@ from robins.ros import nav_sat_fix as nav_sat_fix
 from robins.ros import odometry as odometry
 
 JSON = "json"
-Values = Mapping[str, Any]
-"""Values of a message, by field."""
 _FAILS = (LookupError, TypeError, ValueError, ArithmeticError)
 
 

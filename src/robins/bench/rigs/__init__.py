@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib
 import os
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -64,4 +63,4 @@ def _of_file(path: Path, wanted: str) -> Rig:
             path,
             "assign a robins.bench.Rig to a name at its top level",
         )
-    return replace(found, address=f"{path}:{wanted}")
+    return found.varied(address=f"{path}:{wanted}")

@@ -1,16 +1,16 @@
 """A run on the bench.
 
 - `setup`: its parameters.
-- `session`: its execution. `crew`: its processes. `clocks`: the start of each step. `accounting`:
-  lateness and latencies.
-- `telemetry`, `outcome`: its results, in a `room` on disk if it is long; `numbers`: defaults where
-  a rig defines none.
+- `session`: its execution. `crew`: its processes. `clocks`: the start of each step.
+- `telemetry`, `outcome`: its results, in a `room` on disk if it is long.
 - `watching`: the page and the status file.
 """
 
-from robins.bench.run.accounting import Latencies
+from robins.bench.accounting import Latencies
+from robins.bench.evaluation import Ran
+from robins.bench.rig import Flight
 from robins.bench.run.clocks import LockStep, RealTime
-from robins.bench.run.session import Ran, Session
-from robins.bench.run.setup import Flight, Setup
+from robins.bench.run.session import Session
+from robins.bench.run.setup import Setup
 
 __all__ = ["Flight", "Latencies", "LockStep", "Ran", "RealTime", "Session", "Setup"]

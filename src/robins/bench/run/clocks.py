@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Literal
 
 from robins.bench.broker.link import BenchError
-from robins.bench.run.setup import Flight
+from robins.bench.rig import Flight
 
 Overrun = Literal["continue", "skip", "abort"]
 _BEHIND_S, _BEHIND_PERIODS = 1.0, 10.0  # the longer: from so much on a run is behind its clock

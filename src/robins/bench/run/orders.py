@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from robins.bench.broker.faults import LinkFault
 from robins.bench.broker.injector import Injector
-from robins.bench.rig import Spoken
-from robins.bench.run.setup import Flight
+from robins.bench.evaluation import Spoken
+from robins.bench.rig import Flight
+from robins.bench.wire.fields import Values
 
-
-class Due(NamedTuple):
-    """An operator message that is due."""
-
-    message: str
-    payload: bytes
-    planned: bool  # by the scenario
+Due = tuple[str, bytes, bool]
+"""Name and payload of an operator message that is due; true where the scenario has planned it."""
 
 
 class Orders:
@@ -63,13 +59,13 @@ class Orders:
 
     # ---------------------------------------------------------------------------------- messages
 
-    def say(self, message: str, values: Mapping[str, Any]) -> None:
+    def say(self, message: str, values: Values) -> None:
         """Queue a message for the next step; before the first one, it waits for its end.
 
         Raises:
             SayError: it cannot be sent.
         """
-        self._ordered.append(Due(message, self._rig.desk.payload(message, values), False))
+        self._ordered.append((message, self._rig.desk.payload(message, values), False))
 
     def due(self, step: int) -> list[Due]:
         """Messages sent before a step, in order: of the same message the last one stands."""
@@ -77,14 +73,14 @@ class Orders:
             return []
         planned = [one for at, one in self._planned if at <= step]
         self._planned = [known for known in self._planned if known[0] > step]
-        found = [Due(one.message, one.payload, True) for one in planned] + self._ordered
+        found = [(one.message, one.payload, True) for one in planned] + self._ordered
         self._ordered = []
         decode = self._rig.wire.decode
-        self.said += [Spoken(step, one.message, decode(one.message, one.payload)) for one in found]
+        self.said += [Spoken(step, name, decode(name, payload)) for name, payload, _ in found]
         return found
 
 
-def in_words(message: str, values: Mapping[str, Any]) -> str:
+def in_words(message: str, values: Values) -> str:
     """Text of an operator message for the user."""
     told = ((name, [float(x) for x in _flat(value)]) for name, value in values.items())
     return f"'{message}': " + "; ".join(

@@ -10,13 +10,12 @@ import numpy as np
 import xarray as xr
 
 from robins.bench.broker.link import BenchError
+from robins.bench.evaluation import Flown, Judged, Ran, arrays_of
 from robins.bench.live.feed import latest
 from robins.bench.ports.port import program
-from robins.bench.rig import Judged
-from robins.bench.run.numbers import arrays_of
-from robins.bench.run.session import Ran
-from robins.bench.run.setup import Flight, calling
-from robins.bench.run.telemetry import Flown, difference
+from robins.bench.rig import Flight
+from robins.bench.run.setup import calling
+from robins.bench.run.telemetry import difference
 from robins.bench.run.untested import doubts
 from robins.results import Outcome, array, variable
 from robins.results.summary import dumps, plain
@@ -34,8 +33,6 @@ def judged(flight: Flight, ran: Ran) -> Judged:
     """
     if not ran.steps:
         return Judged()
-    if flight.rig.judge is None:
-        return Judged(arrays=arrays_of(flight.rig, ran.flown))
     with calling(flight.rig, "judge", "or leave it out: then all numbers are drawn"):
         return flight.rig.judge(flight, ran)
 
@@ -48,7 +45,7 @@ def in_one_program(flight: Flight, ran: Ran) -> Mapping[str, np.ndarray] | None:
     """
     rig, setup = flight.rig, flight.setup
     on_lines = all(map(program, setup.ports.values()))
-    if rig.inside is None or setup.clock != "lockstep" or not (ran.steps and on_lines):
+    if setup.clock != "lockstep" or not (ran.steps and on_lines):
         return None
     with calling(rig, "inside", "or leave it out: then no run is compared with it"):
         return rig.inside(ran.kit, ran.steps, *([ran.said] if rig.console else []))
@@ -119,7 +116,7 @@ def outcome(flight: Flight, ran: Ran, record: Path | None) -> Outcome:
     failures = [ran.failure]
     if not (ran.steps or ran.failure):
         failures = ["it was stopped before its first step"]
-    said, inside = Judged(arrays=arrays_of(flight.rig, ran.flown)), None
+    said, inside = Judged(arrays=arrays_of(flight.rig.noted, ran.flown)), None
     # Both are the user's own code; where it fails, what was flown is still shown.
     try:
         inside = in_one_program(flight, ran)

@@ -9,26 +9,27 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from robins import __version__
+from robins.bench.accounting import Latencies
 from robins.bench.broker.broker import Broker, Wiring
 from robins.bench.broker.faults import LinkFault
 from robins.bench.broker.injector import Injector
-from robins.bench.broker.link import BenchError, Direction, Health, Link
+from robins.bench.broker.link import BenchError, Direction, Link
 from robins.bench.broker.revive import History
+from robins.bench.evaluation import Ran
 from robins.bench.parts.node import few_collections, realtime
 from robins.bench.ports.port import BAUD, Pair, open_pair, open_port, parted
 from robins.bench.recording import Entry, Event, Recorder
 from robins.bench.recording.topics import completed
-from robins.bench.rig import Kit, Rig, Spoken
-from robins.bench.run.accounting import Latencies
+from robins.bench.rig import Flight, Kit, Rig
 from robins.bench.run.clocks import clock_of
 from robins.bench.run.crew import Crew, Death
 from robins.bench.run.orders import Orders, in_words
-from robins.bench.run.setup import Flight, counted_from, kit_of, steps_of
+from robins.bench.run.setup import counted_from, kit_of, steps_of
 from robins.bench.run.switching import switch
-from robins.bench.run.telemetry import Flown, Telemetry, know_truth
+from robins.bench.run.telemetry import Telemetry, know_truth
 from robins.bench.wire.frames import VERSION
 from robins.bench.wire.records import Unsound
 
@@ -57,24 +58,6 @@ class Watch(Protocol):
     def commands(self, session: Session) -> list[dict[str, Any]]:
         """Commands of the observer; see `robins.bench.live.Live.commands`."""
         ...
-
-
-class Ran(NamedTuple):
-    """Result of a run."""
-
-    flown: Flown
-    kit: Any  # of the rig
-    steps: int  # that were done
-    seconds: float  # of the wall clock, from the first tick to the last answer
-    latencies: Latencies
-    health: Mapping[str, Health]
-    injected: Mapping[tuple[str, str], int]
-    silent: Mapping[str, int]
-    events: list[Event]
-    deaths: int
-    failure: str  # empty: the run came to its end
-    stopped: bool  # by an observer
-    said: tuple[Spoken, ...] = ()  # by the operator
 
 
 class _DiedAgainError(Exception):
@@ -243,7 +226,7 @@ class Session:
     def _obey(self, step: int) -> None:
         """Execute the commands of the observer; wait while it is paused."""
         time_ns = (step + 1) * self.kit.step_ns
-        switch(self, time_ns, self._speaks, self._bury)
+        switch(self.injector, self.crew, self.broker, time_ns, self._speaks, self._bury, self.event)
         if self._watch is not None:
             began = time.monotonic_ns()
             while True:
@@ -283,10 +266,10 @@ class Session:
 
     def _say(self, step: int) -> None:
         """Send the operator's messages that are due before a step."""
-        for one in self._orders.due(step):
-            self.broker.say(one.message, one.payload)
-            values = self.rig.wire.decode(one.message, one.payload)
-            self.event("said", in_words(one.message, values), one.planned)
+        for message, payload, planned in self._orders.due(step):
+            self.broker.say(message, payload)
+            values = self.rig.wire.decode(message, payload)
+            self.event("said", in_words(message, values), planned)
 
     def active_faults(self) -> list[tuple[str, LinkFault]]:
         """Faults that are active now, with their labels."""
@@ -494,5 +477,5 @@ class Session:
 
 def wiring(rig: Rig, kit: Kit) -> Wiring:
     """Links of a rig: which part sends which message to which."""
-    takes = {part: dict(build(kit).takes) for part, build in rig.build.items()}
+    takes = {part: dict(rig.part(part, kit).takes) for part in rig.parts}
     return Wiring(rig.wire, rig.sends, takes, rig.console)

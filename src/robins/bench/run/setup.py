@@ -17,8 +17,9 @@ import contextlib
 import os
 import traceback
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal
 
 import pydantic
 
@@ -27,7 +28,7 @@ from robins.bench.broker.faults import LinkFault
 from robins.bench.broker.link import BenchError
 from robins.bench.broker.says import Saying
 from robins.bench.ports.port import program
-from robins.bench.rig import Kit, Rig, Timing
+from robins.bench.rig import Flight, Kit, Rig
 from robins.bench.rigs import RIGS, rig_of
 from robins.errors import RobinsError, hint
 from robins.scenario import Parameters, Quantity, ScenarioError
@@ -98,6 +99,7 @@ class Setup(Parameters):
         return self
 
 
+@cache
 def setup_of(rig: Rig) -> type[Setup]:
     """The parameters of a run of a rig: those of all, with its names, its faults and its own."""
     fields: dict[str, Any] = {
@@ -111,21 +113,6 @@ def setup_of(rig: Rig) -> type[Setup]:
     made = pydantic.create_model("Setup", __base__=Setup, **fields)
     made.__doc__, made.rig = Setup.__doc__, rig
     return made
-
-
-class Flight(NamedTuple):
-    """A run that has been read."""
-
-    name: str
-    rig: Rig
-    setup: Any  # of the class of the rig
-    given: Any  # parameters of what flies
-    text: str  # of the scenario of the bench, for the record
-
-    @property
-    def timing(self) -> Timing:
-        """Steps of a complete run."""
-        return self.rig.timing(self.given)
 
 
 @contextlib.contextmanager
@@ -183,10 +170,12 @@ def read(name: str, settings: tuple[str, ...] = ()) -> Flight:
     text, rig = _text(name)
     if not text:
         flies = "" if is_file(name) or name in RIGS else name
-        setup = rig.setup.model_validate({"set": settings} | ({"flies": flies} if flies else {}))
+        setup = setup_of(rig).model_validate(
+            {"set": settings} | ({"flies": flies} if flies else {})
+        )
         title = Path(name).name.replace(".py:", ":") if is_file(name) else name
         return Flight(title, rig, setup, _flies(rig, setup), "")
-    setup = scenario.parse(rig.setup, text, settings, source=name)
+    setup = scenario.parse(setup_of(rig), text, settings, source=name)
     _require_programs(setup.ports, name)
     title = name if name in built_in() else Path(name).stem
     return Flight(title, rig, setup, _flies(rig, setup), text)
@@ -234,7 +223,7 @@ def _flies(rig: Rig, setup: Setup) -> Parameters:
     else:
         there = ", ".join([*packaged, "a .toml file"])
         raise ScenarioError([f"flies: no scenario '{flies}'; there are {there}"])
-    return scenario.parse(rig.parameters(), text, setup.set, source=flies or rig.name)
+    return scenario.parse(rig.given, text, setup.set, source=flies or rig.name)
 
 
 def changed(flight: Flight, options: Mapping[str, Any]) -> Flight:
@@ -250,7 +239,7 @@ def changed(flight: Flight, options: Mapping[str, Any]) -> Flight:
     if "clock" in options and options["clock"] == "lockstep":
         given.pop("rate", None)
     try:
-        setup = flight.rig.setup.model_validate({**given, **options, "ports": ports})
+        setup = setup_of(flight.rig).model_validate({**given, **options, "ports": ports})
     except pydantic.ValidationError as error:
         told = [
             str(e["ctx"]["error"] if "ctx" in e and "error" in e["ctx"] else e["msg"])
@@ -301,8 +290,8 @@ def recorded_flight(
     rig = recorded_rig(header, record)
     try:
         # JSON has lists where parameters have tuples.
-        setup = rig.setup.model_validate(header["setup"], strict=False)
-        given = rig.parameters().model_validate(header["loop"], strict=False)
+        setup = setup_of(rig).model_validate(header["setup"], strict=False)
+        given = rig.given.model_validate(header["loop"], strict=False)
     except (KeyError, TypeError, pydantic.ValidationError) as error:
         raise ScenarioError(
             [f"the record was made by another version of robins ({header.get('robins')}): {error}"]

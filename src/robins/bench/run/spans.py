@@ -6,7 +6,8 @@ It gets the state of the bench each half second, and some faults are shorter.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+
+from robins.bench.live.feed import JsonObject
 
 MOST = 100  # that are kept, the latest
 
@@ -34,7 +35,7 @@ class FaultSpans:
                 self._ends.pop(next(iter(self._ends)))
 
     @property
-    def told(self) -> list[dict[str, Any]]:
+    def told(self) -> list[JsonObject]:
         """Spans for the page; one that is still active has no end."""
         return [
             {"label": label, "begin_s": begin, "end_s": end}

@@ -8,16 +8,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from robins.bench.run.session import Session
+from robins.bench.broker.broker import Broker
+from robins.bench.broker.injector import Injector
+from robins.bench.run.crew import Crew
 
 HELLO_S = 60.0  # for the hello of a part that is switched on
 
 
 def switch(
-    session: Session, time_ns: int, speaks: Mapping[str, str], bury: Callable[[str], None]
+    injector: Injector,
+    crew: Crew,
+    broker: Broker,
+    time_ns: int,
+    speaks: Mapping[str, str],
+    bury: Callable[[str], None],
+    event: Callable[[str, str], None],
 ) -> None:
     """Apply the faults of processes, before a step.
 
@@ -25,27 +31,30 @@ def switch(
     on: what it takes to start is not part of the fault. Boards are left alone.
 
     Args:
-        session: the run.
+        injector: the faults of the run.
+        crew: its processes.
+        broker: its hub.
         time_ns: of the run, that of the end of the step.
         speaks: the ports of the parts that are processes.
         bury: waits until a part has died, and does what the run is to do then.
+        event: notes an event by its kind and text.
 
     Raises:
         BenchError: a part that was switched on sends no hello.
     """
-    for part in session.injector.killed(time_ns):
-        session.event("killed", f"'{part}' is killed, as a fault")
-        session.crew.kill(part)
+    for part in injector.killed(time_ns):
+        event("killed", f"'{part}' is killed, as a fault")
+        crew.kill(part)
         bury(part)
-    off, broker = session.injector.off(time_ns) & speaks.keys(), session.broker
+    off = injector.off(time_ns) & speaks.keys()
     for part in sorted(off - broker.off):
-        session.event("power", f"'{part}' is switched off, as a fault")
-        session.injector.counts["power", part] += 1
-        session.crew.kill(part)
-        while not session.crew.deaths(part):
+        event("power", f"'{part}' is switched off, as a fault")
+        injector.counts["power", part] += 1
+        crew.kill(part)
+        while not crew.deaths(part):
             time.sleep(0.001)
         broker.switch_off(part)
-        session.crew.start(part, speaks[part])
+        crew.start(part, speaks[part])
     for part in sorted(broker.off - off):
         broker.switch_on(part, HELLO_S)
-        session.event("power", f"'{part}' is switched on, and begins anew")
+        event("power", f"'{part}' is switched on, and begins anew")

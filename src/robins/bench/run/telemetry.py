@@ -2,50 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from robins.bench.broker.link import BenchError
+from robins.bench.evaluation import Flown
 from robins.bench.rig import Rig
 from robins.bench.run.room import Room
 
 _OFTEN = 1 << 12  # messages, after which the memory of those before is let go
-
-
-@dataclass(frozen=True)
-class Flown(Mapping[str, np.ndarray]):
-    """Fields of messages over a run, by ``message.field``; E steps.
-
-    A field of one number has the shape (E,), others (E, length). NaN stands where nothing was
-    received, 0 for whole numbers.
-
-    Attributes:
-        time_s: (E,) at the end of each step.
-        arrays: by name.
-    """
-
-    time_s: np.ndarray
-    arrays: Mapping[str, np.ndarray]
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        """A field."""
-        return self.arrays[name]
-
-    def __iter__(self) -> Iterator[str]:
-        """Names of the fields."""
-        return iter(self.arrays)
-
-    def __len__(self) -> int:
-        """Number of fields."""
-        return len(self.arrays)
-
-    def until(self, steps: int) -> Flown:
-        """The first steps."""
-        return Flown(self.time_s[:steps], {name: x[:steps] for name, x in self.arrays.items()})
 
 
 class Telemetry:
@@ -64,7 +32,7 @@ class Telemetry:
             robins.results.ResultError: there is no room on disk.
         """
         self._wire, self._step_ns = rig.wire, step_ns
-        every = [m for m in rig.wire.data if m.name in rig.kept or not rig.kept]
+        every = rig.noted
         self._fields = {m.name: [(f.name, f"{m.name}.{f.name}") for f in m.fields] for m in every}
 
         def form(f: Any) -> tuple[tuple[int, ...], float | int]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from robins.bench.run.session import Ran
-from robins.bench.run.setup import Flight
+from robins.bench.evaluation import Ran
+from robins.bench.rig import Flight
 from robins.scenario import Parameters, Span
 
 

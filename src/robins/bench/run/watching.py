@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from robins.bench.live import Live, Signal
-from robins.bench.rig import Rig
+from robins.bench.live.feed import JsonObject
+from robins.bench.rig import Flight, Rig
 from robins.bench.run.session import Session
-from robins.bench.run.setup import Flight, steps_of
+from robins.bench.run.setup import steps_of
 from robins.bench.run.spans import FaultSpans
 from robins.bench.status import STARTING, Status
 
@@ -35,13 +36,13 @@ class Page(Protocol):
     def push(self, time_s: float, values: Sequence[float]) -> None:
         """Show a sample."""
 
-    def status(self, status: Mapping[str, Any]) -> None:
+    def status(self, status: JsonObject) -> None:
         """Show the state of the bench."""
 
     def event(self, level: Any, time_s: float, text: str) -> None:
         """Show an event."""
 
-    def commands(self) -> list[dict[str, Any]]:
+    def commands(self) -> list[JsonObject]:
         """Commands of the user."""
         ...
 
@@ -93,7 +94,7 @@ class Looking:
             return text
         return "" if flooded else "commands come too fast to show each; the record has them all"
 
-    def commands(self, session: Session) -> list[dict[str, Any]]:
+    def commands(self, session: Session) -> list[JsonObject]:
         """Commands from the page."""
         if self._page is None:
             return []
@@ -120,7 +121,7 @@ class Looking:
                 self._since = step + 1
         self._tell(session, step + 1)
 
-    def _state(self, session: Session, done: int) -> dict[str, Any]:
+    def _state(self, session: Session, done: int) -> JsonObject:
         return state(session, done) | {"fault_spans": self._spans.told}
 
     def _tell(self, session: Session, done: int) -> None:
@@ -132,7 +133,7 @@ class Looking:
             self._status.tell(report(session, done, "" if self._page is None else self._page.url))
 
 
-def state(session: Session, done: int) -> dict[str, Any]:
+def state(session: Session, done: int) -> JsonObject:
     """State of the bench for the page."""
     recent = session.latencies.recent()
     late = recent["cycle"]["lateness_us"]
@@ -170,7 +171,7 @@ def _clock(session: Session) -> str:
     return f"real time, {setup.rate or 1.0 / session.flight.timing.step_s:g} Hz"
 
 
-def starting(flight: Flight) -> dict[str, Any]:
+def starting(flight: Flight) -> JsonObject:
     """The same before there are any parts.
 
     Raises:
@@ -190,7 +191,7 @@ def starting(flight: Flight) -> dict[str, Any]:
     }
 
 
-def report(session: Session, done: int, url: str) -> dict[str, Any]:
+def report(session: Session, done: int, url: str) -> JsonObject:
     """State of the bench for the status file."""
     return starting(session.flight) | {
         "state": "paused" if session.paused else "running",

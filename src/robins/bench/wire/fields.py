@@ -5,8 +5,11 @@ All numbers are little endian; lengths of vectors are fixed, so that firmware ne
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple
 
+Values = Mapping[str, Any]
+"""Values of a message by field: a number, or numbers (length,)."""
 WireType = Literal["u8", "u16", "u32", "u64", "f64"]
 SIZES: dict[WireType, int] = {"u8": 1, "u16": 2, "u32": 4, "u64": 8, "f64": 8}
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from robins.bench.wire.fields import SIZES, Field, Message
+from robins.bench.wire.fields import SIZES, Field, Message, Values
 from robins.errors import RobinsError
 
 _CODES = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "f64": "d"}
@@ -49,7 +48,7 @@ class Record:
         self._numbers = tuple(numbers)
         self._all = struct.Struct("<" + "".join(f"{f.length}{_CODES[f.kind]}" for f in of.fields))
 
-    def encode(self, values: Mapping[str, Any]) -> bytes:
+    def encode(self, values: Values) -> bytes:
         """The payload.
 
         Args:
@@ -66,7 +65,7 @@ class Record:
             )
         return b"".join([_field(of.name, f, values[f.name]) for f in of.fields])
 
-    def decode(self, payload: bytes) -> dict[str, Any]:
+    def decode(self, payload: bytes) -> Values:
         """The values: a number for a field of one, else an array.
 
         Raises:

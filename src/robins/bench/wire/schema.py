@@ -7,13 +7,11 @@ message is a new version of the table.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cached_property
-from typing import Any
 
 import fastcrc
 
-from robins.bench.wire.fields import Field, Message, message
+from robins.bench.wire.fields import Field, Message, Values, message
 from robins.bench.wire.frames import VERSION
 from robins.bench.wire.records import Record, Unsound
 from robins.errors import RobinsError
@@ -112,7 +110,7 @@ class Wire:
         """
         return self._record(name).size
 
-    def encode(self, name: str, values: Mapping[str, Any]) -> bytes:
+    def encode(self, name: str, values: Values) -> bytes:
         """The payload of a message; see `Record.encode`.
 
         Raises:
@@ -121,7 +119,7 @@ class Wire:
         """
         return self._record(name).encode(values)
 
-    def decode(self, name: str, payload: bytes) -> dict[str, Any]:
+    def decode(self, name: str, payload: bytes) -> Values:
         """The values of a payload; see `Record.decode`.
 
         Raises:

@@ -11,7 +11,7 @@ import numpy as np
 from robins import rotation
 from robins.dataset import Dataset, GnssTable
 from robins.ins.frames import to_ned_frd
-from robins.ins.increments import Increments, from_imu
+from robins.ins.increments import Increments, from_imu, own_intervals
 from robins.systems.ins_gnss.parameters import Replay, Rover
 
 TYRES = 0.02  # share of the speed by which wheels may read wrong: tyres, pressure, slip
@@ -40,6 +40,16 @@ class Log(NamedTuple):
     field_b: np.ndarray | None = None  # (K, 3) T, body axes
     wheels: Wheels | None = None
     first: int = 0  # number of increments of the record before these
+
+
+def as_rates(dataset: Dataset) -> Dataset:
+    """Log with rates in the place of increments, forward-right-down and north-east-down."""
+    imu = to_ned_frd(dataset.imu)
+    if imu.kind == "increment":
+        dt = own_intervals(np.diff(imu.time_ns) * 1e-9, imu.gyro, imu.accel)[:, None]
+        imu = replace(imu, gyro=imu.gyro / dt, accel=imu.accel / dt, kind="rate")
+    gnss = None if dataset.gnss is None else to_ned_frd(dataset.gnss)
+    return replace(dataset, imu=imu, gnss=gnss)
 
 
 def in_body_axes(dataset: Dataset, orientation: Sequence[float]) -> Dataset:

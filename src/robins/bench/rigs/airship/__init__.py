@@ -7,15 +7,14 @@ A step is an epoch of the filter; a measurement that is not sent in a step is mi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from robins.bench.broker.faults import Said
-from robins.bench.rig import Rig, later, named, packaged
-from robins.bench.wire.fields import Field, f64, message, size
+from robins.bench.broker.faults import Said, nothing
+from robins.bench.rig import Rig, later, named
+from robins.bench.wire.fields import Field, Values, f64, message, size
 from robins.bench.wire.schema import Wire
 from robins.scenario import Quantity, default
 
@@ -72,51 +71,52 @@ WIRE = Wire(
 )
 
 
-def _flies() -> dict[str, Path]:
-    found = named("robins.systems.airship:SYSTEM").scenarios
-    return {f"airship/{name}": path for name, path in sorted(found.items())}
-
-
-def _shifted(said: Mapping[str, Any], fault: Any, _: int) -> dict[str, Any]:
+def _shifted(said: Values, fault: Any, _: int) -> Values:
     """A radar that takes another place for the one below."""
     return {**said, "place": said["place"] + np.array([fault.shift, 0.0])}
 
 
-def _blind(said: Mapping[str, Any], *_: Any) -> dict[str, Any]:
-    return {name: np.full(np.shape(x), np.nan) for name, x in said.items()}
-
-
 _SAID = {
     "shifted": Said("radar", "fix", "sensed", _shifted, ("shift",)),
-    "blind": Said("star", "attitude", "blind", _blind),
+    "blind": Said("star", "attitude", "blind", nothing),
     "stuck": Said("air", "wind", "repeated"),
 }
 _SHIFT = Annotated[float, Quantity("length", least="-100 km", most="100 km")]
-_OF = f"{__name__}.flying"
 
-RIG = Rig(
-    name="airship",
-    wire=WIRE,
-    build={part: later(f"{_OF}:{part}") for part in WIRE.parts[1:]},
-    sends={
+
+class AirshipRig(Rig):
+    """The airship."""
+
+    name = "airship"
+    wire = WIRE
+    sends: ClassVar = {
         "sins": ("increment",),
         "radar": ("fix",),
         "star": ("attitude",),
         "air": ("wind",),
         "navigation": ("state",),
-    },
-    takes={
+    }
+    takes: ClassVar = {
         **dict.fromkeys(("sins", "radar", "star", "air"), ()),
         "navigation": ("increment", "fix", "attitude", "wind"),
-    },
-    parameters=lambda: named("robins.systems.airship.parameters:Airship"),
-    prepare=later(f"{_OF}:prepare"),
-    kept=("state",),
-    timing=later(f"{_OF}:timing"),
-    flies=_flies,
-    filters=later(f"{_OF}:filters"),
-    scenarios=packaged(__file__),
-    said=lambda: (_SAID, {"shift": (_SHIFT, default("200 m"))}),
-    inside=later(f"{_OF}:inside"),
-    judge=later(f"{_OF}:judge"),
-)
+    }
+    code = f"{__name__}.flying"
+    parameters = "robins.systems.airship.parameters:Airship"
+    kept = ("state",)
+    prepare = later(f"{code}:prepare")
+    timing = later(f"{code}:timing")
+    filters = later(f"{code}:filters")
+    inside = later(f"{code}:inside")
+    judge = later(f"{code}:judge")
+
+    def flies(self) -> dict[str, Path]:
+        """Scenarios of the airship."""
+        found = named("robins.systems.airship:SYSTEM").scenarios
+        return {f"airship/{name}": path for name, path in sorted(found.items())}
+
+    def said(self) -> tuple[dict[str, Said], dict[str, Any]]:
+        """Faults of radar, star sensor and air data."""
+        return _SAID, {"shift": (_SHIFT, default("200 m"))}
+
+
+RIG = AirshipRig()

@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins import manifold
+from robins.bench.evaluation import Flown, Judged, Ran, figures_of
 from robins.bench.parts.station import Inputs, Part
-from robins.bench.rig import Judged, Timing
-from robins.bench.run.numbers import figures_of
-from robins.bench.run.setup import counted_from
-from robins.bench.run.telemetry import Flown
+from robins.bench.rig import Flight, Timing
+from robins.bench.run.setup import Setup, counted_from
+from robins.bench.wire.fields import Values
 from robins.earth import Geodetic
 from robins.filters import Belief, Model, OnlineFilter, run
+from robins.filters.kalman import FilterState
 from robins.filters.run import Step
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
@@ -63,7 +64,7 @@ def timing(given: Airship) -> Timing:
     return Timing(given.epoch, round(given.duration / given.epoch), first)
 
 
-def prepare(setup: Any, given: Airship) -> Kit:
+def prepare(setup: Setup, given: Airship) -> Kit:
     """Kit of run 0 of a campaign of this seed."""
     (study,) = SYSTEM.studies.values()
     problem = study.problem(given, (setup.filter,), setup.seed)
@@ -109,30 +110,26 @@ def air(kit: Kit) -> Part:
     return _says("air", "wind", rows)
 
 
-class Navigating(NamedTuple):
-    """State of the navigation computer."""
-
-    filter: Any
-    increment: Increments  # the last that came
-
-
 def navigation(kit: Kit) -> Part:
-    """The navigation computer: any filter that takes what comes; what does not come is missing."""
+    """The navigation computer: any filter that takes what comes; what does not come is missing.
+
+    Its state is that of the filter and the last increment.
+    """
     windy = WIND in kit.y
     begin = Increments(*(np.asarray(x)[0] for x in kit.u))
     online: list[OnlineFilter] = []  # made when it is needed, not where only its inputs are queried
     starts: list[Any] = []
 
-    def first() -> Navigating:
+    def first() -> tuple[FilterState, Increments]:
         if not online:
             online.append(OnlineFilter(CANDIDATES[kit.filter].make(), kit.model, kit.start))
             starts.append(online[0].state)
-        return Navigating(starts[0], begin)
+        return starts[0], begin
 
-    def act(state: Navigating, k: int, inputs: Inputs):
+    def act(state: tuple[FilterState, Increments], k: int, inputs: Inputs):
         u, fix, seen, wind = (inputs[of] for of in ("increment", "fix", "attitude", "wind"))
         held = u is None
-        increment = state.increment
+        online[0].state, increment = state
         if u is not None:
             increment = Increments(np.float64(u["dt"]), u["theta_b"], u["dv_b"], u["dr_b"])
         nothing = np.full(3, np.nan)
@@ -145,9 +142,9 @@ def navigation(kit: Kit) -> Part:
         if windy:
             y[WIND] = nothing[:2] if wind is None else wind["wind_n"]
         aux = {WIND: np.zeros(3) if wind is None else wind["through_b"]} if windy else {}
-        online[0].state = state.filter
         x = np.asarray(online[0].step(y, increment, aux, keep=_kept))
-        return Navigating(online[0].state, increment), [("state", {**_told(x), "held": int(held)})]
+        said = {**_told(x), "held": int(held)}
+        return (online[0].state, increment), [("state", said)]
 
     takes = {"increment": 0, "fix": 0, "attitude": 0, "wind": 0}
     return Part("navigation", takes, first, act, dict.fromkeys(takes))
@@ -161,7 +158,7 @@ def _kept(step: Step) -> jax.Array:
     return jnp.concatenate([x.q_nb.wxyz, x.v_n, place, belief.sigma])
 
 
-def _told(x: np.ndarray) -> dict[str, Any]:
+def _told(x: np.ndarray) -> Values:
     """The fields of a state, of a vector or of vectors (E, 19)."""
     place = {"lat": x[..., 7], "lon": x[..., 8], "alt": x[..., 9]}
     return {"q_nb": x[..., :4], "v_n": x[..., 4:7], **place, "sigma": x[..., 10:19]}
@@ -184,7 +181,7 @@ def errors(kit: Kit, flown: Flown) -> np.ndarray:
     return np.asarray(off) @ ENU_OF_NED.T
 
 
-def judge(flight: Any, ran: Any) -> Judged:
+def judge(flight: Flight, ran: Ran) -> Judged:
     """Errors over the epochs that count."""
     flown, counted = ran.flown, slice(counted_from(flight, ran.steps), None)
     error, sigma = errors(ran.kit, flown), flown["state.sigma"] @ np.abs(ENU_OF_NED).T

@@ -2,21 +2,20 @@
 
 The plant is a simulated drive or a recorded log, or there is none: boards send the samples. The
 computer runs `robins.systems.ins_gnss.LiveInsGnss`, whose epochs are those of `robins replay`. The
-computer can also be a program: `aboard`, and the C in its folder.
+computer can also be a program: `robins.systems.ins_gnss.aboard`, and the C in this folder.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
 from robins.bench.broker.faults import Said
-from robins.bench.rig import Rig, later, named, packaged
-from robins.bench.wire.fields import Field, f64, message, size
+from robins.bench.rig import Rig, later, named
+from robins.bench.wire.fields import Field, Values, f64, message, size
 from robins.bench.wire.schema import Wire
 from robins.scenario import Quantity, default
 
@@ -78,22 +77,12 @@ WIRE = Wire(
 )
 
 
-def _flies() -> dict[str, Path]:
-    drive = named("robins.systems.ins_gnss:SYSTEM").scenarios["drive"]
-    return {"ins-gnss/drive": drive, "ins-gnss/walk": drive.with_name("walk.toml")}
-
-
-def _filters() -> list[str]:
-    names, smoothed = (named(f"robins.systems.ins_gnss.log:{of}") for of in ("NAMES", "SMOOTHED"))
-    return [name for name in names if name not in smoothed]
-
-
-def _shifted(said: Mapping[str, Any], fault: Any, _: int) -> dict[str, Any]:
+def _shifted(said: Values, fault: Any, _: int) -> Values:
     """A position that is off to the north."""
     return {**said, "lat": said["lat"] + fault.shift / 6.378137e6}
 
 
-def _blind(said: Mapping[str, Any], *_: Any) -> dict[str, Any]:
+def _blind(said: Values, *_: Any) -> Values:
     """No satellites: a stamp and no numbers."""
     nothing = np.full(3, np.nan)
     return {**said, "lat": np.nan, "lon": np.nan, "alt": np.nan, "v_n": nothing, "quality": 0}
@@ -105,26 +94,43 @@ _SAID = {
     "blind": Said("gnss", "fix", "blind", _blind),
 }
 _SHIFT = Annotated[float, Quantity("length", least="-100 km", most="100 km")]
-_OF = f"{__name__}.navigating"
 
-RIG = Rig(
-    name="ins-gnss",
-    wire=WIRE,
-    build={part: later(f"{_OF}:{part}") for part in WIRE.parts[1:]},
-    sends={"imu": ("sample",), "gnss": ("fix",), "navigation": ("state", "epoch")},
-    takes={"imu": (), "gnss": (), "navigation": ("sample", "fix")},
-    parameters=lambda: named(f"{_OF}:Journey"),
-    prepare=later(f"{_OF}:prepare"),
-    kept=("state", "epoch"),
-    timing=later(f"{_OF}:timing"),
-    flies=_flies,
-    filters=_filters,
-    scenarios=packaged(__file__),
-    options=lambda: {"machine": (Literal["jax", "vm", "c"] | None, None)},
-    said=lambda: (_SAID, {"shift": (_SHIFT, default("30 m"))}),
-    view=later(f"{_OF}:view"),
-    topics=later(f"{_OF}:topics"),
-    judge=later(f"{_OF}:judge"),
-    exported="navigation",
-    aboard=later(f"{__name__}.aboard:aboard"),
-)
+
+class InsGnssRig(Rig):
+    """Inertial unit, receiver and navigation computer."""
+
+    name = "ins-gnss"
+    wire = WIRE
+    sends: ClassVar = {"imu": ("sample",), "gnss": ("fix",), "navigation": ("state", "epoch")}
+    takes: ClassVar = {"imu": (), "gnss": (), "navigation": ("sample", "fix")}
+    code = f"{__name__}.navigating"
+    parameters = f"{code}:Journey"
+    kept = ("state", "epoch")
+    exported = "navigation"
+    prepare = later(f"{code}:prepare")
+    timing = later(f"{code}:timing")
+    view = later(f"{code}:view")
+    topics = later(f"{code}:topics")
+    judge = later(f"{code}:judge")
+    aboard = later(f"{code}:aboard")
+
+    def flies(self) -> dict[str, Path]:
+        """Simulated drives."""
+        drive = named("robins.systems.ins_gnss:SYSTEM").scenarios["drive"]
+        return {"ins-gnss/drive": drive, "ins-gnss/walk": drive.with_name("walk.toml")}
+
+    def filters(self) -> list[str]:
+        """Filters that do not wait for the end of a log."""
+        of = "robins.systems.ins_gnss.log"
+        return [name for name in named(f"{of}:NAMES") if name not in named(f"{of}:SMOOTHED")]
+
+    def options(self) -> dict[str, Any]:
+        """Machine that steps the filter; left out: as `LiveInsGnss` chooses."""
+        return {"machine": (Literal["jax", "vm", "c"] | None, None)}
+
+    def said(self) -> tuple[dict[str, Said], dict[str, Any]]:
+        """Faults of the receiver."""
+        return _SAID, {"shift": (_SHIFT, default("30 m"))}
+
+
+RIG = InsGnssRig()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -12,29 +12,35 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins import logs, manifold
+from robins.bench.evaluation import Flown, Judged, Ran, View, figures_of, latest
 from robins.bench.live.feed import Signal
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.recording.topics import JSON, Topic, as_json, nav_sat_fix
 from robins.bench.recording.topics import imu as imu_of_ros
-from robins.bench.rig import Judged, RigError, Timing, View
+from robins.bench.rig import Aboard, Flight, RigError, Timing
 from robins.bench.rigs.ins_gnss import FLAGS, SUSPECTS
-from robins.bench.run.numbers import figures_of, latest
-from robins.bench.run.telemetry import Flown
-from robins.dataset import Dataset
+from robins.bench.wire.fields import Values
+from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
 from robins.earth import Geodetic
 from robins.ins.blocks import rate_about
-from robins.ins.frames import to_ned_frd
-from robins.ins.increments import own_intervals
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsState
+from robins.ros import Message
 from robins.rotation import Rotation
 from robins.scenario import Quantity, default
+from robins.systems.ins_gnss import aboard as program
 from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.live import LiveInsGnss
 from robins.systems.ins_gnss.live_answers import Navigation
 from robins.systems.ins_gnss.live_fixes import some
 from robins.systems.ins_gnss.parameters import Drive, Gnss, Replay
-from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock, with_lever_arm
+from robins.systems.ins_gnss.recording import (
+    Log,
+    as_rates,
+    in_body_axes,
+    on_one_clock,
+    with_lever_arm,
+)
 from robins.systems.ins_gnss.reported import antenna_of, distances, fix_arrays
 from robins.systems.ins_gnss.world import drive_dataset, motion_of
 from robins.systems.suspects import sentences, tables, words
@@ -87,22 +93,14 @@ def _logged(files: tuple[str, ...]) -> Dataset:
     dataset = logs.clean(logs.load_dataset(files))
     if dataset.gnss is None or len(dataset.gnss) == 0:
         raise RigError("the log has no GNSS fixes", ", ".join(files), "give the receiver's file")
-    return _as_sensors_say(dataset)
+    return as_rates(dataset)
 
 
-def _as_sensors_say(dataset: Dataset) -> Dataset:
-    """Rates in the place of increments, forward-right-down and north-east-down."""
-    imu = to_ned_frd(dataset.imu)
-    if imu.kind == "increment":
-        dt = own_intervals(np.diff(imu.time_ns) * 1e-9, imu.gyro, imu.accel)[:, None]
-        imu = replace(imu, gyro=imu.gyro / dt, accel=imu.accel / dt, kind="rate")
-    gnss = None if dataset.gnss is None else to_ned_frd(dataset.gnss)
-    return replace(dataset, imu=imu, gnss=gnss)
-
-
-def _rate_hz(table: Any) -> float:
+def _rate_hz(table: ImuTable | GnssTable | None) -> float:
     # rounded as a replay rounds it: whether a sample is missing may hang on the last digit
-    return 1.0 / float(np.median(np.diff(table.time_ns) * 1e-9)) if len(table) > 1 else 1.0
+    if table is None or len(table) < 2:
+        return 1.0
+    return 1.0 / float(np.median(np.diff(table.time_ns) * 1e-9))
 
 
 def timing(given: Journey) -> Timing:
@@ -128,7 +126,7 @@ def prepare(setup: Any, given: Journey) -> Kit:
         dataset = _logged(given.log)
         believed = with_lever_arm(believed, dataset.lever_arm_b_m)
     elif given.drive is not None:
-        dataset = _as_sensors_say(drive_dataset(given.drive, setup.seed))
+        dataset = as_rates(drive_dataset(given.drive, setup.seed))
     elif silent := sorted({"imu", "gnss"} - set(setup.ports)):
         what = "this configuration has no log and no drive"
         fix = 'give a log, --set \'log=["imu.csv", "gnss.pos"]\', or boards, --node imu=PORT'
@@ -180,11 +178,9 @@ def gnss(kit: Kit) -> Part:
     return Part("gnss", {}, lambda: int(np.searchsorted(since_s, 0.0, side="right")), act)
 
 
-class Navigating(NamedTuple):
-    """State of the navigation computer; the object in it is always the same, and changes."""
-
-    live: LiveInsGnss
-    waiting: tuple[Navigation, ...]  # epochs that have not been sent: one is sent a step
+Navigating = tuple[LiveInsGnss, tuple[Navigation, ...]]
+"""State of the navigation computer: an object that is always the same, and changes; and epochs that
+have not been sent: one is sent a step."""
 
 
 def navigation(kit: Kit) -> Part:
@@ -195,7 +191,7 @@ def navigation(kit: Kit) -> Part:
         if not made:  # which compiles, and is not needed where only its inputs are queried
             made.append(LiveInsGnss(kit.given, *kit.rates_hz, kit.filter, machine=kit.machine))
         made[0].start_over()
-        return Navigating(made[0], ())
+        return made[0], ()
 
     def act(state: Navigating, k: int, inputs: Inputs):
         live, waiting = state
@@ -210,32 +206,50 @@ def navigation(kit: Kit) -> Part:
                 fix["time"], *place, fix["sigma"], *moves, quality=fix["quality"]
             )
             flags, waiting = flags | answer.flags, (*waiting, *live.passed)
-        said: list[tuple[str, dict[str, Any]]] = []
+        said: list[tuple[str, Values]] = []
         if answer is not None:
             said.append(("state", {**_told(answer), "flags": int(flags)}))
         if waiting:
             said.append(("epoch", _told(waiting[0])))
-        return Navigating(live, waiting[1:]), said
+        return (live, waiting[1:]), said
 
     nothing = {"sample": None, "fix": None}
     return Part("navigation", {"sample": 0, "fix": 0}, begin, act, nothing)
 
 
-def _told(n: Navigation) -> dict[str, Any]:
+def _told(n: Navigation) -> Values:
     place = {"lat": n.lat_rad, "lon": n.lon_rad, "alt": n.alt_m}
     wrong = np.array([n.wrong.get(name, np.nan) for name in SUSPECTS])
     state = {"time": n.time_ns, "q_nb": n.q_nb, "v_n": n.v_n, **place}
     return {**state, "sigma": n.sigma, "wrong": wrong}
 
 
+def aboard(flight: Flight) -> Aboard:
+    """Filter and loop of the navigation computer as a program, for the drive or log of a flight.
+
+    Raises:
+        RobinsError: nothing sends as imu or gnss, the log cannot be read or navigated, or the part
+            needs what the loop does not do.
+    """
+    kit = prepare(flight.setup, flight.given)
+    if kit.dataset is None or kit.dataset.gnss is None:
+        raise RigError("the filter is tried on a drive or a log, and there is none", "--board")
+    problem, constants = program.aboard(
+        kit.given, kit.dataset, kit.rates_hz, flight.setup.filter, SUSPECTS, flight.name
+    )
+    here = sorted(Path(__file__).parent.glob("navigation_*.[ch]"))
+    files = {path.name: path.read_text("utf-8") for path in here}
+    return Aboard(problem, "filter", {**files, "navigation_given.h": constants})
+
+
 def topics(kit: Kit) -> tuple[Topic, ...]:
     """Samples and fixes as ROS 2 has them, so that `robins replay` reads a record; states."""
 
-    def fix(v: Any) -> Any:
+    def fix(v: Values) -> Message:
         covariance = np.diag(np.square(v["sigma"]))
         return nav_sat_fix(v["lat"], v["lon"], v["alt"], covariance=covariance)
 
-    def sample(v: Any) -> Any:
+    def sample(v: Values) -> Message:
         return imu_of_ros(v["omega_s"], v["f_s"], body="FRD")
 
     return (
@@ -245,7 +259,7 @@ def topics(kit: Kit) -> tuple[Topic, ...]:
     )
 
 
-def judge(flight: Any, ran: Any) -> Judged:
+def judge(flight: Flight, ran: Ran) -> Judged:
     """Figures of a replay of the log, and errors where the truth is known."""
     flown, kit, blocks = ran.flown, ran.kit, model.state_blocks(False)[:3]
     arrays = track_arrays([_nav(flown, "state").position], "{} of the unit")
@@ -280,7 +294,7 @@ def judge(flight: Any, ran: Any) -> Judged:
     return Judged(metrics, counts, arrays=arrays, lines=[*figures_of(metrics), *said])
 
 
-def _nav(flown: Flown, message: str, rows: Any = slice(None)) -> Nav:
+def _nav(flown: Flown, message: str, rows: np.ndarray | slice = slice(None)) -> Nav:
     q, v, *place = (flown[f"{message}.{f}"][rows] for f in ("q_nb", "v_n", "lat", "lon", "alt"))
     return Nav(Rotation(q), jnp.asarray(v), Geodetic(*place))
 
@@ -291,7 +305,7 @@ def epochs_of(flown: Flown) -> np.ndarray:
     return heard[np.unique(flown["epoch.time"][heard], return_index=True)[1]]
 
 
-def against_fixes(kit: Kit, log: Any, flown: Flown) -> dict[str, Any]:
+def against_fixes(kit: Kit, log: Log, flown: Flown) -> dict[str, Any]:
     """Distances of the antenna from the fixes, as of `robins replay`.
 
     The gyro bias is not on the wire: with a latency it would move the antenna by the lever arm
@@ -309,12 +323,21 @@ def against_fixes(kit: Kit, log: Any, flown: Flown) -> dict[str, Any]:
     return distances(log, np.abs(epoch_s[near] - log.gnss_s) < 1e-6, epoch_s, antenna)
 
 
-def against_truth(t: Any, flown: Flown) -> np.ndarray:
+def against_truth(t: Trajectory, flown: Flown) -> np.ndarray:
     """(E, 9) true less estimated attitude [rad], velocity and position [m], each NED."""
     at = np.clip(np.searchsorted(t.time_ns, flown["state.time"]), 0, len(t) - 1)
     place = Geodetic(*(np.asarray(x)[at] for x in (t.lat_rad, t.lon_rad, t.alt_m)))
     truth = Nav(Rotation(np.asarray(t.q_nb)[at]), jnp.asarray(t.v_n)[at], place)
     return np.asarray(jax.jit(jax.vmap(manifold.local))(_nav(flown, "state"), truth))
+
+
+_OFFERED = (
+    {"label": "gnss: 30 m to the north", "fault": {"kind": "shifted"}},
+    {"label": "gnss: no satellites", "fault": {"kind": "blind"}},
+    {"label": "gnss: link silent", "fault": {"kind": "silent", "link": "gnss"}},
+    {"label": "imu: 2 % of samples lost", "fault": {"kind": "loss", "link": "imu", "share": 0.02}},
+)
+"""Faults that the page offers."""
 
 
 def view() -> View:
@@ -327,12 +350,6 @@ def view() -> View:
     ]
     drawn = [*(Signal(f"q {c}", "1", "attitude", "attitude", "navigated") for c in "wxyz"), *three]
     drawn += [Signal(words(name), "1", "probability of being wrong") for name in SUSPECTS]
-    faults = (
-        ("gnss: 30 m to the north", {"kind": "shifted"}),
-        ("gnss: no satellites", {"kind": "blind"}),
-        ("gnss: link silent", {"kind": "silent", "link": "gnss"}),
-        ("imu: 2 % of samples lost", {"kind": "loss", "link": "imu", "share": 0.02}),
-    )
 
     def sample(flown: Flown, kit: Kit, since: int, step: int) -> list[float]:
         names = ("q_nb", "v_n", "sigma", "wrong", "lat", "lon", "alt")
@@ -343,5 +360,4 @@ def view() -> View:
         to_m = np.array([1.0, np.cos(begin[0]), 0.0]) * 6.378137e6 - np.array([0.0, 0.0, 1.0])
         return [*q, *v, *((np.array(place) - begin) * to_m), *sigma[6:], *wrong]
 
-    offered = tuple({"label": label, "fault": fault} for label, fault in faults)
-    return View(lambda given: drawn, sample, offered=offered)
+    return View(lambda given: drawn, sample, offered=_OFFERED)

@@ -7,24 +7,29 @@ errors, identifies the stars and solves. So a real star sensor can be shown a sk
 
 All messages of the satellite are also those of this rig, with `turn` and `stars` in addition.
 
-- `parts`: the parts that are new, and the same run inside one program.
-- `faults`: of the star simulator.
+`parts` has the parts that are new, and the same run inside one program.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from robins.bench.rig import Rig, later, named, packaged
-from robins.bench.rigs import satellite
-from robins.bench.rigs.laboratory.parts import STARS, dynamics, kinematics, sky, star
-from robins.bench.rigs.satellite import messages
-from robins.bench.wire.fields import f64, message
+import numpy as np
+import pydantic
+
+from robins.bench.broker.faults import Said, nothing
+from robins.bench.rig import later, named
+from robins.bench.rigs.satellite import SatelliteRig, messages
+from robins.bench.wire.fields import Values, f64, message
 from robins.bench.wire.schema import Wire
 
-__all__ = ["BUILD", "RIG", "SENDS", "TAKES", "WIRE"]
+if TYPE_CHECKING:
+    from robins.bench.evaluation import View
 
+__all__ = ["RIG", "STARS", "TAKES", "WIRE"]
+
+STARS = 48  # shown at most: those that a camera reports, and some at the edge of its field
 _SPLIT = {"plant": ("dynamics", "kinematics"), "star": ("sky", "star")}
 
 WIRE = Wire(
@@ -59,32 +64,54 @@ TAKES = {part: taken for part, taken in messages.TAKES.items() if part != "plant
     "sky": ("motion",),
     "star": ("stars", "gyro", "estimate"),
 }
-BUILD = {part: build for part, build in satellite.BUILD.items() if part != "plant"} | {
-    "dynamics": dynamics,
-    "kinematics": kinematics,
-    "sky": sky,
-    "star": star,
+
+
+def _hidden(said: Values, fault: Any, _: int) -> Values:
+    """Stars without the brightest."""
+    said["vectors_s"][: 3 * fault.stars] = np.nan
+    said["magnitude"][: fault.stars] = np.nan
+    return said
+
+
+_SAID: dict[str, Said] = {
+    "dark": Said("sky", "stars", "blind", nothing),
+    "hidden": Said("sky", "stars", "said", _hidden, ("stars",)),
 }
-"""Functions that make each part from a kit."""
-
-
-def _flies() -> dict[str, Path]:
-    from robins.systems.satellite import SYSTEM
-
-    return {"laboratory/stars": SYSTEM.scenarios["stars"]}
-
-
-RIG: Rig = replace(
-    satellite.RIG,
-    name="laboratory",
-    wire=WIRE,
-    build=BUILD,
-    sends=SENDS,
-    takes=TAKES,
-    prepare=later(f"{__name__}.parts:prepare"),
-    flies=_flies,
-    scenarios=packaged(__file__),
-    said=later(f"{__name__}.faults:said"),
-    view=lambda: named(f"{__name__}.faults:view")(),
-    inside=later(f"{__name__}.parts:inside"),
+"""A star simulator that shows nothing, or all but its brightest ``stars``."""
+_STARS = Annotated[int, pydantic.Field(ge=1, le=STARS)]
+_OFFERED: tuple[dict[str, Any], ...] = (
+    {"label": "sky: dark", "fault": {"kind": "dark"}},
+    {"label": "sky: without the brightest star", "fault": {"kind": "hidden"}},
 )
+
+
+class LaboratoryRig(SatelliteRig):
+    """The satellite, with dynamics, kinematics and a star simulator."""
+
+    name = "laboratory"
+    wire = WIRE
+    sends: ClassVar = SENDS
+    takes: ClassVar = TAKES
+    build: ClassVar = {
+        **SatelliteRig.build,
+        **{p: f"{__name__}.parts:{p}" for p in ("dynamics", "kinematics", "sky", "star")},
+    }
+    prepare = later(f"{__name__}.parts:prepare")
+    inside = later(f"{__name__}.parts:inside")
+
+    def flies(self) -> dict[str, Path]:
+        """The scenario of the satellite that has a camera."""
+        return {"laboratory/stars": named("robins.systems.satellite:SYSTEM").scenarios["stars"]}
+
+    def said(self) -> tuple[dict[str, Said], dict[str, Any]]:
+        """Faults of the satellite and of the star simulator."""
+        kinds, parameters = super().said()
+        return {**kinds, **_SAID}, {**parameters, "stars": (_STARS, 1)}
+
+    def view(self) -> View:
+        """Page of the satellite, with the faults of the star simulator."""
+        shown = super().view()
+        return shown._replace(offered=(*shown.offered, *_OFFERED))
+
+
+RIG = LaboratoryRig()

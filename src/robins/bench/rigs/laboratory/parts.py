@@ -12,19 +12,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from robins.bench.evaluation import Spoken
 from robins.bench.parts.station import Inputs, Part
-from robins.bench.rig import Spoken
-from robins.bench.rigs.satellite import computers, errors, preparing
+from robins.bench.rigs.laboratory import STARS
+from robins.bench.rigs.satellite import computers, judging
+from robins.bench.rigs.satellite import kit as satellite
 from robins.bench.rigs.satellite.kit import Kit, driven
 from robins.bench.rigs.satellite.messages import SAFE
 from robins.bench.rigs.satellite.vehicle import Held, acting, rest
+from robins.bench.wire.fields import Values
 from robins.rotation import multiply, normalise
 from robins.scenario import ScenarioError
 from robins.sim import spacecraft
@@ -34,7 +37,6 @@ from robins.systems.satellite import nodes
 from robins.systems.satellite.nodes import Actuation, Frame, Given, Lens, Row, Step, apart
 from robins.systems.satellite.parameters import AttitudeLoop
 
-STARS = 48  # shown at most: those that a camera reports, and some at the edge of its field
 MARGIN_RAD = 2e-3  # shown beyond that edge, for a camera that is turned a little
 
 
@@ -51,7 +53,7 @@ def prepare(setup: Any, given: AttitudeLoop) -> Kit:
                 "fly laboratory/stars, or give it a table [star.camera]"
             ]
         )
-    return preparing.prepare(setup, given)
+    return satellite.prepare(setup, given)
 
 
 # ------------------------------------------------------------------------- the craft in two halves
@@ -97,27 +99,22 @@ def dynamics(kit: Kit) -> Part:
     return Part("dynamics", {"actuation": 0, "motion": 1}, begin, act, example)
 
 
-class Pointing(NamedTuple):
-    """State of the kinematics."""
-
-    q_ib: Any  # (4,)
-    gibbs_b: Any  # (3,) of the last turn
-    omega_b: Any  # (3,) rad/s, after it
-
-
 def kinematics(kit: Kit) -> Part:
-    """Part that computes the attitude after each turn; if none comes, the last is repeated."""
+    """Part that computes the attitude after each turn; if none comes, the last is repeated.
+
+    Its state is the attitude (4,) and the last turn.
+    """
     craft = kit.vehicle.craft
     omega = np.asarray(rate_b(kit.given.craft, craft))
-    first = Pointing(np.asarray(craft.q_ib), 0.5e-9 * kit.step_ns * omega, omega)
+    first = {"gibbs_b": 0.5e-9 * kit.step_ns * omega, "omega_b": omega}
+    begin = np.asarray(craft.q_ib), first
 
-    def act(state: Pointing, k: int, inputs: Inputs):
-        turn = inputs["turn"] or state._asdict()
-        q = np.asarray(_follows(state.q_ib, turn["gibbs_b"]))
-        state = Pointing(q, turn["gibbs_b"], turn["omega_b"])
-        return state, [("motion", {"q_ib": q, "omega_b": state.omega_b})]
+    def act(state: tuple[np.ndarray, Values], k: int, inputs: Inputs):
+        turn = inputs["turn"] or state[1]
+        q = np.asarray(_follows(state[0], turn["gibbs_b"]))
+        return (q, turn), [("motion", {"q_ib": q, "omega_b": turn["omega_b"]})]
 
-    return Part("kinematics", {"turn": 0}, lambda: first, act, {"turn": first._asdict()})
+    return Part("kinematics", {"turn": 0}, lambda: begin, act, {"turn": first})
 
 
 # ------------------------------------------------------------------------- the sky and the sensor
@@ -175,14 +172,6 @@ def sky(kit: Kit) -> Part:
     return Part("sky", {"motion": 0}, lambda: None, act, example)
 
 
-class Tracking(NamedTuple):
-    """State of the star sensor."""
-
-    seen_q_ib: Any  # (4,) what it saw last, for one that is stuck
-    looks_q_ib: Any  # (4,) where it looks for its stars
-    bias: Any  # (3,) rad/s, of the gyro
-
-
 _expected = jax.jit(nodes.expected)
 
 
@@ -190,28 +179,29 @@ def star(kit: Kit) -> Part:
     """The star sensor: a camera that identifies stars near its predicted attitude.
 
     That is the last of attitude determination, turned by the gyro. As long as there is none, or
-    its estimate is marked as unreliable, the sensor uses its own last attitude.
+    its estimate is marked as unreliable, the sensor uses its own last attitude. Its state is the
+    attitude (4,) that it saw last, for one that is stuck, the attitude (4,) where it looks for its
+    stars, and the bias (3,) [rad/s] of the gyro.
     """
     sees = driven(kit._replace(machine="jax"), _sensor)  # an image has no place in a program
     q_first, bias = (f(kit.belief.mean) for f in (jax.jit(kit.form.attitude), kit.form.bias))
-    first = Tracking(np.asarray(kit.vehicle.star_q_ib), np.asarray(q_first), np.asarray(bias))
+    first = tuple(map(np.asarray, (kit.vehicle.star_q_ib, q_first, bias)))
 
-    def act(state: Tracking, k: int, inputs: Inputs):
+    def act(state: tuple[np.ndarray, ...], k: int, inputs: Inputs):
         estimate, stars = inputs["estimate"], inputs["stars"]
-        q, bias = state.looks_q_ib, state.bias
+        seen, q, bias = state
         if estimate is not None and not estimate["flags"] & SAFE:
             q, bias = estimate["q_ib"], estimate["gyro_bias"]
         theta = computers.sample_of(inputs["gyro"])
         looks = np.asarray(_expected(kit.given, q, bias, np.zeros(3) if theta is None else theta))
-        state = Tracking(state.seen_q_ib, looks, bias)
         if stars is None or not _is_due(kit, k):
-            return state, []
+            return (seen, looks, bias), []
         directions = stars["vectors_s"].reshape(STARS, 3)
-        frame = sees(k, directions, stars["magnitude"], looks, state.seen_q_ib)
+        frame = sees(k, directions, stars["magnitude"], looks, seen)
         q = np.asarray(frame.q_ib)
         looks = q if np.all(np.isfinite(q)) else looks
         said = {"q_ib": q, "factor": np.ravel(frame.factor), "stars": int(frame.stars)}
-        return Tracking(np.asarray(frame.seen_q_ib), looks, bias), [("star", said)]
+        return (np.asarray(frame.seen_q_ib), looks, bias), [("star", said)]
 
     shown = {"vectors_s": np.zeros(3 * STARS), "magnitude": np.zeros(STARS)}
     example = {"stars": shown, "gyro": {"theta_b": np.zeros(3)}, "estimate": None}
@@ -238,4 +228,4 @@ def inside(
     kit: Kit, steps: int | None = None, said: Sequence[Spoken] = ()
 ) -> Mapping[str, np.ndarray] | None:
     """The same run inside one program, of the same parts."""
-    return errors.inside(kit, steps, said, _REACT)
+    return judging.inside(kit, steps, said, _REACT)

@@ -10,15 +10,14 @@ own line. The part `autopilot` is ours, or the end of a socket that PX4's or Ard
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import pydantic
 
-from robins.bench.broker.faults import Said
-from robins.bench.rig import Rig, later, named, packaged
-from robins.bench.wire.fields import Field, f64, message
+from robins.bench.broker.faults import Said, nothing
+from robins.bench.rig import Rig, later
+from robins.bench.wire.fields import Field, Values, f64, message
 from robins.bench.wire.schema import Wire
 from robins.scenario import Quantity, default
 
@@ -70,17 +69,12 @@ WIRE = Wire(
 )
 
 
-def _magnet(said: Mapping[str, Any], fault: Any, _: int) -> dict[str, Any]:
+def _magnet(said: Values, fault: Any, _: int) -> Values:
     """A magnet to the right of the compass."""
     return {**said, "field_b": said["field_b"] + np.array([0.0, fault.field, 0.0])}
 
 
-def _blind(said: Mapping[str, Any], *_: Any) -> dict[str, Any]:
-    """No satellites."""
-    return {name: np.full(np.shape(x), np.nan) for name, x in said.items()}
-
-
-def _motor(said: Mapping[str, Any], fault: Any, _: int) -> dict[str, Any]:
+def _motor(said: Values, fault: Any, _: int) -> Values:
     """A motor that gives a share of its command, or nothing."""
     share = np.ones(len(MOTORS))
     share[fault.motor] = fault.left
@@ -89,7 +83,7 @@ def _motor(said: Mapping[str, Any], fault: Any, _: int) -> dict[str, Any]:
 
 _SAID = {
     "magnet": Said("imu", "sample", "sensed", _magnet, ("field",)),
-    "blind": Said("gnss", "fix", "blind", _blind),
+    "blind": Said("gnss", "fix", "blind", nothing),
     "motor": Said("autopilot", "motors", "said", _motor, ("motor", "left"), needs="motor"),
 }
 _MOTOR: Any = Annotated[int, pydantic.Field(ge=0, lt=len(MOTORS))]
@@ -108,40 +102,43 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
-def _once(setup: Any, part: str) -> str:
-    """An autopilot that is a program of its own has a state that no record holds."""
-    if part != "autopilot" or setup.autopilot == "own":
-        return ""
-    return f"'{part}' is {setup.autopilot}, a program whose state no record holds"
+class MultirotorRig(Rig):
+    """The multirotor."""
 
-
-RIG = Rig(
-    name="multirotor",
-    wire=WIRE,
-    build={
-        "craft": later(f"{__name__}.craft:craft"),
-        "imu": later(f"{__name__}.craft:imu"),
-        "gnss": later(f"{__name__}.craft:gnss"),
-        "autopilot": later(f"{__name__}.autopilots:autopilot"),
-    },
-    sends={
+    name = "multirotor"
+    wire = WIRE
+    sends: ClassVar = {
         "craft": ("motion",),
         "imu": ("sample",),
         "gnss": ("fix",),
         "autopilot": ("motors",),
-    },
-    takes={
+    }
+    takes: ClassVar = {
         "craft": ("motors",),
         "imu": ("motion",),
         "gnss": ("motion",),
         "autopilot": ("sample", "fix", "motion"),  # ArduPilot measures the motion by itself
-    },
-    parameters=lambda: named(f"{__name__}.flight:Multirotor"),
-    prepare=later(f"{__name__}.flight:prepare"),
-    truth="motion",
-    scenarios=packaged(__file__),
-    options=lambda: _OPTIONS,
-    said=lambda: (_SAID, _FAULTS),
-    judge=later(f"{__name__}.flight:judge"),
-    once=_once,
-)
+    }
+    code = f"{__name__}.craft"
+    build: ClassVar = {"autopilot": f"{__name__}.autopilots:autopilot"}
+    parameters = f"{__name__}.flight:Multirotor"
+    truth = "motion"
+    prepare = later(f"{__name__}.flight:prepare")
+    judge = later(f"{__name__}.flight:judge")
+
+    def options(self) -> dict[str, Any]:
+        """Autopilot, and where one that is another program connects."""
+        return _OPTIONS
+
+    def said(self) -> tuple[dict[str, Said], dict[str, Any]]:
+        """Faults of compass, receiver and motors."""
+        return _SAID, _FAULTS
+
+    def once(self, setup: Any, part: str) -> str:
+        """An autopilot that is a program of its own has a state that no record holds."""
+        if part != "autopilot" or setup.autopilot == "own":
+            return ""
+        return f"'{part}' is {setup.autopilot}, a program whose state no record holds"
+
+
+RIG = MultirotorRig()

@@ -5,13 +5,15 @@ Another program is waited for in `Part.rare`: once, in the process of the part, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array
 
 from robins.bench.bridges import ardupilot as of_ardupilot
 from robins.bench.bridges import px4 as of_px4
@@ -21,6 +23,7 @@ from robins.bench.parts.station import Inputs, Part
 from robins.bench.rigs.multirotor import craft
 from robins.bench.rigs.multirotor.craft import DOWN, INERTIA_KG_M2, MASS_KG
 from robins.bench.rigs.multirotor.flight import Kit
+from robins.bench.wire.fields import Values
 from robins.earth.atmosphere import G0
 from robins.rotation import conjugate, from_dcm, from_rotvec, multiply, rotate, to_rotvec
 
@@ -34,7 +37,7 @@ def autopilot(kit: Kit) -> Part:
     return {"own": own, "px4": px4, "ardupilot": ardupilot}[kit.autopilot](kit)
 
 
-def _motors(shares: Any = (0.0,) * 4, answered: bool = True) -> dict[str, Any]:
+def _motors(shares: ArrayLike | Sequence[float] = (0.0,) * 4, answered: bool = True) -> Values:
     return {"control": np.clip(np.asarray(shares, float), 0.0, 1.0), "answered": int(answered)}
 
 
@@ -60,7 +63,7 @@ class Mind(NamedTuple):
 
 @jax.jit
 def believed(
-    s: Mind, omega_b: Any, f_b: Any, field_b: Any, fix: Any, field_n: Any, dt: Any
+    s: Mind, omega_b: Array, f_b: Array, field_b: Array, fix: Array, field_n: Array, dt: Array
 ) -> Mind:
     """A step of strapdown, held to the vertical of a hover, to the compass and to the fixes.
 
@@ -85,7 +88,7 @@ def believed(
 
 
 @jax.jit
-def controlled(s: Mind, omega_b: Any, height_m: Any, dt: Any) -> tuple[Mind, Any]:
+def controlled(s: Mind, omega_b: Array, height_m: Array, dt: Array) -> tuple[Mind, Array]:
     """Position over velocity over attitude over rate; the motors' shares (4,), not yet limited."""
     down = jnp.asarray(DOWN)
     off = HOLD_1_S * (-height_m * down - s.p_n)
@@ -111,7 +114,7 @@ def own(kit: Kit) -> Part:
     rest = {"omega_b": none, "f_b": -G0 * DOWN, "field_b": nothing[:3], "pressure": np.nan}
     begin = (Mind(np.array([1.0, 0.0, 0.0, 0.0]), none, none, none), rest)
 
-    def act(state: tuple[Mind, Any], k: int, inputs: Inputs):
+    def act(state: tuple[Mind, Values], k: int, inputs: Inputs):
         mind, sample = state[0], inputs["sample"] or state[1]
         fix = nothing
         if (found := inputs["fix"]) is not None:
@@ -157,7 +160,7 @@ def px4(kit: Kit) -> Part:
         with _until_lost(lines[0]):
             lines[0].accept(CONNECT_S)
 
-    def act(last: dict[str, Any], k: int, inputs: Inputs):
+    def act(last: Values, k: int, inputs: Inputs):
         time_us, sample, fix = (k + 1) * kit.step_ns // 1000, inputs["sample"], inputs["fix"]
         with _until_lost(lines[0]):
             if fix is not None and np.isfinite([fix["lat"], *fix["v_n"]]).all():
@@ -172,7 +175,7 @@ def px4(kit: Kit) -> Part:
     return Part("autopilot", takes, lambda: _motors(answered=False), act, rare=connect)
 
 
-def _sensors(time_us: int, sample: Mapping[str, Any]) -> Sensors:
+def _sensors(time_us: int, sample: Values) -> Sensors:
     now = np.isfinite([sample["pressure"], *sample["field_b"]]).all()
     return Sensors(
         time_us=time_us,
@@ -200,7 +203,7 @@ def ardupilot(kit: Kit) -> Part:
         with _until_lost(lines[0]):
             asked(CONNECT_S, "start ArduPilot's SITL")
 
-    def act(last: dict[str, Any], k: int, inputs: Inputs):
+    def act(last: Values, k: int, inputs: Inputs):
         if (motion := inputs["motion"]) is not None:
             state = of_ardupilot.BodyState(
                 time_s=(k + 1) * kit.step_ns * 1e-9,

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.rigs.multirotor.flight import Kit
@@ -54,7 +55,7 @@ def at_rest() -> Airframe:
 
 
 @jax.jit
-def moved(s: Airframe, control: Any, wind_n: Any, dt: Any) -> Airframe:
+def moved(s: Airframe, control: Array, wind_n: Array, dt: Array) -> Airframe:
     """Step of dt [s] under motor commands (4,) in [0, 1] and the wind (3,) [m/s] NED."""
     down, inertia = jnp.asarray(DOWN), jnp.asarray(INERTIA_KG_M2)
     thrust = s.thrust + (1.0 - jnp.exp(-dt / LAG_S)) * (MOST_N * control - s.thrust)
@@ -77,7 +78,7 @@ def craft(kit: Kit) -> Part:
     wind_n, dt = np.asarray(kit.given.wind), kit.step_ns * 1e-9
     begin = (at_rest(), np.zeros(4))
 
-    def act(state: tuple[Airframe, Any], k: int, inputs: Inputs):
+    def act(state: tuple[Airframe, np.ndarray], k: int, inputs: Inputs):
         asked = inputs["motors"]
         control = state[1] if asked is None else asked["control"]
         after = Airframe(*map(np.asarray, moved(state[0], control, wind_n, dt)))

@@ -7,8 +7,8 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import pydantic
 
-from robins.bench.rig import Judged
-from robins.bench.run.numbers import arrays_of, figures_of
+from robins.bench.evaluation import Judged, Ran, arrays_of, figures_of
+from robins.bench.rig import Flight
 from robins.bench.run.setup import counted_from
 from robins.earth import curvature_radii
 from robins.earth.magnetic import field_n, wmm_for
@@ -83,11 +83,11 @@ def prepare(setup: Any, given: Multirotor) -> Kit:
     return Kit(round(1e9 * given.step), given, setup.seed, *ends, field_T, m_per_rad)
 
 
-def judge(flight: Any, ran: Any) -> Judged:
+def judge(flight: Flight, ran: Ran) -> Judged:
     """Figures of a run: distance from the hover point [m], tilt and heading [deg]."""
     flown, height_m = ran.flown, flight.given.height
     off_n = flown["motion.p_n"] + np.array([0.0, 0.0, height_m])
-    known = np.isfinite(off_n).all(axis=1)
+    known = np.all(np.isfinite(off_n), axis=1)
     known[: counted_from(flight, ran.steps)] = False
     metrics: dict[str, float | None] = {}
     if known.any():
@@ -110,6 +110,6 @@ def judge(flight: Any, ran: Any) -> Judged:
         metrics,
         {"steps_without_control": silent},
         never,
-        off | arrays_of(flight.rig, flown),
+        off | arrays_of(flight.rig.noted, flown),
         figures_of(metrics),
     )

@@ -1,75 +1,152 @@
 """The satellite on the bench: seven parts, each a function of what reaches it over its line.
 
-- `messages`: their messages. `faults`: faults of sensors and actuators.
-- `kit`: the numbers that they are given before a run; `preparing` makes them.
+- `messages`: their messages.
+- `kit`: the numbers that they are given before a run.
 - `vehicle`: plant, rate table, actuators, gyro, star sensor.
 - `computers`: attitude determination and control. `reference`: target attitude.
-- `errors`, `judging`, `view`: evaluation of a run, and its page.
+- `judging`: evaluation of a run, and its page.
 
 What processes of parts do not need is imported where it is used, so they start sooner.
 """
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from robins.bench.rig import Rig, later, named, packaged
-from robins.bench.rigs.satellite.computers import acm, adm
-from robins.bench.rigs.satellite.kit import Kit
-from robins.bench.rigs.satellite.messages import CONSOLE, SENDS, TAKES, WIRE
-from robins.bench.rigs.satellite.vehicle import actuators, gyro, plant, star, table
+import numpy as np
+import pydantic
 
-BUILD = {
-    "plant": plant,
-    "table": table,
-    "gyro": gyro,
-    "star": star,
-    "adm": adm,
-    "acm": acm,
-    "actuators": actuators,
+from robins.bench.broker.faults import Said
+from robins.bench.rig import Rig, later, named
+from robins.bench.rigs.satellite.messages import CONSOLE, SENDS, TAKES, WHEELS, WIRE
+from robins.bench.wire.fields import Values
+from robins.scenario import Parameters, Quantity, default
+
+if TYPE_CHECKING:
+    from robins.sim.rate_table import RateTable
+
+
+class Carrier(Parameters):
+    """A rate table that is a little late; without one the gyro turns with the craft exactly."""
+
+    lag: Annotated[float, Quantity("time", above="0 s")] = default("20 ms")
+    rate_limit: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("100 deg/s")
+    acceleration_limit: Annotated[float, Quantity("angular acceleration", above="0 rad/s^2")] = (
+        default("10 rad/s^2")
+    )
+
+    def table(self) -> RateTable:
+        """Rate table of the simulation."""
+        from robins.sim.rate_table import rate_table
+
+        return rate_table(self.lag, self.rate_limit, self.acceleration_limit)
+
+
+_SECOND_NS = 1_000_000_000
+
+
+def _turned(said: Values, fault: Any, _: int) -> Values:
+    """Times a turn about body z."""
+    from robins.rotation import multiply
+
+    half = 0.5 * fault.angle
+    about_z = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
+    return {**said, "q_ib": np.asarray(multiply(said["q_ib"], about_z))}
+
+
+def _sign(said: Values, _: Any, now_ns: int) -> Values:
+    """The opposite sign in every other second."""
+    odd = (now_ns + 1) // _SECOND_NS % 2 == 1
+    return {**said, "q_ib": -said["q_ib"]} if odd else said
+
+
+def _lost(*_: Any) -> Values:
+    return {"q_ib": np.full(4, np.nan), "factor": np.zeros(9), "stars": 0}
+
+
+def _without_wheel(said: Values, fault: Any, _: int) -> Values:
+    said["wheel_torque"][fault.wheel] = 0.0
+    return said
+
+
+SAID: dict[str, Said] = {
+    "stuck": Said("star", "star", "repeated"),
+    "turned": Said("star", "star", "sensed", _turned, ("angle",)),
+    "lost": Said("star", "star", "blind", _lost),
+    "sign": Said("star", "star", "said", _sign),
+    "wheel": Said("actuators", "actuation", "said", _without_wheel, ("wheel",), needs="wheel"),
 }
-"""Functions that make each part from a kit."""
+"""A star sensor that says again and again what it said last, whose attitude is turned by ``angle``
+about its boresight z, that says none, or one of the other sign, which is no fault; a wheel, by its
+number from 0, that gives no torque."""
+
+_WHEEL: Any = Annotated[int, pydantic.Field(ge=0, lt=WHEELS)]
+PARAMETERS: dict[str, Any] = {
+    "angle": (
+        Annotated[float, Quantity("angle", above="0 deg", most="180 deg")],
+        default("10 deg"),
+    ),
+    "wheel": (_WHEEL | None, None),
+}
 
 
-def _flies() -> dict[str, Path]:
-    from robins.systems.satellite import SYSTEM
-
-    of = {f"satellite/{name}": path for name, path in SYSTEM.scenarios.items()}
-    return {"satellite/s1": of["satellite/s1"]} | of
-
-
-def _filters() -> list[str]:
-    names = named("robins.systems.satellite.study:FILTERS")
-    return ["mekf", *(name for name in names if name != "mekf")]
-
-
-RIG = Rig(
-    name="satellite",
-    wire=WIRE,
-    build=BUILD,
-    sends=SENDS,
-    takes=TAKES,
-    parameters=lambda: named("robins.systems.satellite.parameters:AttitudeLoop"),
-    prepare=later(f"{__name__}.preparing:prepare"),
-    console=CONSOLE,
-    refuses=later(f"{__name__}.reference:refuses"),
-    truth="motion",
-    kept=("motion", "estimate", "innovation", "wheels", *CONSOLE),
-    flies=_flies,
-    filters=_filters,
-    scenarios=packaged(__file__),
-    options=lambda: {
-        "table": (named(f"{__name__}.setup:Carrier") | None, None),
-        "machine": (Literal["jax", "vm", "c"], "jax"),
-    },
-    said=later(f"{__name__}.faults:said"),
-    view=lambda: named(f"{__name__}.view:VIEW"),
-    topics=later(f"{__name__}.topics:topics"),
-    inside=later(f"{__name__}.errors:inside"),
-    judge=later(f"{__name__}.judging:judge"),
-    example="adm",
-    exported="adm",
+_ALL = {"share": 0.02}
+OFFERED: tuple[dict[str, Any], ...] = (
+    {"label": "star: wrong by 10 deg", "fault": {"kind": "turned"}},
+    {"label": "star: stuck", "fault": {"kind": "stuck"}},
+    {"label": "star: lost", "fault": {"kind": "lost"}},
+    {"label": "star: sign flips", "fault": {"kind": "sign"}},
+    {"label": "star: link silent", "fault": {"kind": "silent", "link": "star"}},
+    {"label": "gyro: link silent", "fault": {"kind": "silent", "link": "gyro"}},
+    {"label": "wheel 0: no torque", "fault": {"kind": "wheel", "wheel": 0}},
+    {"label": "all links: 2 % of frames damaged", "fault": {"kind": "bit errors", **_ALL}},
+    {"label": "all links: 2 % of frames lost", "fault": {"kind": "loss", **_ALL}},
 )
+"""Faults that the page offers."""
 
-__all__ = ["BUILD", "RIG", "Kit", "acm", "actuators", "adm", "gyro", "plant", "star", "table"]
+
+class SatelliteRig(Rig):
+    """The satellite."""
+
+    name = "satellite"
+    wire = WIRE
+    sends: ClassVar = SENDS
+    takes: ClassVar = TAKES
+    console = CONSOLE
+    code = f"{__name__}.vehicle"
+    build: ClassVar = {part: f"{__name__}.computers:{part}" for part in ("adm", "acm")}
+    parameters = "robins.systems.satellite.parameters:AttitudeLoop"
+    truth = "motion"
+    kept = ("motion", "estimate", "innovation", "wheels", *CONSOLE)
+    example = exported = "adm"
+    prepare = later(f"{__name__}.kit:prepare")
+    refuses = later(f"{__name__}.reference:refuses")
+    topics = later(f"{__name__}.judging:topics")
+    inside = later(f"{__name__}.judging:inside")
+    judge = later(f"{__name__}.judging:judge")
+    view = later(f"{__name__}.judging:view")
+
+    def flies(self) -> dict[str, Path]:
+        """Scenarios of the satellite, s1 first."""
+        found = named("robins.systems.satellite:SYSTEM").scenarios
+        return {f"satellite/{name}": found[name] for name in ("s1", *found)}
+
+    def filters(self) -> list[str]:
+        """Filters of its study, the MEKF first."""
+        names = named("robins.systems.satellite.study:FILTERS")
+        return ["mekf", *(name for name in names if name != "mekf")]
+
+    def options(self) -> dict[str, Any]:
+        """A rate table that lags, and what the parts compute by."""
+        return {"table": (Carrier | None, None), "machine": (Literal["jax", "vm", "c"], "jax")}
+
+    def said(self) -> tuple[dict[str, Said], dict[str, Any]]:
+        """Faults of star sensor and wheels."""
+        return SAID, PARAMETERS
+
+
+RIG = SatelliteRig()
+
+__all__ = ["RIG", "Carrier", "SatelliteRig"]

@@ -12,11 +12,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.rigs.satellite.kit import Kit, compiled, driven
@@ -32,27 +33,29 @@ from robins.bench.rigs.satellite.messages import (
     USED,
 )
 from robins.bench.rigs.satellite.reference import Plan, rehearse, told, wanted
-from robins.bench.rigs.satellite.vehicle import Held, padded, renew, rest, stale, trusted
+from robins.bench.rigs.satellite.vehicle import Held, Numbers, padded, renew, rest, stale, trusted
+from robins.bench.wire.fields import Values
 from robins.filters import Belief, Code, OnlineFilter
 from robins.filters.chi_square import chi_square
 from robins.filters.kalman import FilterState
-from robins.rotation import normalise
+from robins.rotation import Rotation, normalise
 from robins.systems.satellite import nodes
 from robins.systems.satellite.model import GATE, make_filter, start
 from robins.systems.satellite.nodes import NO_GAIN, STAR, Command, Given, Row
 
+StateT = TypeVar("StateT")
 SILENT_PERIODS = 4  # of the star sensor without a frame, after which it is flagged as silent
 _LIMIT = float(chi_square(GATE, 3))
 
 
-def sample_of(gyro: Any) -> np.ndarray | None:
+def sample_of(gyro: Values | None) -> np.ndarray | None:
     """The turn that a gyro reports; None if it did not come, or not of all axes."""
     if gyro is None or not np.all(np.isfinite(gyro["theta_b"])):
         return None
     return gyro["theta_b"]
 
 
-def late(part: Part, forgets: Callable[[Any], Any]) -> Part:
+def late(part: Part, forgets: Callable[[StateT], StateT]) -> Part:
     """Wrap a part so that it forgets its state where its first step is not that of the run.
 
     It has lost its power: determination then waits for a star frame to start from, and control
@@ -96,12 +99,12 @@ def adm(kit: Kit) -> Part:
     plain, sensor = make_filter("quaternion" if additive else "mekf"), kit.model.sensor(STAR)
 
     @partial(compiled, kit)
-    def judge(belief: Belief, y: Any, factor: Any):
+    def judge(belief: Belief, y: Rotation, factor: Array | None):
         info = plain.update(plain.init(belief, kit.model.dims), sensor, y, factor)[1]
         return info.innovation, info.sigma, info.nis
 
     @partial(compiled, kit)
-    def fresh(q_ib: Any, bias: Any, state: FilterState) -> FilterState:
+    def fresh(q_ib: Array, bias: Array, state: FilterState) -> FilterState:
         q = normalise(q_ib)
         believed = start(q, kit.attitude_rad, 0.0, additive)
         old = state.belief
@@ -171,12 +174,12 @@ def adm(kit: Kit) -> Part:
     return late(part, lambda state: state._replace(lost=True))
 
 
-def _factor(kit: Kit, frame: Any) -> Any:
+def _factor(kit: Kit, frame: Values) -> np.ndarray | None:
     """Factor of the covariance of a frame, where frames bring theirs."""
     return None if kit.given.lens is None else frame["factor"].reshape(3, 3)
 
 
-def _innovation(innovation: Any, sigma: Any, nis: Any) -> dict[str, Any]:
+def _innovation(innovation: Numbers, sigma: Numbers, nis: Numbers | float) -> Values:
     ratio = float(nis) / _LIMIT
     return {
         "innovation": np.asarray(innovation),
@@ -195,7 +198,9 @@ class Steered(NamedTuple):
     stands_by: bool = False
 
 
-def _steers(given: Given, q_ib: Any, bias: Any, theta: Any, wheel_h: Any, row: Row) -> Command:
+def _steers(
+    given: Given, q_ib: Array, bias: Array, theta: Array, wheel_h: Array, row: Row
+) -> Command:
     return nodes.acm(given, q_ib, bias, theta, wheel_h, row.course)
 
 

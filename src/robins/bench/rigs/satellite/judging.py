@@ -1,24 +1,80 @@
-"""Figures of merit of a run of the satellite, and its time series."""
+"""Evaluation of a run of the satellite, its page and topics, and the run inside one program."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache, partial
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
-from robins.bench.rig import Judged
-from robins.bench.rigs.satellite.errors import (
-    ARCSEC,
-    attitude_error,
-    flag,
-    peak_arcsec,
-    rms_arcsec,
-    turn,
+from robins.bench.evaluation import Flown, Judged, Ran, Spoken, Told, View, latest
+from robins.bench.live.feed import Signal
+from robins.bench.recording.topics import JSON, Topic, as_json, imu
+from robins.bench.rig import Flight
+from robins.bench.rigs.satellite import OFFERED
+from robins.bench.rigs.satellite.kit import Kit
+from robins.bench.rigs.satellite.messages import (
+    AS_IT_IS,
+    FLAGS,
+    HELD,
+    KEPT,
+    REFUSED,
+    RUN,
+    SAFE,
+    SHORT,
+    SILENT,
+    STAND_BY,
+    USED,
 )
-from robins.bench.rigs.satellite.reference import reference_q_ib
-from robins.bench.run.session import Ran
-from robins.bench.run.setup import Flight, counted_from
+from robins.bench.rigs.satellite.reference import Said, followed, reference_q_ib, wanted_after
+from robins.bench.rigs.satellite.vehicle import padded
+from robins.bench.run.setup import counted_from
+from robins.bench.wire.fields import Values
+from robins.filters import Belief, Loop, run_closed
+from robins.filters.run import Step
 from robins.results import array, variable
+from robins.rotation import conjugate, from_rotvec, multiply, to_rotvec
+from robins.systems.satellite.model import AttitudeState, QuaternionState
+from robins.systems.satellite.nodes import STAR, Row, StateForm, react
+from robins.systems.satellite.parameters import AttitudeLoop
+
+ARCSEC = np.pi / 648000.0
+Arrays = Mapping[str, np.ndarray]
+
+
+def turn(q_from: np.ndarray, q_to: np.ndarray) -> np.ndarray:
+    """(E, 3) rotation vectors [rad] of conj(q_from) q_to, in the axes of the first."""
+    return np.asarray(to_rotvec(multiply(conjugate(q_from), q_to)))
+
+
+def attitude_error(flown: Arrays) -> np.ndarray:
+    """(E, 3) true less estimated attitude [rad], body axes."""
+    return turn(flown["estimate.q_ib"], flown["motion.q_ib"])
+
+
+def flag(flown: Arrays, text: str) -> np.ndarray:
+    """(E,) bool, whether a flag of the estimate was set; by its text in `FLAGS`."""
+    return (flown["estimate.flags"] >> FLAGS.index(text)) & 1 == 1
+
+
+def rms_arcsec(error: np.ndarray, counted: slice) -> float:
+    """Root sum square of the three axes, root mean over the counted steps."""
+    some = error[counted]
+    some = some[np.all(np.isfinite(some), -1)]
+    return float(np.sqrt(np.mean(np.sum(some**2, -1)))) / ARCSEC if len(some) else float("nan")
+
+
+def peak_arcsec(error: np.ndarray, counted: slice) -> float:
+    """Greatest length over the counted steps."""
+    size = np.linalg.norm(error[counted], axis=-1)
+    return float(np.nanmax(size)) / ARCSEC if np.any(np.isfinite(size)) else float("nan")
+
+
+# ------------------------------------------------------------------------------------------ figures
 
 UNFIT = "safe: do not steer by this"
 _AXES = ("x", "y", "z (boresight)")
@@ -124,3 +180,224 @@ def arrays(ran: Ran, attitude: np.ndarray, pointing: np.ndarray) -> dict[str, An
         add("innovation_sigma", f["innovation.sigma"][heard], "star", **body)
         add("refused", flag(f, "star refused")[heard].astype(np.int8), "star")
     return out
+
+
+# -------------------------------------------------------------------------------------- one program
+
+
+@lru_cache
+def _reacts(react: Callable, form: StateForm) -> Callable:
+    """One function for each form, so that it is compiled once."""
+    return partial(react, form)
+
+
+def _posterior(step: Step) -> Belief:
+    return step.posterior
+
+
+@partial(jax.jit, static_argnames="form")
+def _attitudes(form: StateForm, mean: AttitudeState | QuaternionState) -> Array:
+    return jax.vmap(form.attitude)(mean)
+
+
+def inside(
+    kit: Kit, steps: int | None = None, said: Sequence[Spoken] = (), react: Callable = react
+) -> dict[str, np.ndarray] | None:
+    """The same run inside one program, by `run_closed`, as `robins run --runs 1` does it.
+
+    Args:
+        kit: of the run.
+        steps: number of first steps that are done; None: all.
+        said: messages of the operator. One program cannot put computers on standby or reset them:
+            the result is then None.
+        react: the loop one step on, as of `robins.systems.satellite.nodes`.
+    """
+    if any(one.message != "reference" for one in said):
+        return None
+    heard = [(one.step, one.values["q_ib"], one.values["rate"]) for one in said]
+    loop = Loop(
+        jax.tree_util.Partial(_reacts(react, kit.form), kit.given),
+        kit.vehicle,
+        jax.tree_util.tree_map(lambda x: x[:steps], _rows(kit, heard)),
+        {STAR: kit.due[:steps]},
+    )
+    done = run_closed(kit.filter, kit.model, kit.start, loop, keep=_posterior)
+    mean, seen = done.steps.mean, done.readings
+    momenta = np.asarray(seen.outputs["wheel_momentum"])
+    return {
+        # the first leaf of the state of each kind
+        "motion.q_ib": np.asarray(jax.tree_util.tree_leaves(seen.truth)[0]),
+        "estimate.q_ib": np.asarray(_attitudes(kit.form, mean)),
+        "estimate.gyro_bias": np.asarray(kit.form.bias(mean)),
+        "wheels.momentum": np.stack([padded(h) for h in momenta]),
+    }
+
+
+def _rows(kit: Kit, said: list[Said]) -> Row:
+    """Inputs of each step, with the target attitudes that the operator sent."""
+    if not said:
+        return kit.rows
+    q, omega, alpha = (np.stack(x) for x in zip(*followed(kit, said), strict=True))
+    course = kit.rows.course._replace(
+        ref_q_ib=q[:-1], ref_omega_b=omega[:-1], ref_alpha_b=alpha[:-1], ref_end_q_ib=q[1:]
+    )
+    return kit.rows._replace(course=course)
+
+
+# --------------------------------------------------------------------------------------------- page
+
+_XYZ = ("x", "y", "z")
+_OF_FRAMES = USED | REFUSED | SHORT  # flags of a star frame, so none between two frames
+
+
+def signals(given: AttitudeLoop) -> list[Signal]:
+    """Signals on the page, by the parameters of an attitude loop."""
+
+    def three(plot: str, unit: str, sigma: bool = False) -> list[Signal]:
+        found = []
+        for axis in _XYZ:
+            found.append(Signal(f"{plot} {axis}", unit, plot))
+            if sigma:
+                found.append(Signal(f"{plot} sigma {axis}", unit, plot, "sigma", f"{plot} {axis}"))
+        return found
+
+    def attitude(of: str) -> list[Signal]:
+        return [Signal(f"q {of} {c}", "1", "attitude", "attitude", of) for c in "wxyz"]
+
+    momentum = "wheel momentum"
+    return [
+        *attitude("true"),
+        *attitude("estimated"),
+        *three("attitude error", "arcsec", sigma=True),
+        *three("pointing error", "arcsec"),
+        *three("innovation of the star sensor", "arcsec", sigma=True),
+        Signal("test ratio", "1", "test ratio of the star sensor"),
+        Signal("test ratio limit", "1", "test ratio of the star sensor", "limit"),
+        *three("rate", "deg/s"),
+        *(Signal(f"{momentum} {k}", "mN m s", momentum) for k in range(len(given.wheels.axes))),
+        Signal(f"{momentum} limit", "mN m s", momentum, "limit"),
+        Signal(f"{momentum} lower limit", "mN m s", momentum, "limit"),
+    ]
+
+
+def sample(flown: Flown, kit: Kit, since: int, step: int) -> list[float]:
+    """The signals of a step; of star frames, which are rarer than samples, the latest."""
+    now = slice(step, step + 1)
+    q_ib = flown["motion.q_ib"][now]
+    error = turn(flown["estimate.q_ib"][now], q_ib)[0] / ARCSEC
+    sigma = flown["estimate.sigma"][step, :3] / ARCSEC
+    pointing = turn(wanted_after(kit, flown, step + 1).q_ib[None], q_ib)[0] / ARCSEC
+    innovation, its_sigma, ratio = (
+        latest(flown[f"innovation.{name}"], since, step)
+        for name in ("innovation", "sigma", "ratio")
+    )
+    wheels = len(kit.vehicle.craft.wheel_h)
+    limit = 1e3 * float(np.asarray(kit.given.craft.wheel_momentum_limit)[0])
+    return [
+        *flown["motion.q_ib"][step],
+        *flown["estimate.q_ib"][step],
+        *np.ravel([error, sigma], order="F"),
+        *pointing,
+        *np.ravel([innovation / ARCSEC, its_sigma / ARCSEC], order="F"),
+        float(ratio),
+        1.0,
+        *np.degrees(flown["motion.omega_b"][step]),
+        *(1e3 * flown["wheels.momentum"][step, :wheels]),
+        limit,
+        -limit,
+    ]
+
+
+def counts(flown: Flown, done: int) -> dict[str, int]:
+    """Counts on the page."""
+    return {"refused_measurements": int(np.sum(flag(flown, "star refused")[:done]))}
+
+
+class Alarms:
+    """Listens to the flags of one estimate after another."""
+
+    def __init__(self) -> None:
+        self._stands = 0  # flags whose start was reported and whose end was not
+        self._frames = 0  # refused in a row
+
+    def hear(self, flown: Flown, step: int) -> list[Told]:
+        """Notices of the estimate of a step."""
+        flags = int(flown["estimate.flags"][step])
+        return [one._replace(text=f"adm: {one.text}") for one in self.said(flags)]
+
+    def said(self, flags: int) -> list[Told]:
+        """Notices of the next estimate.
+
+        Frames that are refused one after another are reported once, and their number when one
+        is used again.
+        """
+        now, begun = flags, self._stands
+        if not flags & _OF_FRAMES:  # no frame: the flags of the last one stand
+            now |= begun & (REFUSED | SHORT | KEPT)
+        new, over = now & ~begun, begun & ~now
+        if flags & REFUSED:
+            self._frames = 1 if new & REFUSED else self._frames + 1
+        self._stands = now & ~USED
+        said = []
+        if new & REFUSED:
+            said.append(Told("alarm", "star refused"))
+        if over & REFUSED:
+            frames = "one frame was" if self._frames == 1 else f"{self._frames} frames were"
+            said.append(Told("info", f"star used again, {frames} refused"))
+        for flag_ in (HELD, SILENT, SHORT, KEPT):
+            if new & flag_:
+                said.append(Told("warning", FLAGS[flag_.bit_length() - 1]))
+        if new & SAFE:
+            said.append(Told("alarm", FLAGS[SAFE.bit_length() - 1]))
+        if over & SAFE:
+            said.append(Told("info", "the estimate can be steered by again"))
+        return said
+
+
+def _turned(flown: Flown, kit: Kit, step: int, turn_rad: np.ndarray) -> tuple[str, Values]:
+    """Attitude turned from the present target; it stays inertial."""
+    now = wanted_after(kit, flown, step + 1).q_ib
+    return "reference", {"q_ib": np.asarray(multiply(now, from_rotvec(jnp.asarray(turn_rad))))}
+
+
+_SLEW_DEG = 10.0
+SAYS = {
+    **{
+        f"slew {_SLEW_DEG:g} deg about {axis}": partial(_turned, turn_rad=turn_rad)
+        for axis, turn_rad in zip(_XYZ, np.radians(_SLEW_DEG) * np.eye(3), strict=True)
+    },
+    "hold this attitude": partial(_turned, turn_rad=np.zeros(3)),
+    "back to the course": lambda flown, kit, step: ("reference", {}),
+    "control: stand by": lambda flown, kit, step: ("mode", {"mode": STAND_BY}),
+    "control: run": lambda flown, kit, step: ("mode", {"mode": RUN}),
+    "determination: reset": lambda flown, kit, step: ("mode", {"mode": AS_IT_IS, "reset": 1}),
+}
+"""Operator messages that the page offers."""
+
+
+def view() -> View:
+    """Page of the satellite."""
+    return View(signals, sample, Alarms, counts, OFFERED, SAYS)
+
+
+# ------------------------------------------------------------------------------------------ viewers
+
+_IMU = "sensor_msgs/msg/Imu"
+
+
+def topics(kit: Kit) -> Sequence[Topic]:
+    """Rates, and attitudes with their covariance, along the body's own axes, from inertial ones."""
+    step_s = kit.step_ns * 1e-9
+    return (
+        Topic("gyro", "/gyro/imu", _IMU, lambda v: imu(v["theta_b"] / step_s), "body"),
+        Topic("motion", "/plant/imu", _IMU, lambda v: imu(v["omega_b"], q_nb=v["q_ib"]), "body"),
+        Topic(
+            "estimate",
+            "/adm/imu",
+            _IMU,
+            lambda v: imu(q_nb=v["q_ib"], q_covariance=np.diag(v["sigma"][:3] ** 2)),
+            "body",
+        ),
+        Topic("star", "/star/frame", JSON, as_json, "body"),
+        Topic("wheels", "/actuators/wheels", JSON, as_json, "body"),
+    )

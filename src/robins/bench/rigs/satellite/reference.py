@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from robins.bench.rigs.satellite.kit import Kit
+from robins.bench.wire.fields import Values
 from robins.rotation import conjugate, multiply, rotate, to_rotvec
 from robins.sim.attitude_reference import PEAK_ACCELERATION, PEAK_RATE, Reference, handed_over
 from robins.systems.satellite.nodes import UNIT
@@ -161,7 +162,7 @@ def reference_q_ib(kit: Kit, flown: Mapping[str, np.ndarray], steps: int) -> np.
     return np.array([at.q_ib for at in followed(kit, said)[1 : steps + 1]])
 
 
-def refuses(message: str, values: Mapping[str, Any]) -> str:
+def refuses(message: str, values: Values) -> str:
     """Reason why the operator cannot send this; empty if it can be sent."""
     q = values.get("q_ib", np.full(4, np.nan))
     square = float(np.sum(q * q))

@@ -8,16 +8,19 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.rigs.satellite.kit import Kit, driven
 from robins.bench.rigs.satellite.messages import WHEELS
+from robins.bench.wire.fields import Values
 from robins.rotation import conjugate, multiply, to_rotvec
 from robins.sim.rate_table import RateTable, TableState, step
 from robins.sim.spacecraft import CraftState, rate_b
 from robins.systems.satellite import nodes
 from robins.systems.satellite.nodes import Actuation, Command, Given, Row
 
+Numbers = Array | np.ndarray
 HELD = 1  # steps for which what came last stands for what did not come
 
 
@@ -28,7 +31,7 @@ class Held(NamedTuple):
     age: int = 0
 
 
-def renew(held: Held, came: Any) -> Held:
+def renew(held: Held, came: Values | np.ndarray | tuple | None) -> Held:
     """Values to act on in this step; `trusted` limits for how long."""
     return Held(held.values, held.age + 1) if came is None else Held(came, 0)
 
@@ -43,7 +46,7 @@ def stale(held: Held) -> Held:
     return held._replace(age=HELD + 1)
 
 
-def padded(torque: Any) -> np.ndarray:
+def padded(torque: np.ndarray) -> np.ndarray:
     """Numbers of each wheel, as the wire has them."""
     out = np.zeros(WHEELS)
     out[: len(torque)] = torque
@@ -55,7 +58,7 @@ def rest() -> dict[str, np.ndarray]:
     return {"wheel_torque": np.zeros(WHEELS), "dipole_b": np.zeros(3)}
 
 
-def acting(held: Held, came: Any, wheels: int) -> tuple[Held, Any, Any]:
+def acting(held: Held, came: Values | None, wheels: int) -> tuple[Held, Any, Any]:
     """Torques and dipole that act in this step: those that came, the last ones, or none."""
     held = renew(held, came)
     use = held.values if trusted(held) else rest()
@@ -88,14 +91,14 @@ def plant(kit: Kit) -> Part:
 
 
 @jax.jit
-def _follow(given: RateTable, state: TableState, q_ib: Any, omega_b: Any, dt_s: Any):
+def _follow(given: RateTable, state: TableState, q_ib: Array, omega_b: Array, dt_s: Array):
     # The rate to be where the craft is at the end of the step.
     wanted = to_rotvec(multiply(conjugate(state.q_ib), q_ib)) / dt_s
     return step(given, state, wanted, dt_s)
 
 
 @jax.jit
-def _turn_on(given: RateTable, state: TableState, dt_s: Any):
+def _turn_on(given: RateTable, state: TableState, dt_s: Array):
     # It stays in the rate that it has.
     return step(given, state, state.rate_b, dt_s)
 
@@ -124,7 +127,7 @@ def table(kit: Kit) -> Part:
     return Part("table", {"motion": 0}, lambda: begin, act, example, rare)
 
 
-def _gives(given: Given, wheel_h: Any, command: Command, row: Row) -> Actuation:
+def _gives(given: Given, wheel_h: Array, command: Command, row: Row) -> Actuation:
     return nodes.actuators(given, wheel_h, command, row.course)
 
 
@@ -133,10 +136,10 @@ def actuators(kit: Kit) -> Part:
     wheels = len(kit.vehicle.craft.wheel_h)
     gives = driven(kit, _gives)
 
-    def begin() -> tuple[Any, Held]:
+    def begin() -> tuple[Numbers, Held]:
         return kit.vehicle.craft.wheel_h, Held(rest())
 
-    def act(state: tuple[Any, Held], k: int, inputs: Inputs):
+    def act(state: tuple[Numbers, Held], k: int, inputs: Inputs):
         wheel_h, held = state
         held, torque, dipole = acting(held, inputs["command"], wheels)
         command = Command(torque, dipole)
@@ -159,7 +162,7 @@ def gyro(kit: Kit) -> Part:
     reads = driven(kit, nodes.gyro)
     first = (jnp.asarray(kit.vehicle.craft.q_ib), kit.vehicle.residue)
 
-    def act(state: tuple[Any, Any], k: int, inputs: Inputs):
+    def act(state: tuple[Numbers, Numbers], k: int, inputs: Inputs):
         before, residue = state
         if (mounted := inputs["mounted"]) is None:  # what it turned comes with the next sample
             return state, []
@@ -178,10 +181,10 @@ def star(kit: Kit) -> Part:
     takes = {"motion": 0} if lens is None else {"motion": 0, "gyro": 0, "estimate": 1}
     at_first = np.asarray(kit.vehicle.star_q_ib)
 
-    def begin() -> tuple[Any, Any, Any]:
+    def begin() -> tuple[np.ndarray, ...]:
         return at_first, np.asarray(kit.form.attitude(kit.belief.mean)), np.zeros(3)
 
-    def act(state: tuple[Any, Any, Any], k: int, inputs: Inputs):
+    def act(state: tuple[np.ndarray, ...], k: int, inputs: Inputs):
         seen, q, bias = state
         if lens is not None and (estimate := inputs["estimate"]) is not None:
             q, bias = estimate["q_ib"], estimate["gyro_bias"]

@@ -1,9 +1,9 @@
-"""The navigation computer of INS/GNSS as a program: its filter, and its loop in C.
+"""A filter of INS/GNSS for a board: a problem by which it is tried, and constants of its loop in C.
 
-What `LiveInsGnss` does around the filter is in C next to this file: `navigation_blocks.h`
-integrates samples and cuts them into blocks, `navigation_rest.h` detects when the vehicle rests,
-`navigation_start.h` finds the start, `navigation_board.c` has epochs, late fixes and the wire. The
-drive or the log of the flight gives the rates of samples and fixes, and the data on which the
+What `LiveInsGnss` does around the filter is in C next to the rig `ins_gnss` of the bench:
+`navigation_blocks.h` integrates samples and cuts them into blocks, `navigation_rest.h` detects when
+the vehicle rests, `navigation_start.h` finds the start, `navigation_board.c` has epochs, late fixes
+and the wire. A drive or a log gives the rates of samples and fixes, and the data on which the
 filter is traced and tried.
 """
 
@@ -11,16 +11,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from importlib import resources
-from typing import Any
 
 import jax
 import numpy as np
 
-from robins.bench.rig import Aboard, RigError
-from robins.bench.rigs.ins_gnss import SUSPECTS
-from robins.bench.rigs.ins_gnss.navigating import Kit
 from robins.dataset import Dataset
+from robins.errors import RobinsError
 from robins.ins.blocks import reach_of_rate, usual_width
 from robins.ins.increments import Increments
 from robins.systems.ins_gnss import model
@@ -45,18 +41,27 @@ _FIELDS = {
 }
 
 
-def aboard(flight: Any) -> Aboard:
-    """Filter, problem and C files of the part `navigation`, for the drive or the log of a flight.
+def aboard(
+    given: Replay,
+    dataset: Dataset,
+    rates_hz: tuple[float, float],
+    name: str,
+    suspects: tuple[str, ...],
+    label: str,
+) -> tuple[Problem, str]:
+    """Problem by which a filter is tried that is exported, and `navigation_given.h`.
+
+    Args:
+        given: its parameters.
+        dataset: the drive or the log, with fixes.
+        rates_hz: of samples and fixes.
+        name: of the filter.
+        suspects: instruments in the order of the wire.
+        label: of the drive or log, for errors.
 
     Raises:
-        RigError: nothing sends as imu or gnss, the log cannot be navigated, or the part needs
-            what the loop does not do.
-        robins.logs.LogError: a file of the log cannot be read.
+        RobinsError: the log cannot be navigated, or the part needs what the loop does not do.
     """
-    kit: Kit = flight.rig.prepare(flight.setup, flight.given)
-    given, dataset = kit.given, kit.dataset
-    if dataset is None or dataset.gnss is None:
-        raise RigError("the filter is tried on a drive or a log, and there is none", "--board")
     _refuse_what_c_lacks(given, dataset)
     # as a live filter, which has not seen the log
     gnss = given.gnss.model_copy(update={"lasting_share": 0.0})
@@ -64,36 +69,33 @@ def aboard(flight: Any) -> Aboard:
     try:
         pieces, contender = recorded(dataset, given)
     except ValueError as error:
-        raise RigError(f"it cannot be navigated: {error}", flight.name) from error
+        raise RobinsError(f"it cannot be navigated: {error}", label) from error
     piece = pieces[0]
-    usual = usual_width(given.update.longest_block, 1.0 / kit.rates_hz[0]) + 8
+    usual = usual_width(given.update.longest_block, 1.0 / rates_hz[0]) + 8
     world = _begun(piece.world, usual)
-    chosen = contender(flight.setup.filter)
+    chosen = contender(name)
     problem = Problem(
         epoch_s=piece.epoch_s[:_EPOCHS],
         blocks=model.state_blocks(given.imu.scale_states),
         sensors=model.SENSORS,
         simulate=lambda run: world,
-        contenders={flight.setup.filter: chosen},
+        contenders={name: chosen},
         claims=lambda metrics: [],
         fields=_FIELDS,
     )
     wide = not hasattr(chosen.case(world).start.mean, "q_nb")
     macros = {
         "MEAN(field)": f"mean_{'ins_' if wide else ''}##field",
-        "TELL_WRONG(result, to)": _told_wrong(chosen.filter.suspects),
+        "TELL_WRONG(result, to)": _told_wrong(chosen.filter.suspects, suspects),
     }
-    told = _given_h(given, kit.rates_hz, world, macros)
-    here = resources.files("robins.bench.rigs.ins_gnss")
-    files = {name: (here / name).read_text("utf-8") for name in _FILES}
-    return Aboard(problem, "filter", {**files, "navigation_given.h": told})
+    return problem, _given_h(given, rates_hz, world, macros)
 
 
 def _refuse_what_c_lacks(given: Replay, dataset: Dataset) -> None:
     """Refuse parameters and logs that the loop in C cannot follow.
 
     Raises:
-        RigError: there is such a one.
+        RobinsError: there is such a one.
     """
     g = given.gnss
     lacks = (
@@ -125,10 +127,9 @@ def _refuse_what_c_lacks(given: Replay, dataset: Dataset) -> None:
     )
     for there, what, mend in lacks:
         if there:
-            raise RigError(what, "--board", mend)
+            raise RobinsError(what, "--board", mend)
 
 
-_FILES = tuple(f"navigation_{name}" for name in ("blocks.h", "board.c", "rest.h", "start.h"))
 _SENSORS = (model.POSITION, model.VELOCITY, model.STANDSTILL, model.STILL_RATE)
 
 
@@ -141,16 +142,16 @@ def _begun(world: Case, width: int) -> Case:
     inc = first.u.increments
     if np.any(inc.dt[:, width:] > 0.0):
         what = f"a block of the first {_EPOCHS} holds more than {width} samples: stamps in bursts"
-        raise RigError(what, "--board", "give a log whose samples come evenly at its beginning")
+        raise RobinsError(what, "--board", "give a log whose samples come evenly at its beginning")
     more = max(0, width - inc.dt.shape[1])
     padded = (np.pad(a, [(0, 0), (0, more), (0, 0)][: a.ndim])[:, :width] for a in inc[:3])
     return first._replace(start=world.start, u=Block(Increments(*padded), first.u.noise_scale))
 
 
-def _told_wrong(suspects: tuple[str, ...]) -> str:
+def _told_wrong(suspects: tuple[str, ...], wire: tuple[str, ...]) -> str:
     """C that copies the probabilities of a result in the order of the wire."""
     where = {name: f"(result).wrong[{i}]" for i, name in enumerate(suspects)}
-    return ", ".join(f"(to)[{k}] = {where.get(one, 'NAN')}" for k, one in enumerate(SUSPECTS))
+    return ", ".join(f"(to)[{k}] = {where.get(one, 'NAN')}" for k, one in enumerate(wire))
 
 
 def _given_h(
