@@ -20,7 +20,7 @@ from robins.program.liveness import Equation, Variable, jaxpr_of, variables
 from robins.program.nodes import Graph
 from robins.program.primitives.control import size_of
 from robins.program.primitives.random import bits_of, numbered
-from robins.program.trace import Leaf, Nodes, Program, Walk
+from robins.program.walk import Leaf, Nodes, Program, Walk
 
 ROUNDS = 200  # of a loop of rows that is worth it; a scan is from SHORTEST on
 SHORTEST = 30
