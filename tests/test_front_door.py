@@ -1,9 +1,11 @@
 """The front door: light, lazy, typed, and the same objects as at their homes."""
 
 import importlib
+import re
 
 import front_door
 import pytest
+import rings
 from test_house import python
 
 import robins
@@ -64,3 +66,24 @@ def test_a_name_that_moved_works_for_two_minor_releases(monkeypatch):
     monkeypatch.setattr(robins, "__version__", "0+unknown")
     with pytest.warns(DeprecationWarning, match="is now"):
         assert robins.lms is robins.kalman
+
+
+@pytest.mark.parametrize(
+    ("module", "line"),
+    [
+        ("filters.kalman", r"\*Stable:\* `kalman`\. \*May change:\* `Filter`, .*are inside\.\*"),
+        ("errors", r"\*May change\*, but `RobinsError` is stable\."),
+        ("sim.random", r"\*May change:\* `Component`, `stream`\. \*All .* inside\.\*"),
+        ("program.tape", r"\*Inside\.\*"),
+    ],
+)
+def test_pages_state_the_ring_of_a_name(module, line):
+    assert re.fullmatch(line, rings.line_of(f"robins.{module}"))
+
+
+def test_the_front_door_is_a_table_of_sentences():
+    rows = rings.front_door().splitlines()[2:]
+    assert len(rows) == len(robins.FRONT_DOOR)
+    assert all(
+        re.fullmatch(r"\| `rb\.\w+` \| \{py:\w+\}`robins[\w.]+` \| .{15,} \|", r) for r in rows
+    )

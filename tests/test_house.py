@@ -329,6 +329,20 @@ def test_every_make_command_that_is_named_exists():
     assert named <= targets
 
 
+def test_the_files_that_a_new_thing_touches_exist():
+    """For a system, rule, format, command and rig they are at most two."""
+    text = text_of(ROOT / "CONTRIBUTING.md").partition("## Files that a new thing touches")[2]
+    rows = [line.split("|") for line in text.partition("\n## ")[0].splitlines() if "|" in line]
+    touched = {
+        row[1].strip(): re.findall(r"`(\w[\w/]*\.py)`", row[3]) for row in rows if len(row) == 5
+    }
+    assert {"system", "filter rule", "format of text logs", "command", "rig"} <= set(touched)
+    assert all(len(files) <= 2 for files in touched.values())
+    assert [
+        file for files in touched.values() for file in files if not (SOURCE / file).is_file()
+    ] == []
+
+
 def test_types_are_shipped():
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]
     hooks = {"custom": {"path": "hatch_build.py"}}  # adds the interpreters
