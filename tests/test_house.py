@@ -254,6 +254,12 @@ def test_no_module_grows_beyond_one_idea():
     assert [str(p) for p in modules if len(text_of(p).splitlines()) > LONGEST] == []
 
 
+def test_the_architecture_is_read_in_one_sitting():
+    text = text_of(ROOT / "docs" / "architecture.md")
+    assert len(text.splitlines()) <= 150
+    assert text.count("```text") == 1  # one picture
+
+
 def test_every_module_says_what_it_is():
     said = {p: ast.get_docstring(ast.parse(p.read_text("utf-8"))) for p in SOURCE.rglob("*.py")}
     assert [str(path) for path, text in said.items() if not text] == []
