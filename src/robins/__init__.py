@@ -60,6 +60,7 @@ FRONT_DOOR = {
     "LiveMarg": "robins.systems.marg:LiveMarg",
     "export_filter": "robins.workbench:export_filter",
     # systems and vehicles of your own
+    "study_from_model": "robins.systems.from_model:study_from_model",
     "Scenario": "robins.systems:Scenario",
     "Study": "robins.systems:Study",
     "Rig": "robins.bench:Rig",

@@ -18,6 +18,7 @@ from robins.filters.run import run as run_filter
 from robins.filters.smooth import rts_smoother as rts_smoother
 from robins.logs.loading import load_dataset as load
 from robins.results.reader import read as load_result
+from robins.systems.from_model import study_from_model as study_from_model
 from robins.systems.ins_gnss.live import LiveInsGnss as LiveInsGnss
 from robins.systems.marg.live import LiveMarg as LiveMarg
 from robins.systems.study import Scenario as Scenario
@@ -55,6 +56,7 @@ __all__ = [
     "run",
     "run_filter",
     "student_t",
+    "study_from_model",
     "unscented",
 ]
 __version__: str
