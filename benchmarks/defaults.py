@@ -95,7 +95,7 @@ def told(base: Contender, scale: float) -> Contender:
     motion, s = base.model.motion, jnp.asarray(scale)
     linear = None if motion.linear is None else Partial(_scaled_linear, motion, s)
     louder = Motion(Partial(_scaled_step, motion, s), Partial(_scaled_noise, motion, s), linear)
-    return base._replace(filter=TOLD, model=Model(louder, base.model.sensors))
+    return replace(base, filter=TOLD, model=Model(louder, base.model.sensors))
 
 
 TOLD = kalman(rules=[huber(0.999)])
@@ -207,7 +207,7 @@ def spoilt(problem: Problem, trouble: Callable[..., Case]) -> Problem:
     dt_s = float(problem.epoch_s[1] - problem.epoch_s[0])
     world = jax.eval_shape(problem.simulate, jnp.asarray(0))
     cases = {
-        name: c._replace(case=Partial(lambda world, c=c: _spoilt(trouble, dt_s, c, world)))
+        name: replace(c, case=Partial(lambda world, c=c: _spoilt(trouble, dt_s, c, world)))
         for name, c in problem.contenders.items()
         if jax.eval_shape(c.case, world).start.factor.shape[0] >= _BIASES.stop
     }

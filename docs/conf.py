@@ -24,6 +24,7 @@ extensions = [
     "finding_tables",
     "format_tables",
     "plain_docstrings",
+    "rings",
     "role_table",
 ]
 exclude_patterns = ["_build", "certified.md", "mutants.md"]

@@ -254,6 +254,12 @@ def test_no_module_grows_beyond_one_idea():
     assert [str(p) for p in modules if len(text_of(p).splitlines()) > LONGEST] == []
 
 
+def test_the_architecture_is_read_in_one_sitting():
+    text = text_of(ROOT / "docs" / "architecture.md")
+    assert len(text.splitlines()) <= 150
+    assert text.count("```text") == 1  # one picture
+
+
 def test_every_module_says_what_it_is():
     said = {p: ast.get_docstring(ast.parse(p.read_text("utf-8"))) for p in SOURCE.rglob("*.py")}
     assert [str(path) for path, text in said.items() if not text] == []
@@ -327,6 +333,20 @@ def test_every_make_command_that_is_named_exists():
     named = {n for page in pages for n in re.findall(commands, text_of(page), re.MULTILINE)}
     assert {"check", "docs", "install", "watch"} <= named
     assert named <= targets
+
+
+def test_the_files_that_a_new_thing_touches_exist():
+    """For a system, rule, format, command and rig they are at most two."""
+    text = text_of(ROOT / "CONTRIBUTING.md").partition("## Files that a new thing touches")[2]
+    rows = [line.split("|") for line in text.partition("\n## ")[0].splitlines() if "|" in line]
+    touched = {
+        row[1].strip(): re.findall(r"`(\w[\w/]*\.py)`", row[3]) for row in rows if len(row) == 5
+    }
+    assert {"system", "filter rule", "format of text logs", "command", "rig"} <= set(touched)
+    assert all(len(files) <= 2 for files in touched.values())
+    assert [
+        file for files in touched.values() for file in files if not (SOURCE / file).is_file()
+    ] == []
 
 
 def test_types_are_shipped():

@@ -6,6 +6,7 @@ import pkgutil
 import re
 from pathlib import Path
 
+from rings import line_of
 from sphinx import addnodes
 
 import robins
@@ -26,7 +27,7 @@ def section(name: str, underline: str = "-") -> str:
     A package shows a list of its public names, each linked to the module that defines it.
     """
     module = importlib.import_module(name)
-    lines = [name, underline * len(name), "", f".. automodule:: {name}"]
+    lines = [name, underline * len(name), "", line_of(name), "", f".. automodule:: {name}"]
     if not hasattr(module, "__path__"):
         return "\n".join([*lines, "   :members:", ""])
     lines += ["   :no-members:", ""]

@@ -113,7 +113,7 @@ def own(contender: Contender) -> Contender:
     """A contender of the product model in this study's worlds, reporting what the others do."""
     assert contender.reported is not None
     rows = reported(contender.reported.shape[1], BLOCKS, "ENU")[ROWS]
-    return contender._replace(case=Partial(of_pair, contender.case), reported=rows)
+    return replace(contender, case=Partial(of_pair, contender.case), reported=rows)
 
 
 # ------------------------------------------------------------------------------- the table

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import re
+import sys
 import warnings
 from collections.abc import Callable, Iterable
 from typing import TypeVar
@@ -81,8 +83,9 @@ def require_known(kind: str, name: str, among: Iterable[str], where: str = "this
 
 # ----------------------------------------------------------------------------- names that moved
 
-# By package, what it had: the package that has it now, and its name there.
-MOVED: dict[str, dict[str, tuple[str, str]]] = {
+# By package, what it had: the package that has it now, its name there, and the first release in
+# which it is there, where that is not `FIRST`.
+MOVED: dict[str, dict[str, tuple[str, ...]]] = {
     "robins.linalg": {"steady_state": ("robins.filters", "steady_kalman")},
     "robins.filters": {
         "constrain": ("robins.filters.limits", "constrain"),
@@ -100,20 +103,38 @@ MOVED: dict[str, dict[str, tuple[str, str]]] = {
 }
 
 
+FIRST = "0.2"
+KEPT = 2  # minor releases in which an old name goes on working
+
+
+def _minor(release: str) -> tuple[int, int]:
+    """First two numbers of a release; 0 for one that is missing."""
+    major, minor, *_ = *map(int, re.findall(r"\d+", release)), 0, 0
+    return major, minor
+
+
 def moved(package: str) -> Callable[[str], Callable]:
     """The `__getattr__` of a package (PEP 562), for its names in `MOVED`.
 
-    Code that uses such a name goes on, with a `DeprecationWarning` that states the new place.
+    Code that uses such a name goes on for `KEPT` minor releases, with a `DeprecationWarning` that
+    states the new place; after them, and for any other name, there is an `AttributeError`.
 
     Args:
         package: its ``__name__``.
     """
 
     def attribute(name: str) -> Callable:
-        if name not in MOVED[package]:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        place, now = MOVED[package][name]
-        warnings.warn(f"{package}.{name} is now {place}.{now}", DeprecationWarning, stacklevel=2)
+        here = sys.modules[package]
+        if name not in (rows := MOVED.get(package, {})):
+            near = hint(name, [*getattr(here, "__all__", ()), *rows]).rstrip(".")
+            raise AttributeError(f"module {package!r} has no attribute {name!r}{near}")
+        place, now, *since = rows[name]
+        sentence = f"{package}.{name} is now {place}.{now}"
+        major, minor = _minor(since[0] if since else FIRST)
+        if _minor(sys.modules["robins"].__version__) >= (major, minor + KEPT):
+            raise AttributeError(sentence)
+        last = f"the old name works before robins {major}.{minor + KEPT}"
+        warnings.warn(f"{sentence}; {last}", DeprecationWarning, stacklevel=2)
         return getattr(importlib.import_module(place), now)
 
     return attribute

@@ -1,5 +1,7 @@
 """Names that clash are refused when a problem is made; numbers that cannot be written are kept."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -96,7 +98,7 @@ def test_what_fails_before_anything_is_computed_fails_as_it_is(tmp_path):
 
 
 def test_only_a_gain_that_is_not_held_is_doubted_for_the_order_of_innovations():
-    y, held = {"y": 5.0 * jnp.arange(60.0)[:, None]}, contender()._replace(lasting=True)
+    y, held = {"y": 5.0 * jnp.arange(60.0)[:, None]}, replace(contender(), lasting=True)
     case = Case(Belief(jnp.zeros(2), jnp.eye(2)), None, y, {}, jnp.zeros((60, 2)))
     given = {"contenders": {"kf": contender(), "held": held}, "epoch_s": np.arange(60.0)}
     problem = a_problem(simulate=lambda index: case, **given)

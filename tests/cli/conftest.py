@@ -2,6 +2,7 @@
 
 import sys
 from collections import namedtuple
+from dataclasses import replace
 from pathlib import Path
 
 import jaxtyping
@@ -97,7 +98,7 @@ def systems(monkeypatch):
     claims = {"C1": Claim("it holds", (), len, None)}
     study = Study(Scenario, ("ekf", "ukf"), print, print, print, claims=claims)
     car = System("car", {"drive": study}, default="ukf", replay=print)
-    kite = System("kite", {"fly": study._replace(filters=("ekf",), claims={})})
+    kite = System("kite", {"fly": replace(study, filters=("ekf",), claims={})})
     its = {"town": catalogue.Listed(Path("town.toml"), "A car in town", "")}
     its["road"] = catalogue.Listed(Path("road.toml"), "A car on the road", "")
     monkeypatch.setattr("robins.systems.SYSTEMS", {"car": car, "kite": kite})

@@ -10,7 +10,7 @@ import pytest
 
 from robins.program import Graph, Native, calls, interpreted_step, trace, trace_steps
 from robins.program.nodes import COMMUTING
-from robins.program.trace import Walk
+from robins.program.walk import Walk
 
 
 def trees(program):

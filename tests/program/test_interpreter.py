@@ -24,7 +24,7 @@ from robins.program import (
 )
 from robins.program.interpreter import interpreter_of_many, interpreter_of_one
 from robins.program.operations import KINDS, OPERATIONS
-from robins.program.trace import Leaf
+from robins.program.walk import Leaf
 
 WHOLES = [0, 1, -1, 5, -7, 2**31, -(2**31), 2**40, 1 - 2**62, 3, 12, 63]
 GIVEN = {

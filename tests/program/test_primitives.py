@@ -15,7 +15,7 @@ import robins.program.primitives  # noqa: F401
 from robins.linalg.rows import each_row
 from robins.program import ProgramError, trace
 from robins.program.refused import REFUSED
-from robins.program.trace import RULES
+from robins.program.walk import RULES
 
 RNG = np.random.default_rng(0)
 A, B = RNG.normal(size=(3, 4)), RNG.normal(size=(4, 5))

@@ -79,6 +79,7 @@ def test_component_numbers_are_the_file_format():
         "FAULT": 12,
         "LINK": 13,
         "FILTER": 14,
+        "SENSOR": 15,
     }
 
 

@@ -12,7 +12,7 @@ import robins.program.primitives  # noqa: F401
 from robins import manifold
 from robins.campaign.monte_carlo import solved
 from robins.filters import Belief
-from robins.program.trace import RULES
+from robins.program.walk import RULES
 from robins.systems import SYSTEMS
 from robins.systems.catalogue import SUMMARIES
 from robins.workbench.board_runs import entry_functions, reset_function

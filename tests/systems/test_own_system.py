@@ -82,11 +82,12 @@ def test_a_scenario_file_names_the_file_beside_it(tmp_path, capsys):
 def test_a_default_runs_beside_the_filters_of_a_scenario_and_is_not_judged(tmp_path, capsys):
     shutil.copy(EXAMPLE, tmp_path / "sky.py")
     (tmp_path / "much.py").write_text(
+        "from dataclasses import replace\n"
         "from sky import study as kite\n"
         "from robins.systems import System\n"
         "from robins.systems.judgement import Claim\n"
         'CLAIM = Claim("there is one filter", (), len, (1, 1))\n'
-        'much = System("much", {"": kite._replace(claims={"one": CLAIM})}, default="gated")\n'
+        'much = System("much", {"": replace(kite, claims={"one": CLAIM})}, default="gated")\n'
     )
     text = 'system = "much.py:much"\nruns = 2\nfilters = ["kf"]\nduration = "20 s"\n'
     (tmp_path / "much.toml").write_text(text)

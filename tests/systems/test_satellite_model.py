@@ -14,14 +14,13 @@ from robins.manifold import local, retract
 from robins.rotation import BodyRotation, multiply
 from robins.systems.satellite import design
 from robins.systems.satellite.design import GainSpec, SensorNoise
+from robins.systems.satellite.gyro import equivalent_walk, walk_covariance
 from robins.systems.satellite.model import (
     AttitudeState,
     QuaternionState,
-    equivalent_walk,
     model,
     noise_of,
     start,
-    walk_covariance,
     xi,
 )
 

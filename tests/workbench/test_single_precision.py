@@ -141,6 +141,6 @@ def test_a_case_is_given_arrays_of_jax():
     def gap(world):
         return world._replace(y={"fix": world.y["fix"].at[3].set(jnp.nan)})
 
-    without = {"kf": problem.contenders["kf"]._replace(case=gap)}
+    without = {"kf": replace(problem.contenders["kf"], case=gap)}
     (run,) = board_runs(replace(problem, contenders=without), "kf", 1)
     assert np.isnan(run.given["update_fix"][0][3]).all()

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -206,7 +207,7 @@ def contender(problem: Problem, name: str) -> Contender:
     if name not in problem.contenders:
         raise ValueError(f"no filter '{name}'; this problem has {sorted(problem.contenders)}")
     c = problem.contenders[name]
-    return c._replace(case=as_data(c.case))
+    return replace(c, case=as_data(c.case))
 
 
 def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, Any]:

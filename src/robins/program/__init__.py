@@ -32,7 +32,8 @@ from robins.program.native import (
 from robins.program.nodes import Graph
 from robins.program.precision import DOUBLE, SINGLE, Precision
 from robins.program.refusal import BuildError, ProgramError
-from robins.program.trace import Leaf, Program, trace, trace_step, trace_steps
+from robins.program.trace import trace, trace_step, trace_steps
+from robins.program.walk import Leaf, Program
 
 __all__ = [
     "CPP",

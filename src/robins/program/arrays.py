@@ -21,7 +21,7 @@ import numpy as np
 from jax.extend import core as jex
 
 from robins.program.kept import kept_rounds
-from robins.program.kinds import array_of, numbers_of
+from robins.program.kinds import array_of, kind_of, numbers_of
 from robins.program.lanes import Given, Rounds
 from robins.program.liveness import (
     Equation,
@@ -37,7 +37,7 @@ from robins.program.loops import ENTRYWISE, number_of
 from robins.program.nodes import Graph
 from robins.program.primitives.indexing import filling, gathered, scattered
 from robins.program.refusal import BuildError, ProgramError
-from robins.program.trace import RULES, Leaf, Program, Walk, kind_of
+from robins.program.walk import RULES, Leaf, Program, Walk
 
 Values = dict[Variable, np.ndarray]
 

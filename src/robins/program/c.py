@@ -15,7 +15,7 @@ from robins.program.layout import IN_PLACE, Array, Layout, operands
 from robins.program.nodes import Loop, Node
 from robins.program.operations import OPERATIONS
 from robins.program.precision import DOUBLE, Precision
-from robins.program.trace import Program
+from robins.program.walk import Program
 from robins.program.wrap import wrapped
 
 PREFIX = {"real": "r", "flag": "f", "whole": "i", "word": "u", "word64": "v"}

@@ -14,8 +14,9 @@ import numpy as np
 from jax.core import Tracer
 
 from robins.program.nodes import Graph
+from robins.program.primitives.control import size_of
 from robins.program.refusal import ProgramError
-from robins.program.trace import Walk
+from robins.program.walk import Walk
 
 Data = Any  # a pytree of arrays of numbers
 T = TypeVar("T")
@@ -33,8 +34,6 @@ def evaluated(function: Callable[..., T], *args: Data) -> T:
             are to be refused before. A real converted to a whole number is in its range.
         args: arguments of the function.
     """
-    from robins.program.primitives.control import size_of
-
     given = jax.tree_util.tree_leaves(args)
     if any(isinstance(a, Tracer) for a in given):
         return function(*args)

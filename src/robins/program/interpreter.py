@@ -22,7 +22,7 @@ from robins.program.lanes import Scan
 from robins.program.native import CPP, Step, address, build_once
 from robins.program.refusal import BuildError
 from robins.program.tape import Tape
-from robins.program.trace import Program
+from robins.program.walk import Program
 
 
 class Interpreter:

@@ -36,7 +36,7 @@ from robins.program.native import cache_folder
 from robins.program.nodes import Graph
 from robins.program.primitives.control import called
 from robins.program.tape import Tape
-from robins.program.trace import Leaf, Program
+from robins.program.walk import Leaf, Program
 
 WORTH = 1_000  # nodes of a program that is kept
 IN_WHEEL = Path(str(files("robins.program"))) / "tapes"  # those of the live filters, by a release

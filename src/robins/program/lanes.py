@@ -2,6 +2,17 @@
 
 A round takes what is carried, what stays, and a row of each array that goes along; it gives what is
 carried on, and a row of each array that is made. The body of a `scan` is one.
+
+Compilers call this vectorisation of the outer loop, or one program on many lanes of SIMD (Pharr &
+Mark 2012). An example: ``x = a x + u[k]`` for four runs. Its loop over k stays a loop, and each
+scalar of a round becomes a vector of one entry a run:
+
+    x  = [x0 x1 x2 x3]                    carried
+    uk = [u0[k] u1[k] u2[k] u3[k]]        a row of an array that goes along
+    x  = [a a a a] * x + uk               two instructions for four runs
+
+Operations of a lane are those of the run alone, so a run has the same bits in any lane and batch.
+Lanes without a run repeat the last one.
 """
 
 from __future__ import annotations
@@ -19,7 +30,8 @@ from robins.program.flags import LANE_FLAGS
 from robins.program.kinds import is_key, numbers_of
 from robins.program.library import lengths
 from robins.program.native import CPP, build
-from robins.program.trace import Leaf, Program, positive_zeros
+from robins.program.trace import positive_zeros
+from robins.program.walk import Leaf, Program
 
 KINDS = {"f8": 0, "b1": 1, "i4": 2, "i8": 3, "u4": 4, "u8": 5}  # of arrays, as `scan.h` counts them
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from robins.program.c import function, header, part
 from robins.program.precision import DOUBLE, Precision
-from robins.program.trace import Leaf, Program, counts
+from robins.program.walk import Leaf, Program, counts
 from robins.program.wrap import COLUMNS, wrapped
 
 EXTERN_C = '#ifdef __cplusplus\nextern "C" {\n#endif', "#ifdef __cplusplus\n}\n#endif"

@@ -1,6 +1,20 @@
-"""Last uses of values, and so the memory that a function takes.  A stage is described by the
-variables of a jaxpr that it takes and makes. The equations of a jaxpr are stages too, so what JAX
-computes is counted by the same function.
+"""Last uses of values, and so the memory that a function takes.
+
+A stage is described by the variables of a jaxpr that it takes and makes. The equations of a jaxpr
+are stages too, so what JAX computes is counted by the same function. Compilers call this liveness
+analysis; stages have no branches, so one pass finds the last use of each variable.
+
+An example: of ``sum(sin(a) * a)`` the sine is last used by the product, and the product by the
+sum. The most is held while the product is made: three arrays of 300 numbers.
+
+>>> import jax
+>>> a = jax.ShapeDtypeStruct((300,), "float64")
+>>> jaxpr = jax.make_jaxpr(lambda a: (jax.numpy.sin(a) * a).sum())(a).jaxpr
+>>> stages = [Touched(e.invars, e.outvars) for e in jaxpr.eqns]
+>>> [len(dropped) for dropped in last_uses(stages, {*jaxpr.invars, *jaxpr.outvars})]
+[0, 1, 1]
+>>> most_bytes(stages, jaxpr.invars, jaxpr.outvars) == 8 * 3 * 300
+True
 """
 
 from __future__ import annotations

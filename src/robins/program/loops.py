@@ -4,6 +4,22 @@ A scan goes along its axis; so does an operation on arrays whose first axis is a
 to each row the same by itself; and so do random numbers, as the generator can be given the number
 of an entry. What goes along the same axis is one loop: a row that the next equation needs is never
 written to memory. What a round leaves for the next is carried.
+
+Compilers call this loop fusion, and the array that shrinks to one row array contraction; a scan is
+the loop of a recurrence. An example: ``sin a`` and the sums of ``a``, added. Three equations go
+along the axis of 300, and the loop reads one array and writes one:
+
+    for k:   b = sin a[k];   c = c + a[k];   g[k] = b + c
+
+>>> import jax
+>>> def added(a):
+...     return jax.numpy.sin(a) + jax.lax.scan(lambda c, x: (c + x, c + x), 0.0, a)[1]
+>>> jaxpr = jax.make_jaxpr(added)(jax.ShapeDtypeStruct((300,), "float64")).jaxpr
+>>> [(e.primitive.name, along(e)) for e in jaxpr.eqns]
+[('sin', (300, False)), ('scan', (300, False)), ('add', (300, False))]
+>>> body = Body(jaxpr.eqns, (300, False), lambda v: v in jaxpr.outvars)
+>>> len(body.rows), len(body.after), len(body.made)  # taken row by row, carried, made row by row
+(1, 1, 1)
 """
 
 from __future__ import annotations
@@ -20,7 +36,7 @@ from robins.program.liveness import Equation, Variable, jaxpr_of, variables
 from robins.program.nodes import Graph
 from robins.program.primitives.control import size_of
 from robins.program.primitives.random import bits_of, numbered
-from robins.program.trace import Leaf, Nodes, Program, Walk
+from robins.program.walk import Leaf, Nodes, Program, Walk
 
 ROUNDS = 200  # of a loop of rows that is worth it; a scan is from SHORTEST on
 SHORTEST = 30

@@ -23,7 +23,8 @@ from robins.program.kept import kept_by_name, second_result
 from robins.program.kinds import kind_of
 from robins.program.native import Engine, Step
 from robins.program.refusal import ProgramError
-from robins.program.trace import Leaf, Program, trace
+from robins.program.trace import trace
+from robins.program.walk import Leaf, Program
 
 Function = Callable[..., Any]  # of a state and arguments
 # A program, the structure of its result apart from the state, and what makes steps of it.

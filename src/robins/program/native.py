@@ -25,7 +25,8 @@ from robins.program.c import to_c
 from robins.program.flags import FASTER, FASTER_IN_GCC, FLAGS, SHARED
 from robins.program.kinds import array_of, numbers_of
 from robins.program.refusal import BuildError, ProgramError
-from robins.program.trace import UNROLL, Leaf, Program, trace
+from robins.program.trace import UNROLL, trace
+from robins.program.walk import Leaf, Program
 
 NO_COMPILER = (
     "install one (Debian: `apt install g++`; anywhere: `pip install 'robins[compiler]'`), "

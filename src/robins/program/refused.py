@@ -1,4 +1,4 @@
-"""Primitives of JAX without a rule, with the reason that `robins.program.trace` reports.
+"""Primitives of JAX without a rule, with the reason that `robins.program.walk` reports.
 
 Every primitive that JAX publishes has a rule or a reason here; a test compares both with JAX.
 """

@@ -20,7 +20,8 @@ from robins.program.memory import LIVE_UNROLL, form
 from robins.program.names import Tree
 from robins.program.refusal import BuildError, ProgramError
 from robins.program.tape import Tape
-from robins.program.trace import Program, trace
+from robins.program.trace import trace
+from robins.program.walk import Program
 
 Data = Any  # a pytree of arrays
 Body = Callable[[Data, Data], tuple[Data, Data]]  # (carry, row) -> (carry, kept)

@@ -18,7 +18,7 @@ from robins.program.native import address
 from robins.program.nodes import Loop, Node
 from robins.program.operations import KINDS
 from robins.program.refusal import ProgramError
-from robins.program.trace import Program, counts
+from robins.program.walk import Program, counts
 
 DEEPEST = 16  # loops in each other: the interpreter has so many counters of rounds
 CHANGES = ("keep", "move")  # instructions that change what is there

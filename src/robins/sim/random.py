@@ -51,6 +51,7 @@ class Component(IntEnum):
     FAULT = 12  # when and how a fault strikes
     LINK = 13  # losses and delays on the way from a sensor to the computer
     FILTER = 14  # draws of a filter itself, e.g. of a particle filter
+    SENSOR = 15  # a sensor of any other kind, by its place among those of a model
 
 
 def unit(component: Component, index: SupportsIndex) -> int:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -66,12 +66,16 @@ class Case(NamedTuple):
     loop: Loop | None = None
 
 
+WorldT = TypeVar("WorldT")  # what is simulated of a run: a `Case`, or a type of the study's own
+
+
 def as_simulated(world: Any) -> Case:
     """The case of a problem whose filters all take what is simulated as it is."""
     return world
 
 
-class Contender(NamedTuple):
+@dataclass(frozen=True)
+class Contender(Generic[WorldT]):
     """A filter with the model it believes in.
 
     Filters of one problem may have states of their own: each makes its own case of the simulated
@@ -80,11 +84,14 @@ class Contender(NamedTuple):
 
     filter: Filter
     model: Model
-    case: Callable[[Any], Case] = as_simulated  # from what the problem simulates
-    reported: np.ndarray | None = None  # (r, n) reported = this @ tangent error; None: all of it
+    case: Callable[[WorldT], Case] = as_simulated  # from what the problem simulates
+    reported: np.ndarray | Array | None = (
+        None  # (r, n) reported = this @ tangent error; None: all of it
+    )
     bounds: bool = False  # it states bounds of an H-infinity filter, not standard deviations
     lasting: bool = False  # its gain is not that of least variance, so innovations are correlated
-    facts: Mapping[str, Any] = {}  # figures known without a run, put among its metrics
+    # figures known without a run, put among its metrics
+    facts: Mapping[str, Any] = field(default_factory=dict)
     # why its steps call Python, "it solves ... in Python": such a filter runs by JAX alone
     on_host: str = ""
 
@@ -235,21 +242,35 @@ class Scenario(Parameters):
     keep_diverged: HowMany = 0
 
 
-class Study(NamedTuple):
+ParametersT = TypeVar("ParametersT", bound=Scenario)
+CourseT = TypeVar("CourseT")  # what all runs share
+
+
+def _nothing_shared(given: Scenario) -> Any:
+    return None
+
+
+@dataclass(frozen=True)
+class Study(Generic[ParametersT, CourseT, WorldT]):
     """One kind of scenario of a system: its parts, from which one function makes a problem.
+
+    A checker of types finds the parameters, the course and the world of its functions, and whether
+    they fit each other.
 
     `lay_out` and what follows may raise a ValueError on parameters that do not fit together.
     """
 
-    parameters: type[Scenario]
+    parameters: type[ParametersT]
     filters: tuple[str, ...]
     # (parameters, course, seed, run number) -> world, or a `Case` where all filters take the same;
     # pure, the run number may be traced
-    simulate: Callable[..., Any]
-    contender: Callable[..., Contender]  # (parameters, course, name of the filter)
-    view: Callable[..., View]  # (parameters, course)
-    lay_out: Callable[[Any], Any] = lambda given: None  # parameters -> course: what all runs share
-    claims: Mapping[str, Claim] = {}  # by id, what its scenarios check
+    simulate: Callable[[ParametersT, CourseT, int, Array], WorldT]
+    # (parameters, course, name of the filter)
+    contender: Callable[[ParametersT, CourseT, str], Contender[WorldT]]
+    view: Callable[[ParametersT, CourseT], View]  # (parameters, course)
+    # parameters -> course: what all runs share
+    lay_out: Callable[[ParametersT], CourseT] = _nothing_shared
+    claims: Mapping[str, Claim] = field(default_factory=dict)  # by id, what its scenarios check
     on_request: tuple[str, ...] = ()  # filters too slow to run where none is named
 
     @property
@@ -257,7 +278,7 @@ class Study(NamedTuple):
         """The filters that run where none is named."""
         return tuple(name for name in self.filters if name not in self.on_request)
 
-    def problem(self, given: Any, filters: Sequence[str], seed: int) -> Problem:
+    def problem(self, given: ParametersT, filters: Sequence[str], seed: int) -> Problem:
         """The scenario of these parameters with these filters, by name, ready for a campaign.
 
         Raises:

@@ -145,7 +145,7 @@ def _adjustable(problem: Problem, name: str, numbers: Sequence[str]) -> Problem:
             return made._replace(start=filter_.begun(made.start))
         return made
 
-    return replace(problem, contenders={name: one._replace(filter=filter_, case=case)})
+    return replace(problem, contenders={name: replace(one, filter=filter_, case=case)})
 
 
 def _rig_for(name: str) -> Rig:

@@ -14,7 +14,7 @@ import numpy as np
 
 from robins.program.nodes import Node
 from robins.program.refusal import ProgramError
-from robins.program.trace import Nodes, Walk, rule
+from robins.program.walk import Nodes, Walk, rule
 
 
 def per_matrix(walk: Walk, function: Callable[..., Any], *stacks: Nodes) -> list[Nodes]:

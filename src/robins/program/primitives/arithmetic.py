@@ -9,7 +9,7 @@ import numpy as np
 from robins.program.kinds import kind_of
 from robins.program.nodes import Node
 from robins.program.refusal import ProgramError
-from robins.program.trace import RULES, Nodes, Walk, rule
+from robins.program.walk import RULES, Nodes, Walk, rule
 
 # Primitives that are one operation of `OPERATIONS`, by their names in JAX.
 SAME = {

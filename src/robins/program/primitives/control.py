@@ -10,7 +10,7 @@ from jax.extend import core as jex
 
 from robins.program.nodes import Node
 from robins.program.primitives.reductions import fold
-from robins.program.trace import Nodes, Walk, rule
+from robins.program.walk import Nodes, Walk, rule
 
 Equation = Any  # whose abstract values have neither shape nor type for a checker
 LONGEST = 100_000  # rounds of a loop that are written out

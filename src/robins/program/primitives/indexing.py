@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from robins.program.nodes import Node
-from robins.program.trace import Nodes, Walk, rule
+from robins.program.walk import Nodes, Walk, rule
 
 SIZES = tuple[int, ...]
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from robins.program.trace import Nodes, Walk, rule
+from robins.program.walk import Nodes, Walk, rule
 
 
 @rule("broadcast_in_dim")

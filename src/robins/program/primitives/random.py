@@ -23,7 +23,7 @@ import numpy as np
 from robins.program.kinds import kind_of
 from robins.program.nodes import Node
 from robins.program.refusal import ProgramError
-from robins.program.trace import Nodes, Walk, rule
+from robins.program.walk import Nodes, Walk, rule
 
 HALF = 32  # bits of a word
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from robins.program.kinds import kind_of
 from robins.program.nodes import Node
-from robins.program.trace import RULES, Nodes, Walk, rule
+from robins.program.walk import RULES, Nodes, Walk, rule
 
 REDUCED = {
     "reduce_sum": ("add", 0),

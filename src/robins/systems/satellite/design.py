@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from robins.filters.synthesis import Design, Plant, current_form, kalman_design, observer, riccati
-from robins.systems.satellite.model import ARCSEC, walk_covariance
+from robins.systems.satellite.gyro import ARCSEC, walk_covariance
 
 
 class GainSpec(NamedTuple):

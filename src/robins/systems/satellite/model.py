@@ -6,16 +6,11 @@ sample of length T the gyro reports theta, and of attitude and bias b
     q+ = q exp(theta - T b),    dtheta+ = exp(-[theta - T b]x) dtheta - T J dbias,
 
 J the right Jacobian of the exponential map, here of angles so small that it is the identity to a
-part in a thousand of T dbias. Noise of a sample (spec of a rate-integrating gyro: Farrenkopf 1978;
-Markley & Crassidis 2014, eq. 6.93) is exact at rest:
-
-    Q = [arw^2 T + rrw^2 T^3/3   -rrw^2 T^2/2]
-        [                *          rrw^2 T  ]
+part in a thousand of T dbias. The noise of a sample is that of `robins.systems.satellite.gyro`.
 """
 
 from __future__ import annotations
 
-import math
 from functools import cache
 from typing import Any, Literal, NamedTuple
 
@@ -28,9 +23,9 @@ from robins import linalg
 from robins.filters import Belief, Filter, Model, Motion, Sensor, adaptive, kalman, taylor
 from robins.filters.rules import constant_gain, gate
 from robins.rotation import BodyRotation, conjugate, from_rotvec, multiply, normalise, skew, to_dcm
+from robins.systems.satellite.gyro import walk_covariance
 from robins.systems.satellite.nodes import STAR, StateForm
 
-ARCSEC = math.pi / 648000.0
 GATE = 0.9999962  # chi-square of 3 at 27.9
 PATIENCE = 20  # frames refused in a row, after which what they agree on is believed again
 Build = Literal["mekf", "quaternion", "gated", "adaptive", "fixed", "fixed-gated", "redesigned"]
@@ -57,22 +52,8 @@ class Noise(NamedTuple):
     factor: Array  # (6, 6) of Q, attitude and bias
 
 
-def equivalent_walk(rate_walk: Any, markov: Any, markov_time: Any) -> Any:
-    """Random walk of the rate that stands for itself and a Markov drift, sqrt(rrw^2 + 2 s^2/tau).
-
-    A Markov process of correlation time tau walks away from where it is like that at first.
-    """
-    return math.sqrt(rate_walk**2 + 2.0 * markov**2 / markov_time)
-
-
-def walk_covariance(random_walk: float, rate_walk: float, step_s: float) -> np.ndarray:
-    """(2, 2) Q of an axis: angle, rate."""
-    a, r, T = random_walk**2, rate_walk**2, step_s
-    return np.array([[a * T + r * T**3 / 3.0, -r * T**2 / 2.0], [-r * T**2 / 2.0, r * T]])
-
-
 def noise_of(random_walk: float, rate_walk: float, step_s: float) -> Noise:
-    """The same as a factor for three axes."""
+    """Noise of a sample on three axes, from its densities [rad/sqrt(s), rad/s/sqrt(s)]."""
     one = np.linalg.cholesky(walk_covariance(random_walk, rate_walk, step_s))
     return Noise(jnp.asarray(step_s), jnp.asarray(np.kron(one, np.eye(3))))
 

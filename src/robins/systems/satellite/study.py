@@ -25,7 +25,8 @@ from robins.systems.judgement import ratio_claims
 from robins.systems.parts import during
 from robins.systems.satellite import design, model, stepwise
 from robins.systems.satellite.design import GainSpec, SensorNoise
-from robins.systems.satellite.model import ARCSEC, Build, make_filter
+from robins.systems.satellite.gyro import ARCSEC, equivalent_walk
+from robins.systems.satellite.model import Build, make_filter
 from robins.systems.satellite.nodes import STAR, Given, Row, Step, begin, react
 from robins.systems.satellite.parameters import AttitudeLoop
 from robins.systems.satellite.world import Course, World, lay_out, simulate
@@ -93,7 +94,7 @@ FILTERS: Mapping[str, FilterSpec] = {
 def believed_walk(given: AttitudeLoop, spec: FilterSpec) -> float:
     """Random walk of the gyro's rate that a filter believes in [rad/s/sqrt(s)]."""
     g = given.gyro
-    true = model.equivalent_walk(g.rate_walk, g.markov, g.markov_time)
+    true = equivalent_walk(g.rate_walk, g.markov, g.markov_time)
     if spec.drift is None:
         return true
     believed = true if given.believed.drift is None else given.believed.drift
@@ -242,7 +243,7 @@ def faults(given: AttitudeLoop, time_s: np.ndarray) -> dict[str, np.ndarray]:
     Noise, drift as believed and false stars are no faults.
     """
     g, star, believed = given.gyro, given.star, given.believed.drift
-    true = model.equivalent_walk(g.rate_walk, g.markov, g.markov_time)
+    true = equivalent_walk(g.rate_walk, g.markov, g.markov_time)
     drifts = believed is not None and not math.isclose(believed, true, rel_tol=0.1)
     gyro = drifts or g.scale_factor > 0.0 or g.misalignment > 0.0
     spans = [fault for fault in star.faults if fault.kind != "sign"]

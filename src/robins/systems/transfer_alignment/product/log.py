@@ -10,7 +10,7 @@ is aligned again.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -213,7 +213,7 @@ def contender(parameters: Replay, name: str) -> Contender:
         ValueError: no such filter; a noise of the master that is zero.
     """
     made = product_contender(parameters, name, parameters.believed)
-    return made._replace(case=Recipe(_case, (parameters,), made.case))
+    return replace(made, case=Recipe(_case, (parameters,), made.case))
 
 
 def _case(parameters: Replay, simulated: Recipe, run: PairRun) -> Case:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Annotated, Any, NamedTuple
 
@@ -298,7 +298,7 @@ def of_product(given: VelocityAttitude, name: str, believed: Believed | None = N
     made = product_contender(given, name, believed, blocks=blocks, frame="ENU")
     assert made.reported is not None
     level = np.r_[0:3, 3:5, 6:9, 9:11]  # without the vertical channel
-    return made._replace(case=Partial(_of_pair, made.case), reported=made.reported[level])
+    return replace(made, case=Partial(_of_pair, made.case), reported=made.reported[level])
 
 
 def _of_pair(case: Callable[[product.PairRun], Case], world: World) -> Case:
