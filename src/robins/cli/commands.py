@@ -133,7 +133,7 @@ def run(
     """
     if master is None and slave is None:
         if columns:
-            from robins.workbench.examination import typed
+            from robins.workbench.doctor import typed
 
             where = typed((), columns[:1])
             raise InputError("the option is for logs", where, "give --master and --slave too.")
@@ -382,7 +382,7 @@ def compare(first: Path, second: Path, as_json: bool) -> None:
 
     A metric that differs is shown with the ratio of the second to the first, by component.
     """
-    comparison = importlib.import_module("robins.workbench.comparison")
+    comparison = importlib.import_module("robins.workbench.compare")
     found = comparison.compare(first, second)
     say(found._asdict(), "\n".join(comparison.lines(found)), as_json)
 
@@ -395,7 +395,7 @@ def compare(first: Path, second: Path, as_json: bool) -> None:
 @answers
 def verify(folder: Path, as_json: bool) -> None:
     """Check every file of the result FOLDER against its checksum; bad input if one is damaged."""
-    found = importlib.import_module("robins.workbench.comparison").verify(folder)
+    found = importlib.import_module("robins.workbench.compare").verify(folder)
     say(found, f"{folder}: whole, {found['files']} files of {found['scenario']}", as_json)
 
 

@@ -37,7 +37,7 @@ def judge(
     """
     with only_json(as_json):
         from robins.workbench import examine
-        from robins.workbench.examination import unit_file
+        from robins.workbench.doctor import unit_file
 
         found = examine(log, columns)
     say(found.data if as_json else None, _text(found, log, columns), as_json)
@@ -48,7 +48,7 @@ def judge(
 
 
 def _text(found: Any, log: Sequence[Path], columns: Sequence[Path | str]) -> str:
-    from robins.workbench.examination import typed
+    from robins.workbench.doctor import typed
 
     lines = []
     for table in found.tables:

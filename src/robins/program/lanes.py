@@ -17,9 +17,8 @@ import numpy as np
 from robins.program.c import function, header
 from robins.program.flags import LANE_FLAGS
 from robins.program.kinds import is_key, numbers_of
-from robins.program.library import lengths
 from robins.program.native import CPP, build
-from robins.program.trace import Leaf, Program, positive_zeros
+from robins.program.trace import Leaf, Program, lengths, positive_zeros
 
 KINDS = {"f8": 0, "b1": 1, "i4": 2, "i8": 3, "u4": 4, "u8": 5}  # of arrays, as `scan.h` counts them
 

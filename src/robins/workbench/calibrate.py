@@ -19,8 +19,8 @@ from robins.logs.mounting import turned
 from robins.logs.tables import tables_of
 from robins.results import Outcome, Progress, array, silent, variable
 from robins.units import parse
+from robins.workbench.doctor import mounting_of, parted, typed
 from robins.workbench.errors import InputError, refusing
-from robins.workbench.examination import mounting_of, parted, typed
 
 FILE = "calibration.toml"
 _AXES = ("x", "y", "z")

@@ -16,9 +16,9 @@ from robins.logs import Finding
 from robins.logs.doctor import Use
 from robins.results import Outcome, Progress, silent
 from robins.systems.finding import find_system
+from robins.workbench.doctor import parted
 from robins.workbench.errors import InputError, refusing
-from robins.workbench.examination import parted
-from robins.workbench.exporting import require_formats, with_exports
+from robins.workbench.formats import require_formats, with_exports
 from robins.workbench.publication import part
 from robins.workbench.scenarios import asked, check_filters, find_scenario
 
@@ -49,7 +49,7 @@ def replay(
         filters: names; by default those of the configuration.
         settings: "path=value" texts that change the configuration.
         columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
-        exports: formats of other programs, of `robins.workbench.exporting.FORMATS`; the files are
+        exports: formats of other programs, of `robins.workbench.formats.FORMATS`; the files are
             among those of the outcome.
         seed: recorded in the result; a replay draws nothing.
         progress: called with the share done and what is being done.

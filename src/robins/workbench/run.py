@@ -1,18 +1,15 @@
-"""The commands `run` and `bound`: a scenario simulated, and the best that its sensors allow."""
+"""The commands `run` and `demo`: a scenario simulated with several filters."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 
-from robins import _float64, units
+from robins import _float64
 from robins.campaign import check_machine, simulate
-from robins.campaign.bound import bound as bound_of
 from robins.campaign.machine import machine_for
-from robins.report import bounds
 from robins.results import Outcome, Progress, silent
 from robins.systems.judgement import about
-from robins.workbench.errors import refusing
 from robins.workbench.scenarios import Simulated, asked, beside, check_filters, read_scenario
 
 
@@ -98,53 +95,3 @@ def _not_kept(one: Simulated) -> list[str]:
     if not (one.parameters.keep or one.parameters.keep_diverged):
         return []
     return ["keep and keep_diverged are for `robins campaign run`: here run 0 alone has histories"]
-
-
-def bound(
-    name: str,
-    *,
-    filter_name: str = "",
-    runs: int = 1,
-    seed: int = 0,
-    without: Sequence[str] = (),
-    at: Sequence[str] = (),
-    settings: Sequence[str] = (),
-    progress: Progress = silent,
-) -> Outcome:
-    """Compute the best that the sensors of a scenario allow, with the model of one of its filters.
-
-    Args:
-        name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
-        filter_name: whose model is taken; by default the scenario's first filter.
-        runs: number of simulated trajectories to average over.
-        seed: of the random streams.
-        without: sensors to leave out altogether.
-        at: times to report, such as "200 s"; by default the quarters.
-        settings: "path=value" texts that change the scenario.
-        progress: called with the share done and what is being done.
-
-    Raises:
-        InputError, robins.scenario.ScenarioError, robins.units.UnitError: the request cannot be
-            computed.
-    """
-    _float64.require()
-    one = read_scenario(name, (*settings, f"runs={runs}"))
-    wanted = filter_name or one.own[0]
-    chosen = check_filters(one.label, one.study.filters, [wanted])
-    times = [units.parse(time, "time") for time in at]
-    progress(0.0, "linearising along the truth")
-    with refusing(name):
-        solution = bound_of(one.problem(chosen, seed), wanted, runs, without)
-        epochs = bounds.epochs(solution, times)
-    return Outcome(
-        solution,
-        {wanted: bounds.metrics(solution)},
-        files={"bound.csv": bounds.csv(solution).encode()},
-        notes=bounds.sentences(solution),
-        scenario=one.label,
-        seed=seed,
-        runs=runs,
-        tables=[bounds.table(solution, epochs)],
-        last_lines=[f"Next:   robins run {name}   shows how near the filters come"],
-        **asked(one.text, settings),
-    )

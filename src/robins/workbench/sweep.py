@@ -20,7 +20,7 @@ from robins.campaign.statistics import Statistics, rms_with_bounds
 from robins.campaign.store import Store, open_store
 from robins.results import Outcome, Progress, array, silent
 from robins.systems.study import StateBlock
-from robins.workbench.campaigns import (
+from robins.workbench.campaign import (
     SWEEP,
     Status,
     Where,

@@ -13,8 +13,8 @@ import xarray as xr
 from robins.filters.synthesis import METHODS, Attempt, Design, TradeOff, trade_off
 from robins.results import Outcome, Progress, array, silent, variable
 from robins.results.summary import dumps, plain
+from robins.workbench.design_problem import Problem, read_problem
 from robins.workbench.errors import InputError, refusing
-from robins.workbench.problem import Problem, read_problem
 
 GAINS, TABLE = "gains.json", "trade_off.csv"
 _NUMBERS = ("h2", "hinf", "hinf_sweep", "bound", "radius", "lambda_", "seconds")

@@ -15,7 +15,10 @@ from robins import _float64, scenario, units
 from robins.campaign.tuning import Tuned, choose
 from robins.results import Outcome, Progress, array, silent
 from robins.workbench.errors import refusing
-from robins.workbench.objectives import (
+from robins.workbench.publication import csv_of, part
+from robins.workbench.replay import Findings, open_log, unheard
+from robins.workbench.scenarios import asked
+from robins.workbench.tune_objectives import (
     COMPONENTS,
     DENSITY,
     FIRST_BLOCK,
@@ -28,9 +31,6 @@ from robins.workbench.objectives import (
     total_of,
     worded,
 )
-from robins.workbench.publication import csv_of, part
-from robins.workbench.recorded import Findings, open_log, unheard
-from robins.workbench.scenarios import asked
 
 RUNS = 16  # of either half, where none is given
 
