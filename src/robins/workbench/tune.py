@@ -13,9 +13,10 @@ from scipy.special import ndtri
 
 from robins import _float64, scenario, units
 from robins.campaign.tuning import Tuned, choose
+from robins.report.numbers import csv_of
 from robins.results import Outcome, Progress, array, silent
 from robins.workbench.errors import refusing
-from robins.workbench.publication import csv_of, part
+from robins.workbench.publication import part
 from robins.workbench.replay import Findings, open_log, unheard
 from robins.workbench.scenarios import asked
 from robins.workbench.tune_objectives import (
