@@ -16,24 +16,19 @@ from robins.cli.campaign import campaign, sweep
 from robins.cli.doctor import judge, warn
 from robins.cli.export import write
 from robins.cli.listing import listing
+from robins.cli.made import Call, Given, Made
 from robins.cli.options import (
     COLUMNS,
+    FILTERS,
     LOGS,
-    MACHINE,
-    RESULTS,
     SETTINGS,
     TRUST,
     answers,
-    as_names,
-    choices,
     examples,
     folder_name,
     log_name,
-    publishes,
 )
-from robins.cli.sensitivity import sensitivity
-from robins.cli.tell import carry_out, say
-from robins.cli.tune import tune
+from robins.cli.tell import say
 from robins.workbench import InputError
 
 _EXAMPLES = """
@@ -65,18 +60,14 @@ Exit status: 0 done, 1 failed, 2 bad input, 3 interrupted (run it again).
 """
 
 
-class _Group(click.Group):
-    """Keeps the commands in the order in which one meets them."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(self.commands)
-
-
-@click.group(cls=_Group, epilog=_EXAMPLES, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(epilog=_EXAMPLES, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="robins")
 @click.option("--debug", is_flag=True, expose_value=False, help="Show tracebacks.")
 def app() -> None:
     """Robust inertial navigation: simulate, navigate real logs, compare filters, check claims."""
+
+
+app.list_commands = lambda ctx: list(app.commands)  # in the order in which one meets them
 
 
 def one_run(runs: int | None, what: str) -> None:
@@ -86,134 +77,98 @@ def one_run(runs: int | None, what: str) -> None:
 
 
 _RUNS = option("--runs", type=click.IntRange(min=1), help="Monte Carlo runs. [default: as given]")
-
-
-@app.command(short_help="Simulate a drive and navigate it: a first look.")
-@_RUNS
-@option("--filters", callback=as_names, metavar="a,b", help="Which filters. [default: ekf]")
-@publishes
-def demo(out: Path | None, **options: Any) -> None:
-    """Simulate a drive with a GNSS outage and navigate it: a first look, which needs no data."""
-    carry_out("demo", out=out or RESULTS / "demo", **options)
-
-
-@app.command(
-    short_help="Simulate a scenario with several filters.",
-    epilog=examples(
-        "robins run ins-gnss/drive --runs 50 --filters ekf,ukf --out drive",
-        'robins run my.toml --set gnss.sigma="2 m" --json',
-        "robins run my_system.py:study --runs 100",
-        "robins run transfer-alignment/replay --master master.csv --slave slave.csv",
-    ),
+_PAIR = (
+    option("--master", type=LOGS, metavar="LOG", help="What a master INS reported, with --slave."),
+    option("--slave", type=LOGS, metavar="LOG", help="Samples of the IMU to be aligned to it."),
+    COLUMNS,
 )
-@click.argument("scenario")
-@_RUNS
-@option("--master", type=LOGS, metavar="LOG", help="What a master INS reported, with --slave.")
-@option("--slave", type=LOGS, metavar="LOG", help="Samples of the IMU to be aligned to it.")
-@COLUMNS
-@MACHINE
-@choices
-@TRUST
-@publishes
-def run(
-    scenario: str,
-    out: Path | None,
-    master: Path | None,
-    slave: Path | None,
-    columns: tuple[Path | str, ...],
-    **options: Any,
-) -> None:
-    """Simulate SCENARIO with several filters.
 
-    SCENARIO is a name from `robins list`, a TOML file, or FILE.py:STUDY of your own.
 
-    All filters get the same random numbers; run k of seed S is the same whatever N is.
-
-    With --master and --slave a recorded pair replaces the simulation.
-    """
+def _simulated_or_aligned(given: Given) -> Call:
+    """A scenario simulated, or a recorded pair aligned."""
+    name, master, slave = (given.pop(key) for key in ("name", "master", "slave"))
     if master is None and slave is None:
-        if columns:
+        if columns := given.pop("columns"):
             from robins.workbench.doctor import typed
 
             where = typed((), columns[:1])
             raise InputError("the option is for logs", where, "give --master and --slave too.")
-        carry_out("run", scenario, out=out or RESULTS / folder_name(scenario), **options)
-        return
+        return "run", [name], folder_name(name)
     if master is None or slave is None:
         raise InputError("--master and --slave belong together", fix="give both files, or neither.")
-    one_run(options.pop("runs"), "pair")
-    if options.pop("machine"):
+    one_run(given.pop("runs"), "pair")
+    if given.pop("machine"):
         raise InputError("a recorded pair runs by jax", "--machine", "omit the option.")
-    out = out or RESULTS / slave.name.split(".")[0]
-    options |= {"columns": columns, "findings": warn}
-    carry_out("align", scenario, master, slave, out=out, **options)
+    given["findings"] = warn
+    return "align", [name, master, slave], slave.name.split(".")[0]
 
 
-@app.command(
-    short_help="Compute the best accuracy that the sensors of a scenario allow.",
-    epilog=examples(
-        "robins bound ins-gnss/drive",
-        'robins bound ins-gnss/drive --without gnss_velocity --at "60 s" --at "200 s"',
-        'robins bound transfer-alignment/s0 --filters kf-flexure --set slave.gyro_bias="10 deg/h"',
-    ),
-)
-@click.argument("scenario")
-@option("--runs", type=click.IntRange(min=1), default=1, help="Trajectories to average over.")
-@option("--without", multiple=True, metavar="SENSOR", help="Leave it out; may be repeated.")
-@option("--at", multiple=True, metavar="TIME", help='Print that time, "200 s"; may be repeated.')
-@choices
-@TRUST
-@publishes
-def bound(scenario: str, filters: tuple[str, ...], out: Path | None, **options: Any) -> None:
-    """Compute the covariance bound and observability of SCENARIO; no filter can do better.
-
-    It needs no data: the model of a filter, by default the first of the scenario, is linearised
-    about the simulated truth. It shows the best sigma of each state over time, which states the
-    sensors observe, what each sensor contributes, and which directions are least observable.
-    """
+def _bound_of_one(given: Given) -> Call:
+    """The bound by the model of one filter."""
+    name, filters = given.pop("name"), given.pop("filters")
     if len(filters) > 1:
         raise InputError(
             "a bound is that of one model", f"--filters {','.join(filters)}", "name one."
         )
-    out = out or RESULTS / f"bound-{folder_name(scenario)}"
-    carry_out("bound", scenario, filter_name="".join(filters), out=out, **options)
+    given["filter_name"] = "".join(filters)
+    return "bound", [name], f"bound-{folder_name(name)}"
 
 
-@app.command(
-    short_help="Navigate a recorded log.",
-    epilog=examples(
-        "robins replay imu.csv gnss.pos --out walk",
-        'robins replay imu.csv gnss.pos unit.toml --set gnss.latency="-50 ms" --json',
-        "robins replay my.csv --columns logger.toml --system marg",
-        "robins replay imu.csv gnss.pos --out walk --export csv,kml",
+def _replayed(given: Given) -> Call:
+    """A log, which is one run."""
+    one_run(given.pop("runs"), "log")
+    log = given.pop("paths")
+    return "replay", [log], log_name(log)
+
+
+def _tuned(given: Given) -> Call:
+    """A filter tuned by simulated runs of a scenario, or by the files of a log."""
+    what = given.pop("names")
+    simulated = len(what) == 1 and (what[0].endswith(".toml") or not Path(what[0]).is_file())
+    name = folder_name(what[0]) if simulated else log_name([Path(one) for one in what])
+    return "tune", [what], f"tune-{name}"
+
+
+for _made in (
+    Made("run:demo", "Simulate a drive and navigate it: a first look.", folder=lambda: "demo"),
+    Made(
+        "run:run",
+        "Simulate a scenario with several filters.",
+        (
+            "robins run ins-gnss/drive --runs 50 --filters ekf,ukf --out drive",
+            'robins run my.toml --set gnss.sigma="2 m" --json',
+            "robins run my_system.py:study --runs 100",
+            "robins run transfer-alignment/replay --master master.csv --slave slave.csv",
+        ),
+        call=_simulated_or_aligned,
+        more=(1, _PAIR),
     ),
-)
-@click.argument("log", nargs=-1, required=True, type=LOGS)
-@_RUNS
-@option(
-    "--system", default="ins-gnss", show_default=True, help="The system that navigates the log."
-)
-@option(
-    "--export",
-    "exports",
-    callback=as_names,
-    metavar="a,b",
-    help="Write the result for other programs too: csv, tum, kml, gpx.",
-)
-@COLUMNS
-@choices
-@publishes
-def replay(log: tuple[Path, ...], runs: int | None, out: Path | None, **options: Any) -> None:
-    """Navigate a recorded log: LOG... are its files, inertial samples and GNSS fixes.
-
-    A file that ends in .toml adds what the log lacks: noise, mounting, lever arm. The file of
-    --columns declares the columns of a log that is in no known format.
-
-    --export writes files into exports/ of the result folder: csv has all estimates, tum is t x y z
-    qx qy qz qw in east, north, up, kml and gpx are tracks with UTC. kml and gpx need positions.
-    """
-    one_run(runs, "log")
-    carry_out("replay", log, out=out or RESULTS / log_name(log), findings=warn, **options)
+    Made(
+        "bound:bound",
+        "Compute the best accuracy that the sensors of a scenario allow.",
+        (
+            "robins bound ins-gnss/drive",
+            'robins bound ins-gnss/drive --without gnss_velocity --at "60 s" --at "200 s"',
+            "robins bound transfer-alignment/s0 --filters kf-flexure "
+            '--set slave.gyro_bias="10 deg/h"',
+        ),
+        call=_bound_of_one,
+        more=(5, (FILTERS,)),
+    ),
+    Made(
+        "replay:replay",
+        "Navigate a recorded log.",
+        (
+            "robins replay imu.csv gnss.pos --out walk",
+            'robins replay imu.csv gnss.pos unit.toml --set gnss.latency="-50 ms" --json',
+            "robins replay my.csv --columns logger.toml --system marg",
+            "robins replay imu.csv gnss.pos --out walk --export csv,kml",
+        ),
+        call=_replayed,
+        more=(0, (_RUNS,)),
+    ),
+):
+    app.add_command(_made)
 
 
 @app.command(
@@ -261,76 +216,59 @@ def guess(log: Path, as_json: bool) -> None:
     click.echo(f"Next:   save it as columns.toml, check what is GUESSED, then {words}", err=True)
 
 
-@app.command(
-    short_help="Estimate the noise parameters of a resting IMU.",
-    epilog=examples("robins allan still.csv", "robins allan still.csv --terms N --json"),
-)
-@click.argument("log", type=LOGS)
-@option("--terms", default="NBK", show_default=True, help="Noises to fit, of Q, N, B, K, R.")
-@COLUMNS
-@publishes
-def allan(log: Path, out: Path | None, **options: Any) -> None:
-    """Compute the Allan deviation of a resting IMU, and the noise parameters of its data sheet.
-
-    Q quantisation, N random walk, B bias instability, K rate random walk, R rate ramp.
-    """
-    out = out or RESULTS / f"allan-{log_name([log])}"
-    carry_out("allan", log, out=out, **options)
-
-
-@app.command(
-    short_help="Calibrate hard and soft iron of a magnetometer.",
-    epilog=examples(
-        "robins calibrate turned.csv",
-        'robins calibrate turned.ulg --field "48.5 uT" --begin "20 s" --end "80 s" --json',
-        "robins calibrate circle.csv --horizontal",
+for _made in (
+    Made(
+        "allan:allan",
+        "Estimate the noise parameters of a resting IMU.",
+        ("robins allan still.csv", "robins allan still.csv --terms N --json"),
+        lambda log: f"allan-{log_name([log])}",
     ),
-)
-@click.argument("log", nargs=-1, required=True, type=LOGS)
-@option("--field", metavar="FIELD", help='Its strength at the place, "48.5 uT"; sets the scale.')
-@option("--begin", metavar="TIME", help='Use samples from "20 s" after the first one on.')
-@option("--end", metavar="TIME", help='Use samples up to "80 s" after the first one.')
-@option("--horizontal", is_flag=True, help="The vehicle cannot tilt: it turned about z only.")
-@COLUMNS
-@publishes
-def calibrate(log: tuple[Path, ...], out: Path | None, **options: Any) -> None:
-    """Calibrate hard and soft iron from a log in which the sensor is turned about all its axes.
-
-    It finds the offset and the matrix of ``matrix (measured - offset)``, whose size is that of the
-    Earth's field wherever the sensor points. A .toml file among LOG... gives the mounting of the
-    sensor, as for `robins replay`, which takes the calibration.toml of the result.
-    """
-    out = out or RESULTS / f"calibrate-{log_name(log)}"
-    carry_out("calibrate", log, out=out, **options)
-
-
-@app.command(
-    short_help="Design gains that bound the worst case, and show their cost.",
-    epilog=examples(
-        "robins design attitude-axis",
-        'robins design my.toml --gamma "1, 0.8" --methods riccati,retuned-slack --json',
+    Made(
+        "calibrate:calibrate",
+        "Calibrate hard and soft iron of a magnetometer.",
+        (
+            "robins calibrate turned.csv",
+            'robins calibrate turned.ulg --field "48.5 uT" --begin "20 s" --end "80 s" --json',
+            "robins calibrate circle.csv --horizontal",
+        ),
+        lambda log: f"calibrate-{log_name(log)}",
     ),
-)
-@click.argument("problem")
-@option("--gamma", metavar="a,b", help="Bounds on the H-infinity norm. [default: a range]")
-@option("--methods", callback=as_names, metavar="a,b", help="Which methods to compare.")
-@publishes
-def design(problem: str, out: Path | None, **options: Any) -> None:
-    """Design constant gains for PROBLEM, a TOML file with the matrices of a plant or an example.
-
-    It compares methods that keep the gain from a modelling error to the estimate below gamma, by
-    the true norm from noise to the estimate. Examples: attitude-axis, attitude-axis-drift,
-    baro-height, two-states.
-    """
-    out = out or RESULTS / f"design-{Path(problem).name.removesuffix('.toml')}"
-    carry_out("design", problem, out=out, **options)
-
-
-app.add_command(bench)
-app.add_command(campaign)
-app.add_command(sweep)
-app.add_command(tune)
-app.add_command(sensitivity)
+    Made(
+        "design:design",
+        "Design gains that bound the worst case, and show their cost.",
+        (
+            "robins design attitude-axis",
+            'robins design my.toml --gamma "1, 0.8" --methods riccati,retuned-slack --json',
+        ),
+        lambda problem: f"design-{Path(problem).name.removesuffix('.toml')}",
+    ),
+    bench,
+    campaign,
+    sweep,
+    Made(
+        "tune:tune",
+        "Find parameters of a filter, and judge them on data held out.",
+        (
+            "robins tune ins-gnss/drive --filter ekf --vary believed.r_factor=4",
+            "robins tune imu.csv gnss.pos unit.toml --filter ekf --vary imu.gyro_noise "
+            "--vary imu.accel_noise",
+        ),
+        call=_tuned,
+    ),
+    Made(
+        "sensitivity:sensitivity",
+        "Which uncertain parameter the variance of the error comes from.",
+        (
+            "robins sensitivity transfer-alignment/s0 --filter kf-flexure "
+            '--vary "slave.gyro_bias=1 deg/h to 10 deg/h" '
+            '--vary "flexure.sigma=1 arcmin to 5 arcmin"',
+            'robins sensitivity airship/s1 --filter product --vary "sar.position=10 m to 50 m" '
+            '--vary "barometer.height=5 m to 30 m" --samples 128 --out budget',
+        ),
+        lambda scenario: f"sensitivity-{folder_name(scenario)}",
+    ),
+):
+    app.add_command(_made)
 
 
 @app.command(

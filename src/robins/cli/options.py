@@ -135,15 +135,13 @@ SETTINGS = option(
 )
 
 
+SEED = option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Seed of all noise.")
+FILTERS = option("--filters", callback=as_names, metavar="a,b", help="Which filters to compare.")
+
+
 def choices(command: Callable) -> Callable:
-    """Options that `run` and `replay` share."""
-    for one in (
-        option("--filters", callback=as_names, metavar="a,b", help="Which filters to compare."),
-        SETTINGS,
-        option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Seed of all noise."),
-    ):
-        command = one(command)
-    return command
+    """Options that commands on a campaign share."""
+    return SEED(SETTINGS(FILTERS(command)))
 
 
 def folder_name(scenario: str) -> str:

@@ -3,27 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated
 
 from robins import _float64, units
 from robins.campaign.bound import bound as bound_of
 from robins.report import bounds
 from robins.results import Outcome, Progress, silent
 from robins.workbench.errors import refusing
+from robins.workbench.options import Option, Scenario
 from robins.workbench.scenarios import asked, check_filters, read_scenario
 
 
 def bound(
-    name: str,
+    name: Scenario,
     *,
     filter_name: str = "",
-    runs: int = 1,
+    runs: Annotated[int, Option("Trajectories to average over.", least=1)] = 1,
+    without: Annotated[
+        Sequence[str], Option("Leave it out; may be repeated.", metavar="SENSOR")
+    ] = (),
+    at: Annotated[
+        Sequence[str], Option('Print that time, "200 s"; may be repeated.', metavar="TIME")
+    ] = (),
     seed: int = 0,
-    without: Sequence[str] = (),
-    at: Sequence[str] = (),
     settings: Sequence[str] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Compute the best that the sensors of a scenario allow, with the model of one of its filters.
+    """Compute the covariance bound and observability of SCENARIO; no filter can do better.
+
+    It needs no data: the model of a filter, by default the first of the scenario, is linearised
+    about the simulated truth. It shows the best sigma of each state over time, which states the
+    sensors observe, what each sensor contributes, and which directions are least observable.
 
     Args:
         name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.

@@ -4,26 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Annotated
 
 from robins import _float64
 from robins.campaign import check_machine, simulate
 from robins.campaign.machine import machine_for
 from robins.results import Outcome, Progress, silent
 from robins.systems.judgement import about
+from robins.workbench.options import Option, Runs, Scenario
 from robins.workbench.scenarios import Simulated, asked, beside, check_filters, read_scenario
 
 
 def run(
-    name: str,
+    name: Scenario,
     *,
-    runs: int | None = None,
-    seed: int = 0,
-    filters: Sequence[str] = (),
-    settings: Sequence[str] = (),
+    runs: Runs = None,
     machine: str = "",
+    seed: int = 0,
+    settings: Sequence[str] = (),
+    filters: Sequence[str] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Simulate a scenario with several filters on the same random numbers.
+    """Simulate SCENARIO with several filters.
+
+    SCENARIO is a name from `robins list`, a TOML file, or FILE.py:STUDY of your own.
+
+    All filters get the same random numbers; run k of seed S is the same whatever N is.
+
+    With --master and --slave a recorded pair replaces the simulation.
 
     Args:
         name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
@@ -72,9 +80,14 @@ _STORY = (
 
 
 def demo(
-    *, runs: int | None = None, filters: Sequence[str] = (), progress: Progress = silent
+    *,
+    runs: Runs = None,
+    filters: Annotated[
+        Sequence[str], Option("Which filters. [default: ekf]", metavar="a,b", names=True)
+    ] = (),
+    progress: Progress = silent,
 ) -> Outcome:
-    """Simulate a drive with a GNSS outage: few runs of one filter, six figures.
+    """Simulate a drive with a GNSS outage and navigate it: a first look, which needs no data.
 
     Args:
         runs: how many.

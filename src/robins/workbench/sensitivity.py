@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 
@@ -24,9 +24,9 @@ from robins.campaign.sensitivity import (
 from robins.report import sensitivity as page
 from robins.results import Outcome, Progress, silent
 from robins.workbench.errors import InputError, refusing
+from robins.workbench.options import MOST_OF_SEED, Filter, Option, Scenario
 from robins.workbench.scenarios import asked, check_filters, read_scenario
 
-RUNS, SAMPLES = 10, 256
 MOST = 1 << 14  # samples
 _TRACED = 0.1  # share of the time after which batches are computed
 _RANGE = re.compile(r"(.+?)\s+to\s+(.+)")
@@ -77,21 +77,27 @@ def uncertain(text: str) -> Uncertain:
 
 
 def sensitivity(
-    name: str,
+    name: Scenario,
     *,
-    vary: Sequence[str],
-    filter_name: str = "",
-    runs: int = RUNS,
-    samples: int = SAMPLES,
-    seed: int = 0,
+    filter_name: Filter = "",
+    vary: Annotated[Sequence[str], Option("May be repeated.", metavar="key=low to high")],
+    runs: Annotated[int, Option("At each point.", least=1, shown=True)] = 10,
+    samples: Annotated[
+        int,
+        Option(
+            "Of each parameter; a power of two. There are samples x (parameters + 2) points.",
+            shown=True,
+        ),
+    ] = 256,
     settings: Sequence[str] = (),
+    seed: Annotated[int, Option("Of all noise and points.", least=0, most=MOST_OF_SEED)] = 0,
     progress: Progress = silent,
 ) -> Outcome:
-    """Attribute the variance of the error to the uncertain parameters.
+    """Attribute the variance of a filter's error to the parameters of SCENARIO.
 
-    The world varies; the filter believes the scenario as written. The output is the RMS of the
-    length of the error of each block, over runs and epochs that count: requirements are stated
-    for it, in a unit, and unlike its logarithm it has a variance where it may become zero.
+    An error budget: the simulated world varies between the ends, independently in each parameter,
+    and the filter goes on believing the scenario as written. For each block of the state there are
+    Sobol indices of first order (alone) and in total (with others), with their 95 % bounds.
 
     Args:
         name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
