@@ -19,14 +19,12 @@ from robins.cli.listing import listing
 from robins.cli.made import Call, Given, Made
 from robins.cli.options import (
     COLUMNS,
-    FILTERS,
     LOGS,
     SETTINGS,
     TRUST,
     answers,
     examples,
     folder_name,
-    log_name,
 )
 from robins.cli.tell import say
 from robins.workbench import InputError
@@ -76,7 +74,13 @@ def one_run(runs: int | None, what: str) -> None:
         raise InputError(f"a recorded {what} is one run", f"--runs {runs}", "omit the option.")
 
 
-_RUNS = option("--runs", type=click.IntRange(min=1), help="Monte Carlo runs. [default: as given]")
+_ONE_RUN = option(
+    "--runs",
+    type=click.IntRange(min=1),
+    expose_value=False,
+    callback=lambda _context, _given, runs: one_run(runs, "log"),
+    help="Monte Carlo runs. [default: as given]",
+)
 _PAIR = (
     option("--master", type=LOGS, metavar="LOG", help="What a master INS reported, with --slave."),
     option("--slave", type=LOGS, metavar="LOG", help="Samples of the IMU to be aligned to it."),
@@ -103,70 +107,11 @@ def _simulated_or_aligned(given: Given) -> Call:
     return "align", [name, master, slave], slave.name.split(".")[0]
 
 
-def _bound_of_one(given: Given) -> Call:
-    """The bound by the model of one filter."""
-    name, filters = given.pop("name"), given.pop("filters")
-    if len(filters) > 1:
-        raise InputError(
-            "a bound is that of one model", f"--filters {','.join(filters)}", "name one."
-        )
-    given["filter_name"] = "".join(filters)
-    return "bound", [name], f"bound-{folder_name(name)}"
-
-
-def _replayed(given: Given) -> Call:
-    """A log, which is one run."""
-    one_run(given.pop("runs"), "log")
-    log = given.pop("paths")
-    return "replay", [log], log_name(log)
-
-
-def _tuned(given: Given) -> Call:
-    """A filter tuned by simulated runs of a scenario, or by the files of a log."""
-    what = given.pop("names")
-    simulated = len(what) == 1 and (what[0].endswith(".toml") or not Path(what[0]).is_file())
-    name = folder_name(what[0]) if simulated else log_name([Path(one) for one in what])
-    return "tune", [what], f"tune-{name}"
-
-
 for _made in (
-    Made("run:demo", "Simulate a drive and navigate it: a first look.", folder=lambda: "demo"),
-    Made(
-        "run:run",
-        "Simulate a scenario with several filters.",
-        (
-            "robins run ins-gnss/drive --runs 50 --filters ekf,ukf --out drive",
-            'robins run my.toml --set gnss.sigma="2 m" --json',
-            "robins run my_system.py:study --runs 100",
-            "robins run transfer-alignment/replay --master master.csv --slave slave.csv",
-        ),
-        call=_simulated_or_aligned,
-        more=(1, _PAIR),
-    ),
-    Made(
-        "bound:bound",
-        "Compute the best accuracy that the sensors of a scenario allow.",
-        (
-            "robins bound ins-gnss/drive",
-            'robins bound ins-gnss/drive --without gnss_velocity --at "60 s" --at "200 s"',
-            "robins bound transfer-alignment/s0 --filters kf-flexure "
-            '--set slave.gyro_bias="10 deg/h"',
-        ),
-        call=_bound_of_one,
-        more=(5, (FILTERS,)),
-    ),
-    Made(
-        "replay:replay",
-        "Navigate a recorded log.",
-        (
-            "robins replay imu.csv gnss.pos --out walk",
-            'robins replay imu.csv gnss.pos unit.toml --set gnss.latency="-50 ms" --json',
-            "robins replay my.csv --columns logger.toml --system marg",
-            "robins replay imu.csv gnss.pos --out walk --export csv,kml",
-        ),
-        call=_replayed,
-        more=(0, (_RUNS,)),
-    ),
+    Made("run:demo", "Simulate a drive and navigate it: a first look."),
+    Made("run:run", "Simulate a scenario with several filters.", _simulated_or_aligned, (1, _PAIR)),
+    Made("bound:bound", "Compute the best accuracy that the sensors of a scenario allow."),
+    Made("replay:replay", "Navigate a recorded log.", more=(0, (_ONE_RUN,))),
 ):
     app.add_command(_made)
 
@@ -217,55 +162,16 @@ def guess(log: Path, as_json: bool) -> None:
 
 
 for _made in (
-    Made(
-        "allan:allan",
-        "Estimate the noise parameters of a resting IMU.",
-        ("robins allan still.csv", "robins allan still.csv --terms N --json"),
-        lambda log: f"allan-{log_name([log])}",
-    ),
-    Made(
-        "calibrate:calibrate",
-        "Calibrate hard and soft iron of a magnetometer.",
-        (
-            "robins calibrate turned.csv",
-            'robins calibrate turned.ulg --field "48.5 uT" --begin "20 s" --end "80 s" --json',
-            "robins calibrate circle.csv --horizontal",
-        ),
-        lambda log: f"calibrate-{log_name(log)}",
-    ),
-    Made(
-        "design:design",
-        "Design gains that bound the worst case, and show their cost.",
-        (
-            "robins design attitude-axis",
-            'robins design my.toml --gamma "1, 0.8" --methods riccati,retuned-slack --json',
-        ),
-        lambda problem: f"design-{Path(problem).name.removesuffix('.toml')}",
-    ),
+    Made("allan:allan", "Estimate the noise parameters of a resting IMU."),
+    Made("calibrate:calibrate", "Calibrate hard and soft iron of a magnetometer."),
+    Made("design:design", "Design gains that bound the worst case, and show their cost."),
     bench,
     campaign,
     sweep,
-    Made(
-        "tune:tune",
-        "Find parameters of a filter, and judge them on data held out.",
-        (
-            "robins tune ins-gnss/drive --filter ekf --vary believed.r_factor=4",
-            "robins tune imu.csv gnss.pos unit.toml --filter ekf --vary imu.gyro_noise "
-            "--vary imu.accel_noise",
-        ),
-        call=_tuned,
-    ),
+    Made("tune:tune", "Find parameters of a filter, and judge them on data held out."),
     Made(
         "sensitivity:sensitivity",
         "Which uncertain parameter the variance of the error comes from.",
-        (
-            "robins sensitivity transfer-alignment/s0 --filter kf-flexure "
-            '--vary "slave.gyro_bias=1 deg/h to 10 deg/h" '
-            '--vary "flexure.sigma=1 arcmin to 5 arcmin"',
-            'robins sensitivity airship/s1 --filter product --vary "sar.position=10 m to 50 m" '
-            '--vary "barometer.height=5 m to 30 m" --samples 128 --out budget',
-        ),
-        lambda scenario: f"sensitivity-{folder_name(scenario)}",
     ),
 ):
     app.add_command(_made)

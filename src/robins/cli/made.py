@@ -6,7 +6,6 @@ The function is read from the text of its file, not imported: help and usage err
 from __future__ import annotations
 
 import ast
-import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from importlib.resources import files
@@ -18,6 +17,7 @@ import click
 from robins.cli.doctor import warn
 from robins.cli.options import (
     COLUMNS,
+    FILTER,
     FILTERS,
     LOGS,
     MACHINE,
@@ -28,6 +28,7 @@ from robins.cli.options import (
     as_names,
     examples,
     publishes,
+    result_name,
 )
 from robins.cli.tell import carry_out
 from robins.workbench import options
@@ -38,6 +39,7 @@ Call = tuple[str, Sequence[Any], str]  # function of the workbench, its argument
 
 SHARED: Mapping[str, Decorator] = {
     "columns": COLUMNS,
+    "filter_name": FILTER,
     "filters": FILTERS,
     "machine": MACHINE,
     "seed": SEED,
@@ -52,8 +54,6 @@ class Made(click.Command):
     Args:
         function: "module:name" in `robins.workbench`.
         short: its line in `robins --help`.
-        lines: examples.
-        folder: of the arguments, the name of the result folder.
         call: of all that is given, what to call instead of the function.
         more: options that the function does not have, and the place of the first among the others.
     """
@@ -62,28 +62,34 @@ class Made(click.Command):
         self,
         function: str,
         short: str,
-        lines: Sequence[str] = (),
-        folder: Callable[..., str] = str,
         call: Callable[[Given], Call] | None = None,
         more: tuple[int, Sequence[Decorator]] = (0, ()),
     ):
         self.module, _, self.function = function.partition(":")
-        self.folder, self.call, self.more = folder, call, more
-        epilog = examples(*lines) if lines else None
-        super().__init__(self.function, callback=self._carry_out, short_help=short, epilog=epilog)
-        del self.params, self.help  # they are read from the function
+        self.call, self.more = call, more
+        super().__init__(self.function, callback=self._carry_out, short_help=short)
+        del self.params, self.help, self.epilog  # they are read from the function
+
+    @cached_property
+    def _file(self) -> ast.Module:
+        return ast.parse((files("robins") / "workbench" / f"{self.module}.py").read_text("utf-8"))
 
     @cached_property
     def _read(self) -> ast.FunctionDef:
-        text = (files("robins") / "workbench" / f"{self.module}.py").read_text("utf-8")
-        defined = (node for node in ast.parse(text).body if isinstance(node, ast.FunctionDef))
+        defined = (node for node in self._file.body if isinstance(node, ast.FunctionDef))
         return next(node for node in defined if node.name == self.function)
 
     @cached_property
     def help(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Docstring of the function, without its sections."""
-        text = inspect.cleandoc(ast.get_docstring(self._read) or "")
-        return text.partition("\n\nArgs:\n")[0]
+        return (ast.get_docstring(self._read) or "").partition("\n\nArgs:\n")[0]
+
+    @cached_property
+    def epilog(self) -> str | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Examples, which stand in the first lines of the file that bears the name of a command."""
+        text = (ast.get_docstring(self._file) or "").partition("\n\nExamples::\n\n")[2]
+        lines = [line.strip() for line in text.splitlines()]
+        return examples(*lines) if self.module == self.function else None
 
     @cached_property
     def params(self) -> list[click.Parameter]:  # pyright: ignore
@@ -101,8 +107,8 @@ class Made(click.Command):
         if self.call is not None:
             name, places, folder = self.call(given)
         else:
-            places = [given.pop(one.arg) for one in self._read.args.args]
-            name, folder = self.function, self.folder(*places)
+            name, places = self.function, [given.pop(one.arg) for one in self._read.args.args]
+            folder = "-".join([name, *map(result_name, places)]).removeprefix("replay-")
         if any(one.arg == "findings" for one in self._read.args.kwonlyargs):
             given["findings"] = warn
         carry_out(name, *places, out=out or RESULTS / folder, as_json=as_json, **given)

@@ -1,4 +1,10 @@
-"""The command `allan`: from a log of a resting IMU to the noise parameters of its data sheet."""
+"""The command `allan`: from a log of a resting IMU to the noise parameters of its data sheet.
+
+Examples::
+
+    robins allan still.csv
+    robins allan still.csv --terms N --json
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,11 @@
-"""The command `bound`: the best accuracy that the sensors of a scenario allow."""
+"""The command `bound`: the best accuracy that the sensors of a scenario allow.
+
+Examples::
+
+    robins bound ins-gnss/drive
+    robins bound ins-gnss/drive --without gnss_velocity --at "60 s" --at "200 s"
+    robins bound transfer-alignment/s0 --filters kf-flexure --set slave.gyro_bias="10 deg/h"
+"""
 
 from __future__ import annotations
 
@@ -17,7 +24,6 @@ from robins.workbench.scenarios import asked, check_filters, read_scenario
 def bound(
     name: Scenario,
     *,
-    filter_name: str = "",
     runs: Annotated[int, Option("Trajectories to average over.", least=1)] = 1,
     without: Annotated[
         Sequence[str], Option("Leave it out; may be repeated.", metavar="SENSOR")
@@ -27,6 +33,7 @@ def bound(
     ] = (),
     seed: int = 0,
     settings: Sequence[str] = (),
+    filter_name: str = "",
     progress: Progress = silent,
 ) -> Outcome:
     """Compute the covariance bound and observability of SCENARIO; no filter can do better.

@@ -1,4 +1,11 @@
-"""The command `calibrate`: from a magnetometer that is turned about to its hard and soft iron."""
+"""The command `calibrate`: from a magnetometer that is turned about to its hard and soft iron.
+
+Examples::
+
+    robins calibrate turned.csv
+    robins calibrate turned.ulg --field "48.5 uT" --begin "20 s" --end "80 s" --json
+    robins calibrate circle.csv --horizontal
+"""
 
 from __future__ import annotations
 

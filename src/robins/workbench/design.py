@@ -1,4 +1,10 @@
-"""The command `design`: filters with constant gains, and the cost of a bound on the worst case."""
+"""The command `design`: filters with constant gains, and the cost of a bound on the worst case.
+
+Examples::
+
+    robins design attitude-axis
+    robins design my.toml --gamma "1, 0.8" --methods riccati,retuned-slack --json
+"""
 
 from __future__ import annotations
 

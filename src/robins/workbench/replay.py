@@ -1,4 +1,12 @@
-"""The commands `replay` and `align`: a recorded log navigated, a recorded pair aligned."""
+"""The commands `replay` and `align`: a recorded log navigated, a recorded pair aligned.
+
+Examples::
+
+    robins replay imu.csv gnss.pos --out walk
+    robins replay imu.csv gnss.pos unit.toml --set gnss.latency="-50 ms" --json
+    robins replay my.csv --columns logger.toml --system marg
+    robins replay imu.csv gnss.pos --out walk --export csv,kml
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,12 @@
-"""The commands `run` and `demo`: a scenario simulated with several filters."""
+"""The commands `run` and `demo`: a scenario simulated with several filters.
+
+Examples::
+
+    robins run ins-gnss/drive --runs 50 --filters ekf,ukf --out drive
+    robins run my.toml --set gnss.sigma="2 m" --json
+    robins run my_system.py:study --runs 100
+    robins run transfer-alignment/replay --master master.csv --slave slave.csv
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""The command `sensitivity`: the variance of the error by uncertain parameter."""
+"""The command `sensitivity`: the variance of the error by uncertain parameter.
+
+Examples::
+
+    robins sensitivity transfer-alignment/s0 --filter kf-flexure --vary "slave.gyro_bias=1 deg/h to 10 deg/h" --vary "flexure.sigma=1 arcmin to 5 arcmin"
+    robins sensitivity airship/s1 --filter product --vary "sar.position=10 m to 50 m" --vary "barometer.height=5 m to 30 m" --samples 128 --out budget
+"""  # noqa: E501
 
 from __future__ import annotations
 

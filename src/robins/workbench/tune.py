@@ -1,4 +1,10 @@
-"""The command `tune`: parameters of a filter, by simulated runs or by a recorded log."""
+"""The command `tune`: parameters of a filter, by simulated runs or by a recorded log.
+
+Examples::
+
+    robins tune ins-gnss/drive --filter ekf --vary believed.r_factor=4
+    robins tune imu.csv gnss.pos unit.toml --filter ekf --vary imu.gyro_noise --vary imu.accel_noise
+"""
 
 from __future__ import annotations
 
