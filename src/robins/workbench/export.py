@@ -1,11 +1,20 @@
-"""The command `export`: a filter of a scenario as C, the one that was judged, for a board."""
+"""The command `export`: a filter of a scenario as C, the one that was judged, for a board.
+
+Examples::
+
+    robins export ins-gnss/drive --filter ekf --to drive-c
+    robins export transfer-alignment/s0 --filter kf-flexure --to alignment-c --fast
+    make -C drive-c check
+    robins export satellite/s1 --filter mixed-bias --to adm --board
+    robins export rocket/a1 --filter huber --to rocket-c --adjust 'rules[0].inner.limit'
+"""
 
 from __future__ import annotations
 
 import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from robins import _float64, scenario
 from robins.bench.rig import Rig
@@ -16,6 +25,7 @@ from robins.export.folder import Request, files_of, with_adjustable, write_folde
 from robins.export.single_precision import Cost
 from robins.program import DOUBLE, SINGLE
 from robins.workbench.errors import InputError, refusing
+from robins.workbench.options import MOST_OF_SEED, Option, Scenario
 from robins.workbench.scenarios import check_filters, find_scenario, read_scenario
 
 SMALL = 200  # scalar operations up to which a loop is written out where the code is to be small
@@ -35,18 +45,28 @@ class Exported(NamedTuple):
 
 
 def export_filter(
-    name: str,
-    to: Path,
+    name: Scenario,
+    to: Annotated[Path, Option("A new folder.", "--to", "DIR")],
     *,
-    filter_name: str = "",
-    fast: bool = False,
-    float32: bool = False,
-    seed: int = 0,
+    filter_name: Annotated[str, Option("Which. [default: the system's]", "--filter", "NAME")] = "",
+    fast: Annotated[bool, Option("Keep loops, or write them out.", "--small/--fast")] = False,
+    float32: Annotated[bool, Option("Single precision, and what it costs.")] = False,
+    board: Annotated[bool, Option("Build it as a part of the bench too.")] = False,
+    adjust: Annotated[
+        Sequence[str], Option("A number to be set on board; repeatable.", metavar="NAME")
+    ] = (),
+    seed: Annotated[int, Option("Of the recorded run.", least=0, most=MOST_OF_SEED)] = 0,
     settings: Sequence[str] = (),
-    board: bool = False,
-    adjust: Sequence[str] = (),
 ) -> Exported:
-    """Write a filter of a scenario as C99, with a test for the user's own compiler.
+    """Write a filter of SCENARIO as C99, with a test of it for your own compiler.
+
+    DIR gets one file of C that needs math.h alone, a header that names all fields with their units,
+    a page that explains how to call it, and `make check`: it replays recorded steps and compares
+    each state and each code with those of this program. With --float32 it runs the scenario in
+    single precision too, and reports what that costs against the simulated truth. With --board it
+    builds a program that stands for a part of the bench: the satellite's attitude determination, or
+    the navigation computer of INS/GNSS. A number named by --adjust is a field of the state in the
+    place of a constant; a name that the filter does not have lists those it has.
 
     Args:
         name: "system/name", the path of a TOML file, or "file.py:study" of the user's own; or

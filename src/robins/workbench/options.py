@@ -23,7 +23,7 @@ class Option(NamedTuple):
 
     Attributes:
         help: its line in the help; of an argument there is none.
-        flag: "--flag"; by default the name of the parameter.
+        flag: "--flag"; by default the name of the parameter. Of "--no/--yes" the second sets it.
         metavar: word that stands for its value. "SCENARIO...": it may name code of a user.
         least: lower limit of a number.
         most: upper limit of a number.
@@ -40,9 +40,9 @@ class Option(NamedTuple):
     shown: bool = False
 
 
-Path = str | os.PathLike[str]
-Log = Annotated[Path, Option(metavar="LOG")]
-Logs = Annotated[Sequence[Path], Option(metavar="LOG...")]
+Where = str | os.PathLike[str]
+Log = Annotated[Where, Option(metavar="LOG")]
+Logs = Annotated[Sequence[Where], Option(metavar="LOG...")]
 Scenario = Annotated[str, Option(metavar="SCENARIO")]
 Runs = Annotated[int | None, Option("Monte Carlo runs. [default: as given]", least=1)]
 Filter = Annotated[str, Option("Which. [default: the first]", "--filter", "NAME")]
