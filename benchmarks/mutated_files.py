@@ -46,7 +46,7 @@ from robins.logs import FORMATS, open_log
 from robins.logs.declared import columns_from
 from robins.logs.librsf import read_librsf
 from robins.results import snapshot
-from robins.workbench.campaigns import SWEEP, campaigns_of
+from robins.workbench.campaign import SWEEP, campaigns_of
 
 DECLARED = 'delimiter = ","\n[columns]\ntime = { name = "t", unit = "s" }\n'
 RANGES = "pseudorange3 1.0 2e7 4.0 1e7 2e7 3e6 4 0 45 40\nodom3 1.0 5 0 0 0 0 0.1 1 1 1 1 1 1\n"

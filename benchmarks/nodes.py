@@ -14,10 +14,10 @@ import sys
 import time
 from pathlib import Path
 
+from robins.export.runs import board_runs, entry_functions
 from robins.program import trace_steps
 from robins.systems import SYSTEMS
 from robins.systems.catalogue import listed
-from robins.workbench.board_runs import board_runs, entry_functions
 from robins.workbench.scenarios import read_scenario
 
 

@@ -19,7 +19,7 @@ from short_drive import DRIVE, write_pos
 
 from robins import logs, scenario
 from robins.systems.ins_gnss import Drive, drive_dataset
-from robins.workbench import simulated
+from robins.workbench.run import _STORY
 
 HERE = Path(__file__).parent
 COMPARED = pytest.mark.skipif("COSTS" in os.environ, reason="this run measures what is compared")
@@ -109,7 +109,7 @@ def test_a_promised_command_stays_within_its_counts(line, folder):
         assert counts[kind] >= 0.8 * most[line][kind]
     if line == "demo":
         pictures = (folder / "results" / "demo").rglob("*.png")
-        assert {picture.stem for picture in pictures} == set(simulated._STORY)
+        assert {picture.stem for picture in pictures} == set(_STORY)
 
 
 def test_what_a_process_asks_for_is_counted():

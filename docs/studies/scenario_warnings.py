@@ -71,7 +71,7 @@ def named(name):
 
 def add_runs(name, path, count):
     """Run the first filters of a scenario, so many, that its file does not have; write it."""
-    from robins.workbench.simulated import run
+    from robins.workbench.run import run
 
     kept = json.loads(path.read_text()) if path.exists() else {"filters": [], "warnings": []}
     if missing := [n for n in named(name)[:count] if n not in kept["filters"]]:

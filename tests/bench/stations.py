@@ -186,7 +186,7 @@ def on_threads(
     monkeypatch.setattr(crew, "stations", stations)
     monkeypatch.setattr(crew, "processes", processes)
     monkeypatch.setattr("robins.bench.run.session.Crew", crew)
-    monkeypatch.setattr("robins.workbench.benches._starter", starting)
+    monkeypatch.setattr("robins.workbench.bench._starter", starting)
 
 
 class Loop:

@@ -19,7 +19,7 @@ from robins.cli import main
 from robins.filters import OnlineFilter
 from robins.program import NativeState
 from robins.systems.satellite.nodes import STAR, believable
-from robins.workbench.boards import SMALL, export_filter
+from robins.workbench.export import SMALL, export_filter
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler, gcc")
 SETTINGS = "duration=60 s", "counted_from=10 s"

@@ -25,8 +25,8 @@ from robins.systems.ins_gnss import SYSTEM
 from robins.systems.streaming import Flag
 from robins.workbench import bench_replay, bench_up
 from robins.workbench import replay as replay_log
-from robins.workbench.boards import export_filter
 from robins.workbench.errors import InputError
+from robins.workbench.export import export_filter
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler, gcc")
 RIG = rig_of("ins-gnss")

@@ -27,7 +27,7 @@ from robins.errors import RobinsError
 from robins.program import CPP, LANE_FLAGS
 from robins.results import Outcome
 from robins.workbench import workers as work
-from robins.workbench.campaigns import (
+from robins.workbench.campaign import (
     campaign_report,
     campaign_show,
     campaign_status,

@@ -9,7 +9,7 @@ from robins.campaign.store import open_store
 from robins.campaign.work import Worker, missing
 from robins.errors import RobinsError
 from robins.results.summary import plain as plain_of
-from robins.workbench.campaigns import (
+from robins.workbench.campaign import (
     campaign_show,
     campaign_status,
     campaign_verify,
@@ -18,7 +18,7 @@ from robins.workbench.campaigns import (
     plan_campaign,
     problem_of,
 )
-from robins.workbench.simulated import run
+from robins.workbench.run import run
 
 LOST = (5, 21, 22, 40, 50)
 KEPT = ("keep=[0, 13, 40]", "keep_diverged=2")

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import sys
 from pathlib import Path
 
 import jax
@@ -17,9 +18,9 @@ from robins.report.sensitivity import budget, scatter, table
 from robins.systems import Case
 from robins.systems.ins_gnss.model import POSITION, Fix
 from robins.systems.ins_gnss.world import DriveBelief, as_believed
-from robins.workbench import publish, run, sensitivities
+from robins.workbench import publish, run
 from robins.workbench.scenarios import read_scenario
-from robins.workbench.sensitivities import Uncertain, sensitivity, uncertain
+from robins.workbench.sensitivity import Uncertain, sensitivity, uncertain
 
 HERE = Path(__file__).parent
 PAIR = f"{HERE / 'budget_world.py'}:study"
@@ -309,7 +310,7 @@ def test_errors_that_do_not_vary_and_wide_bounds_are_told(monkeypatch):
         rms = np.stack([1.0 + first + shares[:, 1], np.ones(len(shares)), 1.0 + first], axis=1)
         return np.repeat(rms[:, None] ** 2, runs, axis=1), np.zeros((len(shares), runs)), []
 
-    monkeypatch.setattr(sensitivities, "simulate_points", simulated)
+    monkeypatch.setattr(sys.modules[sensitivity.__module__], "simulate_points", simulated)
     found = sensitivity(PAIR, vary=[LEFT, RIGHT], runs=2, samples=64)
     still, wide = found.warnings
     assert "RMS error of right does not vary" in still

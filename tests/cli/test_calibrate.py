@@ -15,7 +15,8 @@ from robins.cli import main
 from robins.ins.magnetometer_calibration import calibrate
 from robins.sim.magnetometer import observe_field
 from robins.systems import SYSTEMS
-from robins.workbench import magnetometer as command
+from robins.workbench.calibrate import FILE, advice
+from robins.workbench.calibrate import calibrate as command
 
 RATE_HZ, COUNT = 50.0, 2000
 FIELD_N = np.array([20e-6, 0.0, 43e-6])
@@ -78,7 +79,7 @@ def test_offset_and_matrix_come_back(made, log):
 
 def test_the_configuration_is_one_that_a_replay_reads(made):
     _, result = made
-    text = (result.path / command.FILE).read_text()
+    text = (result.path / FILE).read_text()
     magnetometer = scenario.parse(SYSTEMS["marg"].replay_parameters, text, ()).magnetometer
     columns = result.summary["filters"]
     offset = [columns[axis]["offset_ut"] * 1e-6 for axis in "xyz"]
@@ -134,15 +135,15 @@ def test_gaps_and_needless_calibrations_are_told():
     directions = rng.standard_normal((3000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     noise = 1e-7 * rng.standard_normal((3000, 3))
-    assert command.advice(calibrate(4e-5 * directions + HARD + noise)) == []
-    (same,) = command.advice(calibrate(4e-5 * directions + noise))
+    assert advice(calibrate(4e-5 * directions + HARD + noise)) == []
+    (same,) = advice(calibrate(4e-5 * directions + noise))
     assert same.startswith("The offset is within its uncertainty")
     below = directions[directions[:, 2] < 0.1]
-    (gap,) = command.advice(calibrate(4e-5 * below + HARD + noise[: len(below)]))
+    (gap,) = advice(calibrate(4e-5 * below + HARD + noise[: len(below)]))
     assert "of the field along +z" in gap
     cap = directions[directions[:, 2] < -0.8]
     far = 2e-6 * rng.standard_normal((len(cap), 3))
-    assert "the matrix is the identity" in command.advice(calibrate(4e-5 * cap + HARD + far))[0]
+    assert "the matrix is the identity" in advice(calibrate(4e-5 * cap + HARD + far))[0]
 
 
 def test_what_cannot_be_calibrated_is_told_in_a_line(robins, log, tmp_path):
@@ -164,9 +165,9 @@ def test_what_cannot_be_calibrated_is_told_in_a_line(robins, log, tmp_path):
 
 def test_a_vehicle_that_cannot_tilt_drives_a_circle(tmp_path):
     log = write(tmp_path / "circle.npz", tumbling() * [1.0, 0.0, 0.0])
-    found = command.calibrate([log], horizontal=True)
+    found = command([log], horizontal=True)
     offset = [found.metrics[axis]["offset_ut"] for axis in "xyz"]
     np.testing.assert_allclose(offset, [12.0, -25.0, 0.0], atol=0.1)
     assert found.notes[0].startswith("The horizontal axes alone were calibrated")
     half = write(tmp_path / "half.npz", tumbling() * [0.06, 0.0, 0.0])
-    assert any("A sector of 1" in note for note in command.calibrate([half], horizontal=True).notes)
+    assert any("A sector of 1" in note for note in command([half], horizontal=True).notes)

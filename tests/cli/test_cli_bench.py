@@ -20,7 +20,7 @@ from robins.bench.run.setup import built_in
 from robins.bench.wire.c_header import c_header
 from robins.cli import app
 from robins.results import ResultWriter
-from robins.workbench.benches import flight_of
+from robins.workbench.bench import flight_of
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "bench.md").read_text("utf-8")

@@ -14,7 +14,8 @@ from robins.ins import allan
 from robins.ins.allan_noise import moments
 from robins.report import numbers
 from robins.workbench import allan as find_noise
-from robins.workbench import still
+from robins.workbench.allan import expected as expected_deviation
+from robins.workbench.allan import still
 
 RATE_HZ = 100.0
 GYRO_NOISE = np.deg2rad(0.3) / 60.0  # rad/sqrt(s), 0.3 deg/sqrt(h)
@@ -247,7 +248,7 @@ def test_increments_give_what_rates_give(tmp_path):
     rates, increments = tmp_path / "rates.csv", tmp_path / "increments.csv"
     logs.write_log(rates, a_still_imu(10.0), "pyins-imu")
     logs.write_log(increments, a_still_imu(10.0, kind="increment"), "pyins-imu")
-    one, other = still.still(rates), still.still(increments)
+    one, other = still(rates), still(increments)
     np.testing.assert_allclose(one.rates["gyro"], other.rates["gyro"], rtol=1e-9)
     np.testing.assert_allclose(one.rates["accel"], other.rates["accel"], rtol=1e-9)
 
@@ -259,7 +260,7 @@ def test_all_stretches_between_gaps_are_used_and_it_is_said(tmp_path, kind):
     keep[1000:1050] = False
     gapped = ImuTable(table.time_ns[keep], table.gyro[keep], table.accel[keep], kind)
     logs.write_log(tmp_path / "gapped.csv", gapped, "pyins-imu")
-    found = still.still(tmp_path / "gapped.csv")
+    found = still(tmp_path / "gapped.csv")
     per = 1.0 if kind == "rate" else 1.0 / RATE_HZ
     np.testing.assert_allclose(found.rates["gyro"], table.gyro[keep] / per, atol=1e-9)
     (note,) = found.notes
@@ -273,7 +274,7 @@ def test_a_moving_sensor_is_noticed(tmp_path):
     turning[400:600, 2] += 0.2
     for gyro, turned in ((turning, True), (table.gyro, False)):
         imu = ImuTable(table.time_ns, gyro, table.accel, "rate")
-        notes = still.still(written(tmp_path / "log.csv", imu)).notes
+        notes = still(written(tmp_path / "log.csv", imu)).notes
         assert any("turned" in note for note in notes) == turned
 
 
@@ -310,7 +311,7 @@ def test_the_parts_of_the_fit_are_those_it_was_fitted_with(terms, curve):
     ones = allan.Coefficients(*(np.full(3, 1.0 + k) for k in range(5)))
     dof = np.ones(3, int)
     fitted = allan.AllanFit(ones, ones, ones, np.zeros(3), dof, terms, 0.95, curve.tau_s[:1])
-    parts = still.expected(fitted, curve.tau_s)
+    parts = expected_deviation(fitted, curve.tau_s)
     assert "".join(parts) == terms
     mean = moments(curve.clusters, curve.n_samples, curve.dt_s).mean
     for term, part in parts.items():
@@ -357,7 +358,7 @@ def test_declared_columns_are_read_by_the_commands_and_refused_with_their_key(ro
     declared.write_text(LOGGER)
     table = a_still_imu(20.0)
     logs.write_log(log, table, logs.columns_from(declared))
-    np.testing.assert_allclose(still.still(log, [declared]).rates["gyro"], table.gyro, rtol=1e-12)
+    np.testing.assert_allclose(still(log, [declared]).rates["gyro"], table.gyro, rtol=1e-12)
     answer = robins("doctor", log, "--columns", declared)
     assert answer.status == Status.DONE, answer.err
     assert f"robins replay {log} --columns {declared}" in answer.out

@@ -12,9 +12,9 @@ import pytest
 from robins import report, results
 from robins.cli import main
 from robins.filters.synthesis import certify, riccati
-from robins.workbench import problem as reading
-from robins.workbench.contents import designs
-from robins.workbench.gains import as_text
+from robins.workbench.design import as_text
+from robins.workbench.design_problem import read_problem
+from robins.workbench.list import designs
 
 METHODS = ("riccati", "lmi-common", "retuned-slack")
 TWO_STATES = """
@@ -71,7 +71,7 @@ def test_the_table_says_what_each_method_reaches(made):
 def test_the_gains_have_every_digit_and_are_what_is_said(made):
     _, result = made
     told = json.loads((result.path / "gains.json").read_text())
-    p = reading.read_problem(str(result.path.parents[1] / "two.toml")).plant
+    p = read_problem(str(result.path.parents[1] / "two.toml")).plant
     assert told["least_gamma"] == pytest.approx(0.594542, abs=1e-6)
     assert len(told["designs"]) == 1 + 3 + 2
     for design in told["designs"]:

@@ -294,25 +294,25 @@ def as_short_as_can_be(words):
 # Of these commands, which begin to compute when this is called, one line of each kind is computed:
 # that with the most options. Packaged scenarios run above, and `test_cli_bound.py` computes bounds.
 BEGINS = {
-    ("run",): "robins.workbench.simulated.simulate",
-    ("bound",): "robins.workbench.simulated.bound_of",
-    ("allan",): "robins.workbench.still.deviation",
-    ("design",): "robins.workbench.gains.trade_off",
-    ("replay",): "robins.workbench.recorded.part",
-    ("run", "--master"): "robins.workbench.recorded.part",
-    ("replay", "--system"): "robins.workbench.recorded.part",
-    ("campaign", "run"): "robins.workbench.workers.plan_campaign",
-    ("campaign", "report"): "robins.workbench.campaigns.ready",
-    ("campaign", "show"): "robins.workbench.campaigns.ready",
-    ("campaign", "verify"): "robins.workbench.campaigns.ready",
-    ("sweep",): "robins.workbench.sweeps.plan_campaign",
-    ("tune",): "robins.workbench.tuning.choose",
-    ("sensitivity",): "robins.workbench.sensitivities.simulate_points",
-    ("bench", "up"): "robins.bench.run.session.Session.run",
-    ("bench", "replay"): "robins.workbench.benches.kit_of",
-    ("export",): "robins.workbench.boards._library",
-    ("export", "--adjust"): "robins.workbench.boards._library",
-    ("export", "--board"): "robins.workbench.boards._library",
+    ("run",): "robins.workbench.run:simulate",
+    ("bound",): "robins.workbench.bound:bound_of",
+    ("allan",): "robins.workbench.allan:deviation",
+    ("design",): "robins.workbench.design:trade_off",
+    ("replay",): "robins.workbench.replay:part",
+    ("run", "--master"): "robins.workbench.replay:part",
+    ("replay", "--system"): "robins.workbench.replay:part",
+    ("campaign", "run"): "robins.workbench.workers:plan_campaign",
+    ("campaign", "report"): "robins.workbench.campaign:ready",
+    ("campaign", "show"): "robins.workbench.campaign:ready",
+    ("campaign", "verify"): "robins.workbench.campaign:ready",
+    ("sweep",): "robins.workbench.sweep:plan_campaign",
+    ("tune",): "robins.workbench.tune:choose",
+    ("sensitivity",): "robins.workbench.sensitivity:simulate_points",
+    ("bench", "up"): "robins.bench.run.session:Session.run",
+    ("bench", "replay"): "robins.workbench.bench:kit_of",
+    ("export",): "robins.workbench.export:files_of",
+    ("export", "--adjust"): "robins.workbench.export:files_of",
+    ("export", "--board"): "robins.workbench.export:files_of",
 }
 # The option that makes a command compute something else.
 OPTIONS = ("--master", "--system", "--diff", "--adjust", "--board")
@@ -403,7 +403,10 @@ def test_a_command_line_shown_runs(words, folder, computes, monkeypatch):
         computes(words)
     else:
         monkeypatch.chdir(folder)
-        monkeypatch.setattr(BEGINS[kind], begins)
+        module, _, name = BEGINS[kind].partition(":")
+        owner, _, name = name.rpartition(".")
+        of = pkgutil.resolve_name(f"{module}:{owner}" if owner else module)
+        monkeypatch.setattr(of, name, begins)
         # Programs are traced before they begin, batches of JAX are not.
         monkeypatch.setattr("robins.campaign.machine.interpreter_of_many", no_interpreter)
         monkeypatch.setattr("robins.campaign.machine.available_cores", lambda: 1)

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from robins.export.harness import Recorded, check_c, makefile, recorded_h
+from robins.export.library import Entry, Library
+from robins.export.runs import BoardRun, by_jax, entry_functions, reset_function
 from robins.filters import Belief, Model, Motion, Sensor, kalman
 from robins.filters.rules import huber, sage_husa
 from robins.manifold import Angle
 from robins.program import DOUBLE, trace_steps
-from robins.program.harness import Recorded, check_c, makefile, recorded_h
-from robins.program.library import Entry, Library
-from robins.workbench.board_runs import BoardRun, by_jax, entry_functions, reset_function
 
 STEPS = 12
 

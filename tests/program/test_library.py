@@ -10,8 +10,8 @@ import pytest
 from boat import STEPS, made, write_boat
 from exported import found, spoil
 
+from robins.export.library import Library, fields_of, identifier, number, symbol
 from robins.program import DOUBLE, SINGLE, to_c, trace
-from robins.program.library import Library, fields_of, identifier, number, symbol
 
 PRECISIONS = {"double": DOUBLE, "float": SINGLE}
 PRINTED = re.compile(r"[0-9a-f]+ [0-9.e+-]+")

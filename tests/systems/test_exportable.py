@@ -11,12 +11,12 @@ from exported import primitives
 import robins.program.primitives  # noqa: F401
 from robins import manifold
 from robins.campaign.monte_carlo import solved
+from robins.export.field_notes import field_notes, mean_fields, tangent_axes, tangent_fields
+from robins.export.runs import entry_functions, reset_function
 from robins.filters import Belief
 from robins.program.walk import RULES
 from robins.systems import SYSTEMS
 from robins.systems.catalogue import SUMMARIES
-from robins.workbench.board_runs import entry_functions, reset_function
-from robins.workbench.board_words import field_notes, mean_fields, tangent_axes, tangent_fields
 from robins.workbench.scenarios import read_scenario
 
 # Of each study one whose state differs from the others'; and two that are filters of filters.

@@ -29,7 +29,7 @@ from robins.systems.gnss.model import (
 from robins.systems.gnss.parameters import Delays, Replay
 from robins.systems.gnss.weights import by_component, huber_weight, student_weight, switch_weight
 from robins.workbench.errors import InputError
-from robins.workbench.recorded import replay
+from robins.workbench.replay import replay
 
 BERLIN = Place.at(np.array([3785108.0, 899901.0, 5037234.0]))
 RNG = np.random.default_rng(5)

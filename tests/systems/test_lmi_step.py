@@ -23,7 +23,7 @@ from robins.systems.satellite import SYSTEM, design, stepwise
 from robins.systems.satellite.design import GainSpec, SensorNoise
 from robins.systems.satellite.nodes import STAR
 from robins.workbench import InputError
-from robins.workbench.boards import export_filter
+from robins.workbench.export import export_filter
 from robins.workbench.scenarios import read_scenario
 
 ARCSEC = math.pi / 648000.0

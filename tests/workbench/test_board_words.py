@@ -7,12 +7,12 @@ import numpy as np
 import xarray as xr
 
 from robins.earth import Geodetic
+from robins.export.field_notes import components, field_notes, tangent_axes
 from robins.filters import Belief, FilterState
 from robins.ins.extended_pose import ExtendedPose
 from robins.manifold import Angle
 from robins.rotation import Rotation
 from robins.systems.study import Problem, SensorAxes, StateBlock
-from robins.workbench.board_words import components, field_notes, tangent_axes
 
 
 class Mean(NamedTuple):

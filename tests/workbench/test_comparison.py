@@ -7,7 +7,7 @@ import pytest
 
 from robins.results import Outcome, Probability, ResultError
 from robins.workbench import publish
-from robins.workbench.comparison import compare, lines, ratios, verify
+from robins.workbench.compare import compare, lines, ratios, verify
 
 
 def made(folder, rms, *, runs=2, text='system = "x"\n[imu]\nbias = "1 deg/h"\n', verdict="partly"):

@@ -25,7 +25,7 @@ from small_replay import (
 from robins import logs
 from robins.results import Outcome, to_dataframe
 from robins.workbench import InputError, export, replay
-from robins.workbench.exporting import FORMATS, with_exports
+from robins.workbench.formats import FORMATS, with_exports
 
 KML = {"": "http://www.opengis.net/kml/2.2", "gx": "http://www.google.com/kml/ext/2.2"}
 WHOLE = np.delete(np.arange(len(TIME_S)), GAP)

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from robins.export.runs import entry_functions, reset_function
 from robins.filters import Belief, Code, Model, Motion, Sensor, imm, kalman
 from robins.filters.rules import sage_husa
 from robins.program import Native, trace_steps
-from robins.workbench.board_runs import entry_functions, reset_function
 
 F = np.array([[1.0, 0.1], [0.0, 1.0]])
 H = np.array([[1.0, 0.0], [1.0, 0.5]])

@@ -1,5 +1,7 @@
 """From an outcome to a folder: held before, whole or not there after, and its numbers not lost."""
 
+import sys
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -98,3 +100,10 @@ def test_every_function_is_where_it_is_said_to_be():
         assert found.__doc__
     with pytest.raises(AttributeError, match="no attribute 'rnu'"):
         workbench.rnu  # noqa: B018
+
+
+def test_a_file_takes_no_function_of_its_name_away():
+    """Import of a file sets the attribute of its package, as here."""
+    function = workbench.compare
+    workbench.compare = sys.modules["robins.workbench.compare"]
+    assert workbench.compare is function

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from robins.export.library import Entry, Library
+from robins.export.runs import board_runs, by_jax, ends, entry_functions
+from robins.export.single_precision import BlockCost, Cost, cost, differences, in_floats
 from robins.filters import Belief, Model, Motion, Sensor, kalman
 from robins.filters.rules import gate
 from robins.program import SINGLE, trace_steps
-from robins.program.library import Entry, Library
 from robins.systems.study import Case, Contender, Problem, SensorAxes, StateBlock
-from robins.workbench.board_runs import board_runs, by_jax, ends, entry_functions
-from robins.workbench.single_precision import BlockCost, Cost, cost, differences, in_floats
 
 STEPS, NOISE = 200, 0.1
 

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,9 @@ from robins.campaign.store import open_store
 from robins.errors import RobinsError
 from robins.report import figures
 from robins.results import find, read
-from robins.workbench import publish, sweeps, workers
-from robins.workbench.campaigns import campaign_status, campaign_work, needed, problem_of
-from robins.workbench.sweeps import Varied, report, status, sweep, varied
+from robins.workbench import publish, workers
+from robins.workbench.campaign import campaign_status, campaign_work, needed, problem_of
+from robins.workbench.sweep import Varied, report, status, sweep, varied
 
 BALLOON = f"{Path(__file__).parents[2] / 'docs' / 'examples' / 'balloon.py'}:study"
 SHORT = ("duration=20 s",)
@@ -122,7 +123,7 @@ def test_damage_at_a_point_is_computed_again(tmp_path):
 
 
 def test_a_worker_finds_all_points(tmp_path, monkeypatch):
-    monkeypatch.setattr(sweeps, "fill", lambda *_: None)
+    monkeypatch.setattr(sys.modules[sweep.__module__], "fill", lambda *_: None)
     with pytest.raises(RobinsError, match="points/0: has no run of 'kf' yet"):
         sweep(BALLOON, tmp_path, vary=[SIGMAS], runs=RUNS, filters=("kf",), settings=SHORT)
     assert list(campaign_work(tmp_path)) == [(0, 2), (1, 2), (2, 2)]

@@ -1,5 +1,6 @@
 """The command `tune`: on a balloon whose barometer is told wrong, and on a log of it."""
 
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,7 +15,7 @@ from robins.scenario import Parameters, Positive
 from robins.systems.replaying import Piece, Recorded
 from robins.systems.study import Case, Contender
 from robins.workbench import InputError, publish, tune
-from robins.workbench import recorded as recorded_logs
+from robins.workbench.replay import open_log
 
 BALLOON = f"{Path(__file__).parents[2]}/docs/examples/balloon.py:study"
 SHORT = ["duration=60 s", "outlier_share=0"]
@@ -102,7 +103,7 @@ def logged(steps, monkeypatch):
         replay_default=None,
         replay_filters=("kf",),
     )
-    monkeypatch.setattr(recorded_logs, "find_system", lambda name: system)
+    monkeypatch.setattr(sys.modules[open_log.__module__], "find_system", lambda name: system)
     monkeypatch.setattr(
         logs, "load_ranges", lambda _: SimpleNamespace(name="log", findings=(), y=y)
     )

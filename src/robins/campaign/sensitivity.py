@@ -17,12 +17,13 @@ traces in the place of a number.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 from jaxtyping import Array
 from scipy import stats
 
@@ -31,8 +32,9 @@ from robins.campaign.many_runs import ManyRuns
 from robins.campaign.monte_carlo import one_record
 from robins.filters import Belief
 from robins.filters.model import Data
+from robins.results import array
 from robins.scenario import Parameters
-from robins.systems.study import Contender, Study, View
+from robins.systems.study import Contender, StateBlock, Study, View
 
 RESAMPLES = 999  # of the bootstrap
 LEVEL = 0.95  # of its bounds
@@ -58,14 +60,20 @@ class Between(NamedTuple):
         pairs = zip(self.low, self.high, strict=True)
         return all(a * b > 0.0 and max(a / b, b / a) > DECADE * (1.0 + 1e-9) for a, b in pairs)
 
+    @property
+    def law(self) -> str:
+        """Name of the distribution."""
+        return "log-uniform" if self.by_logarithm else "uniform"
+
     def at(self, share: Any) -> dict[Path, Any]:
         """The numbers at a share from 0 to 1 of the way from the low ends to the high ones."""
-
-        def number(a: float, b: float) -> Any:
-            return a * (b / a) ** share if self.by_logarithm else a + (b - a) * share
-
         ends = zip(self.paths, self.low, self.high, strict=True)
-        return {path: number(a, b) for path, a, b in ends}
+        return {path: one_at(share, a, b, self.by_logarithm) for path, a, b in ends}
+
+
+def one_at(share: Data, low: float, high: float, by_logarithm: bool) -> Data:
+    """A number at a share from 0 to 1 of the way between its ends."""
+    return low * (high / low) ** share if by_logarithm else low + (high - low) * share
 
 
 def between(low: Any, high: Any) -> Between:
@@ -154,6 +162,15 @@ def _believed(start: Any) -> Array:
         return jnp.zeros(())
     size = jnp.sum(jnp.asarray(start.factor, float) ** 2, axis=-1)
     return jnp.sum(jnp.where(size > 0.0, jnp.log(jnp.where(size > 0.0, size, 1.0)), 0.0))
+
+
+def follows(believed: np.ndarray) -> list[bool]:
+    """True for each parameter that the belief at the start of a run follows.
+
+    Args:
+        believed: (d + 2, n, runs), as of `simulate_points` at the points of `sobol_points`.
+    """
+    return [not np.allclose(one, believed[0], rtol=1e-9, atol=1e-12) for one in believed[2:]]
 
 
 def depends(before: Any, course: Any, after: Any) -> bool:
@@ -296,3 +313,34 @@ def _estimate(f: np.ndarray) -> np.ndarray:
     found = stats.sobol_indices(func=of, n=f.shape[1])
     both = (np.reshape(x, (-1, len(f) - 2)) for x in (found.first_order, found.total_order))
     return np.stack([x[: f.shape[2]] for x in both])
+
+
+def labelled(
+    name: str,
+    ends: Sequence[tuple[str, str, str]],
+    points: np.ndarray,
+    squares: np.ndarray,
+    blocks: Sequence[StateBlock],
+    found: Indices,
+) -> xr.Dataset:
+    """Arrays of a result: indices of each block, RMS errors and places of all points.
+
+    Args:
+        name: of the filter.
+        ends: name of each parameter, and both ends as texts.
+        points: (d + 2, n, d), of `sobol_points`.
+        squares: (d + 2, n, runs, s) mean squares of each run.
+        blocks: s of them.
+        found: their indices.
+    """
+    data: dict[str, Any] = {"parameter": ("parameter", [key for key, _, _ in ends])}
+    about = {"of_filter": name, "samples": points.shape[1], "runs": squares.shape[2]}
+    rms = np.sqrt(np.mean(squares, axis=2)).reshape(-1, len(blocks))
+    for k, b in enumerate(blocks):
+        for field in Indices._fields:
+            more = about if field == "first" else {}
+            data |= array(f"sobol_{field}", getattr(found, field)[k], b.name, **more)
+        shown = {"unit": b.units, "display_unit": b.display_unit}
+        data |= array("sobol_rms", rms[:, k], b.name, **shown)
+    texts = "; ".join(f"{low} to {high}" for _, low, high in ends)
+    return xr.Dataset(data | array("sobol_share", points.reshape(len(rms), -1), ends=texts))

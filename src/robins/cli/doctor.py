@@ -29,7 +29,7 @@ def warn(findings: Sequence[Any]) -> None:
 
 
 def judge(
-    log: Sequence[Path], columns: Sequence[Path | str], as_json: bool, write: Path | None = None
+    paths: Sequence[Path], columns: Sequence[Path | str], as_json: bool, write: Path | None = None
 ) -> Status:
     """Print what there is and the findings; bad input if a run on this log would be wrong.
 
@@ -37,18 +37,18 @@ def judge(
     """
     with only_json(as_json):
         from robins.workbench import examine
-        from robins.workbench.examination import unit_file
+        from robins.workbench.doctor import unit_file
 
-        found = examine(log, columns)
-    say(found.data if as_json else None, _text(found, log, columns), as_json)
+        found = examine(paths, columns)
+    say(found.data if as_json else None, _text(found, paths, columns), as_json)
     if write is not None:  # after the findings, which explain why nothing may be found
         with only_json(as_json):
-            write.write_text(unit_file(log, columns))
+            write.write_text(unit_file(paths, columns))
     return Status.BAD_INPUT if found.counts["error"] else Status.DONE
 
 
 def _text(found: Any, log: Sequence[Path], columns: Sequence[Path | str]) -> str:
-    from robins.workbench.examination import typed
+    from robins.workbench.doctor import typed
 
     lines = []
     for table in found.tables:

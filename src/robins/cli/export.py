@@ -11,12 +11,12 @@ from robins.cli import cache
 from robins.cli.tell import say
 
 
-def write(scenario: str, to: Path, *, as_json: bool, **options: Any) -> None:
+def write(name: str, to: Path, *, as_json: bool, **options: Any) -> None:
     """Write the folder and list its contents."""
     cache.enable()
     workbench = importlib.import_module("robins.workbench")
-    made = workbench.export_filter(scenario, to, **options)
-    scalars = ", ".join(f"{name} {count}" for name, count in made.scalars.items())
+    made = workbench.export_filter(name, to, **options)
+    scalars = ", ".join(f"{entry} {count}" for entry, count in made.scalars.items())
     costs = (
         f"{made.cost.table()}\n\n{made.cost.codes_off} of {made.cost.codes} codes differ. "
         f"{made.cost.verdict}\n\n"
@@ -24,7 +24,7 @@ def write(scenario: str, to: Path, *, as_json: bool, **options: Any) -> None:
         else ""
     )
     text = (
-        f"Filter {made.filter} of {scenario} as C: {made.bytes / 1000.0:.0f} kB of text; "
+        f"Filter {made.filter} of {name} as C: {made.bytes / 1000.0:.0f} kB of text; "
         f"scalars of each call: {scalars}.\n\n"
         f"{costs}"
         f"Wrote:  {to}/  {', '.join(made.files)}\n"
@@ -36,9 +36,9 @@ def write(scenario: str, to: Path, *, as_json: bool, **options: Any) -> None:
         told = "".join(f" --set {shlex.quote(one)}" for one in options["settings"])
         told += f" --seed {options['seed']}" if options["seed"] else ""
         node = f"{made.program.name.removesuffix('_board')}={made.program}"
-        flown = f"robins bench up {scenario} --filter {made.filter} --node {node}{told}"
+        flown = f"robins bench up {name} --filter {made.filter} --node {node}{told}"
         text += f"\n        {flown}   flies with it"
     cost = made.cost and made.cost.as_data()
-    data = {**made._asdict(), "folder": str(to), "scenario": scenario, "cost": cost}
+    data = {**made._asdict(), "folder": str(to), "scenario": name, "cost": cost}
     data["program"] = made.program and str(made.program)
     say(data, text, as_json)

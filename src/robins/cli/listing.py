@@ -12,11 +12,11 @@ from robins.cli.frame import only_json
 from robins.cli.tell import say
 
 
-def listing(name: str | None, as_json: bool) -> None:
+def listing(system: str | None, as_json: bool) -> None:
     """Print what there is: an overview, the details of a system, or all of it as JSON."""
     from robins import workbench
 
-    sections = workbench.overview()
+    name, sections = system, workbench.overview()
     if name is None and not as_json:
         first = next(scenario for _, titles in sections.values() for scenario in titles)
         click.echo("\n\n".join(_section(name, *told) for name, told in sections.items()))

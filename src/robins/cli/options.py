@@ -9,6 +9,8 @@ from pathlib import Path
 import click
 from click import option
 
+from robins.workbench import InputError
+
 LOGS = click.Path(path_type=Path)
 RESULTS = Path("results")
 
@@ -135,15 +137,32 @@ SETTINGS = option(
 )
 
 
+SEED = option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Seed of all noise.")
+FILTERS = option("--filters", callback=as_names, metavar="a,b", help="Which filters to compare.")
+
+
+def _one_filter(context: click.Context, given: click.Parameter, text: str | None) -> str:
+    """Name of one filter; empty where none is given."""
+    filters = as_names(context, given, text)
+    if len(filters) > 1:
+        raise InputError(
+            "a bound is that of one model", f"--filters {','.join(filters)}", "name one."
+        )
+    return "".join(filters)
+
+
+FILTER = option(
+    "--filters",
+    "filter_name",
+    callback=_one_filter,
+    metavar="a,b",
+    help="Which filters to compare.",
+)
+
+
 def choices(command: Callable) -> Callable:
-    """Options that `run` and `replay` share."""
-    for one in (
-        option("--filters", callback=as_names, metavar="a,b", help="Which filters to compare."),
-        SETTINGS,
-        option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Seed of all noise."),
-    ):
-        command = one(command)
-    return command
+    """Options that commands on a campaign share."""
+    return SEED(SETTINGS(FILTERS(command)))
 
 
 def folder_name(scenario: str) -> str:
@@ -157,3 +176,13 @@ def log_name(log: Sequence[Path]) -> str:
     """Name of the result folder of a log, after its first file that is no configuration."""
     first = next((path for path in log if path.suffix != ".toml"), log[0])
     return os.path.basename(os.path.abspath(first)).split(".")[0] or "log"
+
+
+def result_name(given: str | Path | Sequence[str | Path]) -> str:
+    """Name of the result folder of a scenario, of a problem, or of the files of a log."""
+    files = [given] if isinstance(given, str | Path) else list(given)
+    one = files[0]
+    scenario = isinstance(one, str) and (one.endswith(".toml") or not Path(one).is_file())
+    return (
+        folder_name(str(one)) if scenario and len(files) == 1 else log_name(list(map(Path, files)))
+    )

@@ -11,8 +11,8 @@ is left out. What remains is emitted as C99, compiled, and called from Python; o
     native       function -> the same function, compiled
     NativeState  a state that stays in the memory of C, and programs that step it
 
-`stages` makes of a function of one run one of many, its loops in lanes; `library` writes C for a
-board.
+`stages` makes of a function of one run one of many, its loops in lanes. `robins.export`
+writes C for a board.
 
 This room knows JAX and no filter: no filter, rule or system is written for it.
 """

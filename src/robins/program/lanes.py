@@ -28,10 +28,9 @@ import numpy as np
 from robins.program.c import function, header
 from robins.program.flags import LANE_FLAGS
 from robins.program.kinds import is_key, numbers_of
-from robins.program.library import lengths
 from robins.program.native import CPP, build
 from robins.program.trace import positive_zeros
-from robins.program.walk import Leaf, Program
+from robins.program.walk import Leaf, Program, lengths
 
 KINDS = {"f8": 0, "b1": 1, "i4": 2, "i8": 3, "u4": 4, "u8": 5}  # of arrays, as `scan.h` counts them
 

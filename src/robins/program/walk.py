@@ -64,6 +64,12 @@ def counts(leaves: Sequence[Leaf]) -> tuple[int, int]:
     return sizes[True], sizes[False]
 
 
+def lengths(leaves: Sequence[Leaf]) -> tuple[int, int]:
+    """Lengths of the arrays of C for reals and for all other numbers: one at least."""
+    reals, others = counts(leaves)
+    return max(reals, 1), max(others, 1)
+
+
 @dataclass(frozen=True)
 class Program:
     """A function as scalars.

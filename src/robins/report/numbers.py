@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -155,3 +157,10 @@ def verdict(claims: Sequence[Mapping[str, Any]]) -> str:
     rest = [f"{n} {v}" for v in ("partly", "not", "undecided") if (n := told.count(v))]
     noun = "claim" if len(claims) == 1 else "claims"
     return f"{held} of {len(claims)} {noun} reproduced" + "".join(f", {r}" for r in rest) + "."
+
+
+def csv_of(rows: Sequence[Sequence[str | int | float]]) -> bytes:
+    """A table as the bytes of a CSV file; the first row names the columns."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()

@@ -1,7 +1,9 @@
-"""Sobol indices: what each uncertain parameter adds to the variance of the error."""
+"""Sobol indices: figures, tables and sentences on the variance that each parameter adds."""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,14 +13,17 @@ from matplotlib.patches import Patch
 from rich.table import Table
 from rich.text import Text
 
+from robins import units
 from robins.report import series, style
-from robins.report.numbers import words
+from robins.report.numbers import csv_of, words
 from robins.report.style import Picture
 from robins.results import find
 
 _COLUMNS = 3  # blocks side by side
 _ORDERS = {"first": "first order: alone", "total": "total: with others"}
 _SLICES, _FEW = 10, 8  # of the means over a parameter: how many, and points in each at least
+_WIDE = 0.2  # width of a bound from which on an order is doubted
+_NOTHING = 1e-12  # total index of a parameter that does nothing
 _THICK = 0.36  # of a bar; two of them to a parameter
 
 
@@ -141,3 +146,168 @@ def _bars(axes: Axes, solution: xr.Dataset, block: str) -> None:
     axes.grid(axis="y", visible=False)
     left, right = axes.get_xlim()
     axes.set_xlim(min(left, 0.0), max(right, 1.02 * farthest))
+
+
+# ------------------------------------------------------------------- tables and sentences
+
+
+def metrics(solution: xr.Dataset) -> dict[str, dict[str, float | list[float]]]:
+    """Indices with their bounds, by parameter, as metrics of a summary."""
+    out: dict[str, dict[str, float | list[float]]] = {}
+    found = {(b, o): _of(solution, o, b) for b in find(solution, "sobol_first") for o in _ORDERS}
+    for j, name in enumerate(series.coordinate(solution, "parameter")):
+        rows = {f"{b}_{o}_order": index[:, j].tolist() for (b, o), index in found.items()}
+        out[name] = {}
+        for key, (value, low, high) in rows.items():
+            out[name] |= {key: value, f"{key}_bounds": [low, high]}
+    return out
+
+
+def _ends(solution: xr.Dataset) -> list[tuple[str, str]]:
+    """Both ends of each parameter, as texts."""
+    texts = find(solution, "sobol_share")[""].attrs["ends"].split("; ")
+    return [(low, high) for low, _, high in (text.partition(" to ") for text in texts)]
+
+
+def _spread(solution: xr.Dataset) -> dict[str, tuple[float, float, str]]:
+    """Mean and standard deviation of the RMS over the independent points, and their unit."""
+    every = find(solution, "sobol_rms")
+    samples = int(next(iter(find(solution, "sobol_first").values())).attrs["samples"])
+    rms = np.stack([np.asarray(x, float)[: 2 * samples] for x in every.values()], axis=1)
+    with np.errstate(invalid="ignore"):  # an infinite RMS has no spread
+        pairs = np.transpose([np.mean(rms, axis=0), np.std(rms, axis=0)])
+    out = {}
+    for (block, x), pair in zip(every.items(), pairs, strict=True):
+        unit = x.attrs.get("units", "1")
+        shown = x.attrs.get("display_unit", unit)
+        mean, deviation = (float(units.convert(one, unit, shown)) for one in pair)
+        out[block] = mean, deviation, shown
+    return out
+
+
+def csv(solution: xr.Dataset, laws: Sequence[str]) -> bytes:
+    """A row for each block and parameter: the RMS, the ends, the indices with their bounds.
+
+    Args:
+        solution: as of `robins.campaign.sensitivity.labelled`.
+        laws: distribution of each parameter.
+    """
+    head = "filter block unit rms_mean rms_std parameter low high parameter_unit distribution"
+    orders = [f"{o}{end}" for o in _ORDERS for end in ("", "_low", "_high")]
+    rows: list[list[Any]] = [[*head.split(), *orders, "samples", "runs"]]
+    names, spread, ends = (
+        series.coordinate(solution, "parameter"),
+        _spread(solution),
+        _ends(solution),
+    )
+    for block, first in find(solution, "sobol_first").items():
+        about = first.attrs
+        counts = [int(about["samples"]), int(about["runs"])]
+        mean, deviation, unit = spread[block]
+        index = np.concatenate([_of(solution, order, block) for order in _ORDERS])
+        for j, name in enumerate(names):
+            (low, _, of), (high, _, _) = (text.partition(" ") for text in ends[j])
+            values = [float(low), float(high), of, laws[j], *index[:, j].tolist()]
+            own = [about["of_filter"], block, unit, mean, deviation, name]
+            rows.append([*own, *values, *counts])
+    return csv_of(rows)
+
+
+def points(solution: xr.Dataset, drawn: Sequence[np.ndarray]) -> bytes:
+    """Samples A and B, which are independent, with the RMS of each.
+
+    Args:
+        solution: as of `robins.campaign.sensitivity.labelled`.
+        drawn: (points,) values of each parameter, in its unit.
+    """
+    names = series.coordinate(solution, "parameter")
+    named = [(n, low.partition(" ")[2]) for n, (low, _) in zip(names, _ends(solution), strict=True)]
+    columns = list(drawn)
+    for block, rms in find(solution, "sobol_rms").items():
+        values, unit = series.shown(rms)
+        named.append((f"{block} RMS", unit))
+        columns.append(values[: len(drawn[0])])
+    head = [f"{name} [{unit}]" if unit not in ("", "1") else name for name, unit in named]
+    return csv_of([head, *np.transpose(columns).tolist()])
+
+
+def sentences(solution: xr.Dataset, laws: Sequence[str]) -> list[str]:
+    """Notes on how the indices were found, and on what they mean; arguments as of `csv`."""
+    about = next(iter(find(solution, "sobol_first").values())).attrs
+    name, samples, runs = about["of_filter"], int(about["samples"]), int(about["runs"])
+    names = series.coordinate(solution, "parameter")
+    told = "; ".join(
+        f"{key} {law} from {low} to {high}"
+        for key, law, (low, high) in zip(names, laws, _ends(solution), strict=True)
+    )
+    sizes = "; ".join(
+        f"{block} {mean:.3g} {unit}, standard deviation {deviation:.3g}"
+        for block, (mean, deviation, unit) in _spread(solution).items()
+    )
+    return [
+        f"The world varies, '{name}' believes the scenario as written. "
+        f"{(len(names) + 2) * samples} points: "
+        f"{samples} samples x (2 + {len(names)} parameters), each of the same {runs} runs.",
+        f"Parameters are independent: {told}. The logarithm is uniform where the ends are more "
+        "than a factor of 10 apart.",
+        "First order: the share of the variance of the RMS error that would go if this parameter "
+        "alone were known. Total: the share that would stay if all the others were known; what it "
+        "exceeds the first order by comes from acting together with others.",
+        f"RMS error over the points, mean: {sizes}. Bounds are of 95 % confidence, by "
+        "drawing points and runs again (bootstrap).",
+    ]
+
+
+def doubts(solution: xr.Dataset, follow: Sequence[bool]) -> list[str]:
+    """Warnings where an index is none, or is not what its name says.
+
+    Args:
+        solution: as of `robins.campaign.sensitivity.labelled`.
+        follow: of each parameter, True if the belief at the start follows it.
+    """
+    names, blocks = series.coordinate(solution, "parameter"), find(solution, "sobol_total")
+    name = next(iter(find(solution, "sobol_first").values())).attrs["of_filter"]
+    rms = np.stack([np.asarray(x, float) for x in find(solution, "sobol_rms").values()])
+    total = np.stack([np.asarray(x, float) for x in blocks.values()])
+    lost = int(np.sum(~np.all(np.isfinite(rms), axis=0)))
+    still = [b for b, row in zip(blocks, total, strict=True) if np.all(np.isnan(row))]
+    told = []
+    if lost:
+        told.append(
+            f"at {lost} of {rms.shape[1]} points '{name}' diverged in a "
+            "run: their RMS is infinite and there are no indices; bring the ends nearer together "
+            "or name another filter"
+        )
+    elif still:
+        told.append(f"the RMS error of {', '.join(still)} does not vary, so it has no indices")
+    for j, key in enumerate(names):
+        if follow[j]:
+            told.append(
+                f"{key}: what '{name}' believes at the start follows it, since the world of "
+                "this study brings the start along; its index is that of both"
+            )
+        if len(still) < len(blocks) and not np.any(np.nan_to_num(total[:, j]) > _NOTHING):
+            told.append(f"{key}: changes no error; the simulated world does not depend on it")
+    for block in blocks:
+        value, low, high = _of(solution, "total", block)
+        unsure = [
+            (i, j)
+            for i, j in itertools.pairwise(np.argsort(-value))
+            if low[i] < high[j] and max(high[i] - low[i], high[j] - low[j]) > _WIDE
+        ]
+        if unsure:
+            i, j = unsure[0]
+            told.append(
+                f"{block}: the bounds of {names[i]} and {names[j]} are too wide to say "
+                "which counts more; take more --samples, or more --runs"
+            )
+    return told
+
+
+def greatest(solution: xr.Dataset) -> int | None:
+    """Number of the parameter with the greatest total index of any block; None: there is none."""
+    total = np.stack([np.asarray(x, float) for x in find(solution, "sobol_total").values()])
+    known = np.nan_to_num(total, nan=-np.inf)
+    if not np.any(np.isfinite(known)):
+        return None
+    return int(np.unravel_index(np.argmax(known), known.shape)[1])

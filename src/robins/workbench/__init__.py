@@ -8,6 +8,9 @@
 The first line writes nothing; `publish` makes a result folder of any outcome, with its report.
 Where computing takes long, `publishing` refuses a folder that cannot be written before it begins.
 
+A file bears the name of its command in `robins --help`; `demo` is in `run`, `verify` in `compare`.
+What several of them use bears a noun: `scenarios`, `publication`, `formats`, `workers`.
+
 A function is imported when it is used: the doctor of logs does not wait for the systems, nor a
 list of scenarios for JAX. A new command is a function in a module here, and its row below.
 """
@@ -15,42 +18,58 @@ list of scenarios for JAX. A new command is a function in a module here, and its
 from __future__ import annotations
 
 import importlib
-from typing import Any
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # the functions that are named as their file, for editors
+    from robins.workbench.allan import allan as allan
+    from robins.workbench.bound import bound as bound
+    from robins.workbench.calibrate import calibrate as calibrate
+    from robins.workbench.compare import compare as compare
+    from robins.workbench.design import design as design
+    from robins.workbench.formats import export as export
+    from robins.workbench.guess import guess as guess
+    from robins.workbench.replay import replay as replay
+    from robins.workbench.run import run as run
+    from robins.workbench.sensitivity import sensitivity as sensitivity
+    from robins.workbench.sweep import sweep as sweep
+    from robins.workbench.tune import tune as tune
 
 _WHERE = {
     "InputError": "errors",
-    "align": "recorded",
-    "allan": "still",
-    "bench_node": "benches",
-    "bench_replay": "benches",
-    "bench_up": "benches",
-    "bound": "simulated",
-    "calibrate": "magnetometer",
+    "align": "replay",
+    "allan": "allan",
+    "bench_node": "bench",
+    "bench_replay": "bench",
+    "bench_up": "bench",
+    "bound": "bound",
+    "calibrate": "calibrate",
     "campaign_run": "workers",
-    "campaign_show": "campaigns",
-    "campaign_status": "campaigns",
-    "campaign_verify": "campaigns",
-    "campaign_work": "campaigns",
-    "compare": "comparison",
-    "demo": "simulated",
-    "design": "gains",
-    "examine": "examination",
-    "export": "exporting",
-    "export_filter": "boards",
-    "guess": "guessing",
-    "inventory": "contents",
-    "overview": "contents",
-    "plan_campaign": "campaigns",
+    "campaign_show": "campaign",
+    "campaign_status": "campaign",
+    "campaign_verify": "campaign",
+    "campaign_work": "campaign",
+    "compare": "compare",
+    "demo": "run",
+    "design": "design",
+    "examine": "doctor",
+    "export": "formats",
+    "export_filter": "export",
+    "guess": "guess",
+    "inventory": "list",
+    "overview": "list",
+    "plan_campaign": "campaign",
     "publish": "publication",
     "publishing": "publication",
-    "replay": "recorded",
-    "report": "sweeps",
-    "run": "simulated",
-    "sensitivity": "sensitivities",
-    "status": "sweeps",
-    "sweep": "sweeps",
-    "tune": "tuning",
-    "verify": "comparison",
+    "replay": "replay",
+    "report": "sweep",
+    "run": "run",
+    "sensitivity": "sensitivity",
+    "status": "sweep",
+    "sweep": "sweep",
+    "tune": "tune",
+    "verify": "compare",
     "work_here": "workers",
 }
 
@@ -63,3 +82,14 @@ def __getattr__(name: str) -> Any:
     found = getattr(importlib.import_module(f"{__name__}.{_WHERE[name]}"), name)
     globals()[name] = found
     return found
+
+
+class _Functions(ModuleType):
+    """A package whose functions keep their names when a file of the same name is imported."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name not in _WHERE or not isinstance(value, ModuleType):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Functions

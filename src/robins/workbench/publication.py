@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
 
 from robins import report, results
 from robins.results import Outcome, Progress, Result, silent
@@ -89,10 +86,3 @@ def _write(writer: results.ResultWriter, progress: Progress, outcome: Outcome) -
 def part(progress: Progress, low: float, high: float) -> Progress:
     """The progress of a part, whose 0 and 1 are `low` and `high` of the whole."""
     return lambda share, what: progress(low + (high - low) * share, what)
-
-
-def csv_of(rows: Sequence[Sequence[Any]]) -> bytes:
-    """A table as the bytes of a CSV file; the first row names the columns."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode()

@@ -19,7 +19,7 @@ from robins.campaign.work import missing
 from robins.errors import RobinsError
 from robins.results import Outcome, Progress, silent
 from robins.systems import trust
-from robins.workbench.campaigns import campaign_report, mend, plan_campaign
+from robins.workbench.campaign import campaign_report, mend, plan_campaign
 
 POLL_S = 0.2
 DEATHS = 3  # of workers, without a shard between them, after which a campaign fails

@@ -1,4 +1,11 @@
-"""The command `doctor`: a log examined before it is navigated."""
+"""The command `doctor`: a log examined before it is navigated.
+
+Examples::
+
+    robins doctor imu.csv gnss.pos
+    robins doctor imu.csv unit.toml --json
+    robins doctor imu.csv gnss.pos --write found.toml
+"""
 
 from __future__ import annotations
 
@@ -21,6 +28,7 @@ from robins.logs.quiet import usual_step_s
 from robins.logs.tables import kind_of, tables_of
 from robins.logs.unit_file import find_unit, toml_of
 from robins.workbench.errors import InputError
+from robins.workbench.options import Logs
 
 SEVERITIES = ("error", "warning", "note")
 
@@ -50,10 +58,14 @@ class Examined(NamedTuple):
         }
 
 
-def examine(
-    paths: Sequence[str | os.PathLike[str]], columns: Sequence[str | os.PathLike[str]] = ()
-) -> Examined:
-    """Examine the files of a log; one that ends in .toml gives the mounting of the sensor.
+def examine(paths: Logs, columns: Sequence[str | os.PathLike[str]] = ()) -> Examined:
+    """Examine a log as an engineer would: units, axes, gravity, rates, gaps, time, sigmas.
+
+    The exit status is 2 if a run on it would be wrong, 0 otherwise. A .toml file among LOG... gives
+    the mounting of the sensor, as for `robins replay`.
+
+    With --write, what the log shows of the unit and the receiver (mounting, latency, window of the
+    velocities, noise at rest) becomes a configuration for `robins replay`.
 
     Args:
         paths: the files.

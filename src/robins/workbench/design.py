@@ -1,11 +1,17 @@
-"""The command `design`: filters with constant gains, and the cost of a bound on the worst case."""
+"""The command `design`: filters with constant gains, and the cost of a bound on the worst case.
+
+Examples::
+
+    robins design attitude-axis
+    robins design my.toml --gamma "1, 0.8" --methods riccati,retuned-slack --json
+"""
 
 from __future__ import annotations
 
 import csv
 import io
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
@@ -13,8 +19,9 @@ import xarray as xr
 from robins.filters.synthesis import METHODS, Attempt, Design, TradeOff, trade_off
 from robins.results import Outcome, Progress, array, silent, variable
 from robins.results.summary import dumps, plain
+from robins.workbench.design_problem import Problem, read_problem
 from robins.workbench.errors import InputError, refusing
-from robins.workbench.problem import Problem, read_problem
+from robins.workbench.options import Option
 
 GAINS, TABLE = "gains.json", "trade_off.csv"
 _NUMBERS = ("h2", "hinf", "hinf_sweep", "bound", "radius", "lambda_", "seconds")
@@ -178,13 +185,21 @@ def gammas_of(text: str | None) -> list[float] | None:
 
 
 def design(
-    given: str,
+    given: Annotated[str, Option(metavar="PROBLEM")],
     *,
-    gamma: str | None = None,
-    methods: Sequence[str] = (),
+    gamma: Annotated[
+        str | None, Option("Bounds on the H-infinity norm. [default: a range]", metavar="a,b")
+    ] = None,
+    methods: Annotated[
+        Sequence[str], Option("Which methods to compare.", metavar="a,b", names=True)
+    ] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Constant-gain filters for a problem, and the cost of a bound on the worst case.
+    """Design constant gains for PROBLEM, a TOML file with the matrices of a plant or an example.
+
+    It compares methods that keep the gain from a modelling error to the estimate below gamma, by
+    the true norm from noise to the estimate. Examples: attitude-axis, attitude-axis-drift,
+    baro-height, two-states.
 
     Args:
         given: the path of a problem, or the name of an example.

@@ -1,10 +1,17 @@
-"""The command `calibrate`: from a magnetometer that is turned about to its hard and soft iron."""
+"""The command `calibrate`: from a magnetometer that is turned about to its hard and soft iron.
+
+Examples::
+
+    robins calibrate turned.csv
+    robins calibrate turned.ulg --field "48.5 uT" --begin "20 s" --end "80 s" --json
+    robins calibrate circle.csv --horizontal
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -19,8 +26,9 @@ from robins.logs.mounting import turned
 from robins.logs.tables import tables_of
 from robins.results import Outcome, Progress, array, silent, variable
 from robins.units import parse
+from robins.workbench.doctor import mounting_of, parted, typed
 from robins.workbench.errors import InputError, refusing
-from robins.workbench.examination import mounting_of, parted, typed
+from robins.workbench.options import Logs, Option
 
 FILE = "calibration.toml"
 _AXES = ("x", "y", "z")
@@ -174,16 +182,27 @@ def metrics_of(found: Calibration) -> dict[str, dict[str, Any]]:
 
 
 def calibrate(
-    log: Sequence[str | os.PathLike[str]],
+    log: Logs,
     *,
-    field: str | None = None,
-    begin: str | None = None,
-    end: str | None = None,
-    horizontal: bool = False,
+    field: Annotated[
+        str | None,
+        Option('Its strength at the place, "48.5 uT"; sets the scale.', metavar="FIELD"),
+    ] = None,
+    begin: Annotated[
+        str | None, Option('Use samples from "20 s" after the first one on.', metavar="TIME")
+    ] = None,
+    end: Annotated[
+        str | None, Option('Use samples up to "80 s" after the first one.', metavar="TIME")
+    ] = None,
+    horizontal: Annotated[bool, Option("The vehicle cannot tilt: it turned about z only.")] = False,
     columns: Sequence[str | os.PathLike[str]] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Hard and soft iron of a magnetometer from a log in which it is turned about.
+    """Calibrate hard and soft iron from a log in which the sensor is turned about all its axes.
+
+    It finds the offset and the matrix of ``matrix (measured - offset)``, whose size is that of the
+    Earth's field wherever the sensor points. A .toml file among LOG... gives the mounting of the
+    sensor, as for `robins replay`, which takes the calibration.toml of the result.
 
     Args:
         log: its files; one that ends in .toml gives the mounting of the sensor.

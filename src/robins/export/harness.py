@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from robins.program.library import C_TYPES, CODE, Entry, Field, Library, fields_of, number
+from robins.export.library import C_TYPES, CODE, Entry, Field, Library, fields_of, number
 from robins.program.precision import DOUBLE, SINGLE, Precision
 from robins.program.wrap import wrapped
 

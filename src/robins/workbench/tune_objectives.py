@@ -28,7 +28,7 @@ from robins.filters.values import as_data, content, kind, value
 from robins.results import Progress
 from robins.systems.study import Contender, StateBlock
 from robins.workbench.errors import InputError, refusing
-from robins.workbench.recorded import Findings, OpenLog
+from robins.workbench.replay import Findings, OpenLog
 from robins.workbench.scenarios import check_filters, read_scenario
 
 ERROR, INNOVATIONS = "error", "innovations"

@@ -4,6 +4,10 @@ Names and units are those that loggers use. A unit that no heading states is pro
 specific force by the size of gravity, a magnetic field by that of the Earth, stamps by the year,
 gyros by the doctor, who compares them with gravity and, where there are fixes, with the course.
 What is only likely is marked in a comment, and what is not known is left out.
+
+Examples::
+
+    robins guess my.csv > columns.toml
 """
 
 from __future__ import annotations
@@ -30,6 +34,7 @@ from robins.logs.text import Head
 from robins.units import KINDS, UnitError, to_si
 from robins.units import unit as unit_of
 from robins.workbench.errors import InputError
+from robins.workbench.options import Log
 
 _G = 9.80665
 _SPELLINGS = {
@@ -94,8 +99,12 @@ _FASTEST = 35.0  # rad/s, 2000 deg/s: the range of most gyros
 Columns = dict[str, tuple[str, str, str]]  # quantity -> name, unit or "", why
 
 
-def guess(path: str | os.PathLike[str]) -> str:
-    """TOML that declares the columns of a table, with a comment on what is only likely.
+def guess(path: Log) -> str:
+    """Print TOML that declares the columns of LOG, for the option --columns of other commands.
+
+    Headings tell what columns hold. Units that they do not state are proved by gravity, by the
+    field of the Earth and by the doctor; what is only likely is marked GUESSED in a comment, and
+    what is not known is left out.
 
     Args:
         path: text with headings, or an archive of arrays.

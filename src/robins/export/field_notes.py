@@ -11,9 +11,9 @@ import numpy as np
 from jax.tree_util import KeyPath
 
 from robins import manifold
+from robins.export.library import identifier, symbol
 from robins.filters import Belief
 from robins.manifold import State
-from robins.program.library import identifier, symbol
 from robins.systems.study import Problem, SensorAxes
 
 MEAN = ".belief.mean"  # of a state

@@ -1,11 +1,19 @@
-"""The commands `replay` and `align`: a recorded log navigated, a recorded pair aligned."""
+"""The commands `replay` and `align`: a recorded log navigated, a recorded pair aligned.
+
+Examples::
+
+    robins replay imu.csv gnss.pos --out walk
+    robins replay imu.csv gnss.pos unit.toml --set gnss.latency="-50 ms" --json
+    robins replay my.csv --columns logger.toml --system marg
+    robins replay imu.csv gnss.pos --out walk --export csv,kml
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -16,9 +24,10 @@ from robins.logs import Finding
 from robins.logs.doctor import Use
 from robins.results import Outcome, Progress, silent
 from robins.systems.finding import find_system
+from robins.workbench.doctor import parted
 from robins.workbench.errors import InputError, refusing
-from robins.workbench.examination import parted
-from robins.workbench.exporting import require_formats, with_exports
+from robins.workbench.formats import require_formats, with_exports
+from robins.workbench.options import Logs, Option
 from robins.workbench.publication import part
 from robins.workbench.scenarios import asked, check_filters, find_scenario
 
@@ -30,18 +39,32 @@ def unheard(findings: Sequence[Finding]) -> None:
 
 
 def replay(
-    paths: Sequence[str | os.PathLike[str]],
+    paths: Logs,
     *,
-    system: str = "ins-gnss",
-    filters: Sequence[str] = (),
-    settings: Sequence[str] = (),
+    system: Annotated[str, Option("The system that navigates the log.", shown=True)] = "ins-gnss",
+    exports: Annotated[
+        Sequence[str],
+        Option(
+            "Write the result for other programs too: csv, tum, kml, gpx.",
+            "--export",
+            "a,b",
+            names=True,
+        ),
+    ] = (),
     columns: Sequence[str | os.PathLike[str]] = (),
-    exports: Sequence[str] = (),
     seed: int = 0,
+    settings: Sequence[str] = (),
+    filters: Sequence[str] = (),
     progress: Progress = silent,
     findings: Findings = unheard,
 ) -> Outcome:
-    """Navigate a recorded log: doctor, clean, align, filter, smooth, measure.
+    """Navigate a recorded log: LOG... are its files, inertial samples and GNSS fixes.
+
+    A file that ends in .toml adds what the log lacks: noise, mounting, lever arm. The file of
+    --columns declares the columns of a log that is in no known format.
+
+    --export writes files into exports/ of the result folder: csv has all estimates, tum is t x y z
+    qx qy qz qw in east, north, up, kml and gpx are tracks with UTC. kml and gpx need positions.
 
     Args:
         paths: the log's files; one that ends in .toml is the configuration.
@@ -49,7 +72,7 @@ def replay(
         filters: names; by default those of the configuration.
         settings: "path=value" texts that change the configuration.
         columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
-        exports: formats of other programs, of `robins.workbench.exporting.FORMATS`; the files are
+        exports: formats of other programs, of `robins.workbench.formats.FORMATS`; the files are
             among those of the outcome.
         seed: recorded in the result; a replay draws nothing.
         progress: called with the share done and what is being done.

@@ -1,13 +1,21 @@
-"""The command `list`: what there is to run, listed without importing a system."""
+"""The command `list`: what there is to run, listed without importing a system.
+
+Examples::
+
+    robins list
+    robins list ins-gnss
+    robins list --json
+"""
 
 from __future__ import annotations
 
 import tomllib
 from importlib.resources import files
 from importlib.resources.abc import Traversable
-from typing import Any
+from typing import Annotated, Any
 
 from robins.systems import catalogue
+from robins.workbench.options import Option
 
 _ROBINS = files("robins")
 _RIGS = _ROBINS.joinpath("bench", "rigs")
@@ -21,8 +29,10 @@ def overview() -> dict[str, tuple[str, dict[str, str]]]:
     return told | {"bench": (_BENCH, rigs() | _benches()), "design": (design, designs())}
 
 
-def inventory(system: str | None = None) -> dict[str, Any]:
-    """Inventory of robins or of a system: scenarios, filters, claims, replay of logs.
+def inventory(system: Annotated[str | None, Option(metavar="[SYSTEM]")] = None) -> dict[str, Any]:
+    """List the systems and their scenarios, or the filters and claims of SYSTEM.
+
+    With --json it prints everything, or SYSTEM alone.
 
     Args:
         system: its name, or "file.py:study"; "bench", or a rig that is no system: the bench; all

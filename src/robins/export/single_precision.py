@@ -18,13 +18,14 @@ from jaxtyping import Array
 
 from robins import units
 from robins.campaign.monte_carlo import Blocks, blocks_of, reported_rows
+from robins.export.library import Field, Library
+from robins.export.runs import BoardRun, Calls, Kept
 from robins.filters import Belief
 from robins.filters.analysis.consistency import normalised_sq
 from robins.manifold import local
 from robins.program import FLAGS, Program, build
-from robins.program.library import Field, Library, counts
+from robins.program.trace import counts
 from robins.systems.study import Contender, Problem
-from robins.workbench.board_runs import BoardRun, Calls, Kept
 
 NONE: Mapping[str, float] = {}
 LITTLE, MUCH = 1.01, 1.1  # growth of an error: below the one it does not show, above the other ...

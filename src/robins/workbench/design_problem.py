@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 from robins.filters.synthesis import Plant, current_form, plant
 from robins.foreign import decoding
-from robins.workbench.contents import designs
 from robins.workbench.errors import InputError
+from robins.workbench.list import designs
 
 _FORMS = {
     "prediction": ("A", "Bw", "Bn", "C", "Dw", "Dn", "L"),

@@ -1,32 +1,45 @@
-"""The commands `run` and `bound`: a scenario simulated, and the best that its sensors allow."""
+"""The commands `run` and `demo`: a scenario simulated with several filters.
+
+Examples::
+
+    robins run ins-gnss/drive --runs 50 --filters ekf,ukf --out drive
+    robins run my.toml --set gnss.sigma="2 m" --json
+    robins run my_system.py:study --runs 100
+    robins run transfer-alignment/replay --master master.csv --slave slave.csv
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Annotated
 
-from robins import _float64, units
+from robins import _float64
 from robins.campaign import check_machine, simulate
-from robins.campaign.bound import bound as bound_of
 from robins.campaign.machine import machine_for
-from robins.report import bounds
 from robins.results import Outcome, Progress, silent
 from robins.systems.judgement import about
-from robins.workbench.errors import refusing
+from robins.workbench.options import Option, Runs, Scenario
 from robins.workbench.scenarios import Simulated, asked, beside, check_filters, read_scenario
 
 
 def run(
-    name: str,
+    name: Scenario,
     *,
-    runs: int | None = None,
-    seed: int = 0,
-    filters: Sequence[str] = (),
-    settings: Sequence[str] = (),
+    runs: Runs = None,
     machine: str = "",
+    seed: int = 0,
+    settings: Sequence[str] = (),
+    filters: Sequence[str] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Simulate a scenario with several filters on the same random numbers.
+    """Simulate SCENARIO with several filters.
+
+    SCENARIO is a name from `robins list`, a TOML file, or FILE.py:STUDY of your own.
+
+    All filters get the same random numbers; run k of seed S is the same whatever N is.
+
+    With --master and --slave a recorded pair replaces the simulation.
 
     Args:
         name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
@@ -75,9 +88,14 @@ _STORY = (
 
 
 def demo(
-    *, runs: int | None = None, filters: Sequence[str] = (), progress: Progress = silent
+    *,
+    runs: Runs = None,
+    filters: Annotated[
+        Sequence[str], Option("Which filters. [default: ekf]", metavar="a,b", names=True)
+    ] = (),
+    progress: Progress = silent,
 ) -> Outcome:
-    """Simulate a drive with a GNSS outage: few runs of one filter, six figures.
+    """Simulate a drive with a GNSS outage and navigate it: a first look, which needs no data.
 
     Args:
         runs: how many.
@@ -98,53 +116,3 @@ def _not_kept(one: Simulated) -> list[str]:
     if not (one.parameters.keep or one.parameters.keep_diverged):
         return []
     return ["keep and keep_diverged are for `robins campaign run`: here run 0 alone has histories"]
-
-
-def bound(
-    name: str,
-    *,
-    filter_name: str = "",
-    runs: int = 1,
-    seed: int = 0,
-    without: Sequence[str] = (),
-    at: Sequence[str] = (),
-    settings: Sequence[str] = (),
-    progress: Progress = silent,
-) -> Outcome:
-    """Compute the best that the sensors of a scenario allow, with the model of one of its filters.
-
-    Args:
-        name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
-        filter_name: whose model is taken; by default the scenario's first filter.
-        runs: number of simulated trajectories to average over.
-        seed: of the random streams.
-        without: sensors to leave out altogether.
-        at: times to report, such as "200 s"; by default the quarters.
-        settings: "path=value" texts that change the scenario.
-        progress: called with the share done and what is being done.
-
-    Raises:
-        InputError, robins.scenario.ScenarioError, robins.units.UnitError: the request cannot be
-            computed.
-    """
-    _float64.require()
-    one = read_scenario(name, (*settings, f"runs={runs}"))
-    wanted = filter_name or one.own[0]
-    chosen = check_filters(one.label, one.study.filters, [wanted])
-    times = [units.parse(time, "time") for time in at]
-    progress(0.0, "linearising along the truth")
-    with refusing(name):
-        solution = bound_of(one.problem(chosen, seed), wanted, runs, without)
-        epochs = bounds.epochs(solution, times)
-    return Outcome(
-        solution,
-        {wanted: bounds.metrics(solution)},
-        files={"bound.csv": bounds.csv(solution).encode()},
-        notes=bounds.sentences(solution),
-        scenario=one.label,
-        seed=seed,
-        runs=runs,
-        tables=[bounds.table(solution, epochs)],
-        last_lines=[f"Next:   robins run {name}   shows how near the filters come"],
-        **asked(one.text, settings),
-    )

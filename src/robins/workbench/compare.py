@@ -1,17 +1,21 @@
-"""The commands `compare` and `verify`: two results side by side, and whether one is whole."""
+"""The commands `compare` and `verify`: two results side by side, and whether one is whole.
+
+Examples::
+
+    robins compare results/before results/after
+    robins verify results/before
+"""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from robins import results, scenario
 from robins.results import Probability
-
-Where = str | os.PathLike[str]
+from robins.workbench.options import Option, Where
 
 
 class Comparison(NamedTuple):
@@ -43,8 +47,13 @@ class Comparison(NamedTuple):
         }
 
 
-def compare(first: Where, second: Where) -> Comparison:
-    """Compare two results: their requests and their figures.
+def compare(
+    first: Annotated[Where, Option(metavar="FIRST")],
+    second: Annotated[Where, Option(metavar="SECOND")],
+) -> Comparison:
+    """Compare the result folders FIRST and SECOND: parameters, versions, metrics and verdicts.
+
+    A metric that differs is shown with the ratio of the second to the first, by component.
 
     Raises:
         robins.results.ResultError: one of them is none, or damaged.
@@ -135,8 +144,8 @@ def _shown(value: Any) -> str:
     return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
-def verify(where: Where) -> dict[str, Any]:
-    """Check every file of a result against its checksum.
+def verify(where: Annotated[Where, Option(metavar="FOLDER")]) -> dict[str, Any]:
+    """Check every file of the result FOLDER against its checksum; bad input if one is damaged.
 
     Returns:
         ``scenario``, ``files`` (how many), ``whole``.

@@ -1,11 +1,17 @@
-"""The command `tune`: parameters of a filter, by simulated runs or by a recorded log."""
+"""The command `tune`: parameters of a filter, by simulated runs or by a recorded log.
+
+Examples::
+
+    robins tune ins-gnss/drive --filter ekf --vary believed.r_factor=4
+    robins tune imu.csv gnss.pos unit.toml --filter ekf --vary imu.gyro_noise --vary imu.accel_noise
+"""
 
 from __future__ import annotations
 
 import math
 import os
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
@@ -13,9 +19,14 @@ from scipy.special import ndtri
 
 from robins import _float64, scenario, units
 from robins.campaign.tuning import Tuned, choose
+from robins.report.numbers import csv_of
 from robins.results import Outcome, Progress, array, silent
 from robins.workbench.errors import refusing
-from robins.workbench.objectives import (
+from robins.workbench.options import Filter, Option
+from robins.workbench.publication import part
+from robins.workbench.replay import Findings, open_log, unheard
+from robins.workbench.scenarios import asked
+from robins.workbench.tune_objectives import (
     COMPONENTS,
     DENSITY,
     FIRST_BLOCK,
@@ -28,31 +39,35 @@ from robins.workbench.objectives import (
     total_of,
     worded,
 )
-from robins.workbench.publication import csv_of, part
-from robins.workbench.recorded import Findings, open_log, unheard
-from robins.workbench.scenarios import asked
-
-RUNS = 16  # of either half, where none is given
 
 
 def tune(
-    names: Sequence[str | os.PathLike[str]],
+    names: Annotated[Sequence[str], Option(metavar="SCENARIO|LOG...")],
     *,
-    vary: Sequence[str],
-    filter_name: str = "",
-    runs: int = RUNS,
-    seed: int = 0,
-    by: str = "",
-    system: str = "ins-gnss",
-    settings: Sequence[str] = (),
+    vary: Annotated[
+        Sequence[str],
+        Option("A parameter to tune, and where to begin; may be repeated.", metavar="key[=value]"),
+    ],
+    filter_name: Filter = "",
+    runs: Annotated[int, Option("Simulated runs of either half.", least=6)] = 16,
+    by: Annotated[
+        str, Option("error, the name of a block of the state, innovations.", metavar="WHAT")
+    ] = "",
+    system: Annotated[str, Option("The system that navigates a log.")] = "ins-gnss",
     columns: Sequence[str | os.PathLike[str]] = (),
+    settings: Sequence[str] = (),
+    seed: int = 0,
     progress: Progress = silent,
     findings: Findings = unheard,
 ) -> Outcome:
-    """Find values of parameters with which a filter is best, and judge them on other data.
+    """Find factors on parameters of a filter with which it is best.
 
-    The world stays as in the scenario, or the log; only the filter's assumptions are tuned. If
-    the values found are not better on the data held out, beyond chance, those written stay.
+    With a SCENARIO it is best where the true errors of simulated runs are least; the simulated
+    world stays as it is written. With the files of a LOG it is best where it predicts the
+    measurements best. Every third segment of a log, and as many runs as were used, are held out:
+    the values found are kept only if they are better there, beyond chance.
+
+    It refuses where the data do not determine a parameter. The folder has tuned.toml.
 
     Args:
         names: a scenario, "system/name", a TOML file or "file.py:study"; or the files of a log.

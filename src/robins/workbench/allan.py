@@ -1,11 +1,17 @@
-"""The command `allan`: from a log of a resting IMU to the noise parameters of its data sheet."""
+"""The command `allan`: from a log of a resting IMU to the noise parameters of its data sheet.
+
+Examples::
+
+    robins allan still.csv
+    robins allan still.csv --terms N --json
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -18,6 +24,7 @@ from robins.logs import formats_of, open_log
 from robins.logs.clean import clean_imu
 from robins.results import Outcome, Progress, array, silent, variable
 from robins.workbench.errors import InputError, refusing
+from robins.workbench.options import Log, Option
 
 _NAMES = {
     "Q": "quantisation",
@@ -139,13 +146,15 @@ def _coloured(sensor: str, curve: Allan, fitted: AllanFit) -> list[str]:
 
 
 def allan(
-    log: str | os.PathLike[str],
+    log: Log,
     *,
-    terms: str = "NBK",
+    terms: Annotated[str, Option("Noises to fit, of Q, N, B, K, R.", shown=True)] = "NBK",
     columns: Sequence[str | os.PathLike[str]] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Allan deviation of a resting IMU, with bounds, and the noise parameters of its data sheet.
+    """Compute the Allan deviation of a resting IMU, and the noise parameters of its data sheet.
+
+    Q quantisation, N random walk, B bias instability, K rate random walk, R rate ramp.
 
     Args:
         log: a file in any format of `robins.logs` with inertial samples.

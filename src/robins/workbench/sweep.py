@@ -18,9 +18,10 @@ from robins.campaign.machine import available_cores
 from robins.campaign.plan import Plan
 from robins.campaign.statistics import Statistics, rms_with_bounds
 from robins.campaign.store import Store, open_store
+from robins.report.numbers import csv_of
 from robins.results import Outcome, Progress, array, silent
 from robins.systems.study import StateBlock
-from robins.workbench.campaigns import (
+from robins.workbench.campaign import (
     SWEEP,
     Status,
     Where,
@@ -32,7 +33,6 @@ from robins.workbench.campaigns import (
     sweep_of,
 )
 from robins.workbench.errors import InputError
-from robins.workbench.publication import csv_of
 from robins.workbench.scenarios import asked
 from robins.workbench.workers import fill
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from robins.program.c import function, header, part
 from robins.program.precision import DOUBLE, Precision
-from robins.program.walk import Leaf, Program, counts
+from robins.program.walk import Leaf, Program, lengths
 from robins.program.wrap import COLUMNS, wrapped
 
 EXTERN_C = '#ifdef __cplusplus\nextern "C" {\n#endif', "#ifdef __cplusplus\n}\n#endif"
@@ -264,12 +264,6 @@ def _declared(text: str, note: str) -> list[str]:
 def _within(comment: str) -> str:
     """A text that neither ends the comment it stands in nor begins another."""
     return comment.replace("*/", "* /").replace("/*", "/ *")
-
-
-def lengths(leaves: Sequence[Leaf]) -> tuple[int, int]:
-    """Lengths of the arrays of C for reals and for all other numbers: one at least."""
-    reals, others = counts(leaves)
-    return max(reals, 1), max(others, 1)
 
 
 def number(value: Any, real: bool, precision: Precision = DOUBLE) -> str:
