@@ -143,10 +143,6 @@ class Graph:
         """One of the arguments of the program, counted by kind."""
         return self.add("input", (), kind, index)
 
-    def is_constant(self, node: Node) -> bool:
-        """True if its number is known."""
-        return self.literal[node] is not None
-
     def known(self, node: Node) -> Any:
         """The number of a constant, None of any other node."""
         return None if self.literal[node] is None else self.value[node]
