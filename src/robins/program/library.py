@@ -272,7 +272,7 @@ def lengths(leaves: Sequence[Leaf]) -> tuple[int, int]:
     return max(reals, 1), max(others, 1)
 
 
-def number(value: Any, real: bool, precision: Precision = DOUBLE) -> str:
+def number(value: float | int | np.generic, real: bool, precision: Precision = DOUBLE) -> str:
     """A number in C, to the bit."""
     return precision.number(value) if real else str(int(value))
 

@@ -16,6 +16,7 @@ import jax
 import numpy as np
 from jax import lax
 from jax.extend import core as jex
+from jaxtyping import PyTree
 
 from robins.program.arrays import (
     LARGE,
@@ -43,6 +44,7 @@ from robins.program.loops import (
     operations,
     uses,
 )
+from robins.program.names import Tree
 from robins.program.primitives.control import called
 from robins.program.refusal import BuildError, ProgramError
 from robins.program.trace import lasting
@@ -58,7 +60,7 @@ CUMULATED = {
 }
 
 
-def flattened(function: Callable[..., Any], *shapes: Any) -> tuple[jex.ClosedJaxpr, Any]:
+def flattened(function: Callable[..., PyTree], *shapes: PyTree) -> tuple[jex.ClosedJaxpr, Tree]:
     """A function of these shapes as one jaxpr, and the structure of its results.
 
     All calls are written out, and sums along the first axis are scans; variables occur once.
@@ -67,7 +69,7 @@ def flattened(function: Callable[..., Any], *shapes: Any) -> tuple[jex.ClosedJax
     equations: list[Equation] = []
     known: dict[Variable, Any] = {}
 
-    def write(closed: Any, args: Sequence[Variable]) -> list[Variable]:
+    def write(closed: jex.ClosedJaxpr, args: Sequence[Variable]) -> list[Variable]:
         jaxpr = closed.jaxpr
         now: dict[Variable, Variable] = dict(zip(jaxpr.invars, args, strict=True))
         for v, value in zip(jaxpr.constvars, closed.consts, strict=True):
@@ -94,15 +96,15 @@ def flattened(function: Callable[..., Any], *shapes: Any) -> tuple[jex.ClosedJax
     return jex.ClosedJaxpr(jaxpr, list(known.values())), jax.tree_util.tree_structure(results)
 
 
-def cumulated(e: Equation) -> Any:
+def cumulated(e: Equation) -> jex.ClosedJaxpr | None:
     """A sum, product or extreme along the first axis as the closed jaxpr of a scan."""
     name, p = e.primitive.name, e.params
     if name not in CUMULATED or p["axis"] != 0:
         return None
     join, neutral = CUMULATED[name]
 
-    def scanned(a: Any) -> Any:
-        def step(total: Any, row: Any) -> tuple[Any, Any]:
+    def scanned(a: jax.Array) -> jax.Array:
+        def step(total: jax.Array, row: jax.Array) -> tuple[jax.Array, jax.Array]:
             total = join(total, row)
             return total, total
 
@@ -113,7 +115,7 @@ def cumulated(e: Equation) -> Any:
     return jax.make_jaxpr(scanned)(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
 
 
-def written_out(e: Equation) -> Any:
+def written_out(e: Equation) -> jex.ClosedJaxpr | None:
     """A short scan over large arrays as a closed jaxpr without it: its rounds one after another."""
     p = e.params
     if e.primitive.name != "scan" or p["length"] >= SHORTEST:
@@ -122,7 +124,7 @@ def written_out(e: Equation) -> Any:
         return None
     body, fixed, carried = jex.jaxpr_as_fun(p["jaxpr"]), p["num_consts"], p["num_carry"]
 
-    def rounds(*given: Any) -> tuple[Any, ...]:
+    def rounds(*given: jax.Array) -> tuple[jax.Array, ...]:
         now, rows = given[fixed : fixed + carried], given[fixed + carried :]
         made: list[Any] = [None] * p["length"]
         for k in sorted(range(p["length"]), reverse=p["reverse"]):
@@ -135,7 +137,7 @@ def written_out(e: Equation) -> Any:
     return jax.make_jaxpr(rounds)(*shapes)
 
 
-def _extreme(dtype: Any, sign: int) -> Any:
+def _extreme(dtype: np.dtype, sign: int) -> float | int:
     """The least or greatest number of a type."""
     if np.issubdtype(dtype, np.floating):
         return sign * np.inf
@@ -298,8 +300,8 @@ class Staged:
 
     def __init__(
         self,
-        function: Callable[..., Any],
-        *shapes: Any,
+        function: Callable[..., PyTree],
+        *shapes: PyTree,
         unroll: int | None = UNROLL,
         named: bool = False,
         engine: RoundsEngine = compiled_rounds,
@@ -365,7 +367,7 @@ class Staged:
         loops = [loop.refused for loop in self.loops if loop.refused]
         return [*self._known_refused, *(why for one in arrays for why in one.refused), *loops]
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: PyTree) -> PyTree:
         """The function on arguments with a leading axis of runs, as arrays of NumPy or JAX."""
         leaves = jax.tree_util.tree_leaves(args)
         runs = leaves[0].shape[0]
@@ -379,7 +381,7 @@ class Staged:
                     values[v] = first_of(value)
                 del value
 
-        def found(v: Variable, count: int) -> Any:
+        def found(v: Variable, count: int) -> np.ndarray | jax.Array:
             if isinstance(v, jex.Literal) or v not in self._batched:
                 alone = number_of(v) if isinstance(v, jex.Literal) else values[v]
                 value = np.broadcast_to(alone, (count, *alone.shape))

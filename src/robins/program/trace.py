@@ -14,10 +14,12 @@ from typing import Any
 import jax
 import numpy as np
 from jax.extend import core as jex
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 from robins import _float64  # noqa: F401
 from robins.program.calls import Calls, forget, results_of
-from robins.program.kinds import kind_of, numbers_of
+from robins.program.kinds import Equation, Variable, kind_of, numbers_of
 from robins.program.nodes import Graph, Node
 from robins.program.refusal import ProgramError
 from robins.program.refused import REFUSED
@@ -95,7 +97,7 @@ class Program:
         return self.graph.live([n for nodes in self.outputs for n in nodes.ravel().tolist()])
 
 
-def line_of(equation: Any) -> str:
+def line_of(equation: Equation) -> str:
     """File and line of the user's code that an equation comes from."""
     from jax._src import source_info_util
 
@@ -119,7 +121,9 @@ class Walk:
         self._constants: dict[int, tuple[Any, Nodes]] = {}  # by id, which the value keeps its own
         self.inputs: list[Leaf] = []
 
-    def taken(self, shape: tuple[int, ...], dtype: Any, path: str = "", zero: Any = None) -> Nodes:
+    def taken(
+        self, shape: tuple[int, ...], dtype: Any, path: str = "", zero: np.ndarray | None = None
+    ) -> Nodes:
         """Nodes of one more argument; zero: (shape) which of its entries are known to be zero."""
         leaf = Leaf(shape, dtype, kind_of(dtype, path), path or f"arguments[{len(self.inputs)}]")
         count = counts(self.inputs)[leaf.kind != "real"]
@@ -132,7 +136,7 @@ class Walk:
         """True if so many scalar operations are a loop or a call, and not written out."""
         return self.unroll is not None and size > self.unroll
 
-    def constants(self, value: Any) -> Nodes:
+    def constants(self, value: ArrayLike) -> Nodes:
         """Nodes of known numbers."""
         if (found := self._constants.get(id(value))) is None:
             array = numbers_of(value)
@@ -175,21 +179,21 @@ class Walk:
             return None
         return np.array(values).reshape(nodes.shape)
 
-    def closed(self, jaxpr: Any, *args: Nodes) -> list[Nodes]:
+    def closed(self, jaxpr: jex.ClosedJaxpr, *args: Nodes) -> list[Nodes]:
         """Results of a closed jaxpr on arrays of nodes."""
         return self.open(jaxpr.jaxpr, [self.constants(c) for c in jaxpr.consts], args)
 
-    def open(self, jaxpr: Any, consts: Sequence[Nodes], args: Sequence[Nodes]) -> list[Nodes]:
+    def open(self, jaxpr: jex.Jaxpr, consts: Sequence[Nodes], args: Sequence[Nodes]) -> list[Nodes]:
         """Results of a jaxpr on arrays of nodes."""
         given = [*consts, *args]
         return results_of(
             self._calls, self.graph, jaxpr, given, lambda: self._written(jaxpr, given)
         )
 
-    def _written(self, jaxpr: Any, given: Sequence[Nodes]) -> list[Nodes]:
+    def _written(self, jaxpr: jex.Jaxpr, given: Sequence[Nodes]) -> list[Nodes]:
         values = dict(zip([*jaxpr.constvars, *jaxpr.invars], given, strict=True))
 
-        def read(v: Any) -> Nodes:
+        def read(v: Variable) -> Nodes:
             return self.constants(v.val) if isinstance(v, jex.Literal) else values[v]
 
         for equation in jaxpr.eqns:
@@ -197,7 +201,7 @@ class Walk:
             values.update(zip(equation.outvars, found, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
-    def equation(self, equation: Any, *args: Nodes) -> list[Nodes]:
+    def equation(self, equation: Equation, *args: Nodes) -> list[Nodes]:
         """Results of an equation on arrays of nodes.
 
         Raises:
@@ -221,12 +225,14 @@ class Walk:
             found = [self.wrapped(found[0], equation.outvars[0].aval.dtype)]
         return found
 
-    def function(self, function: Callable[..., Any], *args: Nodes, like: Sequence[Any]) -> Any:
+    def function(
+        self, function: Callable[..., PyTree], *args: Nodes, like: Sequence[PyTree]
+    ) -> list[Nodes]:
         """Results of a function of JAX on arrays of nodes, which stand for arrays `like` these."""
         return self.closed(jax.make_jaxpr(function)(*like), *args)
 
 
-def _leaves(tree: Any, root: str) -> list[Leaf]:
+def _leaves(tree: PyTree, root: str) -> list[Leaf]:
     """The arrays of a pytree of shapes."""
     found = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
@@ -235,7 +241,7 @@ def _leaves(tree: Any, root: str) -> list[Leaf]:
     return found
 
 
-def trace(function: Callable[..., Any], *args: Any, unroll: int | None = UNROLL) -> Program:
+def trace(function: Callable[..., PyTree], *args: PyTree, unroll: int | None = UNROLL) -> Program:
     """A pure function of JAX as a program of scalars.
 
     Args:
@@ -255,7 +261,7 @@ def trace(function: Callable[..., Any], *args: Any, unroll: int | None = UNROLL)
 
 
 def trace_step(
-    function: Callable[..., Any], state: Any, *args: Any, unroll: int | None = UNROLL
+    function: Callable[..., PyTree], state: PyTree, *args: PyTree, unroll: int | None = UNROLL
 ) -> Program:
     """A step from a state to the next, ``(state, *args) -> (state, ...)``, as a program.
 
@@ -274,8 +280,8 @@ def trace_step(
 
 
 def trace_steps(
-    steps: Sequence[tuple[Callable[..., Any], tuple[Any, ...]]],
-    state: Any,
+    steps: Sequence[tuple[Callable[..., PyTree], tuple[PyTree, ...]]],
+    state: PyTree,
     unroll: int | None = UNROLL,
 ) -> list[Program]:
     """Steps that change one state, each ``(state, *args) -> (state, ...)``, as programs.
@@ -341,10 +347,12 @@ def lasting(made: Callable[[Zeros, Calls], list[Program]], zeros: Zeros) -> list
         zeros = kept
 
 
-def _jaxpr(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+def _jaxpr(
+    function: Callable[..., PyTree], args: tuple[PyTree, ...]
+) -> tuple[jex.ClosedJaxpr, PyTree, PyTree]:
     """The jaxpr of a function, and what it takes and gives as pytrees of shapes."""
 
-    def shape(x: Any) -> jax.ShapeDtypeStruct:
+    def shape(x: ArrayLike) -> jax.ShapeDtypeStruct:
         array = jax.typeof(x)
         return jax.ShapeDtypeStruct(array.shape, array.dtype, weak_type=array.weak_type)
 
@@ -354,9 +362,9 @@ def _jaxpr(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, An
 
 
 def _program(
-    jaxpr: Any,
-    given: Any,
-    results: Any,
+    jaxpr: jex.ClosedJaxpr,
+    given: PyTree,
+    results: PyTree,
     unroll: int | None,
     zeros: Zeros,
     calls: Calls | None = None,

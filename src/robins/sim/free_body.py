@@ -39,13 +39,7 @@ class FreeBody(NamedTuple):
 
 
 def free_body(
-    key: Array,
-    body: FreeBody,
-    q0_nb: Number,
-    omega0_b: _given.Listed,
-    dt_s: Number,
-    steps: int,
-    torque_noise: Number,
+    key: Array, body: FreeBody, q0_nb: Any, omega0_b: Any, dt_s: Any, steps: int, torque_noise: Any
 ) -> tuple[Float[Array, "epochs 4"], Float[Array, "epochs 3"]]:
     """Attitude and rates at 0, dt, 2 dt ...; pure JAX, so it maps over keys.
 

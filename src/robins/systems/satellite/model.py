@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +26,7 @@ from jaxtyping import Array
 
 from robins import linalg
 from robins.filters import Belief, Filter, Model, Motion, Sensor, adaptive, kalman, taylor
+from robins.filters.belief import Number
 from robins.filters.rules import constant_gain, gate
 from robins.rotation import BodyRotation, conjugate, from_rotvec, multiply, normalise, skew, to_dcm
 from robins.systems.satellite.nodes import STAR, StateForm
@@ -57,7 +58,7 @@ class Noise(NamedTuple):
     factor: Array  # (6, 6) of Q, attitude and bias
 
 
-def equivalent_walk(rate_walk: Any, markov: Any, markov_time: Any) -> Any:
+def equivalent_walk(rate_walk: float, markov: float, markov_time: float) -> float:
     """Random walk of the rate that stands for itself and a Markov drift, sqrt(rrw^2 + 2 s^2/tau).
 
     A Markov process of correlation time tau walks away from where it is like that at first.
@@ -77,7 +78,7 @@ def noise_of(random_walk: float, rate_walk: float, step_s: float) -> Noise:
     return Noise(jnp.asarray(step_s), jnp.asarray(np.kron(one, np.eye(3))))
 
 
-def _turn(x: Any, theta: Array, noise: Noise) -> Array:
+def _turn(x: AttitudeState | QuaternionState, theta: Array, noise: Noise) -> Array:
     return theta - noise.step_s * x.gyro_bias
 
 
@@ -100,11 +101,11 @@ def _linear(noise: Noise, x: AttitudeState, theta: Array):
     return moved, jnp.concatenate([top, low]), noise.factor
 
 
-def _read(x: AttitudeState, aux: Any) -> BodyRotation:
+def _read(x: AttitudeState, aux: None) -> BodyRotation:
     return x.attitude
 
 
-def _read_linear(x: AttitudeState, aux: Any):
+def _read_linear(x: AttitudeState, aux: None):
     return x.attitude, jnp.eye(3, 6)
 
 
@@ -127,7 +128,7 @@ def _noise_additive(noise: Noise, x: QuaternionState, theta: Array) -> Array:
     return jnp.concatenate([top, noise.factor[3:]])
 
 
-def _read_additive(x: QuaternionState, aux: Any) -> BodyRotation:
+def _read_additive(x: QuaternionState, aux: None) -> BodyRotation:
     return BodyRotation(normalise(x.q_ib))
 
 
@@ -151,11 +152,11 @@ ADDITIVE = StateForm(
 )
 
 
-def _noise_of_frame(x: Any, factor: Array) -> Array:
+def _noise_of_frame(x: AttitudeState | QuaternionState, factor: Array) -> Array:
     return factor
 
 
-def model(noise: Noise, star_rad: Any, additive: bool = False, of_frame: bool = False) -> Model:
+def model(noise: Noise, star_rad: Number, additive: bool = False, of_frame: bool = False) -> Model:
     """Motion and star sensor, whose noise each frame may bring with it."""
     sigma = _noise_of_frame if of_frame else jnp.asarray(star_rad, float)
     if additive:
@@ -165,7 +166,7 @@ def model(noise: Noise, star_rad: Any, additive: bool = False, of_frame: bool = 
     return Model(moves, (Sensor(_read, sigma, 3, STAR, _read_linear),))
 
 
-def start(q_ib: Array, attitude_rad: Any, bias_rad_s: Any, additive: bool = False) -> Belief:
+def start(q_ib: Array, attitude_rad: Number, bias_rad_s: Number, additive: bool = False) -> Belief:
     """Initial belief of filters: no bias, and these sigmas."""
     sizes = jnp.repeat(jnp.stack([jnp.asarray(attitude_rad), jnp.asarray(bias_rad_s)]), 3)
     if not additive:
