@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from jaxtyping import PyTree
-
 from robins.filters import Sensor
 from robins.systems.study import Instrument
 
@@ -23,7 +21,7 @@ def aboard(
     return tuple(sensor for _, sensor in there), tuple((i.name, i.taken) for i, _ in there)
 
 
-def taken(of: Taken, world: Any) -> dict[str, dict[str, PyTree]]:
+def taken(of: Taken, world: Any) -> dict[str, Any]:
     """``y`` and ``aux`` of the `Case` of a filter with these sensors; pure."""
     seen = {name: take(world) if take else (world.readings[name], None) for name, take in of}
     aux = {name: aux for name, (_, aux) in seen.items() if aux is not None}

@@ -236,7 +236,7 @@ def truth_at(truth: PlaceTable, given: Arranged) -> np.ndarray:
     return np.where(((epochs < t[0]) | (epochs > t[-1]))[:, None], np.nan, out)
 
 
-def accuracy(answer: Answer, true: np.ndarray) -> dict[str, float]:
+def accuracy(answer: Answer, true: np.ndarray) -> dict[str, float | int]:
     """Horizontal and vertical errors, and the NEES of the horizontal place over its two axes."""
     error = true - np.asarray(answer.mean.position)
     known = np.all(np.isfinite(error), axis=1)

@@ -59,7 +59,7 @@ def _between(places: tuple[Geodetic, Geodetic]) -> Array:
 
 def distances(
     log: Log, used: np.ndarray, epoch_s: np.ndarray, antenna: Geodetic
-) -> dict[str, float]:
+) -> dict[str, float | int]:
     """Distances of the antenna from the best fixes, with aids and in outages.
 
     The best fixes are those of the quality whose usual sigma is the smallest of the fixes used;

@@ -147,7 +147,7 @@ def replay(
         errors = {name: _errors(dataset.attitude, log, q) for name, q in q_nb.items()}
         variables |= _error_arrays(answers, errors)
 
-    def metrics(answer: Answer) -> dict[str, float]:
+    def metrics(answer: Answer) -> dict[str, float | int]:
         share = {"rest_share": float(np.mean(log.still))}
         if dataset.attitude is None:
             return share
@@ -321,7 +321,7 @@ REPORTED = Reported(
 )
 
 
-def _accuracy(attitude: AttitudeTable, log: Prepared, q_nb: np.ndarray) -> dict[str, float]:
+def _accuracy(attitude: AttitudeTable, log: Prepared, q_nb: np.ndarray) -> dict[str, float | int]:
     q_true, counts = truth_at(attitude, log.time_ns)
     e = orientation_errors(q_nb[counts], q_true[counts])
     return {

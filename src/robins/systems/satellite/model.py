@@ -26,9 +26,9 @@ from jaxtyping import Array
 
 from robins import linalg
 from robins.filters import Belief, Filter, Model, Motion, Sensor, adaptive, kalman, taylor
-from robins.filters.belief import Number
 from robins.filters.rules import constant_gain, gate
 from robins.rotation import BodyRotation, conjugate, from_rotvec, multiply, normalise, skew, to_dcm
+from robins.sim._given import Listed
 from robins.systems.satellite.nodes import STAR, StateForm
 
 ARCSEC = math.pi / 648000.0
@@ -156,7 +156,7 @@ def _noise_of_frame(x: AttitudeState | QuaternionState, factor: Array) -> Array:
     return factor
 
 
-def model(noise: Noise, star_rad: Number, additive: bool = False, of_frame: bool = False) -> Model:
+def model(noise: Noise, star_rad: Listed, additive: bool = False, of_frame: bool = False) -> Model:
     """Motion and star sensor, whose noise each frame may bring with it."""
     sigma = _noise_of_frame if of_frame else jnp.asarray(star_rad, float)
     if additive:
@@ -166,7 +166,7 @@ def model(noise: Noise, star_rad: Number, additive: bool = False, of_frame: bool
     return Model(moves, (Sensor(_read, sigma, 3, STAR, _read_linear),))
 
 
-def start(q_ib: Array, attitude_rad: Number, bias_rad_s: Number, additive: bool = False) -> Belief:
+def start(q_ib: Array, attitude_rad: Listed, bias_rad_s: Listed, additive: bool = False) -> Belief:
     """Initial belief of filters: no bias, and these sigmas."""
     sizes = jnp.repeat(jnp.stack([jnp.asarray(attitude_rad), jnp.asarray(bias_rad_s)]), 3)
     if not additive:
