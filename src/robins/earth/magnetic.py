@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
-from numpy.typing import ArrayLike
 
 from robins import _float64  # noqa: F401
 from robins.earth.wgs84 import dcm_en, ecef_from_geodetic
@@ -208,11 +208,11 @@ def elements(field_n: ArrayLike) -> Elements:
 
 def field_along(
     model: MagneticModel,
-    lat_rad: ArrayLike,
-    lon_rad: ArrayLike,
-    alt_m: ArrayLike,
-    decimal_year: ArrayLike,
-    time_s: ArrayLike | None = None,
+    lat_rad: Any,
+    lon_rad: Any,
+    alt_m: Any,
+    decimal_year: Any,
+    time_s: Any | None = None,
     knot_s: float = 1.0,
 ) -> np.ndarray:
     """Field [T] in north, east, down at each of many places, date and height checked.

@@ -27,10 +27,9 @@ as it reads, so a hard iron along it shows as soon as the vehicle tilts.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from robins.errors import RobinsError
@@ -87,14 +86,14 @@ class Calibration(NamedTuple):
     level: bool = False  # the horizontal axes alone; before, after and gap are of their plane
 
 
-def calibrated(field_t: ArrayLike, offset_t: ArrayLike, matrix: ArrayLike) -> np.ndarray:
+def calibrated(field_t: Any, offset_t: Any, matrix: Any) -> np.ndarray:
     """Field (..., 3) [T] without hard and soft iron, ``W (z - h)``."""
     z, h, W = (np.asarray(v, float) for v in (field_t, offset_t, matrix))
     return (z - h) @ W.T
 
 
 def calibrate(
-    field_t: ArrayLike,
+    field_t: Any,
     strength_t: float | None = None,
     soft_iron: bool | None = None,
     level: bool = False,

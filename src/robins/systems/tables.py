@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from jaxtyping import ArrayLike
 
 from robins.earth.wgs84 import Geodetic
 from robins.filters import Code

@@ -42,6 +42,7 @@ from jaxtyping import Array, ArrayLike
 
 from robins.earth import OMEGA_E, Geodetic, dcm_en, geodetic_from_ecef
 from robins.filters import Belief, Model, Motion, Sensor
+from robins.filters.belief import Number
 from robins.filters.values import Numbers
 from robins.systems.gnss.parameters import Believed, Clock, Delays
 from robins.systems.parts import NED
@@ -129,7 +130,7 @@ def clock_density(clock: Clock) -> tuple[float, float]:
     return LIGHT * math.sqrt(clock.h0 / 2.0), LIGHT * math.pi * math.sqrt(2.0 * clock.h2)
 
 
-def delay_law(delays: Delays, elevation_rad: Numbers, cn0_dbhz: Numbers) -> tuple[Array, Array]:
+def delay_law(delays: Delays, elevation_rad: Number, cn0_dbhz: Number) -> tuple[Array, Array]:
     """Mean and spread [m] of the delay of a signal, by its elevation and C/N0.
 
     With P the probability that it is blocked and u = 2 a cos(e), the mean is P u, and the mean
