@@ -39,6 +39,7 @@ from jaxtyping import Array
 
 from robins.errors import require
 from robins.filters import Motion, Sensor
+from robins.filters.values import Numbers
 from robins.manifold import dim
 from robins.rotation import (
     Rotation,
@@ -239,7 +240,7 @@ def unobserved(field_n: np.ndarray, sigma_rad: float) -> Unobserved:
     mean = mean / np.linalg.norm(mean)
     direction = vectors[:, 0] * (1.0 if vectors[:, 0] @ mean >= 0.0 else -1.0)
 
-    def between(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def between(x: np.ndarray, y: np.ndarray) -> Numbers:
         return np.arctan2(np.linalg.norm(np.cross(x, y), axis=-1), np.sum(x * y, axis=-1))
 
     return Unobserved(
