@@ -42,7 +42,7 @@ from robins.sim.random import Component
 from robins.sim.sar import SarErrorModel, observe_sar
 from robins.sim.star_sensor import observe_euler
 from robins.systems.airship.error_model import error_from_tangent
-from robins.systems.airship.model import AirshipState, WithWind, navigation
+from robins.systems.airship.model import WithWind, navigation
 from robins.systems.airship.parameters import AirData, Airship
 from robins.systems.airship.world import AIR, Course, Datum, World, present
 from robins.systems.study import Instrument, SensorAxes
@@ -67,7 +67,7 @@ def level(datum: Datum, p: Geodetic) -> Array:
     return away * jnp.broadcast_to(datum.metres, away.shape)
 
 
-def read_sar(datum: Datum, x: AirshipState, aux: None) -> tuple[Array, Angle, Array]:
+def read_sar(datum: Datum, x: Any, aux: Any) -> tuple[Array, Angle, Array]:
     """Horizontal position from the datum [m, north east], heading, and height [m] (1,)."""
     q_nb, _, p = navigation(x)
     return level(datum, p), Angle(q_nb.as_euler()[2]), jnp.reshape(p.alt, (1,))
@@ -107,7 +107,7 @@ class Early(NamedTuple):
     age_s: ArrayLike  # (S - 1,)
 
 
-def read_euler(x: AirshipState, aux: None) -> tuple[Angle, Angle, Angle]:
+def read_euler(x: Any, aux: Any) -> tuple[Angle, Angle, Angle]:
     """Pitch, roll, heading."""
     return _angles(navigation(x).q_nb)
 
@@ -172,7 +172,7 @@ EARLY_STARS = Instrument(STAR_EARLY, _EULER, None, _believed_early, _taken_early
 # --------------------------------------------------------------------- air data and the wind
 
 
-def read_wind(x: AirshipState, v_air_b: ArrayLike) -> Array:
+def read_wind(x: Any, v_air_b: ArrayLike) -> Array:
     """Assumed wind (2,) [m/s], north and east: (22)."""
     q_nb, v_n, _ = navigation(x)
     thought = (v_n - q_nb.apply(jnp.asarray(v_air_b)))[:2]
@@ -217,9 +217,9 @@ def along_the_nose(world: World) -> tuple[Array, Array]:
 def wind_of(
     name: str,
     sigma: Callable[[AirData], float],
-    taken: Callable[[World], tuple[Array, Array | tuple]] = as_measured,
+    taken: Callable[[World], tuple[Array, Any]] = as_measured,
     read: Callable[..., Array] = read_wind,
-    linear: Callable[..., tuple] | None = None,
+    linear: Callable[..., Any] | None = None,
 ) -> Instrument:
     """The wind as a constraint, believed with a sigma [m/s] on each axis."""
 
@@ -288,14 +288,14 @@ def printed_constraint(
     return D, jnp.asarray(air_speed_error, float) * jnp.stack([c, s])
 
 
-def _printed_sar(datum: Datum, x: Nav, aux: None):
+def _printed_sar(datum: Datum, x: Any, aux: Any):
     """(45): the heading's row as printed."""
     heading = _turned(x)[2]
     H = jnp.zeros((4, 9)).at[[0, 1, 3], [6, 7, 8]].set(jnp.array([1.0, 1.0, -1.0]))
     return read_sar(datum, x, aux), H.at[2, :3].set(heading)
 
 
-def _printed_euler(x: Nav, aux: None):
+def _printed_euler(x: Any, aux: Any):
     """(48)."""
     return read_euler(x, aux), jnp.concatenate([_turned(x), jnp.zeros((3, 6))], 1)
 
@@ -305,7 +305,7 @@ def _turned(x: Nav) -> Array:
     return -swap(printed_attitude_rows(*to_euler(x.q_nb.wxyz)))
 
 
-def printed_wind(x: Nav, air: tuple[ArrayLike, Array]):
+def printed_wind(x: Any, air: tuple[ArrayLike, Array]):
     """(49), (50): D x = d with x computed minus true; what d leaves over should be zero.
 
     Of a `Nav`, the measured velocity through the air (3,) and the wind as thought (2,), north east,

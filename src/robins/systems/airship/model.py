@@ -62,9 +62,6 @@ class WithWind(NamedTuple):
         return navigation(self.base)
 
 
-AirshipState = Nav | WithWind
-
-
 class WindNoise(NamedTuple):
     """First-order Gauss-Markov error of the wind."""
 
@@ -72,7 +69,7 @@ class WindNoise(NamedTuple):
     time_s: Array  # ()
 
 
-def navigation(x: AirshipState) -> Nav:
+def navigation(x: Any) -> Nav:
     """Attitude, velocity and position of any state of this study."""
     return x if isinstance(x, Nav) else x.nav
 
