@@ -204,7 +204,7 @@ def _sigma(x: GnssState, sky: Sky) -> Array:
     return sky.sigma
 
 
-def _length(x: GnssState, aux: None) -> Array:
+def _length(x: GnssState, aux: Array | None) -> Array:
     square = jnp.sum(x.direction**2)
     return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)[None]
 

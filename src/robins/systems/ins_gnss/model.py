@@ -146,11 +146,11 @@ def _fix_sigma(x: InsState, fix: Fix | Velocity | Wheel):
     return fix.sigma
 
 
-def _read_standstill(x: InsState, aux: None):
+def _read_standstill(x: InsState, aux: Array | None):
     return x.v_n
 
 
-def _read_still_rate(x: InsState, aux: None):
+def _read_still_rate(x: InsState, aux: Array | None):
     return -turn_rate_b(x, jnp.zeros(3))
 
 

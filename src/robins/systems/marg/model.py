@@ -211,11 +211,11 @@ def advance_linear(noise: Noise, x: MargState, block: Block):
     return advance(noise, x, block), F, _factor(noise, x, block)
 
 
-def _read_travel(x: MargState, _: None):
+def _read_travel(x: MargState, _: Array | None):
     return jnp.concatenate([x.v_n, x.p_n])
 
 
-def _travel_linear(x: MargState, _: None):
+def _travel_linear(x: MargState, _: Array | None):
     return _read_travel(x, None), jnp.eye(6, DIM, 3)
 
 

@@ -68,7 +68,7 @@ def slope(c: Coefficients, x: Array) -> Array:
     return jnp.concatenate([c.kinematic * angles, rates])
 
 
-def step(c: Coefficients, state: AngleState, u: None) -> AngleState:
+def step(c: Coefficients, state: AngleState, u: Array | None) -> AngleState:
     """One step of the motion by Runge and Kutta's classic rule."""
     x = jnp.concatenate([jnp.stack([a.rad for a in state[:3]]), state.omega_b])
     h = c.step_s
@@ -81,7 +81,7 @@ def step(c: Coefficients, state: AngleState, u: None) -> AngleState:
     return AngleState(roll, pitch, yaw, state.omega_b + moved[3:])
 
 
-def stand_still(state: AngleState, u: None) -> AngleState:
+def stand_still(state: AngleState, u: Array | None) -> AngleState:
     """No motion; with much noise, what is believed next is only what is measured next."""
     return state
 
@@ -93,12 +93,12 @@ def reckon(step_s: Number, state: AngleState, theta_b: Array) -> AngleState:
 
 
 # (A6)
-def read_rate(state: AngleState, aux: None) -> Array:
+def read_rate(state: AngleState, aux: Array | None) -> Array:
     """(3,) what the gyro reads as a rate [rad/s]."""
     return state.omega_b
 
 
 # (A7)
-def read_angles(state: AngleState, aux: None) -> tuple[Angle, Angle, Angle]:
+def read_angles(state: AngleState, aux: Array | None) -> tuple[Angle, Angle, Angle]:
     """Roll, pitch, yaw: what the "magnetic attitude" reads, or a gyro that has been integrated."""
     return state[:3]

@@ -101,11 +101,11 @@ def _linear(noise: Noise, x: AttitudeState, theta: Array):
     return moved, jnp.concatenate([top, low]), noise.factor
 
 
-def _read(x: AttitudeState, aux: None) -> BodyRotation:
+def _read(x: AttitudeState, aux: Array | None) -> BodyRotation:
     return x.attitude
 
 
-def _read_linear(x: AttitudeState, aux: None):
+def _read_linear(x: AttitudeState, aux: Array | None):
     return x.attitude, jnp.eye(3, 6)
 
 
@@ -128,7 +128,7 @@ def _noise_additive(noise: Noise, x: QuaternionState, theta: Array) -> Array:
     return jnp.concatenate([top, noise.factor[3:]])
 
 
-def _read_additive(x: QuaternionState, aux: None) -> BodyRotation:
+def _read_additive(x: QuaternionState, aux: Array | None) -> BodyRotation:
     return BodyRotation(normalise(x.q_ib))
 
 

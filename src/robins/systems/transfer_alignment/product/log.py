@@ -129,7 +129,7 @@ def _prepare(recorded: Recorded, parameters: Replay, rows: slice) -> PairPiece:
     record = np.full(len(epochs), -1)
     record[np.searchsorted(epochs, stamps - 1e-9)] = used
 
-    def at_epochs(values: np.ndarray, fill: float = np.nan) -> np.ndarray:
+    def at_epochs(values: Numbers, fill: float = np.nan) -> np.ndarray:
         known = (record >= 0).reshape(-1, *([1] * (np.ndim(values) - 1)))
         return np.where(known, np.asarray(values)[record], fill)
 
