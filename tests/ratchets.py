@@ -1,12 +1,14 @@
 """Counts of the source that may fall and never rise, room by room.
 
-python tests/ratchets.py           the table, with the most that is allowed
+python tests/ratchets.py           the table, with the most that is allowed, and lines of code
 python tests/ratchets.py --lower   write what has fallen into `ratchets.toml`
 """
 
 import ast
+import io
 import re
 import sys
+import tokenize
 import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Iterator
@@ -23,6 +25,8 @@ KINDS = {
     "long": "functions of more than 60 lines",
     "loose": "`Any` and `object` in signatures",
 }
+
+LAYOUT = ("COMMENT", "NL", "NEWLINE", "INDENT", "DEDENT", "ENDMARKER")
 
 # First words of a subordinate clause, where a noun phrase or an imperative belongs.
 CLAUSE = re.compile(
@@ -59,6 +63,20 @@ def counted(tree: ast.Module) -> Counter[str]:
             found["long"] += node.end_lineno - node.lineno + 1 > LONG  # type: ignore[operator]
             found["loose"] += loose(node)
     return found
+
+
+def code_lines(text: str) -> int:
+    """Number of lines that are neither blank, comment, docstring nor import."""
+    tree, layout = ast.parse(text), {getattr(tokenize, name) for name in LAYOUT}
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    code = {n for t in tokens if t.type not in layout for n in range(t.start[0], t.end[0] + 1)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            left_out = node.body[:1] if ast.get_docstring(node) is not None else []
+        else:
+            left_out = [node] if isinstance(node, ast.Import | ast.ImportFrom) else []
+        code -= {n for one in left_out for n in range(one.lineno, (one.end_lineno or 0) + 1)}
+    return len(code)
 
 
 def imported_modules(tree: ast.AST, package: str) -> Iterator[tuple[int, str]]:
@@ -142,10 +160,15 @@ def written(found: dict[str, Counter[str]], allowed: dict[str, dict[str, int]]) 
 def main() -> int:
     """Print the table; write what has fallen where it is asked for."""
     found, allowed = measured(), most() if MOST.exists() else {}
-    print(f"{'room':12}" + "".join(f"{kind:>14}" for kind in KINDS))
+    code = Counter[str]()
+    for path in SOURCE.rglob("*.py"):
+        code[room_of(path)] += code_lines(path.read_text("utf-8"))
+    print(f"{'room':12}" + "".join(f"{kind:>14}" for kind in KINDS) + f"{'code':>8}")
     for room, counts in sorted(found.items()):
         rows = (f"{counts[k]} / {allowed.get(room, {}).get(k, counts[k])}" for k in KINDS)
-        print(f"{room:12}" + "".join(f"{row:>14}" for row in rows))
+        print(f"{room:12}" + "".join(f"{row:>14}" for row in rows) + f"{code[room]:8}")
+    total = (sum(counts[kind] for counts in found.values()) for kind in KINDS)
+    print(f"{'all':12}" + "".join(f"{n:>14}" for n in total) + f"{code.total():8}")
     if "--lower" in sys.argv:
         MOST.write_text(written(found, allowed), "utf-8")
     return bool(MOST.exists() and risen(found, most()))

@@ -126,7 +126,7 @@ def moved(package: str) -> Callable[[str], Callable]:
     def attribute(name: str) -> Callable:
         here = sys.modules[package]
         if name not in (rows := MOVED.get(package, {})):
-            near = hint(name, [*getattr(here, "__all__", ()), *rows]).rstrip(".")
+            near = hint(name, [*vars(here).get("__all__", ()), *rows]).rstrip(".")
             raise AttributeError(f"module {package!r} has no attribute {name!r}{near}")
         place, now, *since = rows[name]
         sentence = f"{package}.{name} is now {place}.{now}"

@@ -8,25 +8,24 @@ from scipy.integrate import solve_ivp
 
 from robins.earth import atmosphere
 
-# U.S. Standard Atmosphere 1976, table I, by geometric height [m]: K, mbar, kg/m^3.
+# U.S. Standard Atmosphere 1976, table I, by geometric height [m]: K, mbar.
 PUBLISHED = [
-    (-1000.0, 294.651, 1.1393e3, 1.3470),
-    (0.0, 288.150, 1.01325e3, 1.2250),
-    (1000.0, 281.651, 8.9876e2, 1.1117),
-    (5000.0, 255.676, 5.4048e2, 7.3643e-1),
-    (10000.0, 223.252, 2.6499e2, 4.1351e-1),
-    (20000.0, 216.650, 5.5293e1, 8.8910e-2),
-    (30000.0, 226.509, 1.1970e1, 1.8410e-2),
-    (50000.0, 270.650, 7.9779e-1, 1.0269e-3),
-    (70000.0, 219.585, 5.2209e-2, 8.2829e-5),
+    (-1000.0, 294.651, 1.1393e3),
+    (0.0, 288.150, 1.01325e3),
+    (1000.0, 281.651, 8.9876e2),
+    (5000.0, 255.676, 5.4048e2),
+    (10000.0, 223.252, 2.6499e2),
+    (20000.0, 216.650, 5.5293e1),
+    (30000.0, 226.509, 1.1970e1),
+    (50000.0, 270.650, 7.9779e-1),
+    (70000.0, 219.585, 5.2209e-2),
 ]
 
 
-@pytest.mark.parametrize(("alt_m", "kelvin", "mbar", "density"), PUBLISHED)
-def test_the_published_table(alt_m, kelvin, mbar, density):
+@pytest.mark.parametrize(("alt_m", "kelvin", "mbar"), PUBLISHED)
+def test_the_published_table(alt_m, kelvin, mbar):
     assert atmosphere.temperature_K(alt_m) == pytest.approx(kelvin, abs=1e-3)
     assert atmosphere.pressure_Pa(alt_m) / 100.0 == pytest.approx(mbar, rel=1e-4)
-    assert atmosphere.density_kg_m3(alt_m) == pytest.approx(density, rel=1e-4)
 
 
 def test_pressure_is_the_weight_of_the_air_above():

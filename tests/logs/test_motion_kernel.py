@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from robins.logs import motion, motion_fit
 from robins.logs.checks_motion import estimates
-from robins.logs.gnss_motion import lateness, lowest, steps_of, track_of, velocity_of
+from robins.logs.gnss_motion import lateness, lowest, steps_of, track_of
 from robins.logs.motion_fit import start_of, trimmed
 from robins.logs.motion_models import judge
 from robins.logs.quiet import signal_of, windows_of
@@ -127,14 +127,6 @@ def test_metres_against_pyins(drive):
     expected = transform.lla_to_ned(lla, lla[0])
     # pyins' axes stay those of the first fix, ours follow the ellipsoid: 0.5 km squared over 2 R.
     np.testing.assert_allclose(track.r_n, expected, atol=0.05)
-
-
-def test_velocities_from_positions(drive):
-    track = track_of(drive.gnss)
-    by_place, noise = velocity_of(track._replace(v_n=None))
-    t = track.time_s[5:-5]
-    np.testing.assert_allclose(by_place[5:-5], velocity_ned(t), atol=0.3)
-    assert noise == pytest.approx(np.sqrt(12) * 0.02)
 
 
 def test_steps_over_a_second_and_their_lateness(drive):

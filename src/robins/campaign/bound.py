@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from robins.campaign.machine import with_stack
 from robins.campaign.many_runs import ManyRuns
@@ -30,7 +30,7 @@ from robins.manifold import State, dim, is_element
 from robins.program.interpreter import interpreted_rounds
 from robins.program.stages import Staged
 from robins.results import array, variable
-from robins.systems.study import Contender, Problem, StateBlock
+from robins.systems.study import Case, Contender, Problem, StateBlock
 from robins.systems.tables import block_array
 
 _AT_ONCE = 128  # runs: histories of the information of each are held
@@ -105,7 +105,7 @@ def _of_all(bounded: ManyRuns, runs: int) -> tuple[dict[str, Data], np.ndarray, 
     return first, variance / runs, prior / runs
 
 
-def bound_sigma(problem: Problem, name: str, world: Any, machine: str = "vm") -> np.ndarray:
+def bound_sigma(problem: Problem, name: str, world: PyTree, machine: str = "vm") -> np.ndarray:
     """(E, r) standard deviations of the reported components, no lower than any filter gets.
 
     Args:
@@ -138,7 +138,7 @@ def _left(rows: np.ndarray, L: np.ndarray, D: np.ndarray) -> np.ndarray:
     return np.where(known, np.nan, share)
 
 
-def _start(case: Any) -> Belief:
+def _start(case: Case) -> Belief:
     """The belief a case begins with, also where it holds the state of a filter."""
     return getattr(case.start, "belief", case.start)
 

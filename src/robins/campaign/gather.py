@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import PurePosixPath
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from robins.campaign.monte_carlo import blocks_of, contender, one_record
 from robins.campaign.plan import Plan, Shard
@@ -76,7 +77,7 @@ def gather(store: Store, plan: Plan, problem: Problem | None = None) -> State:
     return State(found, {name: s.runs for name, s in found.items()}, damaged, lacking)
 
 
-def example_of(problem: Problem, name: str) -> Any:
+def example_of(problem: Problem, name: str) -> PyTree:
     """The tree of the record of a run, without its numbers."""
     one, blocks = contender(problem, name), blocks_of(problem)
     number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)

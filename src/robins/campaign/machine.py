@@ -22,6 +22,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from robins.campaign.handover import HandOver
 from robins.campaign.memory import (
@@ -68,7 +69,7 @@ Taken = Callable[[str, Any], Any]  # of a filter's name and its record of a chun
 Simulated = tuple[Any, int, Callable[[str], Any]]
 
 
-def whole(name: str, record: Any) -> Any:
+def whole(name: str, record: PyTree) -> PyTree:
     """All of a record."""
     return record
 
@@ -133,14 +134,14 @@ class ByJax:
             yield
             self._programs = {}
 
-    def _of(self, held: list[Any], count: int, taken: Taken, name: str) -> Any:
+    def _of(self, held: list[PyTree], count: int, taken: Taken, name: str) -> PyTree:
         if name in self._programs:
             self._programs[name].result()  # which serves the call
         return taken(name, record(self.problem, name, held[0], count))
 
     def compute(
         self, chunk: Chunk, width: int, names: Sequence[str], taken: Taken = whole, left: int = 0
-    ) -> dict[str, Any]:
+    ) -> dict[str, PyTree]:
         """Compute a chunk, filled up to a width, and keep what is `taken` of each filter.
 
         Args:
@@ -153,7 +154,7 @@ class ByJax:
         batch, _ = next(worlds(self.problem, width, width, chunk.begin, self._batch))
         return {name: taken(name, record(self.problem, name, batch, chunk.runs)) for name in names}
 
-    def histories(self, chunk: Chunk, width: int, names: Sequence[str]) -> dict[str, Any]:
+    def histories(self, chunk: Chunk, width: int, names: Sequence[str]) -> dict[str, PyTree]:
         """All that was recorded of some filters over one chunk."""
         return self.compute(chunk, width, names)
 
@@ -237,7 +238,7 @@ class InLanes:
 
     def compute(
         self, chunk: Chunk, width: int, names: Sequence[str], taken: Taken = whole, left: int = 0
-    ) -> dict[str, Any]:
+    ) -> dict[str, PyTree]:
         """Compute a chunk, filled up to a width, and keep what is `taken` of each filter.
 
         Args:
@@ -248,7 +249,7 @@ class InLanes:
             left: runs that are still to be computed after these.
         """
 
-        def computed() -> dict[str, Any]:
+        def computed() -> dict[str, PyTree]:
             begun, world = thread_time(), self._worlds(chunk.begin, width, chunk.runs)
             found = {name: self._of(name, world, chunk.runs, taken) for name in names}
             self._took(width, begun, left)
@@ -256,24 +257,24 @@ class InLanes:
 
         return with_stack(computed)
 
-    def histories(self, chunk: Chunk, width: int, names: Sequence[str]) -> dict[str, Any]:
+    def histories(self, chunk: Chunk, width: int, names: Sequence[str]) -> dict[str, PyTree]:
         """All that was recorded of some filters over one chunk."""
 
-        def computed() -> dict[str, Any]:
+        def computed() -> dict[str, PyTree]:
             world = self._worlds(chunk.begin, width, chunk.runs)
             return {name: cut(self._staged(name)(world), chunk.runs) for name in names}
 
         return with_stack(computed)
 
-    def _worlds(self, begin: int, width: int, runs: int) -> Any:
+    def _worlds(self, begin: int, width: int, runs: int) -> PyTree:
         sys.audit("robins.simulate", runs)  # counted by tests
         return self._simulate(np.arange(begin, begin + width))
 
-    def _of(self, name: str, world: Any, count: int, taken: Taken) -> Any:
+    def _of(self, name: str, world: PyTree, count: int, taken: Taken) -> PyTree:
         """Run a filter, and keep what is `taken` of its record without the runs that fill up."""
         return taken(name, joined(*cut(self._filters[name](world), count)))
 
-    def _chunk(self, begin: int, width: int, runs: int, taken: Taken) -> dict[str, Any]:
+    def _chunk(self, begin: int, width: int, runs: int, taken: Taken) -> dict[str, PyTree]:
         begun, count = thread_time(), min(width, runs - begin)
         world = self._worlds(begin, width, count)
         found = {name: self._of(name, world, count, taken) for name in self._filters}
@@ -298,7 +299,7 @@ def threads(count: int) -> Iterator[ThreadPoolExecutor]:
         threading.stack_size(before)
 
 
-def with_stack(function: Callable[[], Any]) -> Any:
+def with_stack(function: Callable[[], PyTree]) -> PyTree:
     """Call a function on a stack that is large enough for lanes."""
     before = threading.stack_size(STACK)
     try:
@@ -315,7 +316,7 @@ def first_worlds(problem: Problem, count: int) -> State:
     return jax.device_put(with_stack(lambda: simulate(np.arange(count))))
 
 
-def first_run(world: Any) -> Any:
+def first_run(world: PyTree) -> PyTree:
     """First of the worlds with a leading axis of runs, holding none of the others."""
 
     def first(x: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
@@ -326,7 +327,7 @@ def first_run(world: Any) -> Any:
     return jax.device_put(jax.tree_util.tree_map(first, world))
 
 
-def one_by_one(function: Callable[..., Any], rows: Any) -> Any:
+def one_by_one(function: Callable[..., PyTree], rows: PyTree) -> PyTree:
     """All rows one after the other: a loop, which lanes can do."""
     return jax.lax.map(function, rows)
 

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.stages import Traced
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from robins.campaign.memory import CHUNK, filled
 from robins.filters import Belief, Code, Step, Tally, run, run_closed
@@ -34,7 +34,7 @@ from robins.systems.tables import updates
 Blocks = tuple[tuple[str, int, int], ...]  # name, first and last of the reported components
 
 
-def _kept(step: Step) -> Any:
+def _kept(step: Step) -> PyTree:
     """Part of a step that a campaign keeps: enough for errors, bounds and innovations."""
     info = {name: u._replace(notes=step.info[name].notes) for name, u in updates(step).items()}
     return step.posterior, info, step.prediction.code == int(Code.DONE)
@@ -42,7 +42,7 @@ def _kept(step: Step) -> Any:
 
 def _judged(
     blocks: Blocks, belief: Belief, truth: State, rows: Array | None, lost: Array
-) -> dict[str, Any]:
+) -> dict[str, PyTree]:
     """Error and stated sigma of the reported components at one epoch."""
     whole, factor = local(belief.mean, truth), belief.factor
     error = whole if rows is None else rows @ whole
@@ -58,7 +58,7 @@ def _judged(
     }
 
 
-def reported_rows(reported: Any, case: Case) -> tuple[Array | None, int | None]:
+def reported_rows(reported: PyTree, case: Case) -> tuple[Array | None, int | None]:
     """Rows that map a tangent error to the reported components, and their axis of time if any.
 
     (r, n) or (E, r, n); None: all of the error is reported.
@@ -68,7 +68,9 @@ def reported_rows(reported: Any, case: Case) -> tuple[Array | None, int | None]:
     return (None if reported is None else jnp.asarray(reported, float)), None
 
 
-def solved(filter_, model, case: Case, keep: Callable[[Step], Any]) -> tuple[Any, Case, Tally]:
+def solved(
+    filter_, model, case: Case, keep: Callable[[Step], PyTree]
+) -> tuple[PyTree, Case, Tally]:
     """Kept parts of the steps of a filter, its case with all its inputs, and the tally.
 
     A case in closed loop knows its truth and its measurements only when the filter has run.
@@ -94,21 +96,21 @@ def whole_case(filter_, model, case: Case) -> Case:
 Over = Callable[[Callable[..., Any], Any], Any]  # a function of a row, on all rows of some arrays
 
 
-def at_once(function: Callable[..., Any], rows: Any) -> Any:
+def at_once(function: Callable[..., PyTree], rows: PyTree) -> PyTree:
     """All rows in one batch."""
     return jax.vmap(function)(rows)
 
 
 def one_record(
-    blocks: Blocks, contender: Contender, world: Any, over: Over = at_once
-) -> dict[str, Any]:
+    blocks: Blocks, contender: Contender, world: PyTree, over: Over = at_once
+) -> dict[str, PyTree]:
     """One run of one filter, to what statistics need."""
     steps, case, tally = solved(contender.filter, contender.model, contender.case(world), _kept)
     posterior, info, moved = steps
     rows, along = reported_rows(contender.reported, case)
     lost = jnp.cumsum(~moved) > 0
 
-    def judged(row: Any) -> dict[str, Any]:
+    def judged(row: PyTree) -> dict[str, PyTree]:
         belief, truth, turned, lost = row
         return _judged(blocks, belief, truth, rows if along is None else turned, lost)
 
@@ -125,12 +127,12 @@ def one_record(
 
 
 @partial(jax.jit, static_argnames="blocks")
-def _records(filter_, blocks: Blocks, model, case, reported, worlds) -> dict[str, Any]:
+def _records(filter_, blocks: Blocks, model, case, reported, worlds) -> dict[str, PyTree]:
     contender = Contender(filter_, model, case, reported)
     return _each(partial(one_record, blocks, contender), worlds)
 
 
-def _each(one: Callable[[Any], Any], many: Any) -> Any:
+def _each(one: Callable[[PyTree], PyTree], many: PyTree) -> PyTree:
     """`one` of each run of a batch.
 
     A run alone is not made a batch of one: its branches stay branches, and it has the very bits of
@@ -144,8 +146,8 @@ def _each(one: Callable[[Any], Any], many: Any) -> Any:
 
 
 def worlds(
-    problem: Problem, runs: int, chunk: int = CHUNK, first: int = 0, batch: Any = None
-) -> Iterator[tuple[Any, int]]:
+    problem: Problem, runs: int, chunk: int = CHUNK, first: int = 0, batch: PyTree = None
+) -> Iterator[tuple[PyTree, int]]:
     """Simulate runs first .. first + runs - 1, a chunk at a time, by `batch_of` the problem.
 
     Yields:
@@ -163,12 +165,12 @@ def worlds(
         yield batch(jnp.arange(begin, begin + width)), min(width, first + runs - begin)
 
 
-def batch_of(problem: Problem) -> Any:
+def batch_of(problem: Problem) -> PyTree:
     """The simulation of a problem for many runs, compiled for each shape once."""
     return jax.jit(partial(_each, problem.simulate))
 
 
-def bytes_of_batch(problem: Problem, batch: Any, width: int) -> int:
+def bytes_of_batch(problem: Problem, batch: PyTree, width: int) -> int:
     """Approximate peak memory of JAX for a chunk of so many runs.
 
     What is traced for it serves again when a chunk of this width is computed.
@@ -210,7 +212,7 @@ def contender(problem: Problem, name: str) -> Contender:
     return replace(c, case=as_data(c.case))
 
 
-def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, Any]:
+def record(problem: Problem, name: str, worlds: PyTree, count: int) -> dict[str, PyTree]:
     """Run a filter of a problem in a chunk of worlds.
 
     Returns:
@@ -233,7 +235,7 @@ def blocks_of(problem: Problem) -> Blocks:
 _NEEDED = ("innovation", "sigma", "nis", "dof")  # of each run's updates, by its statistics
 
 
-def parted(record: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+def parted(record: dict[str, PyTree]) -> tuple[dict[str, PyTree], dict[str, PyTree]]:
     """Split a record: the part that statistics need of each run, and that of the first run only."""
     named = {"mean": record["mean"], "updates": record["updates"]}
     needed = {
@@ -243,12 +245,12 @@ def parted(record: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     return record | {"mean": None, "updates": needed}, named
 
 
-def joined(needed: dict[str, Any], named: dict[str, Any]) -> dict[str, Any]:
+def joined(needed: dict[str, PyTree], named: dict[str, PyTree]) -> dict[str, PyTree]:
     """The record of `parted`; the leading axis of what is shown of one run is one."""
     updates = {name: u._replace(**needed["updates"][name]) for name, u in named["updates"].items()}
     return needed | {"mean": named["mean"], "updates": updates}
 
 
-def cut(records: Any, count: int) -> Any:
+def cut(records: PyTree, count: int) -> PyTree:
     """First runs of records with a leading axis of runs, as NumPy."""
     return jax.tree_util.tree_map(lambda x: np.asarray(x)[:count], records)

@@ -8,13 +8,23 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from jaxtyping import PyTree
 
 from robins.campaign.bound import bound_sigma
 from robins.campaign.histogram import WORST
 from robins.campaign.machine import ByJax, InLanes, machine_for
 from robins.campaign.statistics import PERCENTS, Statistics, thinned
 from robins.filters import Code, Tally, doubts
-from robins.results import Outcome, Probability, Progress, array, keeping, silent, variable
+from robins.results import (
+    Outcome,
+    Probability,
+    Progress,
+    Variables,
+    array,
+    keeping,
+    silent,
+    variable,
+)
 from robins.systems.judgement import RUNS, Metrics, Verdicts
 from robins.systems.study import Contender, Problem, StateBlock
 from robins.systems.suspects import sentences, tables, words
@@ -49,7 +59,7 @@ def simulate(
     by = machine_for(problem, machine) if isinstance(machine, str) else machine
     chunk = chunk or by.width(runs)
 
-    def taken(name: str, record: dict[str, Any]) -> Statistics:
+    def taken(name: str, record: dict[str, PyTree]) -> Statistics:
         """The statistics of a chunk, in the thread that computed it."""
         of_chunk = found[name].blank()
         of_chunk.add(record)
@@ -265,7 +275,7 @@ def campaign_solution(
     return xr.Dataset(data | innovation_tables(seen, problem.sensors, problem.epoch_s))
 
 
-def _scatter(b: StateBlock, found: dict[str, Statistics]) -> dict[str, Any]:
+def _scatter(b: StateBlock, found: dict[str, Statistics]) -> Variables:
     """Spread of the errors of a block over the runs: their mean, covariance, percentiles."""
     runs = next(iter(found.values())).runs
     mean = _stack(found, lambda s: s.mean)[:, :, b.where]

@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from robins.campaign.statistics import Statistics
 from robins.errors import RobinsError
@@ -55,7 +56,7 @@ def tables(statistics: Statistics) -> dict[str, np.ndarray]:
     return found | {f"each {name}": np.concatenate(x) for name, x in statistics.each.items()}
 
 
-def unpack(content: bytes, into: Statistics, example: Any = None) -> dict[str, Any]:
+def unpack(content: bytes, into: Statistics, example: PyTree = None) -> dict[str, PyTree]:
     """Read a shard.
 
     Args:

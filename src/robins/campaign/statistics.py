@@ -13,6 +13,8 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 from scipy.special import stdtrit
 
 from robins.campaign.histogram import counted, joined, percentiles
@@ -62,7 +64,7 @@ class Statistics:
             view.faults,
         )
 
-    def add(self, record: dict[str, Any]) -> None:
+    def add(self, record: dict[str, PyTree]) -> None:
         """Take in a chunk as `robins.campaign.record` gives it."""
         error, sigma = record["error"], record["sigma"]
         if self.example is None:
@@ -146,7 +148,7 @@ class Statistics:
         total = np.sum(values, axis=0)
         self.sums[name] = self.sums[name] + total if name in self.sums else total
 
-    def _each(self, name: str, values: Any) -> None:
+    def _each(self, name: str, values: ArrayLike) -> None:
         self.each.setdefault(name, []).append(np.array(values))
 
     def _count(self, name: str, table: np.ndarray) -> None:
@@ -212,7 +214,7 @@ class Statistics:
             self._each(f"settled {limit.name}", np.where(np.any(over, axis=1), last, 0))
 
     @property
-    def first_run(self) -> dict[str, Any]:
+    def first_run(self) -> dict[str, PyTree]:
         """The record of the first run.
 
         Raises:
@@ -425,7 +427,7 @@ def _first(holds: np.ndarray) -> np.ndarray:
     return np.where(np.any(holds, axis=1), np.argmax(holds, axis=1), -1)
 
 
-def _by_name(tally: Tally) -> dict[str, Any]:
+def _by_name(tally: Tally) -> dict[str, ArrayLike]:
     """The arrays of a tally by names of their own."""
     of = {name: getattr(tally, name) for name in Tally._fields[1:]}
     by = {f"{what}{TALLY}{sensor}": v for what, some in of.items() for sensor, v in some.items()}

@@ -13,10 +13,11 @@ import socket
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import PurePosixPath
 from time import monotonic, sleep
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from robins.campaign.gather import blank
 from robins.campaign.machine import ByJax, InLanes
@@ -95,7 +96,7 @@ class Worker:
     def found(self, chunk: Chunk, names: list[str]) -> dict[str, Statistics]:
         """The statistics of filters over a chunk."""
 
-        def taken(name: str, record: dict[str, Any]) -> Statistics:
+        def taken(name: str, record: dict[str, PyTree]) -> Statistics:
             of_chunk = blank(self.problem)
             of_chunk.add(record)
             if chunk.number:
@@ -116,7 +117,7 @@ class Worker:
             for name, record in self.machine.histories(chunk, self.plan.width, names).items()
         }
 
-    def _alone(self, record: dict[str, Any], index: int) -> Statistics:
+    def _alone(self, record: dict[str, PyTree], index: int) -> Statistics:
         one = blank(self.problem)
         one.add(jax.tree_util.tree_map(lambda x: x[index : index + 1], record))
         return one

@@ -1,4 +1,4 @@
-"""The U.S. Standard Atmosphere 1976 up to 86 km: temperature, pressure and density of a height.
+"""The U.S. Standard Atmosphere 1976 up to 86 km: temperature and pressure of a height.
 
 Seven layers in which the temperature is linear in the geopotential height H:
 
@@ -80,15 +80,6 @@ def pressure_Pa(alt_m: float) -> float:
     """
     at, geopotential_m = _layer(alt_m)
     return _PRESSURES_PA[at] * _fall(_TABLE[at], geopotential_m)
-
-
-def density_kg_m3(alt_m: float) -> float:
-    """Density of the air [kg/m^3] at a height above mean sea level [m] (eq. 42).
-
-    Raises:
-        ValueError: the height is beyond the standard's tables, -5 km to 86 km, or NaN.
-    """
-    return pressure_Pa(alt_m) / (R_OVER_M * temperature_K(alt_m))
 
 
 def pressure_altitude_m(pressure: float) -> float:

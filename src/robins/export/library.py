@@ -266,7 +266,7 @@ def _within(comment: str) -> str:
     return comment.replace("*/", "* /").replace("/*", "/ *")
 
 
-def number(value: Any, real: bool, precision: Precision = DOUBLE) -> str:
+def number(value: float | int | np.generic, real: bool, precision: Precision = DOUBLE) -> str:
     """A number in C, to the bit."""
     return precision.number(value) if real else str(int(value))
 

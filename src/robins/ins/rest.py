@@ -1,9 +1,8 @@
 """Causal detection of rest, sample by sample.
 
-`standstill` looks at the scatter of the samples over a window, as suits a vehicle that stops;
-`still_samples` at their distance from running means, and for how long it has been small, as suits a
-unit in a hand. `robins.ins.alignment.is_static` judges a whole record instead. None of them
-distinguishes a smooth motion at constant speed from rest.
+`standstill` looks at the scatter of the samples over a window, as suits a vehicle that stops.
+`robins.ins.alignment.is_static` judges a whole record instead. Neither distinguishes a smooth
+motion at constant speed from rest.
 """
 
 from __future__ import annotations
@@ -11,9 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from robins.ins.increments import Increments
-
-_MEMORY_S = 0.5  # time constant of the running means
-_FEWEST = 5  # samples in the memory, below which there is no decision
 
 
 def moving_statistics(
@@ -111,45 +107,3 @@ def unrest(
     _, spread_force = moving_statistics(dv / dt[:, None], width, first)
     each = np.concatenate([spread_rate / quiet_rate, spread_force / quiet_force], axis=1)
     return np.max(each, axis=1)
-
-
-def still_samples(
-    increments: Increments, after_s: float, quiet_rate: float, quiet_force: float, most_rate: float
-) -> np.ndarray:
-    """Detect, sample by sample, that the unit has lain still for a while: (N,) bool.
-
-    Still means that rate and specific force stay near their running means, and the mean rate near
-    zero, without a break. Samples that are too rare for a mean over half a second never count as
-    still.
-
-    Args:
-        increments: dt (N,) s, theta (N, 3) rad, dv (N, 3) m/s.
-        after_s: how long without a break.
-        quiet_rate: rad/s, largest distance from the mean.
-        quiet_force: m/s^2, the same.
-        most_rate: rad/s, a mean rate above is no bias but a turn.
-    """
-    dt, theta, dv = increments[:3]
-    rate, force = theta / dt[:, None], dv / dt[:, None]
-    step = float(np.median(dt)) if len(dt) else 0.0
-    if step <= 0.0 or _FEWEST * step > _MEMORY_S:
-        return np.zeros(len(dt), dtype=bool)
-    mean_rate, mean_force = _running_mean(rate, step), _running_mean(force, step)
-    quiet = np.linalg.norm(rate - mean_rate, axis=1) < quiet_rate
-    quiet &= np.linalg.norm(force - mean_force, axis=1) < quiet_force
-    quiet &= np.all(np.abs(mean_rate) < most_rate, axis=1)
-    quiet &= dt < after_s
-    time = np.cumsum(dt)
-    # time at which the quiet spell that holds now began
-    began = np.maximum.accumulate(np.where(quiet, -np.inf, time))
-    began = np.where(np.isfinite(began), began, 0.0)
-    return quiet & (time - began >= after_s)
-
-
-def _running_mean(values: np.ndarray, step: float) -> np.ndarray:
-    """First-order low-pass, started at the first sample."""
-    # Imported here: it takes most of a second, and a simulation needs none of it.
-    from scipy.signal import lfilter
-
-    share = -np.expm1(-step / _MEMORY_S)
-    return np.asarray(lfilter([share], [1.0, share - 1.0], values - values[0], axis=0)) + values[0]

@@ -37,6 +37,7 @@ from scipy.special import bdtrc
 from robins import _float64  # noqa: F401
 from robins.earth.stars import StarIndex, Stars, near
 from robins.errors import require
+from robins.filters.belief import Number
 from robins.rotation import rotate
 
 _WIDE = 4.0
@@ -334,7 +335,7 @@ def track_stars(
     vectors_b: Float[Array, "n 3"],
     q_ib: Float[Array, "4"],
     boresight_b: Float[Array, "3"],
-    tolerance_rad: Any,
+    tolerance_rad: Number,
 ) -> Int[Array, "n"]:
     """Match directions with stars of the catalogue.
 

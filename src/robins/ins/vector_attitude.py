@@ -32,6 +32,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from robins import _float64  # noqa: F401
+from robins.filters.belief import Number
 from robins.rotation import from_dcm, multiply, normalise, rotate
 
 LEAST_SEPARATION_RAD = float(np.radians(0.5))
@@ -57,7 +58,7 @@ def quest(
     vectors_b: Float[Array, "*b n 3"],
     vectors_i: Float[Array, "*b n 3"],
     weight: Float[Array, "*b n"],
-    least_separation_rad: Any = LEAST_SEPARATION_RAD,
+    least_separation_rad: Number = LEAST_SEPARATION_RAD,
 ) -> VectorAttitude:
     """QUEST: no eigenvectors, a polynomial of fourth degree (Shuster & Oh 1981, section VI).
 
@@ -105,7 +106,7 @@ def davenport(
     vectors_b: Float[Array, "*b n 3"],
     vectors_i: Float[Array, "*b n 3"],
     weight: Float[Array, "*b n"],
-    least_separation_rad: Any = LEAST_SEPARATION_RAD,
+    least_separation_rad: Number = LEAST_SEPARATION_RAD,
 ) -> VectorAttitude:
     """Davenport's q-method: the eigenvector of K for its largest eigenvalue; arguments as `quest`.
 
@@ -123,7 +124,7 @@ def svd(
     vectors_b: Float[Array, "*b n 3"],
     vectors_i: Float[Array, "*b n 3"],
     weight: Float[Array, "*b n"],
-    least_separation_rad: Any = LEAST_SEPARATION_RAD,
+    least_separation_rad: Number = LEAST_SEPARATION_RAD,
 ) -> VectorAttitude:
     """Markley's way: C_bi = U diag(1, 1, det U det V) V' of B = U diag(.) V'; arguments as `quest`.
 
@@ -140,7 +141,7 @@ def triad(
     vectors_b: Float[Array, "*b n 3"],
     vectors_i: Float[Array, "*b n 3"],
     weight: Float[Array, "*b n"],
-    least_separation_rad: Any = LEAST_SEPARATION_RAD,
+    least_separation_rad: Number = LEAST_SEPARATION_RAD,
 ) -> VectorAttitude:
     """TRIAD: an orthogonal frame on two directions, once in each axes; arguments as `quest`.
 

@@ -7,28 +7,34 @@ each scalar is an array over the batch. Long chains of them want `settled` in be
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
 
 from robins import _float64  # noqa: F401  # pyright: ignore[reportUnusedImport]  for its effect
 
-Three = Sequence[Any]
-Matrix = Sequence[Sequence[Any]]
+if TYPE_CHECKING:  # stubs lack operators between a scalar of NumPy and an array of JAX
+    Scalar = Any
+else:
+    Scalar = Array | np.ndarray | np.generic | float | int
+Three = Sequence[Scalar]
+Matrix = Sequence[Three]
 
 
-def scalars(v: Any) -> tuple[Any, ...]:
+def scalars(v: Array) -> tuple[Scalar, ...]:
     """The components of a vector."""
     return tuple(v[i] for i in range(v.shape[0]))
 
 
-def matrix(m: Any) -> Matrix:
+def matrix(m: Array) -> Matrix:
     """The rows of a matrix, each a tuple of its components."""
     return tuple(scalars(m[i]) for i in range(m.shape[0]))
 
 
-def settled(*vectors: Sequence[Any]) -> list[tuple[Any, ...]]:
+def settled(*vectors: Three) -> list[tuple[Scalar, ...]]:
     """The same vectors, computed here and once.
 
     Else XLA would compute what a component needs once more wherever that component is needed.
@@ -47,12 +53,12 @@ def minus(a: Three, b: Three) -> Three:
     return tuple(x - y for x, y in zip(a, b, strict=True))
 
 
-def times(s: Any, a: Three) -> Three:
+def times(s: Scalar, a: Three) -> Three:
     """A number times a vector."""
     return tuple(s * x for x in a)
 
 
-def dot(a: Three, b: Three) -> Any:
+def dot(a: Three, b: Three) -> Scalar:
     """Scalar product, of any length."""
     products = [x * y for x, y in zip(a, b, strict=True)]
     return sum(products[1:], products[0]) if products else 0.0
@@ -63,7 +69,7 @@ def cross(a: Three, b: Three) -> Three:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-def apply(m: Matrix, v: Sequence[Any]) -> Three:
+def apply(m: Matrix, v: Three) -> Three:
     """Matrix times vector."""
     return tuple(dot(row, v) for row in m)
 
@@ -73,7 +79,7 @@ def transposed(m: Matrix) -> Matrix:
     return tuple(zip(*m, strict=True))
 
 
-def dcm(q: Sequence[Any]) -> Matrix:
+def dcm(q: Three) -> Matrix:
     """Direction cosine matrix of a unit quaternion, scalar first."""
     w, x, y, z = q
     return (
@@ -83,7 +89,7 @@ def dcm(q: Sequence[Any]) -> Matrix:
     )
 
 
-def product(p: Sequence[Any], q: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
+def product(p: Three, q: Three) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """Hamilton product of quaternions, scalar first."""
     pw, px, py, pz = p
     qw, qx, qy, qz = q
@@ -95,7 +101,7 @@ def product(p: Sequence[Any], q: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
     )
 
 
-def rotate(q: Sequence[Any], v: Three) -> Three:
+def rotate(q: Three, v: Three) -> Three:
     """Turn a vector of three by a unit quaternion, scalar first."""
     t = times(2.0, cross(q[1:], v))
     return plus(v, times(q[0], t), cross(q[1:], t))

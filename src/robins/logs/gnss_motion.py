@@ -61,18 +61,6 @@ def track_of(gnss: GnssTable, *, swap: bool = False) -> Track | None:
     return Track(rows, time_s, r_n, v, sigma_m, sigma_v)
 
 
-def velocity_of(track: Track) -> tuple[np.ndarray, float]:
-    """Velocities, and the noise [m/s] of their change over a second.
-
-    From the positions half a second to either side where the receiver gave no velocities.
-    """
-    if track.v_n is not None:
-        return track.v_n, float(np.sqrt(6.0)) * track.sigma_v
-    ahead, behind = (at(track.time_s + k * _BASE_S, track.time_s, track.r_n) for k in (0.5, -0.5))
-    v_n = (ahead - behind) / _BASE_S
-    return v_n, float(np.sqrt(12.0)) * track.sigma_m / _BASE_S
-
-
 class Steps(NamedTuple):
     """Change of position over one to eight seconds, seen by positions and by velocities [m]."""
 

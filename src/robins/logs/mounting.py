@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +18,8 @@ from robins.dataset import AttitudeTable, Dataset, ImuTable, MagTable, Trajector
 from robins.earth import dcm_en, ecef_from_geodetic, geodetic_from_ecef
 from robins.ins.frames import to_ned_frd
 from robins.logs.findings import LogError
+
+T = TypeVar("T")
 
 # Exchanges east-north-up and north-east-down; its own inverse.
 SWAP = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -164,7 +166,7 @@ class Mounting:
         return dataclasses.replace(table, gyro=gyro, accel=accel, body="FRD")
 
 
-def turned(opened: Any, mounting: Mounting | None) -> Any:
+def turned(opened: T, mounting: Mounting | None) -> T:
     """A table or dataset with all that lies along sensor axes turned to the body's.
 
     Fixes and paths stay as they are, and so does everything where there is no mounting. A dataset

@@ -7,7 +7,7 @@ missing whole, or not believed.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -133,7 +133,7 @@ def _integers(table: Table, field: str, mend: str) -> np.ndarray:
     return np.ascontiguousarray(array, np.int64)
 
 
-def _shaped(table: Table, field: str, array: np.ndarray, shape: tuple[int, ...]) -> Any:
+def _shaped(table: Table, field: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     if array.shape != shape:
         cause = f"has shape {array.shape} where {shape} is needed"
         raise refused(_name(table), field=field)(cause, "one row for each time stamp")

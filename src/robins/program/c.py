@@ -11,6 +11,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from importlib.resources import files
 
+import numpy as np
+
 from robins.program.layout import IN_PLACE, Array, Layout, operands
 from robins.program.nodes import Loop, Node
 from robins.program.operations import OPERATIONS
@@ -319,7 +321,9 @@ def live_inputs(program: Program) -> list[Node]:
     return [n for n in program.live if program.graph.op[n] == "input"]
 
 
-def literal(value: object, kind: str, bare: bool = False, precision: Precision = DOUBLE) -> str:
+def literal(
+    value: float | int | np.generic, kind: str, bare: bool = False, precision: Precision = DOUBLE
+) -> str:
     """A number in C; bare next to an operator, else in the macro of its kind."""
     if kind == "real":
         text = precision.number(value)

@@ -27,9 +27,10 @@ from typing import Any
 import jax
 import numpy as np
 from jax.extend import core as jex
+from jaxtyping import PyTree
 
 from robins.program.interpreter import Interpreter, interpreter_of_many
-from robins.program.kinds import is_key, numbers_of
+from robins.program.kinds import Variable, is_key, numbers_of
 from robins.program.lanes import RoundsEngine
 from robins.program.names import Tree, as_json, by_name, of_json
 from robins.program.native import cache_folder
@@ -144,7 +145,7 @@ def kept_by_name(
     return program, tape
 
 
-def second_result(program: Program, function: Callable[..., Any], *args: Tree) -> Tree:
+def second_result(program: Program, function: Callable[..., PyTree], *args: PyTree) -> Tree:
     """Structure of the second result of a program; traced where a program of the cache lacks it.
 
     Args:
@@ -196,7 +197,9 @@ def _digest_of(texts: list[str | bytes]) -> str:
     return hashlib.sha256(whole).hexdigest()[:32]
 
 
-def _feed(to: list[str | bytes], value: Any, names: dict[Any, int], jaxprs: dict[int, str]) -> None:
+def _feed(
+    to: list[str | bytes], value: Any, names: dict[Variable, int], jaxprs: dict[int, str]
+) -> None:
     """Add texts of a value.
 
     Args:
@@ -243,7 +246,7 @@ def _equations(jaxpr: jex.Jaxpr, jaxprs: dict[int, str]) -> list[str | bytes]:
     to: list[str | bytes] = []
     names: dict[Any, int] = {}
 
-    def number(variables: Iterable[Any]) -> None:
+    def number(variables: Iterable[Variable]) -> None:
         for v in variables:
             names[v] = len(names)
             to.append(f"v{names[v]}:{_text_of(v.aval)};")
@@ -260,5 +263,5 @@ def _equations(jaxpr: jex.Jaxpr, jaxprs: dict[int, str]) -> list[str | bytes]:
 
 
 @lru_cache
-def _text_of(aval: Any) -> str:
+def _text_of(aval: Hashable) -> str:
     return str(aval)

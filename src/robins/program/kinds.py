@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
+from jax.extend import core as jex
 
 from robins.program.refusal import ProgramError
+
+if TYPE_CHECKING:  # to a checker, abstract values have neither shape nor type
+    Equation = Variable = Any
+else:
+    Equation, Variable = jex.JaxprEqn, jex.Var | jex.Literal
 
 KEY = "key<fry>"  # of Threefry 2x32, JAX's generator
 
@@ -50,7 +56,7 @@ def numbers_of(value: Any) -> np.ndarray:
     return np.asarray(words[..., 0] << np.uint64(32) | words[..., 1])
 
 
-def array_of(numbers: np.ndarray, dtype: Any) -> Any:
+def array_of(numbers: np.ndarray, dtype: Any) -> np.ndarray | jax.Array:
     """Numbers as an array of a type: what `numbers_of` made of it."""
     if not is_key(dtype):
         return numbers.astype(dtype)

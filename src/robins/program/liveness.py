@@ -20,17 +20,15 @@ True
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jax.extend import core as jex
 
-from robins.program.kinds import is_key
+from robins.program.kinds import Equation, Variable, is_key
 from robins.program.primitives.control import called
 
 # Of JAX's jaxprs, whose abstract values have neither shape nor type for a checker.
-Equation = Any
-Variable = Any  # or a literal
 
 KEY_BYTES = 8
 
@@ -79,7 +77,7 @@ def most_bytes(
     return most
 
 
-def bytes_of_jaxpr(jaxpr: Any) -> int:
+def bytes_of_jaxpr(jaxpr: jex.Jaxpr) -> int:
     """The most bytes that the values of a jaxpr take at once, one equation after the other.
 
     Rather too much: XLA makes one of several equations, and what they hand on is never in memory.

@@ -80,7 +80,7 @@ def along(e: Equation) -> Along | None:
     return (length, False) if _by_rows(e, name, p, length) else None
 
 
-def _by_rows(e: Equation, name: str, p: Any, length: int) -> bool:
+def _by_rows(e: Equation, name: str, p: Mapping[str, Any], length: int) -> bool:
     """True if an equation does the same to each row of its arrays."""
     given = [v.aval.shape for v in e.invars]
     rank = len(e.outvars[0].aval.shape)

@@ -17,10 +17,13 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 from robins.program.interpreter import interpreted_step, interpreter_of_one
 from robins.program.kept import kept_by_name, second_result
 from robins.program.kinds import kind_of
+from robins.program.names import Tree
 from robins.program.native import Engine, Step
 from robins.program.refusal import ProgramError
 from robins.program.trace import trace
@@ -71,7 +74,7 @@ def slots(leaves: list[Leaf], counted: tuple[int, int] = (0, 0)) -> tuple[list[S
 class Reader:
     """Puts arrays together from where they lie in memory."""
 
-    def __init__(self, told: list[Slot], tree: Any):
+    def __init__(self, told: list[Slot], tree: Tree):
         """Take slots, and the structure whose leaves they are."""
         self._tree = tree
         self._blank = [None] * len(told)
@@ -87,7 +90,7 @@ class Reader:
             if not s.is_real
         ]
 
-    def read(self, reals: np.ndarray, others: np.ndarray) -> Any:
+    def read(self, reals: np.ndarray, others: np.ndarray) -> PyTree:
         """A pytree: views of the reals, copies of all else, scalars of NumPy."""
         leaves: list[Any] = self._blank.copy()
         for k, at, shape in self._arrays:
@@ -131,7 +134,7 @@ class _Call(NamedTuple):
     end: tuple[int, int]  # behind it
     result: Reader  # of the result, counted from there
 
-    def takes(self, leaves: list[Any], tree: Any) -> bool:
+    def takes(self, leaves: list[ArrayLike], tree: Tree) -> bool:
         """True if it was traced for arguments like these."""
         return tree == self.tree and all(map(_alike, leaves, self.forms))
 
@@ -151,7 +154,7 @@ class NativeState:
 
     def __init__(
         self,
-        state: Any,
+        state: PyTree,
         content: Hashable,
         engine: Engine = interpreted_step,
         unroll: int | None = LIVE_UNROLL,
@@ -190,7 +193,7 @@ class NativeState:
         self.state = state
 
     @property
-    def state(self) -> Any:
+    def state(self) -> PyTree:
         """The state now."""
         if self._pytree is None:
             reals, others = self._x[: self._reals].copy(), self._k[: self._others]
@@ -198,7 +201,7 @@ class NativeState:
         return self._pytree
 
     @state.setter
-    def state(self, state: Any) -> None:
+    def state(self, state: PyTree) -> None:
         leaves, tree = jax.tree_util.tree_flatten(state)
         if tree != self._tree:
             raise ProgramError(f"a state of another structure than the first one: {tree}")
@@ -214,7 +217,7 @@ class NativeState:
             slot.view(self._x, self._k)[...] = leaf
         self._pytree = None
 
-    def step(self, name: Hashable, function: Callable[..., Any], *args: Any) -> Any:
+    def step(self, name: Hashable, function: Function, *args: PyTree) -> PyTree:
         """Step the state by ``(state, *args) -> (state, result)``; gives the result.
 
         Args:
@@ -241,7 +244,12 @@ class NativeState:
         return call.result.read(reals, others)
 
     def _call(
-        self, name: Hashable, function: Callable[..., Any], args: Any, leaves: list[Any], tree: Any
+        self,
+        name: Hashable,
+        function: Function,
+        args: tuple[PyTree, ...],
+        leaves: list[ArrayLike],
+        tree: Tree,
     ) -> _Call:
         """A function in this memory, which grows where that is wanted."""
         forms = [form(x) for x in leaves]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 import json
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -13,7 +13,10 @@ import numpy as np
 NAMED = {"robins", "builtins", "jax"}  # packages whose functions and classes are known by name
 NONE = "builtins:NoneType"
 PLAIN = (type(None), bool, int, float, str, bytes)
-Tree = Any  # a structure of JAX, which to a checker is no class
+if TYPE_CHECKING:  # a structure of JAX is no class to a checker
+    Tree = Any
+else:
+    Tree = jax.tree_util.PyTreeDef
 Json = Any
 
 

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from robins.program.c import to_c
 from robins.program.flags import FASTER, FASTER_IN_GCC, FLAGS, SHARED
@@ -187,7 +188,7 @@ class Native:
         ]
         self._buffers = [address(a) for a in (self._x, self._k, self._y, self._m)]
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: PyTree) -> PyTree:
         """The function on pytrees of numbers.
 
         Raises:
@@ -240,8 +241,8 @@ def _laid_out(leaves: list[Leaf]) -> tuple[np.ndarray, np.ndarray, list[np.ndarr
 
 
 def native(
-    function: Callable[..., Any],
-    *args: Any,
+    function: Callable[..., PyTree],
+    *args: PyTree,
     unroll: int | None = UNROLL,
     engine: Engine = compiled_step,
 ) -> Native:

@@ -133,7 +133,7 @@ class Graph:
 
     # ------------------------------------------------------------------------------- leaves
 
-    def constant(self, value: Any, kind: str) -> Node:
+    def constant(self, value: float | int | np.generic | np.ndarray, kind: str) -> Node:
         """A number that is known."""
         number = KINDS[kind](value)
         key = _DOUBLE.pack(number) if kind == "real" else f"{kind} {int(number)}"
@@ -143,11 +143,7 @@ class Graph:
         """One of the arguments of the program, counted by kind."""
         return self.add("input", (), kind, index)
 
-    def is_constant(self, node: Node) -> bool:
-        """True if its number is known."""
-        return self.literal[node] is not None
-
-    def known(self, node: Node) -> Any:
+    def known(self, node: Node) -> np.generic | None:
         """The number of a constant, None of any other node."""
         return None if self.literal[node] is None else self.value[node]
 

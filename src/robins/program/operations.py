@@ -41,32 +41,32 @@ class Operation(NamedTuple):
     commutes: bool = False
 
 
-def _rem(a: Any, b: Any) -> Any:
+def _rem(a: np.number, b: np.number) -> np.number:
     return np.fmod(a, b) if b != 0 or isinstance(a, np.floating) else a
 
 
-def _div(a: Any, b: Any) -> Any:
+def _div(a: np.number, b: np.number) -> np.number:
     if isinstance(a, np.floating):
         return a / b
     return type(a)(math.trunc(int(a) / int(b))) if b != 0 else type(a)(-1)
 
 
-def _total(a: Any) -> tuple[bool, Any, bool]:
+def _total(a: np.number) -> tuple[bool, np.number | float, bool]:
     """A key of the total order of numbers: -0 before 0, NaN last."""
     return (bool(a != a), a if a == a else 0.0, not np.signbit(a)) if a == a else (True, 0.0, True)
 
 
-def _away(a: Any) -> Any:
+def _away(a: np.number) -> np.number:
     return np.copysign(np.floor(np.abs(a) + 0.5), a)
 
 
-def _wrap(a: Any, half: Any) -> Any:
+def _wrap(a: np.number, half: np.number) -> np.number:
     """A whole number between -half and half that is the same but for whole rounds of both."""
-    a, half = int(a), int(half)
-    return np.int64((a + half) % (2 * half) - half)
+    number, most = int(a), int(half)
+    return np.int64((number + most) % (2 * most) - most)
 
 
-def _threefry(key: Any, number: Any) -> Any:
+def _threefry(key: np.uint64, number: np.uint64) -> np.uint64:
     four = np.array([key >> 32, key, number >> 32, number], np.uint64).astype(np.uint32)
     high, low = np.asarray(threefry_2x32(four[:2], four[2:])).astype(np.uint64)
     return high << np.uint64(32) | low

@@ -9,7 +9,7 @@ stays above zero; the bits of a word stay those of a double.
 from __future__ import annotations
 
 import re
-from typing import Any, NamedTuple
+from typing import NamedTuple, SupportsFloat
 
 import numpy as np
 
@@ -29,7 +29,7 @@ class Precision(NamedTuple):
     dtype: type[np.floating]
     sine: str
 
-    def number(self, value: Any) -> str:
+    def number(self, value: SupportsFloat | str) -> str:
         """A real in C, to the bit once it is rounded."""
         number = float(value)
         if np.isnan(number):
@@ -38,7 +38,7 @@ class Precision(NamedTuple):
             return "INFINITY" if number > 0 else "-INFINITY"
         return f"{self.rounded(number)!s}{self.suffix}"
 
-    def rounded(self, number: float) -> Any:
+    def rounded(self, number: float) -> float | np.floating:
         """The finite number nearest to one; not zero unless it is."""
         if self.dtype is np.float64:
             return number

@@ -40,6 +40,7 @@ import jax
 import numpy as np
 from jax import lax
 from jax.extend import core as jex
+from jaxtyping import PyTree
 
 from robins.program.arrays import (
     LARGE,
@@ -67,6 +68,7 @@ from robins.program.loops import (
     operations,
     uses,
 )
+from robins.program.names import Tree
 from robins.program.primitives.control import called
 from robins.program.refusal import BuildError, ProgramError
 from robins.program.trace import lasting
@@ -82,7 +84,7 @@ CUMULATED = {
 }
 
 
-def flattened(function: Callable[..., Any], *shapes: Any) -> tuple[jex.ClosedJaxpr, Any]:
+def flattened(function: Callable[..., PyTree], *shapes: PyTree) -> tuple[jex.ClosedJaxpr, Tree]:
     """A function of these shapes as one jaxpr, and the structure of its results.
 
     All calls are written out, and sums along the first axis are scans; variables occur once.
@@ -91,7 +93,7 @@ def flattened(function: Callable[..., Any], *shapes: Any) -> tuple[jex.ClosedJax
     equations: list[Equation] = []
     known: dict[Variable, Any] = {}
 
-    def write(closed: Any, args: Sequence[Variable]) -> list[Variable]:
+    def write(closed: jex.ClosedJaxpr, args: Sequence[Variable]) -> list[Variable]:
         jaxpr = closed.jaxpr
         now: dict[Variable, Variable] = dict(zip(jaxpr.invars, args, strict=True))
         for v, value in zip(jaxpr.constvars, closed.consts, strict=True):
@@ -118,15 +120,15 @@ def flattened(function: Callable[..., Any], *shapes: Any) -> tuple[jex.ClosedJax
     return jex.ClosedJaxpr(jaxpr, list(known.values())), jax.tree_util.tree_structure(results)
 
 
-def cumulated(e: Equation) -> Any:
+def cumulated(e: Equation) -> jex.ClosedJaxpr | None:
     """A sum, product or extreme along the first axis as the closed jaxpr of a scan."""
     name, p = e.primitive.name, e.params
     if name not in CUMULATED or p["axis"] != 0:
         return None
     join, neutral = CUMULATED[name]
 
-    def scanned(a: Any) -> Any:
-        def step(total: Any, row: Any) -> tuple[Any, Any]:
+    def scanned(a: jax.Array) -> jax.Array:
+        def step(total: jax.Array, row: jax.Array) -> tuple[jax.Array, jax.Array]:
             total = join(total, row)
             return total, total
 
@@ -137,7 +139,7 @@ def cumulated(e: Equation) -> Any:
     return jax.make_jaxpr(scanned)(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
 
 
-def written_out(e: Equation) -> Any:
+def written_out(e: Equation) -> jex.ClosedJaxpr | None:
     """A short scan over large arrays as a closed jaxpr without it: its rounds one after another."""
     p = e.params
     if e.primitive.name != "scan" or p["length"] >= SHORTEST:
@@ -146,7 +148,7 @@ def written_out(e: Equation) -> Any:
         return None
     body, fixed, carried = jex.jaxpr_as_fun(p["jaxpr"]), p["num_consts"], p["num_carry"]
 
-    def rounds(*given: Any) -> tuple[Any, ...]:
+    def rounds(*given: jax.Array) -> tuple[jax.Array, ...]:
         now, rows = given[fixed : fixed + carried], given[fixed + carried :]
         made: list[Any] = [None] * p["length"]
         for k in sorted(range(p["length"]), reverse=p["reverse"]):
@@ -159,7 +161,7 @@ def written_out(e: Equation) -> Any:
     return jax.make_jaxpr(rounds)(*shapes)
 
 
-def _extreme(dtype: Any, sign: int) -> Any:
+def _extreme(dtype: np.dtype, sign: int) -> float | int:
     """The least or greatest number of a type."""
     if np.issubdtype(dtype, np.floating):
         return sign * np.inf
@@ -322,8 +324,8 @@ class Staged:
 
     def __init__(
         self,
-        function: Callable[..., Any],
-        *shapes: Any,
+        function: Callable[..., PyTree],
+        *shapes: PyTree,
         unroll: int | None = UNROLL,
         named: bool = False,
         engine: RoundsEngine = compiled_rounds,
@@ -389,7 +391,7 @@ class Staged:
         loops = [loop.refused for loop in self.loops if loop.refused]
         return [*self._known_refused, *(why for one in arrays for why in one.refused), *loops]
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: PyTree) -> PyTree:
         """The function on arguments with a leading axis of runs, as arrays of NumPy or JAX."""
         leaves = jax.tree_util.tree_leaves(args)
         runs = leaves[0].shape[0]
@@ -403,7 +405,7 @@ class Staged:
                     values[v] = first_of(value)
                 del value
 
-        def found(v: Variable, count: int) -> Any:
+        def found(v: Variable, count: int) -> np.ndarray | jax.Array:
             if isinstance(v, jex.Literal) or v not in self._batched:
                 alone = number_of(v) if isinstance(v, jex.Literal) else values[v]
                 value = np.broadcast_to(alone, (count, *alone.shape))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import numpy as np
+from jax.extend import core as jex
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 from robins import _float64  # noqa: F401
 from robins.program import primitives  # noqa: F401
@@ -21,7 +23,7 @@ from robins.program.walk import Leaf, Program, Walk
 UNROLL = 10_000
 
 
-def _leaves(tree: Any, root: str) -> list[Leaf]:
+def _leaves(tree: PyTree, root: str) -> list[Leaf]:
     """The arrays of a pytree of shapes."""
     found = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
@@ -30,7 +32,7 @@ def _leaves(tree: Any, root: str) -> list[Leaf]:
     return found
 
 
-def trace(function: Callable[..., Any], *args: Any, unroll: int | None = UNROLL) -> Program:
+def trace(function: Callable[..., PyTree], *args: PyTree, unroll: int | None = UNROLL) -> Program:
     """A pure function of JAX as a program of scalars.
 
     Args:
@@ -50,7 +52,7 @@ def trace(function: Callable[..., Any], *args: Any, unroll: int | None = UNROLL)
 
 
 def trace_step(
-    function: Callable[..., Any], state: Any, *args: Any, unroll: int | None = UNROLL
+    function: Callable[..., PyTree], state: PyTree, *args: PyTree, unroll: int | None = UNROLL
 ) -> Program:
     """A step from a state to the next, ``(state, *args) -> (state, ...)``, as a program.
 
@@ -69,8 +71,8 @@ def trace_step(
 
 
 def trace_steps(
-    steps: Sequence[tuple[Callable[..., Any], tuple[Any, ...]]],
-    state: Any,
+    steps: Sequence[tuple[Callable[..., PyTree], tuple[PyTree, ...]]],
+    state: PyTree,
     unroll: int | None = UNROLL,
 ) -> list[Program]:
     """Steps that change one state, each ``(state, *args) -> (state, ...)``, as programs.
@@ -136,10 +138,12 @@ def lasting(made: Callable[[Zeros, Calls], list[Program]], zeros: Zeros) -> list
         zeros = kept
 
 
-def _jaxpr(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+def _jaxpr(
+    function: Callable[..., PyTree], args: tuple[PyTree, ...]
+) -> tuple[jex.ClosedJaxpr, PyTree, PyTree]:
     """The jaxpr of a function, and what it takes and gives as pytrees of shapes."""
 
-    def shape(x: Any) -> jax.ShapeDtypeStruct:
+    def shape(x: ArrayLike) -> jax.ShapeDtypeStruct:
         array = jax.typeof(x)
         return jax.ShapeDtypeStruct(array.shape, array.dtype, weak_type=array.weak_type)
 
@@ -149,9 +153,9 @@ def _jaxpr(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, An
 
 
 def _program(
-    jaxpr: Any,
-    given: Any,
-    results: Any,
+    jaxpr: jex.ClosedJaxpr,
+    given: PyTree,
+    results: PyTree,
     unroll: int | None,
     zeros: Zeros,
     calls: Calls | None = None,

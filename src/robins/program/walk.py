@@ -14,10 +14,12 @@ from typing import Any
 import jax
 import numpy as np
 from jax.extend import core as jex
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 from robins import _float64  # noqa: F401
 from robins.program.calls import Calls, results_of
-from robins.program.kinds import kind_of, numbers_of
+from robins.program.kinds import Equation, Variable, kind_of, numbers_of
 from robins.program.nodes import Graph, Node
 from robins.program.refusal import ProgramError
 from robins.program.refused import REFUSED
@@ -97,7 +99,7 @@ class Program:
         return self.graph.live([n for nodes in self.outputs for n in nodes.ravel().tolist()])
 
 
-def line_of(equation: Any) -> str:
+def line_of(equation: Equation) -> str:
     """File and line of the user's code that an equation comes from."""
     from jax._src import source_info_util
 
@@ -121,7 +123,9 @@ class Walk:
         self._constants: dict[int, tuple[Any, Nodes]] = {}  # by id, which the value keeps its own
         self.inputs: list[Leaf] = []
 
-    def taken(self, shape: tuple[int, ...], dtype: Any, path: str = "", zero: Any = None) -> Nodes:
+    def taken(
+        self, shape: tuple[int, ...], dtype: Any, path: str = "", zero: np.ndarray | None = None
+    ) -> Nodes:
         """Nodes of one more argument; zero: (shape) which of its entries are known to be zero."""
         leaf = Leaf(shape, dtype, kind_of(dtype, path), path or f"arguments[{len(self.inputs)}]")
         count = counts(self.inputs)[leaf.kind != "real"]
@@ -134,7 +138,7 @@ class Walk:
         """True if so many scalar operations are a loop or a call, and not written out."""
         return self.unroll is not None and size > self.unroll
 
-    def constants(self, value: Any) -> Nodes:
+    def constants(self, value: ArrayLike) -> Nodes:
         """Nodes of known numbers."""
         if (found := self._constants.get(id(value))) is None:
             array = numbers_of(value)
@@ -177,21 +181,21 @@ class Walk:
             return None
         return np.array(values).reshape(nodes.shape)
 
-    def closed(self, jaxpr: Any, *args: Nodes) -> list[Nodes]:
+    def closed(self, jaxpr: jex.ClosedJaxpr, *args: Nodes) -> list[Nodes]:
         """Results of a closed jaxpr on arrays of nodes."""
         return self.open(jaxpr.jaxpr, [self.constants(c) for c in jaxpr.consts], args)
 
-    def open(self, jaxpr: Any, consts: Sequence[Nodes], args: Sequence[Nodes]) -> list[Nodes]:
+    def open(self, jaxpr: jex.Jaxpr, consts: Sequence[Nodes], args: Sequence[Nodes]) -> list[Nodes]:
         """Results of a jaxpr on arrays of nodes."""
         given = [*consts, *args]
         return results_of(
             self._calls, self.graph, jaxpr, given, lambda: self._written(jaxpr, given)
         )
 
-    def _written(self, jaxpr: Any, given: Sequence[Nodes]) -> list[Nodes]:
+    def _written(self, jaxpr: jex.Jaxpr, given: Sequence[Nodes]) -> list[Nodes]:
         values = dict(zip([*jaxpr.constvars, *jaxpr.invars], given, strict=True))
 
-        def read(v: Any) -> Nodes:
+        def read(v: Variable) -> Nodes:
             return self.constants(v.val) if isinstance(v, jex.Literal) else values[v]
 
         for equation in jaxpr.eqns:
@@ -199,7 +203,7 @@ class Walk:
             values.update(zip(equation.outvars, found, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
-    def equation(self, equation: Any, *args: Nodes) -> list[Nodes]:
+    def equation(self, equation: Equation, *args: Nodes) -> list[Nodes]:
         """Results of an equation on arrays of nodes.
 
         Raises:
@@ -223,6 +227,8 @@ class Walk:
             found = [self.wrapped(found[0], equation.outvars[0].aval.dtype)]
         return found
 
-    def function(self, function: Callable[..., Any], *args: Nodes, like: Sequence[Any]) -> Any:
+    def function(
+        self, function: Callable[..., PyTree], *args: Nodes, like: Sequence[PyTree]
+    ) -> list[Nodes]:
         """Results of a function of JAX on arrays of nodes, which stand for arrays `like` these."""
         return self.closed(jax.make_jaxpr(function)(*like), *args)

@@ -50,7 +50,7 @@ from robins.results.probability import Probability
 from robins.results.reader import Result, read
 from robins.results.rescue import NotWritten, keeping, rescued
 from robins.results.roles import ROLES, find
-from robins.results.solution import array, variable
+from robins.results.solution import Variables, array, variable
 from robins.results.summary import VERDICTS, plain
 from robins.results.writer import ResultWriter
 
@@ -65,6 +65,7 @@ __all__ = [
     "Result",
     "ResultError",
     "ResultWriter",
+    "Variables",
     "array",
     "clocks",
     "find",

@@ -15,6 +15,9 @@ from robins.foreign import decoding, within
 from robins.results import roles
 from robins.results.errors import ResultError
 
+Variables = dict[str, xr.Variable]
+"""Arrays and coordinates of a solution, by name."""
+
 
 def variable(
     dims: str | Sequence[str], values: Any, unit: str, long_name: str, frame: str = "", **attrs: Any

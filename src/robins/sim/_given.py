@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import PyTree
 
 from robins import _float64  # noqa: F401
 from robins.errors import require
+from robins.filters.belief import Number
 from robins.rotation import normalise
 
+Listed = Number | Sequence[Number] | Sequence[Sequence[Number]]  # an array, or lists of numbers
 
-def known(*values: Any) -> bool:
+
+def known(*values: PyTree) -> bool:
     """True if these are numbers by now, and not placeholders of `jit`, `vmap` or `grad`."""
     return not any(isinstance(x, Tracer) for x in jax.tree_util.tree_leaves(values))
 
 
 def number(
     name: str,
-    value: Any,
+    value: Listed,
     low: float = -np.inf,
     high: float = np.inf,
     *,
@@ -52,7 +57,7 @@ def number(
         raise ValueError(f"{name} must be a {finite}number{bounds}, got {value}")
 
 
-def vector(name: str, value: Any, width: int, **bounds: Any) -> jax.Array:
+def vector(name: str, value: Listed, width: int, **bounds: Any) -> jax.Array:
     """A number or ``width`` of them, checked as `number` does, as a vector.
 
     Raises:
@@ -75,7 +80,7 @@ def count_of(name: str, value: int) -> int:
     return value
 
 
-def rows(name: str, value: Any, *shape: int) -> jax.Array:
+def rows(name: str, value: Listed, *shape: int) -> jax.Array:
     """An array of the shape that the other arguments call for.
 
     Raises:
@@ -86,7 +91,7 @@ def rows(name: str, value: Any, *shape: int) -> jax.Array:
     return x
 
 
-def unit_quaternion(name: str, value: Any) -> jax.Array:
+def unit_quaternion(name: str, value: Listed) -> jax.Array:
     """A quaternion (4,) of unit length to 1e-3, normalised.
 
     Raises:
@@ -97,7 +102,7 @@ def unit_quaternion(name: str, value: Any) -> jax.Array:
     return normalise(q)
 
 
-def presence(present: Any) -> jax.Array:
+def presence(present: Listed) -> jax.Array:
     """Presence of a sample at each epoch, (E,) bool.
 
     Raises:

@@ -8,13 +8,13 @@ they were, and from streams of their own, so both may have the same key.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.filters.belief import Number
 from robins.sim import _given
 from robins.sim.random import gauss_markov
 
@@ -22,7 +22,9 @@ from robins.sim.random import gauss_markov
 _AIR, _WIND = 0, 1
 
 
-def observe_air(key: Array, v_air_b: Any, sigma_m_s: Any, present: Any) -> Float[Array, "epochs 3"]:
+def observe_air(
+    key: Array, v_air_b: _given.Listed, sigma_m_s: _given.Listed, present: _given.Listed
+) -> Float[Array, "epochs 3"]:
     """Velocity through the air as measured, with white noise on each axis [m/s].
 
     Args:
@@ -43,7 +45,7 @@ def observe_air(key: Array, v_air_b: Any, sigma_m_s: Any, present: Any) -> Float
 
 
 def wind_estimate_error(
-    key: Array, count: int, step_s: Any, sigma_m_s: Any, tau_s: Any
+    key: Array, count: int, step_s: Number, sigma_m_s: _given.Listed, tau_s: _given.Listed
 ) -> Float[Array, "{count} 2"]:
     """Error of an estimate of the wind, true less estimated or the reverse, for it has no sign.
 
@@ -70,12 +72,12 @@ _WHITE, _BIAS = 0, 1
 
 def observe_height(
     key: Array,
-    height_m: Any,
-    sigma_m: Any,
-    present: Any,
-    bias_sigma_m: Any = 0.0,
-    bias_tau_s: Any = math.inf,
-    step_s: Any = None,
+    height_m: Number,
+    sigma_m: Number,
+    present: _given.Listed,
+    bias_sigma_m: Number = 0.0,
+    bias_tau_s: Number = math.inf,
+    step_s: _given.Listed | None = None,
 ) -> Float[Array, "epochs"]:
     """Measured height [m].
 

@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.filters.belief import Number
 from robins.linalg import scalars as u
 from robins.rotation import conjugate, multiply, rotate, to_rotvec
 from robins.sim import _given
@@ -41,7 +42,7 @@ class Controller(NamedTuple):
 
 
 def controller(
-    inertia_b: Any, wn: float = 0.12, zeta: float = 0.9, desaturation_k: float = 2e-3
+    inertia_b: _given.Listed, wn: float = 0.12, zeta: float = 0.9, desaturation_k: float = 2e-3
 ) -> Controller:
     """A controller of checked numbers.
 
@@ -130,7 +131,7 @@ def allocate_within(
     return jnp.where(jnp.any(free != used), asked, plain)
 
 
-def allocation_matrix(wheel_axes_b: Any, works: Any = 1.0) -> np.ndarray:
+def allocation_matrix(wheel_axes_b: _given.Listed, works: _given.Listed = 1.0) -> np.ndarray:
     """The matrix (W, 3) that shares a torque among the wheels that work, least in norm.
 
     Args:
@@ -156,7 +157,7 @@ def allocation_matrix(wheel_axes_b: Any, works: Any = 1.0) -> np.ndarray:
 
 
 def desaturation_dipole(
-    k: Any,
+    k: Number,
     momentum_b: Float[Array, "3"],
     field_b_t: Float[Array, "3"],
     limit_a_m2: Float[Array, "3"],

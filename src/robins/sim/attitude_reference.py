@@ -17,6 +17,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from robins import _float64  # noqa: F401
+from robins.filters.belief import Number
+from robins.filters.values import Numbers
 from robins.rotation import conjugate, from_dcm, from_rotvec, multiply, normalise, rotate
 from robins.sim import _given
 from robins.sim.orbit import Orbit
@@ -54,7 +56,7 @@ def _nadir(r, v) -> Reference:
     )
 
 
-def inertial(q_ib: Any, time_s: Any) -> Reference:
+def inertial(q_ib: _given.Listed, time_s: Numbers) -> Reference:
     """One attitude at all times.
 
     Raises:
@@ -67,10 +69,10 @@ def inertial(q_ib: Any, time_s: Any) -> Reference:
 
 def slews(
     base: Reference,
-    amplitude_rad: Any,
-    period_s: Any,
-    time_s: Any,
-    phase_rad: Any = 0.0,
+    amplitude_rad: _given.Listed,
+    period_s: _given.Listed,
+    time_s: Number,
+    phase_rad: Number = 0.0,
     fade_in_s: float = 0.0,
 ) -> Reference:
     """Sinusoidal turns about x, then the new y, then the new z, on top of a reference.
@@ -121,7 +123,13 @@ PEAK_ACCELERATION = 10.0 / 3.0**0.5
 
 
 @jax.jit
-def handed_over(base: Reference, turn_rad: Any, rate_rad_s: Any, length_s: Any, time_s: Any):
+def handed_over(
+    base: Reference,
+    turn_rad: Array,
+    rate_rad_s: Array,
+    length_s: Number,
+    time_s: Array,
+) -> Reference:
     """Reference with the way to it from another: a turn about one axis, from rest to rest.
 
     The turn dies away by 1 - s, s the polynomial 10 x^3 - 15 x^4 + 6 x^5, x = t/length (an
@@ -147,14 +155,14 @@ def handed_over(base: Reference, turn_rad: Any, rate_rad_s: Any, length_s: Any, 
     return _turned(base, *(share * rate_rad_s[None] for share in (on, on1, on2)))
 
 
-def _fade_in(t: Array, length_s: float) -> tuple[Any, Any, Any]:
+def _fade_in(t: Array, length_s: float) -> tuple[Number, Number, Number]:
     """A factor that grows from 0 to 1, and its first two derivatives."""
     if length_s == 0.0:
         return 1.0, 0.0, 0.0
     return _from_rest_to_rest(t, length_s)
 
 
-def _from_rest_to_rest(t: Array, length_s: Any) -> tuple[Any, Any, Any]:
+def _from_rest_to_rest(t: Array, length_s: Number) -> tuple[Array, Array, Array]:
     """Rise from 0 to 1 within a length of time, with two derivatives that are 0 at both ends."""
     x = jnp.clip(t / length_s, 0.0, 1.0)
     return (

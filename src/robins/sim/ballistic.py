@@ -38,13 +38,13 @@ class BallisticPath(NamedTuple):
 
 
 def ballistic(
-    lat_rad: Any,
-    lon_rad: Any,
-    alt_m: Any,
-    speed_m_s: Any,
-    elevation_rad: Any,
-    azimuth_rad: Any,
-    time_s: Any,
+    lat_rad: _given.Listed,
+    lon_rad: _given.Listed,
+    alt_m: _given.Listed,
+    speed_m_s: _given.Listed,
+    elevation_rad: _given.Listed,
+    azimuth_rad: _given.Listed,
+    time_s: _given.Listed,
 ) -> BallisticPath:
     """Fly freely from a place with a velocity that is given relative to inertial space.
 

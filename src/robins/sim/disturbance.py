@@ -7,7 +7,6 @@ be scaled, and a disturbance that is switched off leaves the numbers of the rest
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +15,12 @@ from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.errors import require
+from robins.filters.belief import Number
 from robins.sim import _given
 
 
 def outlier_factor(
-    key: Array, shape: Sequence[int], share: Any, factor: Any
+    key: Array, shape: Sequence[int], share: Number, factor: Number
 ) -> Float[Array, "..."]:
     """``factor`` for a share of the samples, drawn one by one, and 1 for the rest.
 

@@ -112,7 +112,7 @@ def simulate_flexure(
     return angle, rate
 
 
-def _check(model: Flexure, count: int, load_factor: Any) -> None:
+def _check(model: Flexure, count: int, load_factor: ArrayLike | None) -> None:
     if count < 1:
         raise ValueError(f"flexure: count is {count}; at least one step is wanted")
     if model.tail_dof is not None and not model.tail_dof > 2.0:

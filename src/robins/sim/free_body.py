@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.filters.belief import Number
 from robins.rotation import from_euler, from_rotvec, multiply, normalise
 from robins.sim import _given
 
@@ -99,12 +100,12 @@ def free_body(
 
 
 def coning_start(
-    spin_rad_s: Any,
-    cone_half_angle_rad: Any,
-    momentum_elevation_rad: Any,
-    momentum_azimuth_rad: Any,
+    spin_rad_s: Number,
+    cone_half_angle_rad: Number,
+    momentum_elevation_rad: Number,
+    momentum_azimuth_rad: Number,
     body: FreeBody,
-    phase_rad: Any = 0.0,
+    phase_rad: Number = 0.0,
 ) -> tuple[Float[Array, "4"], Float[Array, "3"]]:
     """Attitude q_nb and rates of a body whose x axis goes round its angular momentum in a cone.
 

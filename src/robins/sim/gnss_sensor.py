@@ -304,7 +304,7 @@ def as_table(fixes: GnssFixes, stamp_s: np.ndarray, start_ns: int = 0) -> GnssTa
     there = ~missing
     time_ns = start_ns + np.rint(np.asarray(stamp_s) * 1e9).astype(np.int64)
 
-    def of(x: Any) -> np.ndarray:
+    def of(x: ArrayLike) -> np.ndarray:
         return np.asarray(x)[there]
 
     return GnssTable(

@@ -33,6 +33,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.filters.belief import Number
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 from robins.rotation import conjugate, from_rotvec, multiply, normalise, to_rotvec
 from robins.sim import _given
@@ -51,7 +52,7 @@ class GyroErrors(NamedTuple):
     matrix: Any  # (3, 3) S + M, scale factor errors and misalignments
 
 
-def gyro_errors(key: Array, model: TriadErrors, count: int, dt_s: Any) -> GyroErrors:
+def gyro_errors(key: Array, model: TriadErrors, count: int, dt_s: Number) -> GyroErrors:
     """Draw the errors of a triad for a run of ``count`` samples.
 
     The normal numbers depend on neither the sizes of the errors nor the count: a longer run begins
@@ -92,7 +93,7 @@ def read_gyro(
     angle: Float[Array, "3"],
     matrix: Float[Array, "3 3"],
     residue: Float[Array, "3"],
-    quantum_rad: Any = 0.0,
+    quantum_rad: Number = 0.0,
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Reported angle of a triad over one sample, and the residue of quantisation.
 
@@ -134,7 +135,7 @@ class MemsErrors(NamedTuple):
 
 
 def delta_angles(
-    key: Array, q_nb: Any, dt_s: Any, gyro: MemsGyro
+    key: Array, q_nb: _given.Listed, dt_s: Number, gyro: MemsGyro
 ) -> tuple[Float[Array, "samples 3"], MemsErrors]:
     """Angles [rad] that a triad reports over the E intervals between E + 1 attitudes, body axes.
 
@@ -176,7 +177,7 @@ def delta_angles(
     return reported, MemsErrors(bias, drift, noise, scale)
 
 
-def integrate_angles(q0_nb: Any, theta_b: Any) -> Float[Array, "epochs 4"]:
+def integrate_angles(q0_nb: Number, theta_b: _given.Listed) -> Float[Array, "epochs 4"]:
     """Attitude (E + 1, 4) that delta angles (E, 3) lead to from q0_nb: dead reckoning.
 
     The `delta_angles` of a perfect gyro lead back to the attitudes they were made of.

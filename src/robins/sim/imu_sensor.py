@@ -28,6 +28,7 @@ from jaxtyping import Array, Float
 from robins import _float64  # noqa: F401
 from robins.dataset import ImuTable
 from robins.errors import require_kind
+from robins.filters.belief import Number
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 
 # What follows is part of the file format, as `robins.sim.random.Component` is: a table of normal
@@ -203,10 +204,10 @@ def corrupt_table(imu: ImuTable, model: ImuErrorModel, key: Array) -> tuple[ImuT
     return dataclasses.replace(imu, gyro=gyro, accel=accel), truth
 
 
-def _switch_on(errors: TriadErrors, numbers: Array) -> tuple[_Triad, Any]:
+def _switch_on(errors: TriadErrors, numbers: Array) -> tuple[_Triad, Number | None]:
     """A triad and the start of its Gauss-Markov bias, from normal numbers (9, 3)."""
 
-    def drawn(row: _Once, given: Any, sigma: Any) -> Any:
+    def drawn(row: _Once, given: Number | None, sigma: Number | None) -> Number | None:
         if sigma is None:
             return given
         normal = numbers[row] if jnp.ndim(sigma) == 1 else numbers[row : row + 3]
@@ -221,7 +222,7 @@ def _switch_on(errors: TriadErrors, numbers: Array) -> tuple[_Triad, Any]:
     return _Triad(errors, constants), drawn(_Once.MARKOV_START, None, errors.markov_sigma)
 
 
-def _start(errors: TriadErrors, markov: Any) -> _TriadState:
+def _start(errors: TriadErrors, markov: Number | None) -> _TriadState:
     walk = None if errors.walk is None else jnp.zeros(3)
     residue = None if errors.quantum is None else jnp.zeros(3)
     return _TriadState(markov, walk, residue)
@@ -371,6 +372,6 @@ def _less_tanh(u):
     return jnp.where(small, u * series, safe - jnp.tanh(safe))
 
 
-def _sum(a: Any, b: Any) -> Any:
+def _sum(a: Number | None, b: Number | None) -> Number | None:
     """Sum of two arrays, either of which may be None, for zero."""
     return b if a is None else a if b is None else a + b

@@ -16,14 +16,13 @@ to come from elsewhere, so that its error is not independent of its source.
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.errors import require
+from robins.filters.belief import Number
 from robins.manifold import wrap
 from robins.rotation import conjugate, from_rotvec, normalise, rotate
 from robins.sim import _given
@@ -33,19 +32,19 @@ _ROUNDING_S = 1e-6  # a sample this near to the edge of a burst is on it
 
 def observe_field(
     key: Array,
-    q_nb: Any,
-    field_n: Any,
-    sigma_t: Any,
-    present: Any,
+    q_nb: _given.Listed,
+    field_n: Number,
+    sigma_t: _given.Listed,
+    present: _given.Listed,
     *,
-    turn: Any = None,
-    added_n_t: Any = None,
-    added_b_t: Any = None,
-    q_bs: Any = None,
-    soft_iron: Any = None,
-    hard_iron_t: Any = None,
-    range_t: Any = None,
-    quantum_t: Any = None,
+    turn: _given.Listed | None = None,
+    added_n_t: _given.Listed | None = None,
+    added_b_t: _given.Listed | None = None,
+    q_bs: _given.Listed | None = None,
+    soft_iron: Number | None = None,
+    hard_iron_t: _given.Listed | None = None,
+    range_t: Number | None = None,
+    quantum_t: Number | None = None,
 ) -> Float[Array, "epochs 3"]:
     """Measured field [T] in sensor axes, which are the body's unless ``q_bs`` is given.
 
@@ -99,7 +98,11 @@ def observe_field(
 
 
 def observe_magnetic_attitude(
-    key: Array, euler_rad: Any, sigma_rad: Any, disturbance_rad: Any = None, present: Any = None
+    key: Array,
+    euler_rad: Number,
+    sigma_rad: _given.Listed,
+    disturbance_rad: _given.Listed | None = None,
+    present: _given.Listed | None = None,
 ) -> Float[Array, "epochs 3"]:
     """Roll, pitch, heading [rad] as papers have a magnetometer measure them; it cannot.
 
@@ -127,7 +130,12 @@ def observe_magnetic_attitude(
 
 
 def angle_bursts(
-    key: Array, time_s: Any, size_rad: Any, every_s: Any, length_s: Any, first_s: Any = None
+    key: Array,
+    time_s: Number,
+    size_rad: Number,
+    every_s: Number,
+    length_s: Number,
+    first_s: _given.Listed | None = None,
 ) -> Float[Array, "epochs 3"]:
     """Disturbance of three angles [rad]: of that size, its sign drawn for each angle and burst.
 
@@ -152,7 +160,12 @@ def angle_bursts(
 
 
 def field_bursts(
-    key: Array, time_s: Any, size_rad: Any, every_s: Any, length_s: Any, first_s: Any = None
+    key: Array,
+    time_s: Number,
+    size_rad: Number,
+    every_s: Number,
+    length_s: Number,
+    first_s: _given.Listed | None = None,
 ) -> Float[Array, "epochs 3"]:
     """Turns of the field [rad] as `observe_field` takes them: one axis, drawn, for each burst.
 
@@ -193,12 +206,12 @@ def _turned(field: Array, turn: Array) -> Array:
     return rotate(from_rotvec(jnp.where(turns, ratio * across, 0.0)), field)
 
 
-def _vectors(name: str, value: Any, count: int) -> Array:
+def _vectors(name: str, value: Number, count: int) -> Array:
     x = jnp.asarray(value, float)
     return jnp.broadcast_to(x, (count, 3)) if x.shape == (3,) else _given.rows(name, x, count, 3)
 
 
-def _sigma(sigma_t: Any, count: int) -> Array:
+def _sigma(sigma_t: Number, count: int) -> Array:
     """(E, 3) or (1, 3)."""
     sigma = jnp.asarray(sigma_t, float)
     if sigma.shape in ((), (3,)):

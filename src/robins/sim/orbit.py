@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.earth.magnetic import RADIUS_M, field_along, wmm_for
 from robins.earth.wgs84 import A_M, GM, OMEGA_E, dcm_en, geodetic_from_ecef
 from robins.errors import require
+from robins.filters.belief import Number
 from robins.sim import _given
 
 LOWEST_M = 100e3  # below it nothing goes round
@@ -37,7 +37,11 @@ class Orbit(NamedTuple):
 
 
 def circular_orbit(
-    alt_m: Any, incl_rad: Any, raan_rad: Any, arg_lat_rad: Any, time_s: Any
+    alt_m: Number,
+    incl_rad: Number,
+    raan_rad: Number,
+    arg_lat_rad: Number,
+    time_s: Number,
 ) -> Orbit:
     """A circular two-body orbit.
 
@@ -77,7 +81,7 @@ def _circular(alt, incl, raan, arg_lat, time) -> tuple[Array, Array]:
     )
 
 
-def dipole_field_i(r_i_m: Float[Array, "*b 3"], earth_angle_rad: ArrayLike) -> Float[Array, "*b 3"]:
+def dipole_field_i(r_i_m: Float[Array, "*b 3"], earth_angle_rad: Number) -> Float[Array, "*b 3"]:
     """Field [T] of the tilted dipole in inertial axes, ``(a/r)^3 (3 (m r) r/r^2 - m)``.
 
     It differs from the full field at 500 km by 11 deg rms and 35 deg at most, and in size by a
@@ -104,7 +108,7 @@ def _dipole(r, angle) -> Array:
 def field_along_orbit(
     orbit: Orbit,
     model: str = "dipole",
-    earth_angle_rad: Any = 0.0,
+    earth_angle_rad: Number = 0.0,
     decimal_year: float = 2025.0,
     knot_s: float = 10.0,
 ) -> Float[Array, "epochs 3"]:

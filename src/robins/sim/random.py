@@ -28,6 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.filters.belief import Number
 from robins.sim import _given
 
 UNITS_OF_A_KIND = 256  # stride between the streams of two sensors of one kind
@@ -95,7 +96,7 @@ def _bounded(name: str, value: Any, limit: int) -> int:
 
 
 def gauss_markov(
-    key: Array, count: int, width: int, step_s: Any, tau_s: Any
+    key: Array, count: int, width: int, step_s: Number, tau_s: _given.Listed
 ) -> Float[Array, "{count} {width}"]:
     """Independent processes of unit variance, started in their steady state.
 

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.filters.belief import Number
 from robins.rotation import from_rotvec, multiply, normalise
 from robins.sim import _given
 
@@ -45,7 +46,9 @@ class TableState(NamedTuple):
 
 
 def rate_table(
-    lag_s: Any = 0.02, rate_limit_rad_s: Any = np.inf, acceleration_limit_rad_s2: Any = np.inf
+    lag_s: _given.Listed = 0.02,
+    rate_limit_rad_s: _given.Listed = np.inf,
+    acceleration_limit_rad_s2: _given.Listed = np.inf,
 ) -> RateTable:
     """A rate table of checked numbers, one for all axes or one each; infinity is no limit.
 
@@ -63,7 +66,9 @@ def rate_table(
     )
 
 
-def table_state(q_ib: Any = (1.0, 0.0, 0.0, 0.0), rate_b: Any = 0.0) -> TableState:
+def table_state(
+    q_ib: _given.Listed = (1.0, 0.0, 0.0, 0.0), rate_b: _given.Listed = 0.0
+) -> TableState:
     """The state of a given attitude and rate [rad/s].
 
     Raises:
@@ -73,7 +78,7 @@ def table_state(q_ib: Any = (1.0, 0.0, 0.0, 0.0), rate_b: Any = 0.0) -> TableSta
 
 
 def step(
-    table: RateTable, state: TableState, command_b: Float[Array, "3"], dt_s: Any
+    table: RateTable, state: TableState, command_b: Float[Array, "3"], dt_s: Number
 ) -> tuple[TableState, Float[Array, "4"]]:
     """The state a step later, and its attitude q_ib.
 
@@ -98,7 +103,7 @@ def step(
     return TableState(q, rate), q
 
 
-def _response(table: RateTable, goal: Array, rate: Array, t: Any) -> tuple[Array, Array]:
+def _response(table: RateTable, goal: Array, rate: Array, t: Number) -> tuple[Array, Array]:
     """Rate, and angle gone through, a time t > 0 after a command was given."""
     lag, most = table.lag_s, table.acceleration_limit_rad_s2
     way = goal - rate

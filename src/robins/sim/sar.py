@@ -22,6 +22,7 @@ import jax.numpy as jnp
 
 from robins import _float64  # noqa: F401
 from robins.earth import Geodetic
+from robins.filters.belief import Number
 from robins.manifold import wrap
 from robins.sim import _given
 
@@ -48,7 +49,11 @@ class SarFix(NamedTuple):
 
 
 def observe_sar(
-    model: SarErrorModel, key: jax.Array, position: Geodetic, heading_rad: Any, present: Any
+    model: SarErrorModel,
+    key: jax.Array,
+    position: Geodetic,
+    heading_rad: Number,
+    present: _given.Listed,
 ) -> SarFix:
     """Fixes of a run from its true motion.
 

@@ -22,6 +22,7 @@ commands stay the same over a step. A step must turn by much less than half a tu
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -30,6 +31,7 @@ from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.earth.wgs84 import GM
+from robins.filters.belief import Number
 from robins.linalg import scalars as u
 from robins.rotation import conjugate, rotate
 from robins.sim import _given
@@ -56,13 +58,13 @@ class CraftState(NamedTuple):
 
 
 def spacecraft(
-    inertia_b: Any,
-    wheel_axes_b: Any,
-    wheel_torque_limit: Any,
-    wheel_momentum_limit: Any,
-    dipole_limit_a_m2: Any,
-    residual_dipole_b: Any = 0.0,
-    wheel_works: Any = 1.0,
+    inertia_b: _given.Listed,
+    wheel_axes_b: _given.Listed,
+    wheel_torque_limit: _given.Listed,
+    wheel_momentum_limit: _given.Listed,
+    dipole_limit_a_m2: _given.Listed,
+    residual_dipole_b: _given.Listed = 0.0,
+    wheel_works: _given.Listed = 1.0,
 ) -> Spacecraft:
     """A spacecraft of checked numbers; one number stands for all wheels or axes.
 
@@ -105,7 +107,7 @@ def spacecraft(
     )
 
 
-def _inertia(inertia_b: Any) -> np.ndarray:
+def _inertia(inertia_b: Number) -> np.ndarray:
     J = np.asarray(inertia_b, float)
     if J.shape != (3, 3) or not np.all(np.isfinite(J)):
         raise ValueError(f"inertia_b must be a finite matrix (3, 3), got\n{J}")
@@ -123,7 +125,9 @@ def _inertia(inertia_b: Any) -> np.ndarray:
     return J
 
 
-def craft_state(craft: Spacecraft, q_ib: Any, omega_b: Any, wheel_h: Any = 0.0) -> CraftState:
+def craft_state(
+    craft: Spacecraft, q_ib: _given.Listed, omega_b: _given.Listed, wheel_h: _given.Listed = 0.0
+) -> CraftState:
     """The state of given attitude, rate omega_ib_b [rad/s] and momenta of the wheels [N m s].
 
     Raises:
@@ -169,7 +173,7 @@ def advance(
     r_i_m: Float[Array, "3"],
     field_i_t: Float[Array, "3"],
     disturbance_b: Float[Array, "3"],
-    dt_s: Any,
+    dt_s: Number,
 ) -> CraftState:
     """The state a step later.
 
@@ -209,7 +213,7 @@ def dynamics(
     r_i_m: Float[Array, "3"],
     field_i_t: Float[Array, "3"],
     disturbance_b: Float[Array, "3"],
-    dt_s: Any,
+    dt_s: Number,
 ) -> Turn:
     """The first half of `advance`, whose arguments it has: how the craft turns in a step.
 
@@ -253,7 +257,7 @@ def dynamics(
     return Turn(step[:3], state.momentum_i + jnp.stack(u.apply(C, step[3:])), h1)
 
 
-def kinematics(q_ib: Float[Array, "4"], gibbs_b: Any) -> Float[Array, "4"]:
+def kinematics(q_ib: Float[Array, "4"], gibbs_b: Iterable[Array]) -> Float[Array, "4"]:
     """The attitude after a turn, from that before it.
 
     Args:
@@ -271,7 +275,7 @@ def wheels_give(craft: Spacecraft, wheel_torque: Float[Array, "w"]) -> Float[Arr
 
 
 def wheels_after(
-    craft: Spacecraft, wheel_h: Float[Array, "w"], wheel_torque: Float[Array, "w"], dt_s: Any
+    craft: Spacecraft, wheel_h: Float[Array, "w"], wheel_torque: Float[Array, "w"], dt_s: Number
 ) -> Float[Array, "w"]:
     """Momenta of the wheels [N m s] after a step under a commanded torque [N m]."""
     # A wheel that was given more than its limit may lose it, but is not torn back to it.

@@ -27,6 +27,7 @@ from jaxtyping import Array, Float, Int
 
 from robins import _float64  # noqa: F401
 from robins.earth.stars import StarIndex, Stars, index_stars, near
+from robins.filters.belief import Number
 from robins.ins.star_identification import track_stars
 from robins.ins.vector_attitude import quest
 from robins.manifold import wrap
@@ -44,11 +45,11 @@ ARCSEC = np.pi / 648e3
 
 def star_errors(
     key: Array,
-    sigma_rad: Any,
-    frame_s: Any,
+    sigma_rad: _given.Listed,
+    frame_s: Number,
     count: int,
-    low_frequency_rad: Any = 0.0,
-    low_frequency_period_s: Any = 600.0,
+    low_frequency_rad: _given.Listed = 0.0,
+    low_frequency_period_s: Number = 600.0,
 ) -> Float[Array, "{count} 3"]:
     """Errors of ``count`` frames, rotation vectors [rad] in sensor axes: white noise and a sine.
 
@@ -82,7 +83,7 @@ def star_errors(
 
 
 def read_star(
-    q_ib: Float[Array, "4"], error: Float[Array, "3"], q_bs: Any = None
+    q_ib: Float[Array, "4"], error: Float[Array, "3"], q_bs: _given.Listed | None = None
 ) -> Float[Array, "4"]:
     """Measured q_ib: the true attitude after a small turn of the sensor about its own axes.
 
@@ -220,7 +221,11 @@ def _in_field(there: Shown, camera: StarCamera, most: int, margin_rad: float = 0
 
 
 def photograph(
-    key: Array, index: StarIndex, q_ib: Float[Array, "4"], camera: StarCamera, turn_rad: Any = None
+    key: Array,
+    index: StarIndex,
+    q_ib: Float[Array, "4"],
+    camera: StarCamera,
+    turn_rad: _given.Listed | None = None,
 ) -> StarImage:
     """Stars as a camera sees them. Pure JAX: it maps over keys, attitudes and sizes of errors.
 
@@ -288,9 +293,9 @@ def measure_attitude(
     index: StarIndex,
     q_ib: Float[Array, "4"],
     camera: StarCamera,
-    turn_rad: Any = None,
-    q_ib_prior: Any = None,
-    tolerance_rad: Any = None,
+    turn_rad: _given.Listed | None = None,
+    q_ib_prior: _given.Listed | None = None,
+    tolerance_rad: _given.Listed | None = None,
 ) -> tuple[Float[Array, "4"], Float[Array, "3 3"], Int[Array, ""]]:
     """A frame of a star sensor: photograph, identify the stars, QUEST. Pure JAX.
 
@@ -317,8 +322,8 @@ def solve(
     image: StarImage,
     index: StarIndex,
     camera: StarCamera,
-    q_ib_prior: Any = None,
-    tolerance_rad: Any = None,
+    q_ib_prior: _given.Listed | None = None,
+    tolerance_rad: _given.Listed | None = None,
 ) -> tuple[Float[Array, "4"], Float[Array, "3 3"], Int[Array, ""]]:
     """The attitude of an image, from `expose`; all else as `measure_attitude` has it."""
     star = image.star
@@ -342,7 +347,9 @@ def _shifted(unit: Float[Array, "n 3"], angles: Float[Array, "n 2"]) -> Float[Ar
     return moved / jnp.sqrt(jnp.sum(moved**2, 1, keepdims=True))
 
 
-def observe_euler(key: Array, q_nb: Any, sigma_rad: Any, present: Any) -> Float[Array, "epochs 3"]:
+def observe_euler(
+    key: Array, q_nb: _given.Listed, sigma_rad: _given.Listed, present: _given.Listed
+) -> Float[Array, "epochs 3"]:
     """Measured pitch, roll, heading [rad] of the body, each with white noise.
 
     The angles are those of `robins.rotation.to_euler`, in another order. Roll and heading are

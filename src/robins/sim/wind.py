@@ -42,6 +42,8 @@ from robins import (
     _float64,  # noqa: F401
     linalg,
 )
+from robins.filters.belief import Number
+from robins.filters.values import Numbers
 from robins.sim import _given
 from robins.sim.random import gauss_markov
 
@@ -65,11 +67,11 @@ class Carried(NamedTuple):
 def gusts(
     key: Array,
     count: int,
-    begin_s: Any,
-    end_s: Any,
-    every_s: Any,
-    speed_m_s: tuple[Any, Any] = (5.0, 10.0),
-    direction_rad: tuple[Any, Any] = (0.5 * math.pi, 0.25 * math.pi),
+    begin_s: Number,
+    end_s: Number,
+    every_s: Number,
+    speed_m_s: tuple[Number, Number] = (5.0, 10.0),
+    direction_rad: tuple[Number, Number] = (0.5 * math.pi, 0.25 * math.pi),
 ) -> Float[Array, "{count} 2"]:
     """Winds drawn at fixed times: ``count`` of them, each held for ``every_s``.
 
@@ -114,7 +116,13 @@ def gusts(
     return jnp.stack([speed * jnp.cos(direction), speed * jnp.sin(direction)], 1)
 
 
-def carry(wind: Any, step_s: Any, commanded_m_s: Any, tau_s: Any, start_m_s: Any) -> Carried:
+def carry(
+    wind: Numbers,
+    step_s: Number,
+    commanded_m_s: Number,
+    tau_s: _given.Listed,
+    start_m_s: Number,
+) -> Carried:
     """The motion of a point mass in a wind that is held over steps, exact.
 
     Args:
@@ -148,7 +156,7 @@ def carry(wind: Any, step_s: Any, commanded_m_s: Any, tau_s: Any, start_m_s: Any
     return Carried(step_s, velocity, displacement, target, tau_s)
 
 
-def carried_at(carried: Carried, time_s: Any) -> tuple[Array, Array, Array]:
+def carried_at(carried: Carried, time_s: Number) -> tuple[Array, Array, Array]:
     """Velocity [m/s], displacement [m] and acceleration [m/s^2] at instants, each (..., 2).
 
     Beyond the last step its wind is held. Where two steps meet the acceleration is that of the
@@ -168,7 +176,7 @@ def carried_at(carried: Carried, time_s: Any) -> tuple[Array, Array, Array]:
     return velocity, displacement, (towards - velocity) / carried.tau_s
 
 
-def wind_at(wind: Any, step_s: Any, time_s: Any) -> Array:
+def wind_at(wind: Numbers, step_s: Number, time_s: Number) -> Array:
     """The wind of (M, 2) that blows at instants (...), each step held: (..., 2).
 
     Beyond the last step its wind is held; where two steps meet the later one counts.
@@ -188,7 +196,7 @@ def _after(velocity, displacement, towards, time, tau):
     return velocity + missing * gone, displacement + towards * time - missing * (tau * gone)
 
 
-def _step_of(time_s: Any, step_s: Any, count: int) -> tuple[Array, Array]:
+def _step_of(time_s: Number, step_s: Number, count: int) -> tuple[Array, Array]:
     """Number of the step an instant is in, and the time since it began."""
     _given.number("time_s", time_s, 0.0)
     time = jnp.asarray(time_s, float)
@@ -211,11 +219,11 @@ _LEAST_SHARE = 1e-13  # of an eigenvalue, as a share of the greatest
 def dryden(
     key: Array,
     count: int,
-    step_s: Any,
-    airspeed_m_s: Any,
-    sigma_m_s: Any,
-    length_m: Any = DRYDEN_LENGTH_M,
-    direction_rad: Any = 0.0,
+    step_s: Number,
+    airspeed_m_s: Number,
+    sigma_m_s: _given.Listed,
+    length_m: _given.Listed = DRYDEN_LENGTH_M,
+    direction_rad: Number = 0.0,
 ) -> Float[Array, "{count} 2"]:
     """Dryden turbulence [m/s] at 0, step, 2 step ..., in its steady state from the first on.
 
@@ -245,11 +253,11 @@ def dryden(
 def von_karman(
     key: Array,
     count: int,
-    step_s: Any,
-    airspeed_m_s: Any,
-    sigma_m_s: Any,
-    length_m: Any = VON_KARMAN_LENGTH_M,
-    direction_rad: Any = 0.0,
+    step_s: Number,
+    airspeed_m_s: Number,
+    sigma_m_s: _given.Listed,
+    length_m: _given.Listed = VON_KARMAN_LENGTH_M,
+    direction_rad: Number = 0.0,
 ) -> Float[Array, "{count} 2"]:
     """Von Karman turbulence [m/s] at 0, step, 2 step ...; arguments are those of `dryden`.
 

@@ -13,7 +13,9 @@ from scipy.special import ndtri, stdtrit
 
 from robins import units
 from robins.errors import require, require_known
+from robins.results import Probability
 
+Metric = float | int | str | list | Probability | None
 Metrics = Mapping[str, Mapping[str, Any]]  # by filter
 Band = Sequence[float | int | None]  # from, to
 Verdicts = list[dict[str, Any]]  # of claims, as `summary.json` has them
@@ -34,7 +36,7 @@ class Claim(NamedTuple):
     tested: bool = False  # the value or its band states a confidence, so it has no interval
 
 
-def graded(good: object, fair: object = False) -> str:
+def graded(good: bool | np.bool_, fair: bool | np.bool_ = False) -> str:
     """A verdict from two answers."""
     return "reproduced" if good else "partly" if fair else "not"
 
@@ -189,7 +191,7 @@ def interval_of(
 def _verdict(
     claim: Claim,
     metrics: Metrics,
-    value: Any,
+    value: float | int,
     interval: Sequence[float] | None,
     drawn: Sequence[Metrics],
 ) -> str:
@@ -203,7 +205,7 @@ def _verdict(
     return verdict if decided else "undecided"
 
 
-def _graded(claim: Claim, value: Any) -> str:
+def _graded(claim: Claim, value: float | int) -> str:
     return graded(_inside(value, claim.band), _inside(value, claim.partly))
 
 
@@ -232,7 +234,7 @@ def rms_by_component(statistics: Any) -> np.ndarray:
     return statistics.pooled_rms
 
 
-def rms_by_axis(statistics: Any, all_axes: Sequence[str] = ()) -> dict[str, Any]:
+def rms_by_axis(statistics: Any, all_axes: Sequence[str] = ()) -> dict[str, Metric]:
     """RMS error of every axis of every block in its display unit, over runs and epochs that count.
 
     Of the blocks in `all_axes` the RMS over all axes is reported too.
@@ -247,7 +249,7 @@ def rms_by_axis(statistics: Any, all_axes: Sequence[str] = ()) -> dict[str, Any]
     return out
 
 
-def standard_metrics(statistics: Any) -> dict[str, Any]:
+def standard_metrics(statistics: Any) -> dict[str, Metric]:
     """RMS error of every block, consistency of the filter, and number of diverged runs."""
     rms, errors = rms_by_component(statistics), {}
     for block in statistics.blocks:
@@ -257,7 +259,7 @@ def standard_metrics(statistics: Any) -> dict[str, Any]:
     return errors | consistency(statistics) | {"diverged_runs": statistics.diverged}
 
 
-def consistency(statistics: Any) -> dict[str, Any]:
+def consistency(statistics: Any) -> dict[str, Metric]:
     """Metrics of campaign statistics on the consistency of errors and stated covariance.
 
     A NEES is the mean over runs and epochs, over its degrees of freedom, and named by what it is
@@ -339,7 +341,7 @@ def _nis_inside(metrics: Mapping[str, Any]) -> bool:
     return all(_inside(metrics[k], metrics[f"{k}_band"]) for k in _grand_means(metrics))
 
 
-def _inside(value: Any, band: Band | None) -> bool:
+def _inside(value: float | int, band: Band | None) -> bool:
     if band is None:
         return False
     low, high = band

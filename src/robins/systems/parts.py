@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pydantic
 from jax.tree_util import Partial
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array, ArrayLike, PyTree
 
 from robins.filters import Motion
+from robins.filters.belief import Number
+from robins.filters.values import Numbers
 from robins.ins.increments import Increments
 from robins.scenario import Parameters, Quantity, Span, default
 from robins.sim import _given
+from robins.sim._given import Listed
 from robins.sim.commands import Command, accelerate, climb, stop, straight, turn
 from robins.systems import quantities as q
 
@@ -74,12 +77,12 @@ def during(spans: Sequence[Span | None], time_s: np.ndarray) -> np.ndarray:
     return ~outside([span for span in spans if span is not None], time_s)
 
 
-def as_array(numbers: Any) -> Any:
+def as_array(numbers: PyTree) -> Numbers:
     """Numbers of parameters as an array: NumPy's, which can be checked; JAX's if one is traced."""
     return (np if _given.known(numbers) else jnp).asarray(numbers, float)
 
 
-def any_there(numbers: Sequence[Any]) -> bool:
+def any_there(numbers: Sequence[Number]) -> bool:
     """True if one of some sizes is not zero, or may not be, for it is traced."""
     return not _given.known(numbers) or any(numbers)
 
@@ -88,7 +91,7 @@ Draw = Literal["normal", "plus-sigma", "random-sign"]
 """Draw of errors of a stated size: with it as sigma, as stated, or with random signs."""
 
 
-def signed(key: Array, size: Any, draw: Draw) -> Array:
+def signed(key: Array, size: Listed, draw: Draw) -> Array:
     """Errors of a stated size, of any shape."""
     sigma = jnp.asarray(size, float)
     normal = jax.random.normal(key, sigma.shape)
@@ -165,12 +168,12 @@ class Block(NamedTuple):
     noise_scale: ArrayLike  # () multiplies the process noise factor: 1, more across an IMU gap
 
 
-def noise_of_linear(linear: Callable[..., Any], x: Any, u: Any) -> Array:
+def noise_of_linear(linear: Callable[..., tuple], x: PyTree, u: PyTree) -> Array:
     """The noise of a step, the third that the linear form of its motion gives."""
     return linear(x, u)[2]
 
 
-def moved_by(step: Callable[..., Any], linear: Callable[..., Any], *given: Any) -> Motion:
+def moved_by(step: Callable[..., PyTree], linear: Callable[..., tuple], *given: PyTree) -> Motion:
     """A motion by its step and its linear form, which take `given` before state and input."""
     slope = Partial(linear, *given)
     return Motion(Partial(step, *given), Partial(noise_of_linear, slope), slope)

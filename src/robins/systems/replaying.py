@@ -18,6 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jax.typing import ArrayLike
+from jaxtyping import Array, PyTree
 
 from robins import rotation
 from robins.filters import Belief, Code, StepWarning, Tally, doubts, rts_smoother, run
@@ -30,6 +32,7 @@ from robins.ins.increments import after_gap
 from robins.program import BuildError, ProgramError
 from robins.program.scanned import on_each
 from robins.results import Outcome, Progress, silent, variable
+from robins.systems.judgement import Metric
 from robins.systems.study import Case, Contender, SensorAxes, StateBlock
 from robins.systems.suspects import probabilities, sentences, tables
 from robins.systems.tables import (
@@ -156,7 +159,7 @@ def gap_counts(pieces: Sequence[Piece], problems: Sequence[str]) -> dict[str, in
 # ----------------------------------------------------------------------------- pieces to answers
 
 
-def kept(step: Step) -> tuple[Any, Any, dict[str, Update]]:
+def kept(step: Step) -> tuple[PyTree, Array, dict[str, Update]]:
     """Keep the posterior's mean and standard deviations and how the updates went, by sensor.
 
     Of a bank also how likely each mode is.
@@ -249,13 +252,13 @@ def epochs_of(pieces: Sequence[Piece]) -> np.ndarray:
     return np.concatenate(rows[1:])
 
 
-def end_to_end(trees: Sequence[Any]) -> Any:
+def end_to_end(trees: Sequence[PyTree]) -> PyTree:
     """Join what was found of each piece, with a row of NaN between two: no curve crosses a gap.
 
     What holds no real number has a zero there.
     """
 
-    def join(*leaves: Any) -> jax.Array:
+    def join(*leaves: ArrayLike) -> jax.Array:
         rows = [np.asarray(leaf) for leaf in leaves]
         blank = np.full_like(rows[0][:1], np.nan if rows[0].dtype.kind == "f" else 0)
         return jnp.asarray(np.concatenate([rows[0], *(a for r in rows[1:] for a in (blank, r))]))
@@ -271,8 +274,8 @@ def outcome(
     answers: Mapping[str, Answer],
     reported: Reported,
     *,
-    metrics: Callable[[Answer], dict[str, Any]],
-    variables: Mapping[str, Any],
+    metrics: Callable[[Answer], Mapping[str, Metric]],
+    variables: Mapping[str, xr.Variable],
     counts: Mapping[str, int],
     notes: Sequence[str],
     origin_ns: int | None = None,
@@ -304,7 +307,9 @@ def outcome(
     origin = {} if origin_ns is None else {"origin_ns": np.int64(origin_ns)}
     return Outcome(
         solution=xr.Dataset(_tables(epoch_s, answers, reported) | dict(variables), attrs=origin),
-        metrics={name: metrics(answer) | _innovations(answer) for name, answer in answers.items()},
+        metrics={
+            name: dict(metrics(answer)) | _innovations(answer) for name, answer in answers.items()
+        },
         counts=dict(counts),
         notes=[*notes, *suspicions, *compiled],
         warnings=[*doubtful, reported.causes] if doubtful else [],
@@ -345,7 +350,7 @@ def _sigma(answer: Answer, block: StateBlock) -> np.ndarray | None:
     return here if here.shape[1] == len(block.axes) else None
 
 
-def _innovations(answer: Answer) -> dict[str, Any]:
+def _innovations(answer: Answer) -> dict[str, Metric]:
     """Grand mean NIS with its band, and number of refusals, of each sensor with measurements.
 
     The bound of an H-infinity filter is no covariance, so it has no NIS.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import IntFlag
 from functools import partial
 from typing import Any, ClassVar, TypeVar
@@ -18,6 +18,8 @@ from typing import Any, ClassVar, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 from robins.errors import RobinsError
 from robins.filters import Belief, Filter, FilterState, Model, OnlineFilter
@@ -189,11 +191,11 @@ class Live:
         self.counts: Counter[str] = Counter()
         self._made_with = made_with
 
-    def _state_now(self) -> Any:
+    def _state_now(self) -> PyTree:
         """State of the filter, or None before there is one."""
         raise NotImplementedError
 
-    def _go_on_from(self, state: Any) -> None:
+    def _go_on_from(self, state: PyTree) -> None:
         """Take a state of the filter whose leaves are these."""
         raise NotImplementedError
 
@@ -220,7 +222,7 @@ class Live:
             fix = "use the robins that wrote it, or start without it"
             raise ResultError(path, what, fix) from error
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple:
         """Pickle as it is saved: compiled code is compiled again."""
         return _made_again, (type(self), *self._all_known())
 
@@ -275,7 +277,7 @@ def _is_part(value: Part) -> bool:
     return type(value).__module__.startswith("robins.") and hasattr(value, "__dict__")
 
 
-def as_before(like: Any, leaves: list[Any]) -> Any:
+def as_before(like: PyTree, leaves: Sequence[ArrayLike]) -> PyTree:
     """A state of the structure of another, with these leaves.
 
     Raises:

@@ -6,10 +6,12 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import ArrayLike
 
+from robins.earth.wgs84 import Geodetic
 from robins.filters import Code
 from robins.filters.run import Step
-from robins.results import array, variable
+from robins.results import Variables, array, variable
 from robins.systems.study import Output, SensorAxes, StateBlock
 
 EULER = StateBlock("euler", slice(0, 3), "rad", "deg", "FRD to NED", ("roll", "pitch", "heading"))
@@ -38,8 +40,8 @@ def updates(step: Step, notes: Collection[str] = ()) -> dict[str, Update]:
 
 
 def block_array(
-    role: str, block: StateBlock | Output, values: Any, long_name: str = "", **attrs: Any
-) -> dict[str, Any]:
+    role: str, block: StateBlock | Output, values: ArrayLike, long_name: str = "", **attrs: Any
+) -> Variables:
     """An array of a block of the state, or of an output, in its units and frame."""
     shown = {"display_unit": block.display_unit, "axes": block.axes}
     about = {"unit": block.units, "long_name": long_name, "frame": block.frame}
@@ -47,8 +49,8 @@ def block_array(
 
 
 def place_arrays(
-    role: str, places: Iterable[Any], name: str = "{}", dims: str | None = None
-) -> dict[str, Any]:
+    role: str, places: Iterable[ArrayLike], name: str = "{}", dims: str | None = None
+) -> Variables:
     """Latitude, longitude [rad] and height [m] of a track, a reference or fixes.
 
     `name` is their long name, where {} stands for which of the three it is.
@@ -62,13 +64,13 @@ def place_arrays(
     return made
 
 
-def track_arrays(places: Iterable[Any], name: str = "{}") -> dict[str, Any]:
+def track_arrays(places: Iterable[Geodetic], name: str = "{}") -> Variables:
     """Estimated positions of each filter: a `Geodetic` of each, leading axis E epochs."""
     rows = zip(*((place.lat, place.lon, place.alt) for place in places), strict=True)
     return place_arrays("track", map(np.stack, rows), name)
 
 
-def attitude_array(q_nb: Any, frame: str, time: str = "time", words: str = "") -> dict[str, Any]:
+def attitude_array(q_nb: ArrayLike, frame: str, time: str = "time", words: str = "") -> Variables:
     """Attitude of each filter (F, E, 4) as q_nb, at the times of a clock; see `results.ROLES`.
 
     Args:
@@ -83,8 +85,8 @@ def attitude_array(q_nb: Any, frame: str, time: str = "time", words: str = "") -
 
 
 def innovation_tables(
-    seen: Sequence[Mapping[str, Any]], axes: Mapping[str, SensorAxes], epoch_s: np.ndarray
-) -> dict[str, Any]:
+    seen: Sequence[Mapping[str, Update]], axes: Mapping[str, SensorAxes], epoch_s: np.ndarray
+) -> Variables:
     """Arrays and coordinates of a solution, at the epochs of each sensor's measurements.
 
     Args:
@@ -113,7 +115,7 @@ def innovation_tables(
     return data
 
 
-def _every(seen: Sequence[Mapping[str, Any]], sensor: str, what: str) -> np.ndarray:
+def _every(seen: Sequence[Mapping[str, Update]], sensor: str, what: str) -> np.ndarray:
     """Kept part of a sensor by every filter, leading axis; NaN for one without the sensor."""
     rows = [getattr(of[sensor], what) if sensor in of else None for of in seen]
     blank = np.full(np.shape(next(row for row in rows if row is not None)), np.nan)

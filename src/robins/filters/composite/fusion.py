@@ -267,7 +267,9 @@ def covariance_intersection(
     return information_sum(beliefs, intersection_weights(beliefs, criterion))
 
 
-def intersection_weights(beliefs: Sequence[Belief], criterion: Any) -> Array:
+def intersection_weights(
+    beliefs: Sequence[Belief], criterion: Criterion | ArrayLike | Sequence[float]
+) -> Array:
     """(N,) weights of `covariance_intersection`."""
     check_criterion(criterion, len(beliefs))
     if not isinstance(criterion, str):

@@ -20,11 +20,12 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from robins import linalg, manifold
@@ -178,7 +179,7 @@ class Particle(Filter):
 
 def particle(
     count: int,
-    key: Any,
+    key: ArrayLike,
     sampled: Sequence[int] | None = None,
     linearise: Linearisation | None = None,
     resample: Number = 0.5,
@@ -235,7 +236,7 @@ def particle(
     )
 
 
-def reseed(state: FilterState, key: Any) -> FilterState:
+def reseed(state: FilterState, key: ArrayLike) -> FilterState:
     """The same state of a particle filter with other draws to come; `reset` it to draw the
     particles again.
 
@@ -246,7 +247,7 @@ def reseed(state: FilterState, key: Any) -> FilterState:
     return state._replace(memory=state.memory._replace(key=_as_key(key)))
 
 
-def _as_key(key: Any) -> Array:
+def _as_key(key: ArrayLike) -> Array:
     """The numbers of a key, which unlike keys can be saved."""
     if not jnp.issubdtype(jnp.result_type(key), jax.dtypes.prng_key):
         if jnp.shape(key) == (2,):

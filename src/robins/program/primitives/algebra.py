@@ -7,17 +7,17 @@ numbers.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from robins.program.kinds import Equation
 from robins.program.nodes import Node
 from robins.program.refusal import ProgramError
 from robins.program.walk import Nodes, Walk, rule
 
 
-def per_matrix(walk: Walk, function: Callable[..., Any], *stacks: Nodes) -> list[Nodes]:
+def per_matrix(walk: Walk, function: Callable[..., Sequence[Nodes]], *stacks: Nodes) -> list[Nodes]:
     """A function of matrices over their leading axes."""
     lead = stacks[0].shape[:-2]
     flat = [s.reshape(-1, *s.shape[-2:]) for s in stacks]
@@ -25,7 +25,13 @@ def per_matrix(walk: Walk, function: Callable[..., Any], *stacks: Nodes) -> list
     return [np.stack(found).reshape(*lead, *found[0].shape) for found in zip(*each, strict=True)]
 
 
-def call(walk: Walk, routine: str, sizes: list[int], arrays: list[Nodes], shapes: Any) -> Any:
+def call(
+    walk: Walk,
+    routine: str,
+    sizes: list[int],
+    arrays: list[Nodes],
+    shapes: Sequence[tuple[int, ...]],
+) -> list[Nodes]:
     """A routine on arrays, one after the other, and its results, likewise."""
     counts = [int(np.prod(shape)) for shape in shapes]
     args = [n for a in arrays for n in a.ravel().tolist()]
@@ -45,10 +51,10 @@ def dot(walk: Walk, a: list[Node], b: list[Node]) -> Node:
 
 
 @rule("dot_general")
-def _dot_general(walk: Walk, equation: Any, a: Nodes, b: Nodes) -> Nodes:
+def _dot_general(walk: Walk, equation: Equation, a: Nodes, b: Nodes) -> Nodes:
     (over_a, over_b), (with_a, with_b) = equation.params["dimension_numbers"]
 
-    def arranged(x: Nodes, batch: Any, over: Any) -> Nodes:
+    def arranged(x: Nodes, batch: Sequence[int], over: Sequence[int]) -> Nodes:
         free = [k for k in range(x.ndim) if k not in {*batch, *over}]
         lead, rest = [x.shape[k] for k in batch], [x.shape[k] for k in free]
         depth = int(np.prod([x.shape[k] for k in over]))
@@ -74,11 +80,11 @@ def _product(walk: Walk, A: Nodes, B: Nodes) -> Nodes:
 
 
 @rule("cholesky")
-def _cholesky(walk: Walk, equation: Any, P: Nodes) -> list[Nodes]:
+def _cholesky(walk: Walk, equation: Equation, P: Nodes) -> list[Nodes]:
     return per_matrix(walk, _cholesky_of, P)
 
 
-def _cholesky_of(walk: Walk, P: Nodes) -> tuple[Nodes]:
+def _cholesky_of(walk: Walk, P: Nodes) -> tuple[Nodes, ...]:
     """Lower factor by rows; all NaN where a pivot is not positive, as JAX returns it."""
     n, apply = len(P), walk.graph.apply
     if walk.stays_whole(n**3 // 3):
@@ -101,7 +107,7 @@ def _cholesky_of(walk: Walk, P: Nodes) -> tuple[Nodes]:
 
 
 @rule("triangular_solve")
-def _triangular_solve(walk: Walk, equation: Any, A: Nodes, B: Nodes) -> list[Nodes]:
+def _triangular_solve(walk: Walk, equation: Equation, A: Nodes, B: Nodes) -> list[Nodes]:
     p = equation.params
 
     def one(walk: Walk, A: Nodes, B: Nodes) -> tuple[Nodes]:
@@ -136,7 +142,7 @@ def _solve_lower(walk: Walk, A: Nodes, B: Nodes, unit: bool) -> Nodes:
 
 
 @rule("qr")
-def _qr(walk: Walk, equation: Any, A: Nodes) -> list[Nodes]:
+def _qr(walk: Walk, equation: Equation, A: Nodes) -> list[Nodes]:
     p = equation.params
     if p.get("pivoting"):
         raise ProgramError("a QR with exchange of columns", "", "use one without")
@@ -206,7 +212,7 @@ def _reflect(walk: Walk, A: Nodes, j: int, v: list[tuple[int, Node]], g: Node) -
 
 
 @rule("eigh")
-def _eigh(walk: Walk, equation: Any, A: Nodes) -> list[Nodes]:
+def _eigh(walk: Walk, equation: Equation, A: Nodes) -> list[Nodes]:
     """Vectors as columns, and values from least to greatest."""
     if equation.params.get("subset_by_index") not in (None, (0, A.shape[-1])):
         raise ProgramError("some of the eigenvalues of a matrix", "", "take all of them")
@@ -224,7 +230,7 @@ def _eigh(walk: Walk, equation: Any, A: Nodes) -> list[Nodes]:
 
 
 @rule("lu")
-def _lu(walk: Walk, equation: Any, A: Nodes) -> list[Nodes]:
+def _lu(walk: Walk, equation: Equation, A: Nodes) -> list[Nodes]:
     """Triangles in one matrix, exchanges, and the permutation that they make."""
 
     def one(walk: Walk, A: Nodes) -> tuple[Nodes, Nodes, Nodes]:

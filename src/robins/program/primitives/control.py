@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from jax.extend import core as jex
 
+from robins.program.kinds import Equation
 from robins.program.nodes import Node
 from robins.program.primitives.reductions import fold
 from robins.program.walk import Nodes, Walk, rule
 
-Equation = Any  # whose abstract values have neither shape nor type for a checker
 LONGEST = 100_000  # rounds of a loop that are written out
 
 
 CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call"}
 
 
-def called(equation: Equation) -> Any:
+def called(equation: Equation) -> jex.ClosedJaxpr | None:
     """The closed jaxpr that an equation calls, if it is a plain call."""
     if equation.primitive.name not in CALLS:
         return None
@@ -73,11 +73,11 @@ def _cond(walk: Walk, equation: Equation, index: Nodes, *args: Nodes) -> list[No
     ]
 
 
-def _flat(arrays: Any) -> list[Node]:
+def _flat(arrays: Iterable[Nodes]) -> list[Node]:
     return [n for a in arrays for n in a.ravel().tolist()]
 
 
-def _shaped(nodes: list[Node], like: Any) -> list[Nodes]:
+def _shaped(nodes: list[Node], like: Iterable[Nodes]) -> list[Nodes]:
     """Nodes one after the other as arrays of the shapes of some."""
     out, at = [], 0
     for a in like:

@@ -7,11 +7,12 @@ it may be: few are chains of selects, many an array of C with an index.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, SupportsIndex
 
 import numpy as np
 
+from robins.program.kinds import Equation
 from robins.program.nodes import Node
 from robins.program.walk import Nodes, Walk, rule
 
@@ -76,12 +77,12 @@ def _places(
 
 
 @rule("dynamic_slice")
-def _dynamic_slice(walk: Walk, equation: Any, a: Nodes, *start: Nodes) -> Nodes:
+def _dynamic_slice(walk: Walk, equation: Equation, a: Nodes, *start: Nodes) -> Nodes:
     return window(walk, a, [s.item() for s in start], tuple(equation.params["slice_sizes"]))
 
 
 @rule("dynamic_update_slice")
-def _dynamic_update(walk: Walk, equation: Any, a: Nodes, new: Nodes, *start: Nodes) -> Nodes:
+def _dynamic_update(walk: Walk, equation: Equation, a: Nodes, new: Nodes, *start: Nodes) -> Nodes:
     out = a.copy()
     most = [n - size for n, size in zip(a.shape, new.shape, strict=True)]
     inside = [_clamped(walk, s.item(), m) for s, m in zip(start, most, strict=True)]
@@ -91,13 +92,19 @@ def _dynamic_update(walk: Walk, equation: Any, a: Nodes, new: Nodes, *start: Nod
     return out
 
 
-def _drops(equation: Any) -> bool:
+def _drops(equation: Equation) -> bool:
     """True if a window outside is left out, not moved inside."""
     return getattr(equation.params["mode"], "name", "") == "FILL_OR_DROP"
 
 
 def _starts(
-    walk: Walk, indices: Nodes, batch: tuple[int, ...], rank: int, axes: Any, along: Any, by: Any
+    walk: Walk,
+    indices: Nodes,
+    batch: tuple[int, ...],
+    rank: int,
+    axes: Sequence[SupportsIndex],
+    along: Sequence[SupportsIndex],
+    by: Sequence[SupportsIndex],
 ) -> list[Node]:
     """Start of the window of one index vector, in all axes of the array."""
     start = [walk.graph.constant(0, "whole")] * rank
@@ -109,7 +116,12 @@ def _starts(
 
 
 def _windows(
-    shape: SIZES, sizes: SIZES, indices: np.ndarray, axes: Any, along: Any, by: Any
+    shape: SIZES,
+    sizes: SIZES,
+    indices: np.ndarray,
+    axes: Iterable[Any],
+    along: Sequence[SupportsIndex],
+    by: Sequence[SupportsIndex],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places of the entries of windows (batch..., *sizes) in an array, for indices that are known.
 
@@ -128,7 +140,7 @@ def _windows(
     return begin.reshape(*begin.shape, *[1] * len(sizes)) + within, inside
 
 
-def gathered(equation: Any, indices: np.ndarray, places: np.ndarray) -> np.ndarray:
+def gathered(equation: Equation, indices: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Places that a gather takes at indices that are known; -1 is what it gives outside."""
     p, d = equation.params, equation.params["dimension_numbers"]
     sizes = tuple(int(n) for n in p["slice_sizes"])
@@ -147,7 +159,7 @@ def gathered(equation: Any, indices: np.ndarray, places: np.ndarray) -> np.ndarr
 
 
 def scattered(
-    equation: Any, indices: np.ndarray, places: np.ndarray, new: np.ndarray
+    equation: Equation, indices: np.ndarray, places: np.ndarray, new: np.ndarray
 ) -> np.ndarray:
     """Places of an array, those of what is scattered into it at indices that are known put in."""
     d = equation.params["dimension_numbers"]
@@ -169,7 +181,7 @@ def scattered(
 
 
 @rule("gather")
-def _gather(walk: Walk, equation: Any, a: Nodes, indices: Nodes) -> Nodes:
+def _gather(walk: Walk, equation: Equation, a: Nodes, indices: Nodes) -> Nodes:
     known = walk.known(indices)
     if known is not None:
         at = gathered(equation, known, np.arange(a.size).reshape(a.shape))
@@ -198,7 +210,7 @@ def _gather(walk: Walk, equation: Any, a: Nodes, indices: Nodes) -> Nodes:
     return np.moveaxis(found, range(found.ndim), [*others, *offsets])
 
 
-def filling(equation: Any) -> np.ndarray:
+def filling(equation: Equation) -> np.ndarray:
     """The number that a gather gives outside of its array."""
     dtype, value = np.dtype(equation.outvars[0].aval.dtype), equation.params["fill_value"]
     if value is None:
@@ -219,7 +231,7 @@ JOINED = {
 
 
 @rule(*JOINED)
-def _scatter(walk: Walk, equation: Any, a: Nodes, indices: Nodes, new: Nodes) -> Nodes:
+def _scatter(walk: Walk, equation: Equation, a: Nodes, indices: Nodes, new: Nodes) -> Nodes:
     d, join = equation.params["dimension_numbers"], JOINED[equation.primitive.name]
     windows = [int(k) for k in d.update_window_dims]
     others = [k for k in range(new.ndim) if k not in windows]

@@ -20,7 +20,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from robins.program.kinds import kind_of
+from robins.program.kinds import Equation, kind_of
 from robins.program.nodes import Node
 from robins.program.refusal import ProgramError
 from robins.program.walk import Nodes, Walk, rule
@@ -65,7 +65,7 @@ def numbered(walk: Walk, keys: Nodes, shape: tuple[int, ...], row: Node | None =
 
 
 @rule("random_seed")
-def _seed(walk: Walk, equation: Any, seeds: Nodes) -> Nodes:
+def _seed(walk: Walk, equation: Equation, seeds: Nodes) -> Nodes:
     kind_of(equation.outvars[0].aval.dtype)  # refuses other generators
     graph, narrow = walk.graph, equation.invars[0].aval.dtype.itemsize < 8
 
@@ -76,31 +76,31 @@ def _seed(walk: Walk, equation: Any, seeds: Nodes) -> Nodes:
 
 
 @rule("random_wrap")
-def _wrap(walk: Walk, equation: Any, data: Nodes) -> Nodes:
+def _wrap(walk: Walk, equation: Equation, data: Nodes) -> Nodes:
     kind_of(equation.outvars[0].aval.dtype)
     return walk.each(lambda a, b: joined(walk, a, b), data[..., 0], data[..., 1])
 
 
 @rule("random_unwrap")
-def _unwrap(walk: Walk, equation: Any, keys: Nodes) -> Nodes:
+def _unwrap(walk: Walk, equation: Equation, keys: Nodes) -> Nodes:
     found = [words(walk, key) for key in keys.ravel().tolist()]
     return np.array(found, dtype=np.int64).reshape((*keys.shape, 2))
 
 
 @rule("random_fold_in")
-def _fold_in(walk: Walk, equation: Any, keys: Nodes, numbers: Nodes) -> Nodes:
+def _fold_in(walk: Walk, equation: Equation, keys: Nodes, numbers: Nodes) -> Nodes:
     graph = walk.graph
     wide = walk.each(lambda n: graph.convert(graph.convert(n, "word"), "word64"), numbers)
     return walk.apply("threefry", keys, wide)
 
 
 @rule("random_split")
-def _split(walk: Walk, equation: Any, keys: Nodes) -> Nodes:
+def _split(walk: Walk, equation: Equation, keys: Nodes) -> Nodes:
     return numbered(walk, keys, tuple(equation.params["shape"]))
 
 
 @rule("random_bits")
-def _bits(walk: Walk, equation: Any, keys: Nodes) -> Nodes:
+def _bits(walk: Walk, equation: Equation, keys: Nodes) -> Nodes:
     return bits_of(walk, keys, tuple(equation.params["shape"]), equation.outvars[0].aval.dtype)
 
 
@@ -116,7 +116,7 @@ def bits_of(
 
 
 @rule("threefry2x32")
-def _threefry(walk: Walk, equation: Any, *words_of: Nodes) -> list[Nodes]:
+def _threefry(walk: Walk, equation: Equation, *words_of: Nodes) -> list[Nodes]:
     """The generator itself, on two words of a key and two of a number."""
 
     def both(*four: Node) -> Node:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
 
 import numpy as np
 
-from robins.program.kinds import kind_of
+from robins.program.kinds import Equation, kind_of
 from robins.program.nodes import Node
 from robins.program.walk import RULES, Nodes, Walk, rule
 
@@ -22,14 +21,16 @@ REDUCED = {
 }
 
 
-def _empty(walk: Walk, kind: str, number: Any) -> Node:
+def _empty(walk: Walk, kind: str, number: float | int) -> Node:
     """Value of a reduction of nothing."""
     if kind == "whole" and not np.isfinite(number):
         number = np.iinfo(np.int64).min if number < 0 else np.iinfo(np.int64).max
     return walk.graph.constant(number, kind)
 
 
-def fold(walk: Walk, op: str, number: Any, a: Nodes, axes: tuple[int, ...], kind: str) -> Nodes:
+def fold(
+    walk: Walk, op: str, number: float | int, a: Nodes, axes: tuple[int, ...], kind: str
+) -> Nodes:
     """An array with some axes reduced, in the order of its entries."""
     kept = [axis for axis in range(a.ndim) if axis not in axes]
     rows = a.transpose([*kept, *axes]).reshape(*(a.shape[k] for k in kept), -1)
@@ -57,8 +58,8 @@ def _finite(walk: Walk, row: list[Node]) -> list[Node]:
     return [one, *(n for n in row if graph.op[n] != "is_finite")]
 
 
-def _reduced(op: str, number: Any):
-    def of(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+def _reduced(op: str, number: float | int):
+    def of(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
         kind = kind_of(equation.invars[0].aval.dtype)
         return fold(walk, op, number, a, tuple(map(int, equation.params["axes"])), kind)
 
@@ -71,7 +72,7 @@ CUMULATED = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"
 
 
 def _cumulated(op: str):
-    def of(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+    def of(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
         axis, back = equation.params["axis"], equation.params["reverse"]
         rows = np.moveaxis(np.flip(a, axis) if back else a, axis, 0)
         out = [np.asarray(row) for row in rows]
@@ -87,7 +88,7 @@ RULES.update({name: _cumulated(op) for name, op in CUMULATED.items()})
 
 
 @rule("argmax", "argmin")
-def _arg(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+def _arg(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
     """The first place of the extreme; a NaN is more extreme than any number."""
     graph, (axis,) = walk.graph, equation.params["axes"]
     most = equation.primitive.name == "argmax"
@@ -110,7 +111,7 @@ def _arg(walk: Walk, equation: Any, a: Nodes) -> Nodes:
 
 
 @rule("sort")
-def _sort(walk: Walk, equation: Any, *arrays: Nodes) -> list[Nodes]:
+def _sort(walk: Walk, equation: Equation, *arrays: Nodes) -> list[Nodes]:
     """Stable, by exchanges of neighbours: n (n - 1) / 2 comparisons, none of them a branch."""
     axis, keys = equation.params["dimension"], equation.params["num_keys"]
     graph = walk.graph

@@ -40,7 +40,7 @@ from robins import _float64  # noqa: F401
 from robins.earth import Geodetic, curvature_radii, earth_rate_n, gravity_n, transport_rate_n
 from robins.filters import Belief, Code, Motion, Rule
 from robins.filters.rule import Memory
-from robins.filters.values import value
+from robins.filters.values import Numbers, value
 from robins.ins.frames import swap
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
@@ -276,7 +276,7 @@ def feedback() -> Rule:
     return Feedback()
 
 
-def _start_sigma(given: Airship, course: Course) -> list[np.ndarray]:
+def _start_sigma(given: Airship, course: Course) -> list[Numbers]:
     """East, north, up; longitude and latitude in radians."""
     enu = start_sigma(given).reshape(3, 3)[:, [1, 0, 2]].ravel()
     return [enu / np.array([*np.ones(6), *course.datum.metres[::-1], 1.0])]
@@ -305,7 +305,7 @@ class Surroundings(NamedTuple):
     lonlat_rate: Array  # rad/s
 
 
-def surroundings(lat: Any, alt: Any, v: Any) -> Surroundings:
+def surroundings(lat: Array, alt: Array, v: Array) -> Surroundings:
     """Rates, gravity and how the place changes [rad/s], at a place and velocity (ENU)."""
     omega_ie = swap(earth_rate_n(lat))
     omega_en = swap(transport_rate_n(lat, alt, swap(v)))

@@ -27,7 +27,7 @@ from robins.systems.airship.instruments import SAR, STAR, WIND, WIND_OF_STAR
 from robins.systems.airship.model import NINE, PRODUCT, WIND_STATES, States
 from robins.systems.airship.parameters import Airship
 from robins.systems.airship.world import Course, World, lay_out, simulate
-from robins.systems.judgement import Claim, ratio_claims
+from robins.systems.judgement import Claim, Metric, ratio_claims
 from robins.systems.parts import ENU
 from robins.systems.study import Case, Contender, Instrument, Norm, Recipe, StateBlock, Study, View
 
@@ -221,7 +221,9 @@ def published(name: str, windy: bool) -> dict[str, float]:
     return {f"published_{key}": value for key, value in zip(METRICS, row, strict=False)}
 
 
-def airship_metrics(epoch_s: np.ndarray, at_s: Sequence[float], statistics: Any) -> dict[str, Any]:
+def airship_metrics(
+    epoch_s: np.ndarray, at_s: Sequence[float], statistics: Any
+) -> dict[str, Metric]:
     """Metrics of one filter from its campaign statistics, over the epochs that count.
 
     Means and standard deviations over time are of the length of the horizontal error, averaged over

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.earth import Geodetic, curvature_radii
+from robins.filters.values import Numbers
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 from robins.ins.increments import Increments, joined
 from robins.ins.mechanise import Nav, mechanise
@@ -135,7 +136,7 @@ def present(time_s: np.ndarray, instrument: Readings) -> np.ndarray:
     return (np.arange(1, len(time_s) + 1) % every == 0) & outside(instrument.lost, time_s)
 
 
-def _attitude(given: Airship, time_s: Any):
+def _attitude(given: Airship, time_s: Numbers):
     """Roll, pitch, heading [rad] at times, NumPy or JAX: sines that grow in gusts."""
     hull, wind = given.hull, given.wind
     xp = np if isinstance(time_s, np.ndarray) else jnp
@@ -268,7 +269,7 @@ def _turned_since(single: Increments) -> Array:
     return jnp.stack(rest, 1) if rest else jnp.zeros((single.dt.shape[0], 0, 3))
 
 
-def start_sigma(given: Airship) -> Any:
+def start_sigma(given: Airship) -> Numbers:
     """(9,) of attitude, velocity and position."""
     s = given.start
     return as_array([*s.attitude, *s.velocity, *s.position])

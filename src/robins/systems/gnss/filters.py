@@ -9,6 +9,7 @@ import numpy as np
 from robins.errors import require_known
 from robins.filters import kalman, rules
 from robins.filters.rule import Rule
+from robins.filters.values import Numbers
 from robins.systems.gnss.model import (
     RANGES,
     GnssState,
@@ -61,7 +62,7 @@ def weighing(name: str, weights: Weights) -> tuple[Rule, ...]:
     return (rules.only(RANGES, by_component(chosen[name], name.replace("-", "_"))),)
 
 
-def _case(kind: Kind, believed: Believed, numbers: tuple[Place, Any], world: World) -> Case:
+def _case(kind: Kind, believed: Believed, numbers: tuple[Place, Numbers], world: World) -> Case:
     place, member = numbers
     systems = np.shape(member)[1]
     first = Travel(*(a[0] for a in world.u))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from robins.systems.gnss.model import (
     LENGTH,
     POSITION,
     RANGES,
+    GnssState,
     Place,
     Sky,
     Travel,
@@ -235,7 +236,7 @@ def truth_at(truth: PlaceTable, given: Arranged) -> np.ndarray:
     return np.where(((epochs < t[0]) | (epochs > t[-1]))[:, None], np.nan, out)
 
 
-def accuracy(answer: Answer, true: np.ndarray) -> dict[str, Any]:
+def accuracy(answer: Answer, true: np.ndarray) -> dict[str, float | int]:
     """Horizontal and vertical errors, and the NEES of the horizontal place over its two axes."""
     error = true - np.asarray(answer.mean.position)
     known = np.all(np.isfinite(error), axis=1)
@@ -253,7 +254,7 @@ def accuracy(answer: Answer, true: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _estimates(mean: Any) -> Mapping[str, Any]:
+def _estimates(mean: GnssState) -> Mapping[str, np.ndarray]:
     return {
         "position": np.asarray(mean.position),
         "euler": heading_rad(mean.direction)[:, None],

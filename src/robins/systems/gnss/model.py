@@ -42,6 +42,8 @@ from jaxtyping import Array, ArrayLike
 
 from robins.earth import OMEGA_E, Geodetic, dcm_en, geodetic_from_ecef
 from robins.filters import Belief, Model, Motion, Sensor
+from robins.filters.belief import Number
+from robins.filters.values import Numbers
 from robins.systems.gnss.parameters import Believed, Clock, Delays
 from robins.systems.parts import NED
 from robins.systems.study import SensorAxes, StateBlock
@@ -95,17 +97,17 @@ class Place(NamedTuple):
         lat, lon, _ = geodetic_from_ecef(jnp.asarray(origin_e, float))
         return cls(jnp.asarray(origin_e, float), dcm_en(lat, lon))
 
-    def ecef(self, position: Any) -> Array:
+    def ecef(self, position: ArrayLike) -> Array:
         """(..., 3) Earth-fixed, of positions north, east, down."""
         along = jnp.asarray(position) @ self.C_en.T
         return along + jnp.broadcast_to(self.origin_e, along.shape)
 
-    def local(self, r_e: Any) -> Array:
+    def local(self, r_e: ArrayLike) -> Array:
         """(..., 3) north, east, down, of Earth-fixed positions."""
         r_e = jnp.asarray(r_e)
         return (r_e - jnp.broadcast_to(self.origin_e, r_e.shape)) @ self.C_en
 
-    def geodetic(self, position: Any) -> Geodetic:
+    def geodetic(self, position: ArrayLike) -> Geodetic:
         """Latitude, longitude and height of positions north, east, down."""
         return Geodetic.from_ecef(self.ecef(position))
 
@@ -117,7 +119,7 @@ class Kind(NamedTuple):
     memory: bool = True  # without it every epoch stands alone: least squares
 
 
-def sagnac_m(satellite_e: Any, receiver_e: Any) -> Any:
+def sagnac_m(satellite_e: Numbers, receiver_e: Numbers) -> Numbers:
     """Contribution of the Earth's rotation to a range [m], (...) of positions (..., 3)."""
     x, y = satellite_e[..., 0], satellite_e[..., 1]
     return OMEGA_E / LIGHT * (x * receiver_e[..., 1] - y * receiver_e[..., 0])
@@ -128,7 +130,7 @@ def clock_density(clock: Clock) -> tuple[float, float]:
     return LIGHT * math.sqrt(clock.h0 / 2.0), LIGHT * math.pi * math.sqrt(2.0 * clock.h2)
 
 
-def delay_law(delays: Delays, elevation_rad: Any, cn0_dbhz: Any) -> tuple[Any, Any]:
+def delay_law(delays: Delays, elevation_rad: Number, cn0_dbhz: Number) -> tuple[Array, Array]:
     """Mean and spread [m] of the delay of a signal, by its elevation and C/N0.
 
     With P the probability that it is blocked and u = 2 a cos(e), the mean is P u, and the mean
@@ -141,7 +143,7 @@ def delay_law(delays: Delays, elevation_rad: Any, cn0_dbhz: Any) -> tuple[Any, A
     return mean, jnp.sqrt(d.multipath**2 + 2.0 * blocked * reach**2 - mean**2)
 
 
-def _turned(angle: Any, c: Any) -> Array:
+def _turned(angle: Array, c: Array) -> Array:
     s, k = jnp.sin(angle), jnp.cos(angle)
     return jnp.stack([k * c[0] - s * c[1], s * c[0] + k * c[1]])
 
@@ -198,11 +200,11 @@ def _read(numbers: tuple[Place, Array], x: GnssState, sky: Sky) -> Array:
     return pseudoranges(*numbers, x, sky)
 
 
-def _sigma(x: GnssState, sky: Sky) -> Any:
+def _sigma(x: GnssState, sky: Sky) -> Array:
     return sky.sigma
 
 
-def _length(x: GnssState, aux: Any) -> Array:
+def _length(x: GnssState, aux: Array | None) -> Array:
     square = jnp.sum(x.direction**2)
     return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)[None]
 
@@ -230,7 +232,7 @@ def gnss_model(believed: Believed, kind: Kind, place: Place, member: np.ndarray)
 
 
 def start_belief(
-    believed: Believed, kind: Kind, fix: Any, place: Place, systems: int, u: Travel
+    believed: Believed, kind: Kind, fix: Numbers, place: Place, systems: int, u: Travel
 ) -> Belief:
     """Belief about the first fix; nothing is known of the heading.
 
@@ -261,7 +263,7 @@ def start_belief(
     return Belief(mean, jnp.diag(jnp.concatenate(sigma)))
 
 
-def first_fix(y: Any, sky: Sky, member: Any, system_bias_m: float) -> Array:
+def first_fix(y: Numbers, sky: Sky, member: Numbers, system_bias_m: float) -> Array:
     """(4 + K,) position [m, ECEF], clock and systems by least squares, from the Earth's centre on.
 
     Gauss-Newton on the pseudoranges there are, weighed by their sigmas, as `pseudoranges` has
@@ -299,7 +301,7 @@ def sensor_axes(satellites: tuple[str, ...]) -> dict[str, SensorAxes]:
     }
 
 
-def heading_rad(direction: Any) -> np.ndarray:
+def heading_rad(direction: Numbers) -> np.ndarray:
     """(E,) heading of directions (E, 2)."""
     c = np.asarray(direction)
     return np.arctan2(c[:, 1], c[:, 0])

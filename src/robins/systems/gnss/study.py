@@ -11,7 +11,7 @@ from robins.systems.gnss import filters, world
 from robins.systems.gnss.model import POSITION, sensor_axes
 from robins.systems.gnss.parameters import City
 from robins.systems.gnss.world import Course
-from robins.systems.judgement import Claim, Metrics, consistency, nees_claim, ratio
+from robins.systems.judgement import Claim, Metric, Metrics, consistency, nees_claim, ratio
 from robins.systems.study import Contender, Norm, Study, View
 from robins.systems.tables import place_arrays, track_arrays
 
@@ -39,7 +39,7 @@ def view(city: City, course: Course) -> View:
     )
 
 
-def _metrics(statistics: Any) -> dict[str, Any]:
+def _metrics(statistics: Any) -> dict[str, Metric]:
     """Horizontal mean and RMS over runs and epochs, vertical RMS, consistency."""
     square = statistics.pooled_rms**2
     return {

@@ -36,7 +36,7 @@ from robins.systems.gnss.model import (
     first_fix,
     pseudoranges,
 )
-from robins.systems.gnss.parameters import City
+from robins.systems.gnss.parameters import Believed, City
 
 _ORBIT_M = 26.56e6  # radius of a GPS orbit
 _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
@@ -218,7 +218,7 @@ def simulate(city: City, course: Course, seed: int, index: Array) -> World:
     return World(fix, u, wanted, sky, truth)
 
 
-def length_once(believed: Any, way_m: np.ndarray) -> np.ndarray:
+def length_once(believed: Believed, way_m: np.ndarray) -> np.ndarray:
     """(E, 1) one at the epoch where the way is long enough to know the heading, NaN elsewhere."""
     out = np.full((len(way_m), 1), np.nan)
     far = np.flatnonzero(way_m >= believed.wheels.aligned_after)

@@ -28,6 +28,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Array, PyTree
 
 from robins.dataset import ImuTable
 from robins.errors import require
@@ -487,10 +488,10 @@ class LiveInsGnss(Live):
             self._compiled_state = None if self._online is None else self._online.state
             self.start_over()
 
-    def _state_now(self) -> Any:
+    def _state_now(self) -> PyTree:
         return None if self._online is None else self._states
 
-    def _go_on_from(self, state: Any) -> None:
+    def _go_on_from(self, state: list[Array]) -> None:
         count = len(self._past)
         each = len(state) // count
         like = self._compiled_state

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from robins.filters import Code
+from robins.filters import Belief, Code, Filter, FilterState, Model
 from robins.filters.kalman import WRONG
 from robins.filters.run import Step
 from robins.systems.ins_gnss.robust import navigation
@@ -43,12 +43,12 @@ class Navigation(NamedTuple):
     seen: Mapping[str, Seen] = {}  # by sensor, in the last step of the filter
 
 
-def predicted(filter_: Any, model: Any, state: Any, u: Block) -> jax.Array:
+def predicted(filter_: Filter, model: Model, state: FilterState, u: Block) -> jax.Array:
     """Mean and standard deviations after a block, in one vector."""
     return _vector(filter_.predict(state, model.motion, u)[1].belief)
 
 
-def _vector(belief: Any) -> jax.Array:
+def _vector(belief: Belief) -> jax.Array:
     x = navigation(belief.mean)
     p = x.position
     place = jnp.stack([p.lat, p.lon, p.alt])

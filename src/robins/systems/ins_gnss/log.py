@@ -14,11 +14,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from robins.dataset import Dataset
 from robins.earth import Geodetic
 from robins.errors import require_known
 from robins.filters import Belief
+from robins.filters.values import Numbers
 from robins.ins.blocks import cut, epochs_between, gained_in_window, rate_about, usual_width
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
@@ -192,7 +194,7 @@ def first_belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
 
 def measured_fixes(
     log: Log, used: np.ndarray, epochs: np.ndarray, rate: np.ndarray, window_s: float
-) -> tuple[dict[str, Any], dict[str, Any]]:
+) -> tuple[dict[str, PyTree], dict[str, PyTree]]:
     """GNSS measurements by epoch; NaN where there is no fix or it is withheld."""
     given, g = used & ~log.withheld, log.gnss
     at = np.searchsorted(epochs, log.gnss_s[given] - 1e-9)
@@ -216,7 +218,7 @@ def measured_fixes(
 
 def measured_rest(
     log: Log, epochs: np.ndarray, rate: np.ndarray, aids: Aids, usual: Usual
-) -> tuple[dict[str, Any], dict[str, Any]]:
+) -> tuple[dict[str, PyTree], dict[str, PyTree]]:
     """Measurements of what is known without a receiver: standing still, or not slipping."""
     still, mean_rate = at_rest(log, aids, usual, epochs)
     stands = still[:, None]
@@ -443,6 +445,6 @@ def replay(
     return replace(outcome, verdict=word, files=files)
 
 
-def _estimates(mean: InsState) -> Mapping[str, Any]:
+def _estimates(mean: InsState) -> Mapping[str, Numbers]:
     biases_and_scales = {name: getattr(mean, name) for name in InsState._fields[3:]}
     return {"velocity": mean.v_n, "q_nb": mean.q_nb.wxyz, **biases_and_scales}

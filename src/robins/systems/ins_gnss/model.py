@@ -22,6 +22,7 @@ and their Jacobians H follow by differentiation on the manifold.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -31,6 +32,7 @@ from jaxtyping import Array, ArrayLike
 
 from robins.earth import Geodetic, earth_rate_n, gravity_n
 from robins.filters import Belief, Model, Sensor
+from robins.filters.belief import Number
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 from robins.systems.ins_gnss.parameters import Aids, Gnss, Imu, Start
@@ -144,11 +146,11 @@ def _fix_sigma(x: InsState, fix: Fix | Velocity | Wheel):
     return fix.sigma
 
 
-def _read_standstill(x: InsState, aux: Any):
+def _read_standstill(x: InsState, aux: Array | None):
     return x.v_n
 
 
-def _read_still_rate(x: InsState, aux: Any):
+def _read_still_rate(x: InsState, aux: Array | None):
     return -turn_rate_b(x, jnp.zeros(3))
 
 
@@ -227,10 +229,10 @@ def start_belief(
     nav: Nav,
     imu: Imu,
     start: Start,
-    tilt_rad: Any,
-    heading_rad: Any,
-    gyro_bias: Any = None,
-    fix_sigma_m: Any = (0.0, 0.0, 0.0),
+    tilt_rad: Number,
+    heading_rad: Number,
+    gyro_bias: ArrayLike | None = None,
+    fix_sigma_m: Iterable[Number] = (0.0, 0.0, 0.0),
 ) -> Belief:
     """The belief at the start, uncorrelated, about attitude, velocity and position of the IMU.
 

@@ -16,7 +16,7 @@ from robins.filters.chi_square import chi2_band
 from robins.filters.tally import CORRELATED
 from robins.ins.state import InsState
 from robins.program.scanned import named_scan, on_each
-from robins.results import array, variable
+from robins.results import Variables, array, variable
 from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.recording import Log
@@ -57,7 +57,9 @@ def _between(places: tuple[Geodetic, Geodetic]) -> Array:
     return places[0].local(places[1])
 
 
-def distances(log: Log, used: np.ndarray, epoch_s: np.ndarray, antenna: Geodetic) -> dict[str, Any]:
+def distances(
+    log: Log, used: np.ndarray, epoch_s: np.ndarray, antenna: Geodetic
+) -> dict[str, float | int]:
     """Distances of the antenna from the best fixes, with aids and in outages.
 
     The best fixes are those of the quality whose usual sigma is the smallest of the fixes used;
@@ -92,7 +94,7 @@ def _rms(x: np.ndarray) -> float:
     return float(np.sqrt(np.mean(x**2))) if x.size else float("nan")
 
 
-def fix_arrays(log: Log) -> dict[str, Any]:
+def fix_arrays(log: Log) -> Variables:
     """The fixes of a log, on its clock."""
     g = log.gnss
     out: dict[str, Any] = {

@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array, ArrayLike, PyTree
 
 from robins.earth import Geodetic
 from robins.filters import Belief, Filter, Model, Motion, Rule, Sensor, kalman, taylor
@@ -153,7 +153,7 @@ def widened(
     return Belief(Wide(start.mean, z, share, jnp.zeros(3)), factor)
 
 
-def navigation(x: Any) -> InsState:
+def navigation(x: InsState | Wide) -> InsState:
     """The navigation state of a wide one; another as it is."""
     return x.ins if isinstance(x, Wide) else x
 
@@ -194,7 +194,7 @@ def _step_linear(motion: Motion, of: Hypothesis, lasting: Array | None, x: Wide,
     return x._replace(ins=ins), Phi @ takes, noise
 
 
-def _read(read: Any, x: Wide, aux: Any):
+def _read(read: Callable, x: Wide, aux: PyTree):
     return read(x.ins, aux)
 
 
@@ -217,11 +217,11 @@ def _aged(fix: Velocity, share: ArrayLike) -> Velocity:
     return fix._replace(gained_b=gained, age_s=age)
 
 
-def _read_share(read: Any, x: Wide, fix: Velocity):
+def _read_share(read: Callable, x: Wide, fix: Velocity):
     return read(x.ins, fix if x.share is None else _aged(fix, x.share[0]))
 
 
-def _read_fresh(read: Any, x: InsState, fix: Velocity):
+def _read_fresh(read: Callable, x: InsState, fix: Velocity):
     return read(x, _aged(fix, 0.0))
 
 

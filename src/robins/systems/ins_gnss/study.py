@@ -18,7 +18,7 @@ from robins.results import array
 from robins.systems.ins_gnss.model import IMU, SENSORS, ins_gnss_model, state_blocks
 from robins.systems.ins_gnss.parameters import Drive, Imu
 from robins.systems.ins_gnss.world import Course, as_believed, belief_of, lay_out, simulate
-from robins.systems.judgement import consistency, consistency_claims
+from robins.systems.judgement import Metric, consistency, consistency_claims
 from robins.systems.parts import refuse_unsettled
 from robins.systems.study import Contender, StateBlock, Study, View
 from robins.systems.tables import place_arrays, track_arrays
@@ -105,13 +105,15 @@ def view(drive: Drive, course: Course) -> View:
     )
 
 
-def _metrics(outage: np.ndarray, blocks: Sequence[StateBlock], statistics: Any) -> dict[str, Any]:
+def _metrics(
+    outage: np.ndarray, blocks: Sequence[StateBlock], statistics: Any
+) -> dict[str, Metric]:
     """RMS errors over runs and epochs, with GNSS and without; consistency; runs that diverged."""
     rms = statistics.rms[statistics.count_from :]
     aided = ~outage[statistics.count_from :]
     where = {b.name: b.where for b in blocks}
 
-    def pooled(columns: Any, epochs: np.ndarray = aided) -> float:
+    def pooled(columns: slice | list[int], epochs: np.ndarray = aided) -> float:
         return float(np.sqrt(np.mean(np.sum(rms[epochs][:, columns] ** 2, axis=1))))
 
     north = where["position"].start

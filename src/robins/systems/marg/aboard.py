@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 from scipy.spatial.transform import Rotation as SciRotation
 
 from robins.dataset import Dataset, ImuTable, MagTable
@@ -91,7 +91,7 @@ def block_of(u: Given) -> model.Block:
     return model.Block(integrals, u.still, u.lost_turn, u.lost_dv)
 
 
-def _of_increments(inner: Callable[..., Any], x: model.MargState, u: Given) -> Any:
+def _of_increments(inner: Callable[..., PyTree], x: model.MargState, u: Given) -> PyTree:
     return inner(x, block_of(u))
 
 

@@ -20,12 +20,14 @@ What differs from a replay of the whole log:
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, PyTree
 
 from robins.errors import require
 from robins.filters import Code, OnlineFilter
@@ -256,7 +258,7 @@ class LiveMarg(Live):
         if not self._starting:
             self._q = self._turned(self._q, *since)
 
-    def _turned(self, q: Any, dt: float, theta: np.ndarray) -> tuple[float, ...]:
+    def _turned(self, q: Sequence[float], dt: float, theta: np.ndarray) -> tuple[float, ...]:
         true = theta + self._gain @ theta - self._bias * dt
         angle = math.sqrt(float(true @ true))
         share = math.sin(0.5 * angle) / angle if angle > 1e-9 else 0.5
@@ -352,10 +354,10 @@ class LiveMarg(Live):
 
     # ------------------------------------------------------------------------------- the file
 
-    def _state_now(self) -> Any:
+    def _state_now(self) -> PyTree:
         return None if self._online is None else self._online.state
 
-    def _go_on_from(self, state: Any) -> None:
+    def _go_on_from(self, state: list[Array]) -> None:
         increments = Increments(np.ones(1), np.zeros((1, 3)), np.array([[0.0, 0.0, -9.81]]))
         belief = first_belief(first_look(increments, np.full((1, 3), np.nan), self.parameters),
                               self.parameters)  # fmt: skip

@@ -211,11 +211,11 @@ def advance_linear(noise: Noise, x: MargState, block: Block):
     return advance(noise, x, block), F, _factor(noise, x, block)
 
 
-def _read_travel(x: MargState, _: Any):
+def _read_travel(x: MargState, _: Array | None):
     return jnp.concatenate([x.v_n, x.p_n])
 
 
-def _travel_linear(x: MargState, _: Any):
+def _travel_linear(x: MargState, _: Array | None):
     return _read_travel(x, None), jnp.eye(6, DIM, 3)
 
 
@@ -242,26 +242,26 @@ def _rest_sigma(noise: Noise, x: MargState, seen_b: Array):
     return jnp.repeat(jnp.stack([velocity, rate]), 3)
 
 
-def _level(x: MargState, field_b: Any):
+def _level(x: MargState, field_b: Array):
     """Strength along the horizontal, safe at zero, and the field in navigation axes."""
     m = x.q_nb.apply(field_b)
     square = m[0] ** 2 + m[1] ** 2
     return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0), m
 
 
-def _read_magnetometer(x: MargState, field_b: Any):
+def _read_magnetometer(x: MargState, field_b: Array):
     strength, m = _level(x, field_b)
     there = strength > 0.0
     azimuth = jnp.arctan2(jnp.where(there, m[1], 0.0), jnp.where(there, m[0], 1.0))
     return Angle(azimuth - x.declination), jnp.stack([strength, m[2]]) - x.field
 
 
-def _magnetometer_linear(x: MargState, field_b: Any):
+def _magnetometer_linear(x: MargState, field_b: Array):
     H = jnp.zeros((3, DIM)).at[0, HEADING].set(1.0).at[0, DECLINATION].set(-1.0)
     return _read_magnetometer(x, field_b), H.at[1:, FIELD].set(-jnp.eye(2))
 
 
-def _magnetometer_sigma(noise: Noise, x: MargState, field_b: Any):
+def _magnetometer_sigma(noise: Noise, x: MargState, field_b: Array):
     strength, _ = _level(x, field_b)
     # A field that points down has no azimuth: half a turn is as little as can be known.
     azimuth = jnp.pi * jnp.tanh(noise.field / jnp.maximum(strength, 1e-3 * noise.field) / jnp.pi)

@@ -23,6 +23,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from robins.dataset import ImuTable
 from robins.filters import Belief
@@ -371,7 +372,7 @@ def measurements(
     looks: Sequence[Look],
     parameters: Replay,
     pace: Pace,
-) -> tuple[dict[str, Any], dict[str, Any]]:
+) -> tuple[dict[str, PyTree], dict[str, PyTree]]:
     """Measurements at the end of each of K blocks, and what they depend on; NaN where nothing is.
 
     Args:

@@ -20,8 +20,9 @@ from robins.dataset import AttitudeTable, Dataset
 from robins.earth.magnetic import MagneticModelError, decimal_year, elements, field_n, wmm_for
 from robins.errors import require_known
 from robins.filters import Code
+from robins.filters.values import Numbers
 from robins.ins.frames import to_ned_frd
-from robins.results import Outcome, Progress, array, silent, variable
+from robins.results import Outcome, Progress, Variables, array, silent, variable
 from robins.systems import replaying
 from robins.systems.marg import model, monitor
 from robins.systems.marg.filters import BARE, filter_of, one_prior
@@ -146,7 +147,7 @@ def replay(
         errors = {name: _errors(dataset.attitude, log, q) for name, q in q_nb.items()}
         variables |= _error_arrays(answers, errors)
 
-    def metrics(answer: Answer) -> dict[str, Any]:
+    def metrics(answer: Answer) -> dict[str, float | int]:
         share = {"rest_share": float(np.mean(log.still))}
         if dataset.attitude is None:
             return share
@@ -303,7 +304,7 @@ def stated_sigma(
     return np.concatenate([np.hypot(sigma[:, :3], floor), sigma[:, 3:]], axis=1)
 
 
-def _estimates(mean: model.MargState) -> Mapping[str, Any]:
+def _estimates(mean: model.MargState) -> Mapping[str, Numbers]:
     values = {name: np.asarray(getattr(mean, of)) for name, of in _ESTIMATED.items()}
     return {name: x.reshape(len(x), -1) for name, x in values.items()} | {"q_nb": mean.q_nb.wxyz}
 
@@ -320,7 +321,7 @@ REPORTED = Reported(
 )
 
 
-def _accuracy(attitude: AttitudeTable, log: Prepared, q_nb: np.ndarray) -> dict[str, Any]:
+def _accuracy(attitude: AttitudeTable, log: Prepared, q_nb: np.ndarray) -> dict[str, float | int]:
     q_true, counts = truth_at(attitude, log.time_ns)
     e = orientation_errors(q_nb[counts], q_true[counts])
     return {
@@ -342,7 +343,7 @@ def _errors(attitude: AttitudeTable, log: Prepared, q_nb: np.ndarray) -> Errors:
     return Errors(-orientation_errors(q, q_true).heading, tilt, counts)
 
 
-def _error_arrays(answers: Mapping[str, Answer], errors: Mapping[str, Errors]) -> dict[str, Any]:
+def _error_arrays(answers: Mapping[str, Answer], errors: Mapping[str, Errors]) -> Variables:
     out: dict[str, Any] = {}
     for block, values, words in (
         (_HEADING, [e.heading[:, None] for e in errors.values()], "true minus estimated heading"),
@@ -363,7 +364,7 @@ def _refused(log: Prepared, answer: Answer) -> np.ndarray:
 
 def _variables(
     log: Prepared, answers: Mapping[str, Answer], doubt: Mapping[str, monitor.Doubt]
-) -> dict[str, Any]:
+) -> Variables:
     still = log.still.astype(np.int8)
     data = array("context", still, "rest", unit="1", long_name="unit lies still")
     data |= array(
@@ -384,7 +385,7 @@ def _variables(
     )
 
 
-def _attitudes(log: Prepared, q_nb: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def _attitudes(log: Prepared, q_nb: Mapping[str, np.ndarray]) -> Variables:
     """Attitude at every sample, on a clock of its own."""
     since_s = (log.time_ns - log.time_ns[0]) * 1e-9
     clock = variable("sample_time", since_s, "s", "time of the inertial samples")

@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from robins.filters.belief import Number
 from robins.manifold import Angle
 from robins.rotation import from_euler, from_rotvec, multiply, to_euler
 
@@ -67,7 +68,7 @@ def slope(c: Coefficients, x: Array) -> Array:
     return jnp.concatenate([c.kinematic * angles, rates])
 
 
-def step(c: Coefficients, state: AngleState, u: Any) -> AngleState:
+def step(c: Coefficients, state: AngleState, u: Array | None) -> AngleState:
     """One step of the motion by Runge and Kutta's classic rule."""
     x = jnp.concatenate([jnp.stack([a.rad for a in state[:3]]), state.omega_b])
     h = c.step_s
@@ -80,24 +81,24 @@ def step(c: Coefficients, state: AngleState, u: Any) -> AngleState:
     return AngleState(roll, pitch, yaw, state.omega_b + moved[3:])
 
 
-def stand_still(state: AngleState, u: Any) -> AngleState:
+def stand_still(state: AngleState, u: Array | None) -> AngleState:
     """No motion; with much noise, what is believed next is only what is measured next."""
     return state
 
 
-def reckon(step_s: Any, state: AngleState, theta_b: Array) -> AngleState:
+def reckon(step_s: Number, state: AngleState, theta_b: Array) -> AngleState:
     """Turn by the angles [rad] that the gyro reports of a step; its mean rate is that believed."""
     q = multiply(from_euler(*(a.rad for a in state[:3])), from_rotvec(theta_b))
     return angle_state(q, theta_b / step_s)
 
 
 # (A6)
-def read_rate(state: AngleState, aux: Any) -> Array:
+def read_rate(state: AngleState, aux: Array | None) -> Array:
     """(3,) what the gyro reads as a rate [rad/s]."""
     return state.omega_b
 
 
 # (A7)
-def read_angles(state: AngleState, aux: Any) -> tuple[Angle, Angle, Angle]:
+def read_angles(state: AngleState, aux: Array | None) -> tuple[Angle, Angle, Angle]:
     """Roll, pitch, yaw: what the "magnetic attitude" reads, or a gyro that has been integrated."""
     return state[:3]

@@ -39,6 +39,7 @@ from jaxtyping import Array
 
 from robins.errors import require
 from robins.filters import Motion, Sensor
+from robins.filters.values import Numbers
 from robins.manifold import dim
 from robins.rotation import (
     Rotation,
@@ -75,6 +76,9 @@ class ScaledState(NamedTuple):
     scale: Any  # (3,) relative
 
 
+AnyState = FieldState | ScaledState
+
+
 class Turn(NamedTuple):
     """Input of a step: what the gyro reports, and how much more it is doubted than its noise."""
 
@@ -101,23 +105,23 @@ def field_sensor(sine: Array, name: str = FIELD) -> Sensor:
 
 
 # (B1)
-def propagate(g: GyroNoise, x: Any, u: Turn) -> Any:
+def propagate(g: GyroNoise, x: AnyState, u: Turn) -> AnyState:
     """Turn by what the gyro reports of a step."""
     return x._replace(q_nb=Rotation(normalise(multiply(x.q_nb.wxyz, from_rotvec(_turn(g, x, u))))))
 
 
-def _turn(g: GyroNoise, x: Any, u: Turn) -> Array:
+def _turn(g: GyroNoise, x: AnyState, u: Turn) -> Array:
     """(3,) the true turn w of a step, as the state sees it through what the gyro reports."""
     return (u.theta_b - g.step_s * x.bias) / _stretch(x)
 
 
-def _stretch(x: Any) -> Array:
+def _stretch(x: AnyState) -> Array:
     """(3,) 1 + s, which is far from zero wherever a gyro is worth the name."""
     return 1.0 + x.scale if isinstance(x, ScaledState) else jnp.ones(3)
 
 
 # (B2)
-def propagated(g: GyroNoise, x: Any, u: Turn):
+def propagated(g: GyroNoise, x: AnyState, u: Turn):
     """`propagate` with its Jacobian and noise."""
     w, gain = _turn(g, x, u), 1.0 / _stretch(x)
     # a step turns little, but coning bodies turn fast
@@ -129,19 +133,19 @@ def propagated(g: GyroNoise, x: Any, u: Turn):
 
 
 # (B3)
-def noise_of(g: GyroNoise, x: Any, u: Turn) -> Array:
+def noise_of(g: GyroNoise, x: AnyState, u: Turn) -> Array:
     """(n,) of a step: alike on all axes, so the same in body and navigation axes."""
     angle = jnp.sqrt(g.angle**2 + u.doubt**2)
     return jnp.concatenate([jnp.full(3, angle), jnp.full(3, g.bias), jnp.zeros(dim(x) - 6)])
 
 
 # (B4)
-def read_field(x: Any, field_n: Array) -> Array:
+def read_field(x: AnyState, field_n: Array) -> Array:
     """(3,) field in body axes, in the unit of ``field_n``."""
     return rotate(conjugate(x.q_nb.wxyz), field_n)
 
 
-def observed(x: Any, field_n: Array):
+def observed(x: AnyState, field_n: Array):
     """`read_field` with its Jacobian: R(q)' exp(-phi) B = R(q)' (B + B x phi)."""
     C_bn = to_dcm(x.q_nb.wxyz).T
     H = jnp.concatenate([C_bn @ skew(field_n), jnp.zeros((3, dim(x) - 3))], axis=1)
@@ -149,7 +153,7 @@ def observed(x: Any, field_n: Array):
 
 
 # (B5)
-def field_noise(sine: Array, x: Any, field_n: Array) -> Array:
+def field_noise(sine: Array, x: AnyState, field_n: Array) -> Array:
     """(3,) standard deviations: an angle, so in proportion to the field."""
     return jnp.full(3, sine * jnp.sqrt(field_n @ field_n))
 
@@ -236,7 +240,7 @@ def unobserved(field_n: np.ndarray, sigma_rad: float) -> Unobserved:
     mean = mean / np.linalg.norm(mean)
     direction = vectors[:, 0] * (1.0 if vectors[:, 0] @ mean >= 0.0 else -1.0)
 
-    def between(x: np.ndarray, y: np.ndarray) -> Any:
+    def between(x: np.ndarray, y: np.ndarray) -> Numbers:
         return np.arctan2(np.linalg.norm(np.cross(x, y), axis=-1), np.sum(x * y, axis=-1))
 
     return Unobserved(

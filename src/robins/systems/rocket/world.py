@@ -215,7 +215,7 @@ def _field(given: Flight, course: Course, key: Array, world: World) -> Array:
     )
 
 
-def _burst(draw: Any, given: Flight, course: Course, key: Array) -> Array | None:
+def _burst(draw: Callable[..., Array], given: Flight, course: Course, key: Array) -> Array | None:
     """(E, 3) rad, disturbances of the magnetometer."""
     if (burst := given.magnetometer.disturbance) is None:
         return None

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import cache
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -96,7 +96,7 @@ def inflation(b: SensorNoise, spec: GainSpec) -> np.ndarray:
     return B
 
 
-def facts(b: SensorNoise, spec: GainSpec) -> Mapping[str, Any]:
+def facts(b: SensorNoise, spec: GainSpec) -> Mapping[str, float]:
     """Figures of a filter from its certified norms, for its metrics.
 
     ``predicted_rms_arcsec``: the H2 norms of the three axes as one, the error at star frames if the

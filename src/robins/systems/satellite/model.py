@@ -12,7 +12,7 @@ part in a thousand of T dbias. The noise of a sample is that of `robins.systems.
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +23,7 @@ from robins import linalg
 from robins.filters import Belief, Filter, Model, Motion, Sensor, adaptive, kalman, taylor
 from robins.filters.rules import constant_gain, gate
 from robins.rotation import BodyRotation, conjugate, from_rotvec, multiply, normalise, skew, to_dcm
+from robins.sim._given import Listed
 from robins.systems.satellite.gyro import walk_covariance
 from robins.systems.satellite.nodes import STAR, StateForm
 
@@ -58,7 +59,7 @@ def noise_of(random_walk: float, rate_walk: float, step_s: float) -> Noise:
     return Noise(jnp.asarray(step_s), jnp.asarray(np.kron(one, np.eye(3))))
 
 
-def _turn(x: Any, theta: Array, noise: Noise) -> Array:
+def _turn(x: AttitudeState | QuaternionState, theta: Array, noise: Noise) -> Array:
     return theta - noise.step_s * x.gyro_bias
 
 
@@ -81,11 +82,11 @@ def _linear(noise: Noise, x: AttitudeState, theta: Array):
     return moved, jnp.concatenate([top, low]), noise.factor
 
 
-def _read(x: AttitudeState, aux: Any) -> BodyRotation:
+def _read(x: AttitudeState, aux: Array | None) -> BodyRotation:
     return x.attitude
 
 
-def _read_linear(x: AttitudeState, aux: Any):
+def _read_linear(x: AttitudeState, aux: Array | None):
     return x.attitude, jnp.eye(3, 6)
 
 
@@ -108,7 +109,7 @@ def _noise_additive(noise: Noise, x: QuaternionState, theta: Array) -> Array:
     return jnp.concatenate([top, noise.factor[3:]])
 
 
-def _read_additive(x: QuaternionState, aux: Any) -> BodyRotation:
+def _read_additive(x: QuaternionState, aux: Array | None) -> BodyRotation:
     return BodyRotation(normalise(x.q_ib))
 
 
@@ -132,11 +133,11 @@ ADDITIVE = StateForm(
 )
 
 
-def _noise_of_frame(x: Any, factor: Array) -> Array:
+def _noise_of_frame(x: AttitudeState | QuaternionState, factor: Array) -> Array:
     return factor
 
 
-def model(noise: Noise, star_rad: Any, additive: bool = False, of_frame: bool = False) -> Model:
+def model(noise: Noise, star_rad: Listed, additive: bool = False, of_frame: bool = False) -> Model:
     """Motion and star sensor, whose noise each frame may bring with it."""
     sigma = _noise_of_frame if of_frame else jnp.asarray(star_rad, float)
     if additive:
@@ -146,7 +147,7 @@ def model(noise: Noise, star_rad: Any, additive: bool = False, of_frame: bool = 
     return Model(moves, (Sensor(_read, sigma, 3, STAR, _read_linear),))
 
 
-def start(q_ib: Array, attitude_rad: Any, bias_rad_s: Any, additive: bool = False) -> Belief:
+def start(q_ib: Array, attitude_rad: Listed, bias_rad_s: Listed, additive: bool = False) -> Belief:
     """Initial belief of filters: no bias, and these sigmas."""
     sizes = jnp.repeat(jnp.stack([jnp.asarray(attitude_rad), jnp.asarray(bias_rad_s)]), 3)
     if not additive:

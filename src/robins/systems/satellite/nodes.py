@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from robins import linalg
 from robins.earth.stars import StarIndex
@@ -217,7 +217,7 @@ def solved(q_ib: Array, covariance: Array, stars: Array) -> tuple[Array, Array, 
     return q_ib, linalg.cholesky(jnp.where(there, covariance, jnp.eye(3))), stars
 
 
-def shut(*_: Any) -> tuple[Array, Array, Array]:
+def shut(*_: PyTree) -> tuple[Array, Array, Array]:
     """Result of a camera with its shutter closed."""
     return jnp.full(4, jnp.nan), jnp.eye(3), jnp.asarray(0)
 
@@ -248,7 +248,7 @@ class StateForm(NamedTuple):
     rows: Callable[[Array], Any]  # q_ib -> rows that are reported, or None
 
 
-def apart(node: Callable, *args: Any) -> Any:
+def apart(node: Callable, *args: PyTree) -> PyTree:
     """A node as if it were compiled alone, so that it gives the same bits as where it is."""
     settled = jax.lax.optimization_barrier
     return settled(node(*settled(args)))

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from robins.filters import Belief, Code, Rule, StepInfo, StepWarning
 from robins.filters.kalman import FilterState
@@ -43,7 +43,7 @@ from robins.filters.synthesis import (
     current_form,
     kalman_design,
 )
-from robins.filters.values import value
+from robins.filters.values import Numbers, value
 from robins.rotation import conjugate, multiply, to_rotvec
 from robins.systems.satellite.design import GainSpec, SensorNoise, axis_plant
 from robins.systems.satellite.nodes import NO_GAIN, STAR
@@ -80,7 +80,7 @@ def frozen(b: SensorNoise, spec: GainSpec, sample_s: float) -> Frozen:
     return Frozen(np.asarray(sample_s), np.asarray(b.period_s), noise, error, star)
 
 
-def plant_at(rate_b: Any, of: Frozen) -> Plant:
+def plant_at(rate_b: Numbers, of: Frozen) -> Plant:
     """The plant of a craft that goes on turning at this rate [rad/s], body axes; current form.
 
     Its gain is to have an H-infinity norm of at most one.
@@ -94,7 +94,7 @@ def plant_at(rate_b: Any, of: Frozen) -> Plant:
     return current_form(A, of.noise, of.error, seen, np.diag(of.star), L=seen)
 
 
-def gain_at(rate_b: Any, of: Frozen) -> tuple[np.ndarray, np.ndarray]:
+def gain_at(rate_b: Numbers, of: Frozen) -> tuple[np.ndarray, np.ndarray]:
     """The certified gain at a rate, on the host.
 
     A function of its arguments alone: the units of the program are those of the craft at rest.
@@ -195,7 +195,7 @@ def redesigned() -> Rule:
     return LmiStep()
 
 
-def begun(state: FilterState, of: Frozen, gain: Any) -> FilterState:
+def begun(state: FilterState, of: Frozen, gain: Numbers) -> FilterState:
     """A state of such a filter with its numbers.
 
     Args:
@@ -205,7 +205,7 @@ def begun(state: FilterState, of: Frozen, gain: Any) -> FilterState:
     """
     as_arrays = Frozen(*(jnp.asarray(x, float) for x in of))
 
-    def told(memory: Any) -> Any:
+    def told(memory: PyTree) -> PyTree:
         if not isinstance(memory, Redesigned):
             return memory
         return memory._replace(of=as_arrays, gain=jnp.asarray(gain, float))

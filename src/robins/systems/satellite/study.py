@@ -21,7 +21,7 @@ from robins.filters import Loop
 from robins.filters.rules import with_gains
 from robins.filters.synthesis import MissingExtra
 from robins.results import array
-from robins.systems.judgement import ratio_claims
+from robins.systems.judgement import Metric, ratio_claims
 from robins.systems.parts import during
 from robins.systems.satellite import design, model, stepwise
 from robins.systems.satellite.design import GainSpec, SensorNoise
@@ -174,7 +174,7 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
     )
 
 
-def attitude_metrics(statistics: Any) -> dict[str, Any]:
+def attitude_metrics(statistics: Any) -> dict[str, Metric]:
     """Metrics of "attitude-loop": components 0 to 2 are the attitude's, body axes.
 
     ``attitude_rms_arcsec`` is the root sum square of the three axes of the error of attitude

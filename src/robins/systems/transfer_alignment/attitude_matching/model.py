@@ -27,13 +27,13 @@ so flexure drives no other state, and enters Z once. What the accelerometers do 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 from jax.tree_util import Partial
-from jaxtyping import ArrayLike
+from jaxtyping import Array, ArrayLike
 
 from robins import _float64, units  # noqa: F401
 from robins.earth import earth_rate_n, transport_rate_n
@@ -132,7 +132,7 @@ class LinearSystem(NamedTuple):
         G = jnp.asarray(self.G)
         return Model(Motion(_move, G, linear=Partial(_moved, G)), (reading(float(sigma)),))
 
-    def inputs(self) -> tuple[Any, dict[str, Any]]:
+    def inputs(self) -> tuple[Array, dict[str, Array]]:
         """``u`` and ``aux`` of a run."""
         return jnp.asarray(self.F), {ATTITUDE: jnp.asarray(self.H)}
 

@@ -22,7 +22,7 @@ from robins.filters import Filter, Step, kalman, run
 from robins.filters.rules.h_infinity import Infeasible, h_infinity, with_gamma
 from robins.results import Probability, array
 from robins.sim.flexure import Flexure
-from robins.systems.judgement import Claim, Metrics, graded, ratio, rms_by_axis
+from robins.systems.judgement import Claim, Metric, Metrics, graded, ratio, rms_by_axis
 from robins.systems.parts import ENU, RFU
 from robins.systems.study import Case, Contender, Limit, SensorAxes, StateBlock, Study, View
 from robins.systems.transfer_alignment.attitude_matching import model as am
@@ -115,7 +115,7 @@ def _contender(
     filter_: Filter,
     system: am.LinearSystem,
     sigma: float,
-    facts: Mapping[str, Any] | None = None,
+    facts: Mapping[str, Metric] | None = None,
     unit: float = 1.0,
 ) -> Contender:
     """A filter of a system; with facts, an H-infinity filter whose gamma has a unit."""
@@ -143,7 +143,7 @@ def existence(
     course: Course,
     gamma: float = np.nan,
     over_least: float | None = None,
-) -> dict[str, Any]:
+) -> dict[str, Metric]:
     """Facts on an H-infinity filter, found by running it over nothing but zeros.
 
     A filter that does not exist has no result: its figures are there, and empty. The filter has
@@ -235,7 +235,7 @@ NO_RESULT: dict[str, Any] = {
 """The figures of a filter that does not exist."""
 
 
-def metrics_of(statistics: Any) -> dict[str, Any]:
+def metrics_of(statistics: Any) -> dict[str, Metric]:
     """Metrics of one filter from its campaign statistics, over the epochs that count."""
     settled = statistics.settled(FIVE_ARCMIN.name)
     return rms_by_axis(statistics, all_axes=("attitude",)) | {

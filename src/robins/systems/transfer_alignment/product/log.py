@@ -22,6 +22,7 @@ from robins import linalg, units
 from robins.dataset import Dataset, Trajectory
 from robins.earth import earth_rate_n, transport_rate_n
 from robins.filters import Belief
+from robins.filters.values import Numbers
 from robins.ins.blocks import cut, epochs_between
 from robins.ins.frames import to_ned_frd
 from robins.ins.increments import Increments, from_imu
@@ -29,6 +30,7 @@ from robins.ins.mechanise import Nav, nav_at, refuse_polar, vector
 from robins.results import Outcome, Progress, silent, variable
 from robins.rotation import Rotation
 from robins.systems import replaying
+from robins.systems.judgement import Metric
 from robins.systems.replaying import Answer, Piece, Reported
 from robins.systems.study import Alignment, Case, Contender, Recipe
 from robins.systems.tables import place_arrays
@@ -127,7 +129,7 @@ def _prepare(recorded: Recorded, parameters: Replay, rows: slice) -> PairPiece:
     record = np.full(len(epochs), -1)
     record[np.searchsorted(epochs, stamps - 1e-9)] = used
 
-    def at_epochs(values: Any, fill: float = np.nan) -> np.ndarray:
+    def at_epochs(values: Numbers, fill: float = np.nan) -> np.ndarray:
         known = (record >= 0).reshape(-1, *([1] * (np.ndim(values) - 1)))
         return np.where(known, np.asarray(values)[record], fill)
 
@@ -225,7 +227,7 @@ def _case(parameters: Replay, simulated: Recipe, run: PairRun) -> Case:
 # ---------------------------------------------------------------------------------- what came out
 
 
-def _estimates(mean: ProductState) -> Mapping[str, Any]:
+def _estimates(mean: ProductState) -> Mapping[str, Numbers]:
     """Blocks that are vectors, and the attitude of the slave."""
     found = {
         "velocity": mean.ins.v_n,
@@ -250,7 +252,7 @@ _UNKNOWN = 0.7  # of the sigma at the start; what keeps more of it was hardly se
 _LARGE_RAD = np.deg2rad(5.0)
 
 
-def metrics_of(answer: Answer) -> dict[str, Any]:
+def metrics_of(answer: Answer) -> dict[str, Metric]:
     """Mounting, biases and attitude at the end with their sigmas."""
     out: dict[str, Any] = {}
     found, last = _estimates(answer.mean), np.asarray(answer.sigma)[-1]

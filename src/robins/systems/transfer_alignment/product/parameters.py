@@ -6,11 +6,12 @@ Vectors along the body are forward, right, down; along the Earth north, east, do
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import pydantic
 
+from robins.filters.values import Numbers
 from robins.scenario import Dof, Parameters, Positive, Quantity, Share, Span, default
 from robins.sim.flexure import Flexure
 from robins.systems import quantities as q
@@ -121,13 +122,13 @@ class Slave(Parameters):
     accel_calibration: q.AccelSizes | None = None
 
     @property
-    def gyro_left(self) -> Any:
+    def gyro_left(self) -> Numbers:
         """(3,) sigma of what is left of the constant drift [rad/s]."""
         calibrated = self.gyro_calibration
         return as_array(self.gyro_bias if calibrated is None else calibrated)
 
     @property
-    def accel_left(self) -> Any:
+    def accel_left(self) -> Numbers:
         """(3,) sigma of what is left of the constant bias [m/s^2]."""
         calibrated = self.accel_calibration
         return as_array(self.accel_bias if calibrated is None else calibrated)

@@ -19,11 +19,12 @@ from robins.errors import require_known
 from robins.filters import Belief, Model
 from robins.ins.frames import swap
 from robins.ins.state import InsNoise, InsState
-from robins.results import Probability
+from robins.results import Probability, Variables
 from robins.rotation import Rotation
 from robins.sim.flexure import Flexure, transition
 from robins.systems.judgement import (
     Claim,
+    Metric,
     consistency,
     consistency_claims,
     rms_by_axis,
@@ -208,7 +209,7 @@ CLAIMS = consistency_claims(
 }
 
 
-def product_metrics(statistics: Any) -> dict[str, Any]:
+def product_metrics(statistics: Any) -> dict[str, Metric]:
     """Metrics of one filter from its campaign statistics, over the epochs that count.
 
     Attitudes are listed east, north, up, as in the other studies; the rest as in its block. The
@@ -225,7 +226,7 @@ def product_metrics(statistics: Any) -> dict[str, Any]:
             error, stated = (np.linalg.norm(x[block.where]) for x in (rms, sigma))
             out["attitude_over_sigma"] = float(error / stated)
             for key in ("attitude_rms_arcmin", "attitude_last_sigma_arcmin"):
-                north, east, down = out[key]
+                north, east, down = np.asarray(out[key]).tolist()
                 out[key] = [east, north, down]  # sizes, which have no sign
     settled = statistics.settled(FIVE_ARCMIN)
     out["share_below_5_arcmin"] = Probability.among(settled <= statistics.count_from)
@@ -236,7 +237,7 @@ def _contender(given: Product, course: Course, name: str) -> Contender:
     return product_contender(given, name, given.believed)
 
 
-def tracks(means: Mapping[str, pm.ProductState]) -> dict[str, Any]:
+def tracks(means: Mapping[str, pm.ProductState]) -> Variables:
     """Estimated positions of the slave, by filter."""
     return track_arrays((mean.ins.position for mean in means.values()), "{} of the slave")
 

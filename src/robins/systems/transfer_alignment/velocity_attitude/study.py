@@ -38,7 +38,7 @@ from robins.ins.increments import Increments
 from robins.results import Probability, array
 from robins.rotation import Rotation, multiply, to_euler
 from robins.scenario import Parameters, Quantity, default
-from robins.systems.judgement import ratio_claims, rms_by_axis
+from robins.systems.judgement import Metric, ratio_claims, rms_by_axis
 from robins.systems.parts import ENU, RFU, Names, Runs, refuse_unsettled, warn_of_large_angles
 from robins.systems.study import (
     Case,
@@ -336,7 +336,7 @@ def view(given: VelocityAttitude, course: Course) -> View:
     )
 
 
-def metrics_of(epoch_s: np.ndarray, statistics: Any) -> dict[str, Any]:
+def metrics_of(epoch_s: np.ndarray, statistics: Any) -> dict[str, Metric]:
     """Metrics of one filter from its campaign statistics, over the epochs that count.
 
     Lists run east, north, up and right, forward, up. A run has settled below a limit when its worst
