@@ -31,7 +31,7 @@ Ceilings = dict[str, dict[str, int]]
 
 
 def costs() -> dict:
-    """What was measured: "files", and of the whole run "modules", "peak_mib" and "seconds".
+    """Measurements: "files", and of the whole run "modules", "peak_mib" and "seconds".
 
     Seconds are the sum of all files, so that they are as new as each of them.
     """

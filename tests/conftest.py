@@ -1,4 +1,4 @@
-"""What every test stands on: checked shapes, strict JAX, one float width, where the data lies.
+"""Ground of every test: checked shapes, strict JAX, one float width, where the data lies.
 
 Loaded by each worker of a parallel run before any test module, so before `robins` is imported.
 """
@@ -132,7 +132,7 @@ def pytest_collection_modifyitems(config, items):
 
 
 def pytest_collection_finish():
-    """What was imported stays: the collector of garbage need not look through it again.
+    """Freeze all imports: the collector of garbage need not look through them again.
 
     Tracing makes many objects that live on, so it is not to look after every 700 either.
     """

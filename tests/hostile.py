@@ -51,7 +51,7 @@ class Slow(BaseException):
 
 
 class Answer(NamedTuple):
-    """What came of a line."""
+    """Outcome of a command line."""
 
     words: list[str]
     status: int | None  # None: it was accepted

@@ -48,7 +48,7 @@ def table() -> list[dict]:
 
 
 def planted(mutant: dict, root: Path) -> tuple[Path, str, list[str]]:
-    """Of a commit in a folder the file, its text with the fault, and the tests that should see it.
+    """File of a planted fault, its text with the fault, and the tests that should see it.
 
     Raises ValueError if the fault has no place there.
     """
@@ -113,7 +113,7 @@ def seen_with(mutant: dict, root: Path, stamp: int, given: argparse.Namespace) -
 
 
 def tried(mutant: dict, root: Path, stamp: int, given: argparse.Namespace) -> dict:
-    """What became of one fault: status, seconds, the tests that caught it, why it was not run."""
+    """Outcome of one fault: status, seconds, the tests that caught it, or why it was not run."""
     began, caught, why = time.monotonic(), [], ""
     try:
         seen = seen_with(mutant, root, stamp, given)

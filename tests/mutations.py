@@ -155,7 +155,7 @@ def drawn(source: Path, tests: Path, number: int, seed: int) -> list[dict]:
 
 
 def is_python(text: str, mutant: dict) -> bool:
-    """Whether a file with a mutant can be read; any test would catch one that cannot."""
+    """Test for a mutant that can be read; any test would catch one that cannot."""
     with contextlib.suppress(SyntaxError):
         return bool(ast.parse(text.replace(mutant["old"], mutant["new"])))
     return False

@@ -48,7 +48,7 @@ def loose(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 
 
 def is_value(node: ast.ClassDef) -> bool:
-    """Whether a class is a value of `robins.filters.values`, which stands for a function."""
+    """Test for a class that is a value of `robins.filters.values`, which stands for a function."""
     return any(getattr(one, "id", "") == "value" for one in node.decorator_list)
 
 

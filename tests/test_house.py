@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from ratchets import imported_modules
+from ratchets import counted, imported_modules
 
 import robins
 
@@ -74,7 +74,7 @@ def rooms_as_drawn(text: str) -> dict[str, set[str]]:
 
 
 def allowed(drawn: dict[str, set[str]]) -> dict[str, set[str]]:
-    """Who may import whom, downwards all the way; raises if the table runs in a circle."""
+    """Imports allowed to each room, downwards all the way; raises if the table runs in a circle."""
     if unknown := set().union(*drawn.values()) - set(drawn) - {"*"}:
         raise ValueError(f"rooms named but not drawn: {sorted(unknown)}")
     closed: dict[str, set[str]] = {}
@@ -263,6 +263,12 @@ def test_the_architecture_is_read_in_one_sitting():
 def test_every_module_says_what_it_is():
     said = {p: ast.get_docstring(ast.parse(p.read_text("utf-8"))) for p in SOURCE.rglob("*.py")}
     assert [str(path) for path, text in said.items() if not text] == []
+
+
+def test_no_docstring_of_a_test_begins_with_a_clause():
+    """The ratchets count those of the source, by room."""
+    trees = {p: ast.parse(p.read_text("utf-8")) for p in sorted((ROOT / "tests").rglob("*.py"))}
+    assert [str(path) for path, tree in trees.items() if counted(tree)["clauses"]] == []
 
 
 def test_no_two_files_of_tests_share_a_name():

@@ -19,7 +19,7 @@ def parsed(file):
 
 
 def defined(name):
-    """Whether a file of tests defines the function of a name, "room/test_x.py::test_y"."""
+    """Test for a file that defines the function of a name, "room/test_x.py::test_y"."""
     file, *path = name.split("::")
     tree = parsed(HERE / file)
     inner = {n.name: n for n in tree.body if isinstance(n, (ast.ClassDef, ast.FunctionDef))}

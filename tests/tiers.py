@@ -52,7 +52,7 @@ def heavy() -> set[str]:
 
 
 def meant(entry: dict[str, str], node: str) -> bool:
-    """Whether an entry means a test: its name, alone or with parameters that match ``only``."""
+    """Test for an entry that names a test, alone or with parameters that match ``only``."""
     name, _, parameters = node.partition("[")
     wanted = re.compile(entry.get("only", ".*"))
     return name == entry["test"] and bool(wanted.fullmatch(parameters.removesuffix("]")))

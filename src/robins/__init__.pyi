@@ -23,11 +23,11 @@ from robins.systems.ins_gnss.live import LiveInsGnss as LiveInsGnss
 from robins.systems.marg.live import LiveMarg as LiveMarg
 from robins.systems.study import Scenario as Scenario
 from robins.systems.study import Study as Study
-from robins.workbench.boards import export_filter as export_filter
-from robins.workbench.examination import examine as doctor
+from robins.workbench.doctor import examine as doctor
+from robins.workbench.export import export_filter as export_filter
 from robins.workbench.publication import publish as publish
-from robins.workbench.recorded import replay as replay
-from robins.workbench.simulated import run as run
+from robins.workbench.replay import replay as replay
+from robins.workbench.run import run as run
 
 __all__ = [
     "Belief",

@@ -11,7 +11,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 def installed() -> str:
-    """Where one is; the test is skipped if there is none."""
+    """Path of an installed browser; the test is skipped if there is none."""
     path = next(filter(None, map(shutil.which, BROWSERS)), None)
     if path is None:
         pytest.skip(f"needs a Chromium: none of {', '.join(BROWSERS)} is on the path")

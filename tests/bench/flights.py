@@ -27,7 +27,7 @@ def in_order(rig, made):
 def flown(
     rig, kit, steps, lost=lambda name, k: False, begin=0, states=None, wrong=lambda name, k, x: x
 ):
-    """What the parts say, as a bench would note it, and their last states with what they heard.
+    """Messages of the parts, as a bench would note them, and their last states with their inputs.
 
     All must be sound. A message for which ``lost(name, step)`` holds reaches nobody, but is noted;
     what others hear is ``wrong(name, step, values)``. From ``begin`` on it continues with the

@@ -40,7 +40,7 @@ def crc32c(data: bytes) -> int:
 
 
 def unstuffed(data: bytes) -> bytes | None:
-    """What was stuffed; None: it was not."""
+    """Bytes before stuffing; None: they were not stuffed."""
     out, at = bytearray(), 0
     while at < len(data):
         code = data[at]

@@ -35,7 +35,7 @@ Meddle = Callable[[int, str, str, bytes], list[tuple[int, bytes]]]
 
 
 def alive(pid: int) -> bool:
-    """Whether there is a process of this number."""
+    """Test for a process of this number."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -89,7 +89,7 @@ def parts(of: Any, rig: Rig = RIG) -> Mapping[str, Part]:
 
 
 class Node(threading.Thread):
-    """In the place of the process of a part: a thread at the end of a pseudo-terminal."""
+    """Stand-in for the process of a part: a thread at the end of a pseudo-terminal."""
 
     pid = None
 
@@ -138,7 +138,7 @@ class Node(threading.Thread):
 
 
 class Threads(Crew):
-    """In the place of `Crew`: parts of a rig on threads, but for programs and a few.
+    """Stand-in for `Crew`: parts of a rig on threads, but for programs and a few.
 
     Attributes:
         stations: of parts that are odd.
@@ -161,7 +161,7 @@ class Threads(Crew):
 
 @contextmanager
 def starting(flight: Flight, part: str, program: Path | None) -> Iterator[Start]:
-    """In the place of what starts a process for a replay."""
+    """Stand-in for the function that starts a process for a replay."""
     programs = {} if program is None else {part: program}
     with Threads(flight.rig, kit_of(flight), programs=programs) as crew:
 

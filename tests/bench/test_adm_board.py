@@ -48,7 +48,7 @@ def program(tmp_path_factory):
 
 
 def flown(of, meddled):
-    """What reaches the filter in each step, and what the part of Python answers to it."""
+    """Inputs of the filter in each step, and the answers of the part in Python."""
     reached = [{} for _ in range(STEPS)]
 
     def meddle(step, name, taker, payload):
@@ -70,7 +70,7 @@ def flown(of, meddled):
 
 
 def answers(program, of, reached, first=0):
-    """What the board answers to the same from a step on, by message."""
+    """Answers of the board to the same inputs from a step on, by message."""
     told = {"estimate": [], "innovation": [], "done": []}
     with open_pair() as pair:
         board = Board(program, pair)

@@ -1,4 +1,4 @@
-"""What is said of the flags of estimates: when a thing begins and when it ends, and no more."""
+"""Alerts on the flags of estimates: one when a thing begins, one when it ends, and no more."""
 
 import pytest
 

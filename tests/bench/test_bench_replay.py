@@ -37,7 +37,7 @@ def encoded(name: str, sequence: int, at_ns: int, run: int = RUN, **values) -> b
 
 
 def estimate(total: np.ndarray, step: int) -> dict:
-    """What the part says: sums of all that it heard, so that one wrong frame changes all after."""
+    """Output of the part: sums of all inputs, so that one wrong frame changes all after."""
     return {
         "q_ib": [1.0, *total],
         "gyro_bias": np.sqrt(np.abs(total)),

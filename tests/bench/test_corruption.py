@@ -53,7 +53,7 @@ def stream(kind: str, seed: int = 8, edges: slice = slice(None)) -> Pieces:
 
 
 def received(pieces: Pieces, seed: int = 9) -> tuple[list[Frame], Receiver]:
-    """What comes out of them, cut up anew at random."""
+    """Frames received from the bytes, cut up at random."""
     rng, taker = np.random.default_rng(seed), Receiver()
     line = b"".join(data for data, _, _ in pieces) + b"\0"
     found, at = [], 0
@@ -138,7 +138,7 @@ def test_these_tests_find_a_receiver_without_a_check(monkeypatch):
 
 
 def test_one_edge_a_frame_would_not_do():
-    """With a zero behind each frame only, noise takes the frame after it along."""
+    """Each frame needs both zeros: with one behind it only, noise takes the next frame along."""
     pieces = stream("noise", edges=slice(1, None))
     lost = {frame for _, frame, _ in pieces} - set(received(pieces)[0])
     assert len(lost) > EACH / 2

@@ -72,7 +72,7 @@ def day(tmp_path_factory):
 
 
 def test_the_page_is_there_all_day(day):
-    """Whoever comes in the afternoon sees the morning, and is obeyed."""
+    """A page opened in the afternoon shows the morning, and its commands are obeyed."""
     process, _, _ = day
     told = ""
     while not (url := re.search(r"http://127.0.0.1:\d+\S*", told)):

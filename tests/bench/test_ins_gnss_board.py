@@ -70,7 +70,7 @@ def kit(scenario):
 
 
 def sensed(kit, steps):
-    """What reaches the part in each step, by message."""
+    """Inputs of the part in each step, by message."""
     parts, found = [RIG.part(name, kit) for name in ("imu", "gnss")], []
     states = [part.begin() for part in parts]
     for k in range(steps):
@@ -82,7 +82,7 @@ def sensed(kit, steps):
 
 
 def of_the_part(kit, reached):
-    """What the part in Python says to that, by step."""
+    """Answers of the part in Python, by step."""
     part, told = parts(kit, RIG)["navigation"], []
     state = part.begin()
     for k, inputs in enumerate(reached):
@@ -103,7 +103,7 @@ class Navigator(Board):
 
 
 def of_the_board(program, kit, reached, runs=1):
-    """What the program says to that, by step; in the last of some runs."""
+    """Answers of the program, by step; in the last of some runs."""
     told = []
     with open_pair() as pair:
         board = Navigator(program, pair)
@@ -164,7 +164,7 @@ def compare(told, wanted, name):
 
 
 def meddled(reached):
-    """With what may go wrong: lost, repeated, late and impossible samples and fixes, and a gap."""
+    """Inputs with faults: lost, repeated, late and impossible samples and fixes, and a gap."""
     rows = [dict(row) for row in reached]
     at = [k for k, row in enumerate(rows) if "fix" in row]
     begun = next(k for k in at if k > 300)

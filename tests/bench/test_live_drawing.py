@@ -1,4 +1,4 @@
-"""What the scripts of the live page compute, in the browser, against NumPy."""
+"""Results of the scripts of the live page, in the browser, against NumPy."""
 
 import shutil
 from itertools import pairwise

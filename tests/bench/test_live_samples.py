@@ -1,4 +1,4 @@
-"""What the page keeps and draws of a long run, in the browser, against NumPy."""
+"""Samples that the page keeps and draws of a long run, in the browser, against NumPy."""
 
 import base64
 
@@ -132,7 +132,7 @@ def test_a_long_run_is_drawn_with_few_points_and_every_spike(page):
 
 @pytest.mark.parametrize(("begin", "end"), [(400, 470), (8990, 9040), (9990, 20_000)])
 def test_every_span_is_drawn_as_it_was(page, begin, end):
-    """Of what is kept each, the samples; of a history, its buckets; and one before them."""
+    """Every kept sample, every bucket of a history, and the one before them."""
     time_s, values = drawn(2, 10_000, share=1.0)
     span = [time_s[begin] - 1e-6, time_s[min(end, 9999)] + 1e-6]
     asked = {

@@ -93,7 +93,7 @@ def numbers(samples: list[bytes]) -> np.ndarray:
 
 
 def gone(pid: int, within_s: float = 4.0) -> bool:
-    """Whether a process ends; one that nobody waited for yet has ended too."""
+    """Test for the end of a process; one that nobody waited for yet has ended too."""
     until = time.monotonic() + within_s
     while time.monotonic() < until:
         try:

@@ -110,7 +110,7 @@ def test_a_page_that_was_away_for_long_gets_what_it_missed(chromium):
 
 
 def a_day(signals: int) -> bytes:
-    """What a server has after 24 h of 20 samples a second: 3375 buckets of 512."""
+    """State of a server after 24 h of 20 samples a second: 3375 buckets of 512."""
     n, samples = 3375, 24 * 3600 * 20
     first = 0.05 * (512 * np.arange(n) + 1)
     noise = np.random.default_rng(0).uniform(0.5, 1.0, size=(signals, n))

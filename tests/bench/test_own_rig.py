@@ -93,7 +93,7 @@ def test_viewers_decode_every_message_of_its_record(flown):
 
 @pytest.mark.parametrize("name", [*RIGS, RIG])
 def test_the_page_of_any_rig_offers_faults_that_it_has(name):
-    """Of an own rig those of every line; each can be injected as it stands."""
+    """An own rig offers the faults of every line; each can be injected as it stands."""
     rig = rig_of(name)
     made = [rig.fault.model_validate({**one["fault"], "begin": 1.0}) for one in rig.shown.offered]
     labels = [one["label"] for one in rig.shown.offered]

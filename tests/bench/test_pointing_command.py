@@ -201,7 +201,7 @@ def test_a_slew_keeps_its_greatest_rate_and_what_the_wheels_can(of):
 
 
 def test_another_attitude_on_the_way_goes_on_without_a_jump(of, asked):
-    """By differences of the attitudes that are to be had."""
+    """Check by differences of the target attitudes."""
     said = [(50, asked, 0.0), (200, np.array([1.0, 0, 0, 0]), 0.0), (350, NONE, 0.0)]
     ways = followed(of, said)
     q, omega = np.stack([at.q_ib for at in ways]), np.stack([at.omega_b for at in ways])

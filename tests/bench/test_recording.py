@@ -217,7 +217,7 @@ def test_the_summary_leads_to_what_is_asked(made, tmp_path):
 
 
 def ends(content: bytes, some: list[Entry | Event]) -> list[int]:
-    """Where the bytes of each message end in the file, found by looking for them."""
+    """Ends of the bytes of each message in the file, found by looking for them."""
     out, at = [], 0
     for one in some:
         event = isinstance(one, Event)
@@ -228,7 +228,7 @@ def ends(content: bytes, some: list[Entry | Event]) -> list[int]:
 
 
 def is_beginning(entries: list[Entry], events: list[Event], some: list[Entry | Event]) -> bool:
-    """Whether they are the first of some, in their order."""
+    """Test for the first of some items, in their order."""
     return (entries, events) == split(some[: len(entries) + len(events)])
 
 
@@ -287,7 +287,7 @@ def test_a_flipped_bit_gives_what_comes_before_it(tmp_path):
 
 
 def heads(content: bytes) -> list[int]:
-    """Where the chunks of a file begin."""
+    """Beginnings of the chunks of a file."""
     summary = make_reader(BytesIO(content)).get_summary()
     return [index.chunk_start_offset for index in summary.chunk_indexes]
 

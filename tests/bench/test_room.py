@@ -1,4 +1,4 @@
-"""What passes in a long run lies on disk: the same numbers, little memory, nothing left behind."""
+"""Numbers of a long run on disk: the same numbers, little memory, nothing left behind."""
 
 import gc
 import os
@@ -28,7 +28,7 @@ def on_disk(monkeypatch):
 
 
 def maps(folder):
-    """Of files of a folder in the memory of this process: kB that are resident, by mapping."""
+    """Resident memory [kB] of this process for files of a folder, by mapping."""
     lines = Path("/proc/self/smaps").read_text().splitlines()
     found = [k for k, line in enumerate(lines) if f" {folder}/" in line]
     return [next(int(x.split()[1]) for x in lines[k:] if x.startswith("Rss:")) for k in found]

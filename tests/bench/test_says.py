@@ -1,4 +1,4 @@
-"""What the operator says through the bench: what can be said, when it goes out, and by whom."""
+"""Operator messages through the bench: which can be sent, at which time, and by whom."""
 
 import numpy as np
 import pytest

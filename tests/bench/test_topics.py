@@ -126,7 +126,7 @@ def made(tmp_path_factory) -> tuple[list[Entry | Event], bytes]:
 
 
 def sent(some: list[Entry | Event], link: str) -> list[tuple[Entry, Header, dict]]:
-    """What a link sent that is sound, as the wire decodes it."""
+    """Sound messages that a link sent, as the wire decodes them."""
     out = []
     for one in some:
         if isinstance(one, Event) or (one.link, one.direction) != (link, "from"):
@@ -177,7 +177,7 @@ def decode_rosbags(found: list) -> list:
 
 
 def decode_mcap_ros2(found: list) -> list:
-    """By the definitions in the file alone."""
+    """Decode by the definitions in the file alone."""
     decoders = pytest.importorskip("mcap_ros2.decoder", reason="needs mcap-ros2-support")
     factory = decoders.DecoderFactory()
     out = []

@@ -1,4 +1,4 @@
-"""Who looks on sees what matters, however much else happens."""
+"""Observers see all that matters, however much else happens."""
 
 import os
 import re

@@ -28,7 +28,7 @@ RUNS = 53
 
 @pytest.fixture
 def problem(three):  # noqa: F811
-    """With one filter, limits, norms and windows."""
+    """Problem with one filter, limits, norms and windows."""
     return replace(
         three,
         contenders={"right": three.contenders["right"]},
@@ -46,7 +46,7 @@ def quick(monkeypatch):
 
 
 def equal(a, b):
-    """To the bit, in all that statistics hold."""
+    """Equality to the bit, in all that statistics hold."""
     assert (a.runs, a.diverged, a.n) == (b.runs, b.diverged, b.n)
     assert list(a.sums) == list(b.sums)
     for name in a.sums:

@@ -22,7 +22,7 @@ RUNS = 53  # no whole number of chunks or lanes
 
 @pytest.fixture
 def problem(three):  # noqa: F811
-    """With one filter, as each is compiled."""
+    """Problem with one filter, as each is compiled."""
     return replace(three, contenders={"right": three.contenders["right"]})
 
 

@@ -14,7 +14,7 @@ BAD = 4  # a run that is not finite from the middle on
 
 
 def a_record(error):
-    """What a campaign yields of runs without a sensor."""
+    """Record of a campaign of runs without a sensor."""
     square = np.sum(error**2, axis=2)
     return {
         "error": error,
@@ -35,7 +35,7 @@ def added(chunks, last: int | None = LAST):
 
 @pytest.fixture(scope="module")
 def statistics():
-    """In chunks of three, three and one."""
+    """Statistics of chunks of three, three and one."""
     return added([ERROR[:3], ERROR[3:6], ERROR[6:]])
 
 

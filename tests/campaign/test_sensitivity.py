@@ -29,7 +29,7 @@ LEFT, RIGHT = "noise.left=0.5 m to 2 m", "noise.right=0.1 m to 3 m"
 
 
 def budget_of(name, filter_, vary, settings=(), seed=0):
-    """What the command makes of these words."""
+    """Budget that the command makes of these words."""
     read = read_scenario(name, settings)
     study, given = read.study, read.parameters
     course = study.lay_out(given)
@@ -319,7 +319,7 @@ def test_errors_that_do_not_vary_and_wide_bounds_are_told(monkeypatch):
 
 
 def test_bounds_are_those_of_chance_in_points_and_in_runs():
-    """Where all runs are alike the bounds are of the points; more points bring them together."""
+    """Bounds are of the points where all runs are alike; more points bring them together."""
     shares = sobol.sobol_points(2, 256, 0)
     output = (shares[..., 0] + 0.5 * shares[..., 1] + 1.0)[..., None, None]
     alike = sobol.indices(np.repeat(output, 3, axis=2) ** 2, 1, 199)

@@ -190,7 +190,7 @@ def test_sizes_that_an_archive_declares_are_not_believed(monkeypatch):
 
 
 def test_shards_of_others_with_a_checksum_that_fits():
-    """Whoever can write a file can write its checksum: its parts are looked at all the same."""
+    """A checksum proves nothing: anybody can write one, so the parts are checked all the same."""
     about = {"filter": "kf"}
     told = statistics(0)
     told.example = {"error": np.zeros(3)}

@@ -1,4 +1,4 @@
-"""What a bank finds wrong: kept by a campaign, scored against the faults, said and shown."""
+"""Faults found by a bank: kept by a campaign, scored against the truth, reported and shown."""
 
 import jax
 import jax.numpy as jnp

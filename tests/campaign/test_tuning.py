@@ -69,7 +69,7 @@ def test_rows_part_what_is_measured_at_once():
 
 
 def told(size):
-    """Of a size that is data, or the structure of a tree."""
+    """Filter of a size that is data, or the structure of a tree."""
     return {"data": (jnp.asarray(size),), "structure": {str(size): ()}}
 
 

@@ -40,7 +40,7 @@ def robins(capsys, monkeypatch, tmp_path, sketched):
 
 
 class Workbench:
-    """In the place of `robins.workbench`: notes what it is asked, computes nothing or raises."""
+    """Stand-in for `robins.workbench`: notes requests, computes nothing or raises."""
 
     publishing = staticmethod(publishing)
 

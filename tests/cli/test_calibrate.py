@@ -57,7 +57,7 @@ def log(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def made(log):
-    """What the command says, and its result."""
+    """Output of the command, and its result."""
     said, out = io.StringIO(), log.parent / "result"
     with contextlib.redirect_stdout(said):
         assert main(["calibrate", str(log), "--out", str(out)]) == 0

@@ -1,4 +1,4 @@
-"""What the command promises: statuses, streams, errors in a line, nothing left behind."""
+"""Promises of the command: statuses, streams, errors in a line, nothing left behind."""
 
 import importlib.machinery
 import importlib.metadata

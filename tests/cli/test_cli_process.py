@@ -72,7 +72,7 @@ def test_a_signal_leaves_the_earlier_result_and_status_3(tmp_path, robins, workb
 
 
 def test_a_terminal_that_is_closed_is_an_interrupt(tmp_path):
-    """What is then written to it fails, also what click writes before it passes Ctrl-C on."""
+    """Writes to a closed terminal fail, also those of click before it passes Ctrl-C on."""
     screen, keyboard = os.openpty()
     process = start(SLOW, *RUN, cwd=tmp_path, stderr=keyboard)
     os.close(keyboard)

@@ -32,7 +32,7 @@ units = { z = "m", n = "m/s" }
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """What the command says, and its result."""
+    """Output of the command, and its result."""
     folder, said = tmp_path_factory.mktemp("design"), io.StringIO()
     (folder / "two.toml").write_text(TWO_STATES)
     with (

@@ -1,4 +1,4 @@
-"""What is packaged or documented runs: every scenario, every filter, every command line shown.
+"""All that is packaged or documented runs: scenarios, filters, command lines shown.
 
 Figures and claims are judged elsewhere; here it counts that a user who types it gets a result. What
 a scenario or a filter gets wrong shows when its run is traced; that is done for all. To compile and
@@ -328,7 +328,7 @@ def kind_of(words):
 
 
 class BeginsError(BaseException):
-    """In the place of a computation; passes all who would tell it to the user."""
+    """Stand-in for a computation; passes all that would report it to the user."""
 
 
 def begins(*_, **__):
@@ -356,12 +356,12 @@ for words in sorted(SHOWN, key=lambda words: sum(word.startswith("--") for word 
 
 
 def runs_whole(words):
-    """Whether a line is run to its end by every `make test`."""
+    """Test for a line that every `make test` runs to its end."""
     return kind_of(words) not in BEGINS or words == WHOLE_LINES.get(kind_of(words))
 
 
 def needed(line):
-    """Whether other lines use what this one leaves behind."""
+    """Test for a line whose files other lines use."""
     return any(word in line for word in NEEDED)
 
 

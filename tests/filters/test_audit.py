@@ -59,7 +59,7 @@ class Counting(Rule):
         return memory + self.each, posterior, info
 
     def report(self, start, final, again, time):
-        """What it was asked with; run once more with each a hundred."""
+        """Arguments of the report; run once more with each a hundred."""
         more = None if again is None else int(again(replace(self, each=100.0 * self.each)))
         HEARD.append((int(self.who), int(start), int(final), more, time))
 

@@ -1,4 +1,4 @@
-"""What joined filters promise step by step: who reads what, what stands, what is refused."""
+"""Promises of joined filters step by step: who reads what, what stands, what is refused."""
 
 import inspect
 from functools import partial

@@ -20,7 +20,7 @@ MODEL, START = SYSTEM.model(), SYSTEM.start()
 
 
 def gains_and_covariances(y):
-    """By blocks: the gain of x alone, P_xx, P_xp updated and P_pp left (Schmidt 1966)."""
+    """Gain of x alone, and P_xx, P_xp updated, P_pp kept, by blocks (Schmidt 1966)."""
     order = np.array(KEPT + HELD)
     F, H = SYSTEM.F[np.ix_(order, order)], SYSTEM.H[:, order]
     Q, P = SYSTEM.Q[np.ix_(order, order)], SYSTEM.P0[np.ix_(order, order)]

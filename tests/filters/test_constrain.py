@@ -267,7 +267,7 @@ DATA = by_sensor(Y)
 
 
 def recursion(noise=None, weight="covariance", gate=np.inf):
-    """By the book: predict, near, constrain, far, constrain again where that is exact."""
+    """Textbook recursion: predict, near, constrain, far, constrain again where that is exact."""
     m, P = SYSTEM.m0, SYSTEM.P0
     means, covariances = [], []
 

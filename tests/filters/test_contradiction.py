@@ -23,7 +23,7 @@ def updated(factor, H, W, y, one=ONE):
 
 
 def possible(factor, H, W, y) -> bool:
-    """Whether the residual is in the range of its covariance, by the singular values of that."""
+    """Test for a residual in the range of its covariance, by the singular values of that."""
     wide = np.concatenate([H @ factor, W], axis=1)
     r = np.asarray(y) - H @ MEAN
     return bool(np.linalg.norm(r - wide @ np.linalg.pinv(wide, rcond=1e-10) @ r) < 1e-8)

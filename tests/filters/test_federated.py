@@ -184,7 +184,7 @@ ROBUST = channel("a", kalman(rules=[huber(0.9)]))
     ids=["scalar", "root", "diagonal"],
 )
 def test_a_silent_filter_hands_its_share_to_the_others(given):
-    """What is left is the federated filter of the others, with a master that holds the floor."""
+    """The rest is the federated filter of the others, with a master that holds the floor."""
     s, y = SYSTEMS[0], {"a": Y[0, :12, :2] * 1.5, "b": np.full((12, 1), np.nan)}
     motion = Motion(Partial(times, jnp.array(s.F)), s.G)
     rows = {name: jnp.array(s.H[r]) for name, r in ROWS.items()}

@@ -1,4 +1,4 @@
-"""What a newcomer types wrong first is answered by a sentence that names it."""
+"""First mistakes of a newcomer, each answered by a sentence that names it."""
 
 import inspect
 import re

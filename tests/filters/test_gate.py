@@ -205,7 +205,7 @@ RECOVERING = {name: kalman(rules=[gate(0.9999, 4, name)]) for name in RECOVERIES
 
 
 def turned(recovery, turn_rad, measured_rad, heading_rad):
-    """What was found of 60 steps: the run, what it noted, and how far off its heading is."""
+    """Results of 60 steps: the run, its notes, and the error of its heading."""
     u, y = jnp.full(60, turn_rad), Angle(jnp.asarray(measured_rad))
     solution = run(RECOVERING[recovery], COMPASS, KNOWN, y, u)
     error = np.abs(np.asarray(Angle(heading_rad).local(solution.mean["heading"]))[:, 0])

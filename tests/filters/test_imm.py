@@ -139,7 +139,7 @@ def test_it_is_the_dense_recursion(solution, k):
 
 
 def test_the_likeliest_mode_is_told_where_one_is_rare_and_wide():
-    """Of a right narrow mode and a rare wide one: NIS is chi-square, the estimate is the same."""
+    """A right narrow mode and a rare wide one: NIS is chi-square, the estimate is the same."""
     wide = Sensor(Partial(times, jnp.array(H)), jnp.array(100.0 * W[0]), 2)
     modes = [mode(kalman()), mode(kalman(), sensors=[wide])]
     change = np.array([[0.99, 0.01], [0.5, 0.5]])
@@ -216,7 +216,7 @@ def scaled(row):
 
 
 def test_a_family_is_the_modes_one_by_one(solution):
-    """With measurements missing and refused; from one mode none comes back."""
+    """Modes of a family with measurements missing and refused; from one mode none comes back."""
     y = solution[0][0]
     numbers = (np.array([1.0, 8.0]), np.array([1.0, 5.0]))
     rows = list(zip(*numbers, strict=True))

@@ -242,7 +242,7 @@ READS = {
 
 
 def one_step(one, y, step="stays", read="seen", mean=1.0, r=0.5):
-    """Of four states of which three are measured, all alike; which model it is, is a number."""
+    """One step of four states, three of them measured, all alike; a number selects the model."""
     motion = Motion(by_number(tuple(STEPS.values())), jnp.full(4, 0.1))
     sensor = Sensor(by_number(tuple(READS.values())), jnp.full(3, r), 3)
     start = Belief(np.full(4, mean), np.eye(4))

@@ -129,7 +129,7 @@ def test_a_sensor_that_stays_off_still_tells_of_changes():
 
 
 def test_an_offset_turns_an_angle_about():
-    """What it adds to an angle is wrapped: 3.1 rad and an offset of 0.2 read -2.98 rad."""
+    """The sum of angle and offset is wrapped: 3.1 rad and an offset of 0.2 read -2.98 rad."""
     read = Sensor(lambda x, aux: Angle(x[0]), np.array([0.1]), 1, "heading")
     still = Model(Motion(lambda x, u: x, np.array([1e-4])), (read,))
     start = Belief.of(jnp.array([3.1]), np.array([[1e-6]]))

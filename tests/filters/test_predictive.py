@@ -32,7 +32,7 @@ def y():
 
 
 def log_density(z, S):
-    """Of a normal density with a share of outliers, by SciPy."""
+    """Log density of a normal law with a share of outliers, by SciPy."""
     zero = np.zeros(len(z))
     square = scale(len(z)) ** 2
     parts = [stats.multivariate_normal(zero, k * square * S).logpdf(z) for k in (1.0, WIDER**2)]

@@ -1,4 +1,4 @@
-"""What the hooks of a rule promise, with rules made for the purpose."""
+"""Promises of the hooks of a rule, with rules made for the purpose."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""What every rule promises, over the table of rules: see rule_table.py."""
+"""Laws of every rule, over the table of rules: see rule_table.py."""
 
 import inspect
 from functools import cache

@@ -248,7 +248,7 @@ def test_streaming_counts_predictions_that_were_not_taken():
 
 
 def log_likelihood(one, log_r, log_q, damping):
-    """Of a pendulum, by its noise and a parameter of its motion."""
+    """Log-likelihood of a pendulum, by its noise and a parameter of its motion."""
 
     def swing(damping, x, u):
         return x + 0.1 * jnp.stack([x[1], -9.8 * jnp.sin(x[0]) - damping * x[1]])

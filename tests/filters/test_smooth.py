@@ -92,7 +92,7 @@ def test_with_part_of_the_start_known_the_prediction_is_singular(rank):
 
 
 def inverse(rows):
-    """Of a matrix of fractions, by elimination."""
+    """Inverse of a matrix of fractions, by elimination."""
     n = len(rows)
     work = [[*row, *(Fraction(int(i == j)) for j in range(n))] for i, row in enumerate(rows)]
     for i in range(n):

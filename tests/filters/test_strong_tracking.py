@@ -30,7 +30,7 @@ Y = jumping(5, 0.25, 2.0)
 
 
 class Fading(NamedTuple):
-    """What the textbook recursion is told; `keep` and `gain` are the weights of V and r r'."""
+    """Parameters of the textbook recursion; `keep` and `gain` are the weights of V and r r'."""
 
     form: str
     keep: float

@@ -1,4 +1,4 @@
-"""What a run says of steps that were not taken, and why a reader should doubt a filter."""
+"""Reports of a run on steps that were not taken, and reasons to doubt a filter."""
 
 import json
 import re
@@ -127,7 +127,7 @@ def test_joseph_form_beyond_its_condition_is_not_taken_for_a_run(cases_dir):
 
 
 def tally(nis=100.0, dof=100, **codes) -> Tally:
-    """Of one sensor whose predictions were all taken."""
+    """Tally of one sensor whose predictions were all taken."""
     total = np.zeros(len(Code), int)
     predictions = total.copy()
     for code, number in codes.items():

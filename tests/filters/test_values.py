@@ -174,7 +174,7 @@ KINDS = {
 
 
 def shape(tree):
-    """What JAX compiles for: structure, and types of the leaves."""
+    """Key of a compilation by JAX: structure, and types of the leaves."""
     leaves, structure = jax.tree_util.tree_flatten(tree)
     return structure, [jax.typeof(x) for x in leaves]
 
@@ -223,12 +223,12 @@ ROBUST = kalman(rules=[gate(0.999), huber(0.9), h_infinity(300.0, L)])
 
 @jax.jit
 def log_likelihood(filter_, y):
-    """Of a run."""
+    """Log-likelihood of a run."""
     return run(filter_, MODEL, START, y).log_likelihood
 
 
 def test_slopes_in_the_numbers_of_a_filter_are_right():
-    """By finite differences, each leaf scaled as a whole."""
+    """Check by finite differences, each leaf scaled as a whole."""
     y = np.nan_to_num(Y[:8], nan=0.3)
     slopes = jax.tree_util.tree_leaves(jax.jit(jax.grad(log_likelihood))(ROBUST, y))
     leaves, structure = jax.tree_util.tree_flatten(ROBUST)

@@ -62,6 +62,6 @@ def block(motion, count=100, dt=0.01):
 
 
 def padded(increments, count=100):
-    """With increments of zero length behind."""
+    """Block padded with increments of zero length."""
     more = count - len(increments.dt)
     return jax.tree.map(lambda a: np.concatenate([a, np.zeros((more, *a.shape[1:]))]), increments)

@@ -13,7 +13,7 @@ from robins.manifold import local, retract
 
 
 def raw_sample(x, f_b, omega_b, dt):
-    """What the sensors of x deliver over one interval dt, as a block padded with zeros."""
+    """Readings of the sensors of x over one interval dt, as a block padded with zeros."""
     rate = omega_b * (1.0 + x.gyro_scale) + x.gyro_bias
     force = f_b * (1.0 + x.accel_scale) + x.accel_bias
     return padded(Increments(np.array([dt]), *(np.asarray(a * dt)[None] for a in (rate, force))))
@@ -69,7 +69,7 @@ def test_every_entry_of_the_error_dynamics(seed, lat_deg):
 
 
 def test_jacobian_against_differences():
-    """What the tests here differentiate by `jacfwd`, once more by differences of the states."""
+    """Derivatives by `jacfwd`, which the tests here use, against differences of the states."""
     x, increments = state(4), block(violent)
     size = 0.1 * np.append(SIZE, np.repeat([1e-3, 1e-1], 3))
     steps = jnp.asarray(np.concatenate([np.diag(size), -np.diag(size)]))

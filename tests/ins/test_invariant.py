@@ -92,7 +92,7 @@ def test_transition_is_the_slope_of_propagate(side):
         np.testing.assert_array_equal(a, b)
 
     def moved(d):
-        """By errors of the state, and of what the sensors add."""
+        """State moved by its errors and by those of the sensors."""
         dv = INCREMENT.dv + d[18:]
         dr = INCREMENT.dr + 0.5 * INCREMENT.dt * d[18:]
         u = INCREMENT._replace(theta=INCREMENT.theta + d[15:18], dv=dv, dr=dr)

@@ -19,7 +19,7 @@ compiled = jax.jit(lambda *given: {name: way(*given) for name, way in METHODS.it
 
 
 def every(b, r, weight):
-    """What each method finds in k sets of up to MOST directions, with one compilation for all."""
+    """Results of each method for k sets of up to MOST directions, with one compilation for all."""
     k, n = weight.shape
     pads = (0, -k % POINTINGS), (0, MOST - n)
     b, r = (np.pad(x, (*pads, (0, 0))) for x in (b, r))

@@ -1,4 +1,4 @@
-"""What JAX does with `each_row` is what it does with `vmap`, to the bit."""
+"""Results of `each_row` under JAX: those of `vmap`, to the bit."""
 
 import jax
 import jax.numpy as jnp

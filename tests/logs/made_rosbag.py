@@ -15,7 +15,7 @@ NS = 10**9
 
 
 def header(stamp_ns):
-    """With the frame "abc"."""
+    """Header with the frame "abc"."""
     return b"\0\1\0\0" + struct.pack("<iII4s", *divmod(stamp_ns, NS), 4, b"abc")
 
 

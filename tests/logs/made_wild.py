@@ -68,7 +68,7 @@ def named(n=40, hz=100.0):
 
 
 def bytes_of(write, *args, **kwargs):
-    """What a function writes into a file that is open."""
+    """Bytes that a function writes into a file that is open."""
     file = io.BytesIO()
     write(file, *args, **kwargs)
     return file.getvalue()

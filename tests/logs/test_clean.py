@@ -195,7 +195,7 @@ def test_denormals_and_large_but_possible_numbers_pass():
     ids=["set back", "a restart", "a lone stamp in the future"],
 )
 def test_a_clock_that_steps_costs_the_shorter_part(rows, step_ns, lost, counts, gaps):
-    """Where it is set back, time is refused until it passes, and declared as a gap."""
+    """A clock set back: time is refused until it passes, and declared as a gap."""
     time_ns = IMU.time_ns.copy()
     time_ns[rows] += step_ns
     got = clean(with_imu(DATA, time_ns=time_ns))
@@ -232,7 +232,7 @@ def test_nan_for_ever_is_refused_with_the_reason():
 @pytest.mark.parametrize("stamps", [read_at_once, in_bursts])
 @pytest.mark.parametrize("kind", ["rate", "increment"])
 def test_samples_read_at_once_are_spread_evenly(stamps, kind):
-    """With them the field of the same file, whose readings may repeat within a batch."""
+    """Samples, and the field of the same file, whose readings may repeat within a batch."""
     imu = dataclasses.replace(IMU, kind=kind)
     field_t = np.repeat(np.random.default_rng(4).normal(size=(N // 10, 3)), 10, axis=0) * 1e-5
     data = dataclasses.replace(DATA, imu=imu, mag=MagTable(IMU.time_ns, field_t))

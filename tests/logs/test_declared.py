@@ -165,7 +165,7 @@ def test_columns_decide_which_table_it_is(tmp_path, columns, kind):
 
 
 def test_dates_counts_constants_rates_offsets_and_decimal_commas(own):
-    """What loggers do to time and numbers, each by hand."""
+    """Forms in which loggers write time and numbers, each by hand."""
 
     def read(toml, rows):
         declared, log = own(toml, LOG.splitlines()[0] + "\n" + rows)

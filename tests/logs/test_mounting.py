@@ -54,7 +54,7 @@ def test_what_is_seen_from_the_ground_does_not_depend_on_the_mounting(data):
 
 
 def test_turning_by_right_angles_keeps_every_bit_and_every_nan_on_its_axis(data):
-    """That of the walk only exchanges axes."""
+    """Turns by right angles: the turn of the walk only exchanges axes."""
     mounting = Mounting(180.0, 0.0, -90.0)
     assert mounting.dcm_bs().tolist() == [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
     gyro = data.imu.gyro.copy()

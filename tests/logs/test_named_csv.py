@@ -100,7 +100,7 @@ def test_angles_in_another_unit(tmp_path, column, value, words, cause):
 
 
 def test_single_rows_that_cannot_be_are_missing(tmp_path):
-    """What is said of them is in `test_findings`."""
+    """Single rows that cannot be; `test_findings` checks their findings."""
     path = tmp_path / "m.csv"
     rows = [ROW.format(t=t, heading=1e4 if t == 2 else 30) for t in range(5)]
     path.write_text(HEADER + "\n" + "".join(rows))

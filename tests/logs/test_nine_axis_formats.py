@@ -34,7 +34,7 @@ def refusal(tmp_path, content, name="log"):
 
 
 def same(one, two):
-    """Whether two datasets hold the same numbers, NaN where NaN is."""
+    """Equality of the numbers of two datasets, NaN where NaN is."""
     for kind, fields in {
         "imu": ("time_ns", "gyro", "accel"),
         "mag": ("time_ns", "field_t"),

@@ -19,7 +19,7 @@ class Nothing(Parameters):
 
 @pytest.fixture
 def seen(monkeypatch):
-    """What a system of attitude is given."""
+    """Input of a system of attitude."""
     given = []
 
     def replay(dataset, parameters, filters, progress):

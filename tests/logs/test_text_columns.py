@@ -27,7 +27,7 @@ def lines(n, first=1):
 
 
 def plainly(text):
-    """What a file should give, by Python's own float."""
+    """Expected content of a file, by Python's own float."""
     rows = [line.split(",") for line in text]
     return [r[0].encode() for r in rows], [[float(v) for v in r[1:]] for r in rows]
 
@@ -179,7 +179,7 @@ def test_a_text_log_cut_anywhere_gives_an_exact_prefix(tmp_path):
 
 
 def is_prefix(columns, text):
-    """Whether the rows are the first rows of the text, bit by bit."""
+    """Test for the first rows of the text, bit by bit."""
     stamps, values = plainly(text)
     n = len(columns.rows)
     return columns.texts[:, 0].tolist() == stamps[:n] and columns.values.tolist() == values[:n]

@@ -136,7 +136,7 @@ def test_broken_framing_ends_the_log_there(tmp_path):
 
 
 def test_damaged_definitions_are_refused(tmp_path):
-    """What a number means is never guessed."""
+    """Damaged definitions: the meaning of a number is never guessed."""
     for old, new in (
         (b"float[3] gyro_rad", b"gloat[3] gyro_rad"),
         (b"gyro_rad", b"gyro_rax"),

@@ -1,4 +1,4 @@
-"""What the doctor finds of a unit and its receiver, on logs whose unit and receiver are known."""
+"""Findings of the doctor on a unit and its receiver, on logs where both are known."""
 
 from dataclasses import replace
 

@@ -51,7 +51,7 @@ AMPLIFIED = 1e-9  # of its size a number is moved by a million roundings
 
 
 def _sizes(series):
-    """What each number of a series is small against: itself over time, or a row of its matrix."""
+    """Scale of each number of a series: itself over time, or a row of its matrix."""
     size = np.max(np.abs(series), axis=0, initial=0.0, where=np.isfinite(series))
     return np.max(size, axis=-1, keepdims=True, initial=0.0) if series.ndim > 2 else size
 
@@ -68,7 +68,7 @@ def stepping(filter_, model):
 
 
 def _nudges(numbers, steps, run):
-    """How far each number of each step is off in a run, in parts of itself; in run 0 none is."""
+    """Deviation of each number of each step of a run, in parts of itself; zero in run 0."""
     rng = np.random.default_rng(run)
     sizes = [(steps, *np.shape(x)) for x in jax.tree.leaves(numbers)]
     return [NUDGE * rng.choice((-1.0, 1.0), size) * (run > 0) for size in sizes]
@@ -146,7 +146,7 @@ def _stacked(steps):
 
 
 def differs(want, near, got, within):
-    """Where C differs from JAX by more than roundings do, and whether the run amplifies these.
+    """Differences of C and JAX beyond roundings, and a flag for a run that amplifies these.
 
     Codes and counts are to be the same; a flag may be the other way where a rounding turns it.
     Numbers are to be within a bound, or five times what roundings move in the runs that are near.

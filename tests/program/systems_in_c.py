@@ -32,13 +32,13 @@ STUDIES = (
 
 @cache
 def world_of(name):
-    """What all filters of a scenario are given, simulated once."""
+    """Inputs of all filters of a scenario, simulated once."""
     problem = read_scenario(name, ("runs=1",)).problem((), 0)
     return jax.jit(problem.simulate)(jnp.asarray(0))
 
 
 def check(name, filter_):
-    """That a filter of a scenario runs in C as by JAX."""
+    """Check a filter of a scenario in C against JAX."""
     problem = read_scenario(name, ("runs=1",)).problem((filter_,), 0)
     one = contender(problem, filter_)
 
@@ -56,7 +56,7 @@ def check(name, filter_):
 
 
 def walk(name):
-    """What differs of all filters of a scenario, by their names."""
+    """Differences of all filters of a scenario, by their names."""
     # A smoother runs the filter that it is named after; what is on request calls Python.
     filters = [f for f in read_scenario(name, ()).study.usual if not f.endswith("+rts")]
     differs = {}

@@ -35,7 +35,7 @@ def flat(leaves):
 
 
 def check(step, cases, unroll=None):
-    """That lanes give to the bit what one run after the other gives."""
+    """Check lanes to the bit against one run after the other."""
     program = trace(step, *cases[0], unroll=unroll)
     one = Native(program, quickly)
     given = [flat(jax.tree.leaves(case)) for case in cases]
@@ -77,7 +77,7 @@ def test_a_filter(lanes, unroll):
 
 
 def numbers(x, k, u, c):
-    """What a filter may not use: words, conversions, loops that end by numbers, indices."""
+    """Operations that a filter may not use: words, conversions, loops ended by numbers, indices."""
     i = jnp.clip(k, 0, 8)
     return (
         jax.lax.while_loop(lambda s: s < 100.0, lambda s: s * 1.7, jnp.abs(x[0]) + 1.0),

@@ -1,4 +1,4 @@
-"""What routines and loops of C read in place, and what has to be copied for them."""
+"""Arrays that routines and loops of C read in place, and those copied for them."""
 
 import re
 import subprocess
@@ -112,7 +112,7 @@ LEAST = ROUNDS * N * N  # numbers of all rows
 
 
 def copied(case):
-    """How many numbers are copied for each factorisation of rows."""
+    """Number of copied numbers for each factorisation of rows."""
     text = function(trace(case, X, unroll=20))
     found = map(int, re.findall(r"real in\d+_\d\[(\d+)\] = ", text))
     return [n for n in found if n >= LEAST]

@@ -1,4 +1,4 @@
-"""What a graph folds, and what it must not fold."""
+"""Foldings of a graph, and those that it must not make."""
 
 import numpy as np
 import pytest

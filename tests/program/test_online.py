@@ -159,7 +159,7 @@ def test_a_memory_that_reports_is_asked_after_every_call():
 
 
 def test_numbers_of_a_filter_are_on_the_device():
-    """By JAX none is handed over at each call."""
+    """Numbers of a filter: by JAX none is handed over at each call."""
     leaves = jax.tree.leaves(OnlineFilter(kalman(rules=[gate()]), MODEL, START)._machine._filter)
     assert leaves
     assert all(isinstance(x, jax.Array) for x in leaves)

@@ -29,7 +29,7 @@ def quick():
 
 
 def world(number):
-    """What a simulation does: noise, walks, scans over them, and arithmetic along the time."""
+    """World of a simulation: noise, walks, scans over them, and arithmetic along the time."""
     key = jax.random.fold_in(jax.random.key(3), number)
     a, b, c = jax.random.split(key, 3)
     noise = jax.random.normal(a, (T, 3))

@@ -1,4 +1,4 @@
-"""What a reader would see of a figure: its lines, and its texts with their places."""
+"""Content of a figure as a reader sees it: its lines, and its texts with their places."""
 
 import itertools
 

@@ -230,7 +230,7 @@ def test_a_picture_of_one_colour_can_be_packed():
 
 @pytest.fixture
 def walk(town):
-    """What a folder holds beside its summary."""
+    """Files of a folder beside its summary."""
     names = ["lat_rad", "lon_rad", "outage", "error_velocity", "sigma_velocity"]
     return a_drive(1, seconds=40.0)[names]
 

@@ -17,7 +17,7 @@ HITS = np.arange(N + 1)
 
 @pytest.mark.parametrize("level", [0.9, 0.95, 0.999])
 def test_each_end_leaves_half_the_rest_to_what_was_counted(level):
-    """What defines the interval: at its ends, so many hits or worse have half of 1 - level."""
+    """Definition of the interval: at its ends, so many hits or worse have half of 1 - level."""
     low, high = interval(HITS, N, level)
     half = 0.5 * (1.0 - level)
     np.testing.assert_allclose(stats.binom.sf(HITS[1:] - 1, N, low[1:]), half, rtol=1e-9)
@@ -41,7 +41,7 @@ def test_none_and_all_have_a_closed_form(of):
 
 @pytest.mark.parametrize("of", [5, 50, 300])
 def test_the_interval_holds_the_truth_as_often_as_it_says(of):
-    """By all outcomes and their probabilities; no share is left out, however rare the event."""
+    """Coverage over all outcomes and their probabilities, however rare the event."""
     low, high = interval(np.arange(of + 1), of)
     for p in (1e-4, 0.01, 0.03, 0.3, 0.5, 0.77, 0.995):
         covered = stats.binom.pmf(np.arange(of + 1), of, p)[(low <= p) & (p <= high)].sum()

@@ -1,4 +1,4 @@
-"""What is written comes back as it was, or is refused."""
+"""Results come back as they were written, or are refused."""
 
 import json
 import math

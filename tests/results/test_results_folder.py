@@ -1,4 +1,4 @@
-"""What was there before survives every failure, and nothing of the user is ever deleted."""
+"""An earlier result survives every failure, and nothing of the user is ever deleted."""
 
 import errno
 import os
@@ -312,7 +312,7 @@ def test_a_file_size_limit_leaves_the_earlier_result(earlier):
 
 
 def test_the_second_writer_of_a_folder_is_refused_at_once(earlier):
-    """By its path or a link to it, before it has computed anything; others are not concerned."""
+    """The second writer, by path or link, is refused before it has computed anything."""
     link = earlier.parent / "latest"
     link.symlink_to(earlier)
     first = ResultWriter(earlier)

@@ -18,7 +18,7 @@ NOT_DRAWN = {"attitude", "bound_left", "covariance", "gramian", "trade_off_bound
 
 
 def examples():
-    """Of each row, what an array may be of: every choice, or a name that begins like another."""
+    """Examples of what an array may be of: every choice, or a name that begins like another."""
     for role in ROLES:
         found = re.search(r"\{(.*)\}", role.variable)
         for of in found[1].split("|") if found else [""]:

@@ -232,7 +232,7 @@ def test_axes_are_turned_as_by_matrices(body, nav):
     ],
 )
 def test_a_level_body_that_heads_east(body, nav, q_nb, f_b):
-    """In ROS its x axis is east: no turn at all; and at rest it feels +9.8 upwards."""
+    """East is the x axis of ROS: no turn at all; and at rest it feels +9.8 upwards."""
     made = ros.imu(None, f_b, q_nb, body=body, nav=nav)
     np.testing.assert_allclose(np.abs(made.orientation), [0, 0, 0, 1], atol=1e-15)
     assert tuple(made.linear_acceleration) == (0.0, 0.0, 9.8)

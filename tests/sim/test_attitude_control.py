@@ -52,7 +52,7 @@ def closed_loop(craft, control, start, reference, places, fields, dt):
 
 
 def second_order(t, wn=0.12, zeta=0.9):
-    """Of theta'' + 2 zeta wn theta' + wn^2 theta = 0 from one and at rest."""
+    """Solution of theta'' + 2 zeta wn theta' + wn^2 theta = 0 from one and at rest."""
     damped = wn * np.sqrt(1.0 - zeta**2)
     swing = np.cos(damped * t) + zeta * wn / damped * np.sin(damped * t)
     return np.exp(-zeta * wn * t) * swing
@@ -200,7 +200,7 @@ def test_the_magnetorquers_unload_the_wheels(unloading):
 
 
 def test_the_momentum_of_the_whole_changes_as_torques_say(unloading):
-    """Of a body that points to nadir exactly, by SciPy: only the total momentum is left."""
+    """A body that points to nadir exactly, by SciPy: only the total momentum is left."""
     time, orbit, field, reference, momentum_b = unloading
     q, omega = np.array(reference.q_ib), np.array(reference.omega_b)
     C = Rotation.from_quat(q, scalar_first=True).as_matrix()

@@ -39,7 +39,7 @@ def vehicle(t):
 
 
 def truth_at(t):
-    """What `antenna` wants, from the path alone."""
+    """Arguments of `antenna`, from the path alone."""
     r_e, eb = vehicle(t)
     lat, lon, alt = geodetic(r_e)
     C_en = axes(lat, lon)

@@ -84,7 +84,7 @@ def of_many_runs():
 
 
 def within(samples, variance, count):
-    """Whether a mean square fits its variance; count independent samples in it."""
+    """Test for a mean square that fits its variance; count independent samples in it."""
     low, high = stats.chi2.ppf([1e-5, 1.0 - 1e-5], count) / count
     assert low < np.mean(samples**2) / variance < high
 

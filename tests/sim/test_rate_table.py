@@ -45,7 +45,7 @@ GOALS = np.array([[0.4, 0.9, -0.5], [-3.0, 0.2, 0.8], [0.0, -5.0, 0.1], [0.45, 0
 
 
 def integrated(table, goals):
-    """By SciPy, attitude as nine direction cosines, in pieces on which the command is the same."""
+    """Attitude by SciPy as nine direction cosines, in pieces on which the command is the same."""
     lag, most_rate, most = (np.array(x) for x in table)
     y = np.concatenate([rotation(Q0).as_matrix().ravel(), RATE0])
 

@@ -49,7 +49,7 @@ def in_sensor(image):
 
 
 def stars_in_sensor(image):
-    """Where the stars of an image truly are."""
+    """True places of the stars of an image."""
     inertial = SKY.unit_i[image.star]
     return np.stack([(TRUE[k] * MOUNT).inv().apply(inertial[k]) for k in range(POINTINGS)])
 
@@ -128,7 +128,7 @@ def test_an_error_of_all_stars_is_one_of_the_attitude(image):
 
 
 def test_a_camera_that_is_turned_before_a_sky_sees_what_it_sees_there():
-    """What is shown reaches beyond the field, so stars come in at its edge, and others go."""
+    """Shown stars reach beyond the field, so stars come in at its edge, and others go."""
     turn = jnp.array([3e-3, -2e-3, 5e-3])
 
     q_is = jnp.asarray((TRUE * MOUNT).as_quat(scalar_first=True))

@@ -33,7 +33,7 @@ class Found(NamedTuple):
     counted: slice
 
     def mean(self, first: int) -> float:
-        """Of the length of two level components from this one on; over runs and time."""
+        """Mean length of two level components from this one on; over runs and time."""
         level = self.error[:, self.counted, first : first + 2]
         return float(np.mean(np.linalg.norm(level, axis=2)))
 
@@ -69,7 +69,7 @@ class Flights(NamedTuple):
         return problem(self.name, self.settings, filters)
 
     def found(self, name: str) -> Found:
-        """What a filter makes of them."""
+        """Results of a filter on these runs."""
         problem = self.problem(name)
         error, square = _program(self.name, self.settings, name)(self.batch)
         counted = slice(problem.count_from, problem.count_to)
@@ -94,7 +94,7 @@ def flights(name: str, settings: tuple[str, ...] = TO_THE_END, runs: int = RUNS)
 
 
 def beginning(batch: World, epochs: int) -> World:
-    """Of runs the first so many epochs."""
+    """First epochs of runs."""
     count = batch.wind.shape[1]
     return jax.tree.map(lambda x: x[:, :epochs] if x.shape[1:2] == (count,) else x, batch)
 
@@ -107,7 +107,7 @@ def without_radar(batch: World, begin: int, end: int) -> World:
 
 
 def told_by_radar(batch: World, changed: Callable[[Any, Any], Any]) -> World:
-    """What radar and barometer say changed: arrays (runs, E, ...), and what aligns epochs with."""
+    """Changed reports of radar and barometer: arrays (runs, E, ...), and the lag of the epochs."""
     before = batch.readings[SAR]
     after = jax.tree.map(lambda x: changed(x, (None, slice(None), *[None] * (x.ndim - 2))), before)
     return batch._replace(readings=batch.readings | {SAR: after})
@@ -148,5 +148,5 @@ def _program(name: str, settings: tuple[str, ...], filter_: str):
 
 @cache
 def found(name: str, filter_: str, runs: int = MANY) -> Found:
-    """What a filter makes of a packaged scenario."""
+    """Results of a filter on a packaged scenario."""
     return flights(name, runs=runs).found(filter_)

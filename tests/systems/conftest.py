@@ -1,4 +1,4 @@
-"""What the tests of a system computed is kept for its file alone."""
+"""Results computed by the tests of a system, kept for its file alone."""
 
 import sys
 from pathlib import Path

@@ -110,7 +110,7 @@ def _judging(contender: Any):
 
 @cache
 def found(name: str, filter_: str, runs: int = MANY) -> Found:
-    """What a filter makes of flights of a scenario."""
+    """Results of a filter on flights of a scenario."""
     settings = SHORT if name.startswith("a") else ()
     p, burst = problem(name, settings, (filter_,)), parsed(name)[0].magnetometer.disturbance
     error, square = each(_judging(p.contenders[filter_]))(flights(name, settings, runs))

@@ -22,7 +22,7 @@ ARCSEC = math.pi / 648000.0
 
 
 class Found(NamedTuple):
-    """What came of runs, in arcsec; (runs, E, ...)."""
+    """Results of runs, in arcsec; (runs, E, ...)."""
 
     error: np.ndarray  # (.., 3) of attitude determination, body axes
     nees: np.ndarray  # (..) of the attitude, by its three components
@@ -91,7 +91,7 @@ def flights(name: str, runs: int, settings: tuple[str, ...]) -> Any:
 
 @cache
 def flown(name: str, filter_: str, runs: int, settings: tuple[str, ...] = ()) -> Found:
-    """What a filter makes of runs of a packaged scenario, changed."""
+    """Results of a filter on runs of a packaged scenario, changed."""
     p = problem(name, (filter_,), settings)
     judged = each(_judging(p.contenders[filter_]))(flights(name, runs, settings))
     error, nees, sigma, outputs, used = judged

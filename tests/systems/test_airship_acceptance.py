@@ -181,7 +181,7 @@ STEEP = ('start.attitude=["2 deg", "3 deg", "20 deg"]',)  # no small angle
 @jax.jit
 @jax.vmap
 def compared(total, fed, truth):
-    """What the two estimates differ by, the error of the total state, and its sigma; (9,)."""
+    """Difference of the two estimates, the error of the total state, and its sigma; (9,)."""
 
     def away(a, b):
         parts = (a.q_nb.local(b.q_nb), b.v_n - a.v_n, a.position.local(b.position))
@@ -246,7 +246,7 @@ def test_the_printed_constraint_diverges_at_once():
 
 
 def test_the_printed_attitude_rows_diverge_before_the_end():
-    """To the speed of a satellite, where the Earth falls away below; every run."""
+    """Divergence to the speed of a satellite, where the Earth falls away below; every run."""
     error = speed_error(found("s0", "ukf-printed-h").error)
     assert np.all(np.max(error, axis=1) > 5e3)
     assert np.all(error[:, 0] < 1.0)

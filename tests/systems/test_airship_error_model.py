@@ -264,7 +264,7 @@ def test_the_printed_rows_are_wrong_by_two_towards_east_in_either_reading(counte
 
 
 def test_the_printed_rows_hold_terms_of_neither_sense():
-    """At 30 deg of roll towards east the false term of (44) is 2 sin(pitch) sin(roll) cos(roll)."""
+    """False term of (44) at 30 deg of roll towards east: 2 sin(pitch) sin(roll) cos(roll)."""
     pitch, roll = 0.3, np.radians(30.0)
     right = numerical_rows(pitch, roll, -np.pi / 2) * np.array([[1.0], [1.0], [-1.0]])
     found = np.asarray(instruments.printed_attitude_rows(roll, pitch, np.pi / 2))
@@ -292,7 +292,7 @@ def test_the_printed_constraint_is_the_printed_one():
 
 
 def test_the_air_speed_error_of_the_printed_constraint():
-    """What d leaves over, at a heading of 90 deg: (0, dv_a)."""
+    """Remainder of d at a heading of 90 deg: (0, dv_a)."""
     x = nav(0.0, 0.0, np.pi / 2)._replace(v_n=jnp.array([4.0, 23.0, 0.0]))
     left, _ = instruments.printed_wind(x, (jnp.array([4.5, 0.0, 0.0]), jnp.array([0.0, 20.0])))
     assert_allclose(left, [0.0, -0.5], atol=1e-15)

@@ -47,7 +47,7 @@ def sky_of(n, place=BERLIN):
 
 
 def test_light_that_travels_while_the_earth_turns():
-    """In inertial axes the receiver meets the signal where the Earth has carried it."""
+    """Reception in inertial axes: the receiver meets the signal where the Earth has carried it."""
     q, most = np.asarray(BERLIN.origin_e), 0.0
     for satellite in sky_of(8):
         length = np.linalg.norm(satellite - q)

@@ -69,7 +69,7 @@ def vector(n):
 
 
 def events(dataset, late_s, skipped=()):
-    """What comes in, by the time it does: (time, is a fix, row)."""
+    """Events in the order in which they come in: (time, is a fix, row)."""
     fixes = [k for k in range(len(dataset.gnss)) if k not in skipped]
     comes = [(int(t), 0, k) for k, t in enumerate(dataset.imu.time_ns)]
     comes += [(int(dataset.gnss.time_ns[k] + 1e9 * late_s[k]), 1, k) for k in fixes]
@@ -190,7 +190,7 @@ def test_steps_have_the_bits_of_those_of_a_replay(live, log, parameters, begin_s
 
 
 def test_an_answer_is_the_state_carried_on_over_the_samples_since(live, log):
-    """What a replay says that ends with a fix in this sample, but for that fix."""
+    """Answer of a replay that ends with a fix in this sample, but for that fix."""
     all_events = events(log, np.zeros(len(log.gnss)))
     end = next(i for i, e in enumerate(all_events) if e[0] > log.imu.time_ns[0] + 11.3e9)
     answers, _ = played(live, log, all_events[:end])

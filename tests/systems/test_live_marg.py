@@ -156,7 +156,7 @@ def test_a_start_in_motion_waits_for_three_seconds(live):
 
 @pytest.mark.parametrize("told", [True, False])
 def test_peaks_beyond_the_range_wait_for_their_flank(told):
-    """With a range that is told every answer is the replay's, but those that wait for a flank."""
+    """A stated range: every answer is the replay's, but those that wait for a flank."""
     log = made_log(20.0, 2)
     gyro = log.imu.gyro.copy()
     peak = np.exp(-(((np.arange(len(gyro))[:, None] - [900, 1005, 1104, 1317, 1500]) / 5.0) ** 2))

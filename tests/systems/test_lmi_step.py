@@ -67,7 +67,7 @@ def blocks(rate_b, share):
 
 
 def close(gain, wanted, share):
-    """To a share of the largest, of the attitude's gains and of those of the bias."""
+    """Equality to a share of the largest, of the attitude's gains and of those of the bias."""
     for rows in (slice(0, 3), slice(3, 6)):
         size = np.max(np.abs(wanted[rows]))
         np.testing.assert_allclose(gain[rows], wanted[rows], rtol=0, atol=share * size)

@@ -18,7 +18,7 @@ MADGWICK_DEG = 4.9  # published, with its one best parameter
 
 @pytest.fixture(scope="module")
 def found(data_dir):
-    """What a replay makes of a trial, from its number."""
+    """Results of a replay of a trial, from its number."""
 
     @cache
     def of(number):

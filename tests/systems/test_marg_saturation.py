@@ -47,7 +47,7 @@ def test_a_range_whose_edge_the_chip_filters_is_found():
 
 @pytest.mark.parametrize("stays_s", [0.03, 0.6, 5.0])
 def test_a_turn_at_one_rate_is_no_plateau(stays_s):
-    """Of a machine that gets there in 0.3 s."""
+    """A turn of a machine that gets there in 0.3 s."""
     edges = np.cumsum([5.0, 0.3, stays_s, 0.3])
     rate = np.interp(TIME, edges, [0.0, 6.0, 6.0, 0.0])
     assert np.all(np.isinf(levels(np.stack([rate] * 3, axis=1), 0.01)))

@@ -19,7 +19,7 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "balloon.p
 
 @pytest.fixture(autouse=True)
 def modules_as_before(monkeypatch):
-    """What a test imports is forgotten after it."""
+    """Forget the modules that a test imports after it."""
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(trust, "_local", {})
     before = set(sys.modules)

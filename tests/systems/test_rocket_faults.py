@@ -1,4 +1,4 @@
-"""What the rocket's filters make of bad samples, lost sensors and scenarios that cannot be."""
+"""Bad samples, lost sensors and scenarios that cannot be, in the rocket's filters."""
 
 from typing import Any, NamedTuple
 
@@ -32,7 +32,7 @@ def parsed(kind, name, *settings):
 
 
 class Seen(NamedTuple):
-    """Of each step of a run."""
+    """Results of each step of a run."""
 
     posterior: Belief
     predicted: Belief
@@ -46,7 +46,7 @@ def seen_of(step):
 
 
 def found(c, worlds):
-    """What a contender makes of many worlds, leading axis."""
+    """Results of a contender in many worlds, leading axis."""
 
     def one(world):
         it = c.case(world)

@@ -100,7 +100,7 @@ def test_start_says_why_it_cannot():
 
 
 def test_a_magnetometer_tells_the_heading_where_no_course_does():
-    """Of a field made at a known attitude; true north, so with the declination of the place."""
+    """A field made at a known attitude; true north, so with the declination of the place."""
     log = _walk(4.0, 2.0, 0.1, -0.05, 0.0, 1.0)
     slow = log._replace(gnss=replace(log.gnss, v_n=0.0 * log.gnss.v_n))
     roll, pitch, heading = 0.1, -0.05, 2.2

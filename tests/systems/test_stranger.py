@@ -152,7 +152,7 @@ def test_standstill_uses_nothing_of_the_future():
     [(True, "0.02 m", 0.5), (False, "0.02 m", 0.5), (False, "0.2 m", 0.1), (False, "3 m", 0.0)],
 )
 def test_a_smooth_road_is_not_taken_for_rest(velocities, sigma, share):
-    """What lies within its noise proves no rest: the share that is found is less, none is wrong."""
+    """A path within its noise proves no rest: the share that is found is less, none is wrong."""
     log = drive_dataset(scenario.parse(Drive, SMOOTH, (f"gnss.sigma={sigma}",)), seed=1)
     given = log if velocities else replace(log, gnss=replace(log.gnss, v_n=None, sigma_v=None))
     whole, aids = on_one_clock(given, Replay()), Replay().aids

@@ -50,7 +50,7 @@ COURSE = lay_out(given())
 
 
 def sizes_of(parameters):
-    """How large what a run draws is, by table and key."""
+    """Sizes of the draws of a run, by table and key."""
     tables = {name: dict(getattr(parameters, name)) for name in ("slave", "flexure", "mounting")}
     return tables | {"master": {"attitude_noise": parameters.master.attitude_noise}}
 

@@ -119,7 +119,7 @@ SIGMAS = {p.ATTITUDE: MINUTE, p.VELOCITY: 0.05, p.POSITION: 5.0}
 
 
 class Derived(NamedTuple):
-    """What a model says of a state, and what differences say."""
+    """Derivatives of a state, by the model and by differences."""
 
     Phi: Any
     factor: Any  # of the process noise
@@ -333,7 +333,7 @@ NO_NOISE = [
 
 
 def test_without_noise_the_reading_is_the_record():
-    """In a steep turn, with biases, mounting, flexure, lever arm and records 80 ms late."""
+    """A steep turn, with biases, mounting, flexure, lever arm and records 80 ms late."""
     pair = load(Product, SCENARIOS / "aircraft.toml", NO_NOISE)
     contender = product_contender(pair, believed=pair.believed)
     course = lay_out(pair)

@@ -308,7 +308,7 @@ def test_a_long_gap_of_the_slave_is_declared_and_the_pieces_are_joined(pairs, an
 
 
 def test_what_the_motion_does_not_show_is_said(answers, clean):
-    """In the straight part, 3 s long, a mounting error and one of attitude are the same."""
+    """A straight part, 3 s long: a mounting error and one of attitude are the same."""
     early = until(answers[0], 12)
     (said,) = [n for n in remarks("product", early) if "mounting" in n]
     assert "product: mounting" in said

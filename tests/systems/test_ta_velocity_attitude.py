@@ -76,7 +76,7 @@ class Mechanisation:
         return np.array(moved), C @ skew(omega) - skew(rate) @ C
 
     def error_rate(self, x):
-        """How the error x changes by itself: computed minus true, both by `derivative`."""
+        """Rate of the error x: computed minus true, both by `derivative`."""
         true, C_rate = self.derivative(self.at, self.C, self.f_b, self.omega)
         C_hat = exp(-x[4:7]) @ self.C
         f_b, omega = self.f_b + np.append(x[7:9], 0.0), self.omega + x[9:]

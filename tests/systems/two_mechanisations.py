@@ -51,7 +51,7 @@ class State(NamedTuple):
 
 
 class Stages(NamedTuple):
-    """What the SINS says, (steps, 4, ...): at the stages of each RK4 step."""
+    """Output of the SINS, (steps, 4, ...): at the stages of each RK4 step."""
 
     C: np.ndarray
     v: np.ndarray
@@ -249,7 +249,7 @@ def slipped_rate(x, sins, errors, slips):
 
 @jax.jit(static_argnames="slips")
 def model_end(flown: Flown, slips=(), dt=DT_S, gyro=GYRO_ERROR, accel=ACCEL_ERROR):
-    """Where the error model ends, (B, 9), from where the mechanisations begin, by their steps."""
+    """End of the error model, (B, 9), from where the mechanisations begin, by their steps."""
     errors = error_model.SensorErrors(gyro, accel)
 
     def stage(carry, now):
@@ -272,7 +272,7 @@ def model_end(flown: Flown, slips=(), dt=DT_S, gyro=GYRO_ERROR, accel=ACCEL_ERRO
 
 
 def apart(flown: Flown, found) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How far off in phi [rad], dv [m/s] and position [m], each (B,): lengths."""
+    """Distance in phi [rad], dv [m/s] and position [m], each (B,): lengths."""
     off = np.asarray(found) - flown.end
     off[:, :3] = np.remainder(off[:, :3] + np.pi, 2.0 * np.pi) - np.pi
     M, N = radii(flown.truth.lat)

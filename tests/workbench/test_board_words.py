@@ -1,4 +1,4 @@
-"""What a header says of its fields."""
+"""Words of a header on its fields."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""What single precision costs: told of a filter that it does not hurt, and of one that it ruins."""
+"""Costs of single precision: of a filter that it does not hurt, and of one that it ruins."""
 
 from dataclasses import replace
 

@@ -24,7 +24,7 @@ RUNS = 8  # everywhere: one program serves all
 
 
 class Here(workers._Process):
-    """In the place of a worker's process: computes in this one, and has ended."""
+    """Stand-in for a worker's process: computes in this one, and has ended."""
 
     status, said = 0, ""
 

@@ -66,7 +66,7 @@ def test_what_cannot_be_tuned_is_told(vary, by, says):
 
 
 class Told(Parameters):
-    """What the filter of the log is told."""
+    """Parameters given to the filter of the log."""
 
     noise: Positive = 20.0
     filters: tuple[str, ...] = ("kf",)

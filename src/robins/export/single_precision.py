@@ -24,7 +24,7 @@ from robins.filters import Belief
 from robins.filters.analysis.consistency import normalised_sq
 from robins.manifold import local
 from robins.program import FLAGS, Program, build
-from robins.program.trace import counts
+from robins.program.walk import counts
 from robins.systems.study import Contender, Problem
 
 NONE: Mapping[str, float] = {}

@@ -77,7 +77,7 @@ def steps_of(track: Track, late_s: float = 0.0) -> Steps | None:
     """
     if track.v_n is None:
         return None
-    of_position, of_velocity, duration = _steps_over(track, _BASE_S, late_s)
+    of_position, of_velocity, duration = _steps_over(track, track.v_n, _BASE_S, late_s)
     # By either view, so that positions or velocities in a wrong unit do not pass for rest.
     by_either = _moves(of_velocity, duration, track.sigma_m)
     by_either |= _moves(of_position, duration, track.sigma_m)
@@ -86,7 +86,7 @@ def steps_of(track: Track, late_s: float = 0.0) -> Steps | None:
     either = Steps(of_position[by_either], of_velocity[by_either])
     # Of steps chosen by noisy positions, noise has made the ways longer.
     for base_s in _BASES_S:
-        of_position, of_velocity, duration = _steps_over(track, base_s, late_s)
+        of_position, of_velocity, duration = _steps_over(track, track.v_n, base_s, late_s)
         moving = _moves(of_velocity, duration, track.sigma_m)
         if np.count_nonzero(moving) >= 10:
             return Steps(of_position[moving], of_velocity[moving])
@@ -99,7 +99,7 @@ def _moves(way: np.ndarray, duration: np.ndarray, sigma_m: float) -> np.ndarray:
 
 
 def _steps_over(
-    track: Track, base_s: float, late_s: float
+    track: Track, v_n: np.ndarray, base_s: float, late_s: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Change of position by positions and by velocities (k, 3) [m], and over what time (k,) [s]."""
     time_s = track.time_s
@@ -110,7 +110,7 @@ def _steps_over(
         return np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
     near = time_s[last] - time_s[first] < 1.5 * np.median(time_s[last] - time_s[first])
     first, last = first[near], last[near]
-    path = integral(time_s, velocity_of(track)[0])
+    path = integral(time_s, v_n)
     ends = (at(time_s[rows] + late_s, time_s, path) for rows in (last, first))
     return track.r_n[last] - track.r_n[first], np.subtract(*ends), time_s[last] - time_s[first]
 

@@ -47,7 +47,7 @@ def test_a_gamma_that_a_gain_meets_is_not_refused():
 
 
 def by_inverses(p, gamma):
-    """Whether the game ends, with P itself and its inverse; n in x and in y must be apart."""
+    """Test for the end of the game, with P and its inverse; n in x and in y must be apart."""
     Q, R = p.Bn @ p.Bn.T, p.Dn @ p.Dn.T
     P = Q
     for _ in range(400):

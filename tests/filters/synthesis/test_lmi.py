@@ -254,7 +254,7 @@ def test_full_order_is_refused_for_the_published_plant_before_any_solver_is_aske
 
 @pytest.mark.parametrize(("rate", "step", "radius"), RATES)
 def test_the_solver_would_have_called_it_optimal(rate, step, radius):
-    """Why the refusal comes first: R is driven to the tolerance and the answer looks well."""
+    """Reason for the early refusal: R is driven to the tolerance and the answer looks well."""
     published = quaternion(rate_rad_s=rate * step, euler=True)
     scales = balanced(published, 3.0)
     assert programs.solve(scales.plant(published), "full", "mixed").status.startswith("optimal")

@@ -114,7 +114,7 @@ def test_bad_arguments():
 
 
 def test_frozen_designs_need_not_make_a_filter_whose_errors_decay():
-    """Why it warns: two plants in turns, each with a gain certified for it."""
+    """Reason for the warning: two plants in turns, each with a gain certified for it."""
     each, errors = designer(500.0), []
     for A in ([[0.5, 2.0], [0.0, 0.5]], [[0.5, 0.0], [2.0, 0.5]]):
         noisy = noisier(two_states(), 100.0)._replace(A=np.array(A))
