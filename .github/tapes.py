@@ -15,12 +15,12 @@ RATES_HZ = (50.0, 100.0, 200.0, 400.0)  # of an IMU
 
 def make() -> None:
     """Make the live filters at usual rates, which writes their programs into the user's cache."""
+    from robins.systems.ins_gnss import InsGnssReplay as Navigated
     from robins.systems.ins_gnss import LiveInsGnss
-    from robins.systems.ins_gnss import Replay as Navigated
-    from robins.systems.marg import LiveMarg, Replay
+    from robins.systems.marg import LiveMarg, MargReplay
 
     for rate_hz in RATES_HZ:
-        LiveMarg(Replay(), rate_hz)
+        LiveMarg(MargReplay(), rate_hz)
         for name in ("ekf", "robust"):
             LiveInsGnss(Navigated(), rate_hz, filter=name)
 

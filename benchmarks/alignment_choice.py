@@ -25,7 +25,7 @@ from defaults import STRUCTURES, problem_of, score
 
 from robins.campaign.monte_carlo import worlds
 from robins.systems.transfer_alignment.product import filters
-from robins.systems.transfer_alignment.product.filters import KICKED, QUIET, Hypothesis
+from robins.systems.transfer_alignment.product.filters import KICKED, QUIET, NoiseHypothesis
 from robins.systems.transfer_alignment.product.parameters import Structure
 
 WHERE = (
@@ -43,7 +43,7 @@ class Candidate(NamedTuple):
 
     def take(self) -> None:
         """The package has these numbers from here on."""
-        noisy = Hypothesis(gyro=self.gyro)
+        noisy = NoiseHypothesis(gyro=self.gyro)
         modes = QUIET, noisy, noisy._replace(walk=self.gyro)
         filters._STIFF_MODES, filters._FLEXING_MODES = modes, (QUIET, KICKED, *modes[1:])
         sigma, time = math.radians(self.sigma_arcmin / 60.0), self.time_s

@@ -53,7 +53,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from robins.dataset import AttitudeTable, Dataset, ImuTable, MagTable
 from robins.logs.broad import read_broad
 from robins.rotation import multiply
-from robins.systems.marg import Replay, replay
+from robins.systems.marg import MargReplay, replay
 from robins.systems.marg.replay import orientation_errors, rms_deg, truth_at
 
 ENU_TO_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
@@ -235,7 +235,7 @@ def scored(trial: Trial, q_nb: np.ndarray) -> Row:
     return Row(total, heading, rms_deg(e.inclination))
 
 
-def of_robins(trial: Trial, parameters: Replay) -> dict[str, Row]:
+def of_robins(trial: Trial, parameters: MargReplay) -> dict[str, Row]:
     """The causal and the smoothed replay."""
     begin = time.perf_counter()
     found = replay(trial.log, parameters)
@@ -429,7 +429,7 @@ def main() -> None:
     found: dict[tuple[str, bool, str], list[Row]] = {}
     print(f"| trial, estimator | {' | '.join(head)} |\n|{'---|' * (len(head) + 1)}")
     for trial in trials:
-        rows = of_robins(trial, Replay()) | of_peers(trial)
+        rows = of_robins(trial, MargReplay()) | of_peers(trial)
         for name, row in rows.items():
             print(line(f"{trial.set} {trial.name}, {name}", row), flush=True)
             found.setdefault((trial.set, trial.development, name), []).append(row)

@@ -33,7 +33,7 @@ from attitude_board import READERS
 from scipy.stats import kstest
 
 from robins.filters import rts_smoother, run
-from robins.systems.marg import Replay, model_of, one_prior, prepare
+from robins.systems.marg import MargReplay, model_of, one_prior, prepare
 from robins.systems.marg.model import HEADING
 from robins.systems.marg.replay import orientation_errors, truth_at
 
@@ -73,7 +73,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     for name in ("broad", "repoimu"):
         parser.add_argument(f"--{name}", type=Path, action="append", default=[])
-    given, rng, p = vars(parser.parse_args()), np.random.default_rng(0), Replay()
+    given, rng, p = vars(parser.parse_args()), np.random.default_rng(0), MargReplay()
     found: dict[tuple[str, str], list[tuple[float, float, float, float]]] = {}
     print(f"| trial, way | NEES | of draws | within 0.5 to 2 | below |\n|{'---|' * 5}")
     for name, folders in given.items():

@@ -11,7 +11,7 @@ says how long compiling took, how far their RMS errors are apart, and the most m
 The second measures the most memory in use by a campaign of an alignment, over truth steps and
 runs, and of the drive, each in a process of its own: of its set-up, and of all. The third times an
 alignment over truth steps and over runs, after it has compiled. The fourth compiles each loop of
-some campaigns, in seconds of the compiler by node, for `robins.campaign.handover`.
+some campaigns, in seconds of the compiler by node, for `robins.campaign.compilation`.
 """
 
 import resource
@@ -25,8 +25,8 @@ import numpy as np
 
 from robins import scenario
 from robins.campaign import Statistics, simulate
-from robins.campaign.handover import LOOP_S
-from robins.campaign.machine import ByJax, InLanes, available_cores
+from robins.campaign.compilation import LOOP_S
+from robins.campaign.machine import JaxMachine, LaneMachine, available_cores
 from robins.systems.finding import find_system
 
 CAMPAIGNS = (
@@ -35,7 +35,7 @@ CAMPAIGNS = (
     ("ins-gnss", "drive", "ekf"),
 )
 WARM = 64  # runs that compile
-in_c = partial(InLanes, name="c")
+in_c = partial(LaneMachine, name="c")
 
 
 ALIGNMENT, DRIVE = CAMPAIGNS[0], CAMPAIGNS[2]
@@ -108,7 +108,7 @@ def linear():
     print(
         f"{'machine':>8s}{'steps':>8s}{'runs':>8s}{'time [s]':>12s}{'a step [us]':>14s}{'MB':>8s}"
     )
-    for made, sizes in ((in_c, LINEAR), (ByJax, LINEAR_BY_JAX)):
+    for made, sizes in ((in_c, LINEAR), (JaxMachine, LINEAR_BY_JAX)):
         for steps, runs in sizes:
             duration = f"manoeuvre.duration={0.01 * steps} s"
             problem = problem_of(*ALIGNMENT, duration, "settle=5 s")
@@ -123,7 +123,7 @@ def compile_loops():
     """Seconds of the compiler for each loop, and milliseconds for a node beside `LOOP_S`."""
     print(f"{'campaign':34s}{'nodes':>8s}{'compiler [s]':>14s}{'a node [ms]':>14s}")
     for campaign in (*CAMPAIGNS, ("rocket", "a1", "ukf")):
-        machine = InLanes(problem_of(*campaign))
+        machine = LaneMachine(problem_of(*campaign))
         simulate(machine.problem, 8, machine=machine)
         for loop in machine._hand_over._loops:
             before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
@@ -149,7 +149,7 @@ def main():
     print(f"{head[0]:34s}" + "".join(f"{h:>10s}" for h in head[1:]))
     for campaign in (c for c in CAMPAIGNS if c[0] in (sys.argv[2:] or c[0])):
         problem = problem_of(*campaign)
-        slow_first, slow, want = timed(ByJax(problem), runs)
+        slow_first, slow, want = timed(JaxMachine(problem), runs)
         fast_first, fast, got = timed(in_c(problem), runs)
         size = np.max(np.abs(want), axis=0)
         apart = np.max(np.abs(got - want) / np.where(size > 0.0, size, 1.0))

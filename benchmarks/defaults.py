@@ -58,7 +58,7 @@ from robins.rotation import Rotation
 from robins.systems import catalogue
 from robins.systems.finding import find_system
 from robins.systems.study import Case, Contender, Problem
-from robins.systems.transfer_alignment.product.parameters import Believed
+from robins.systems.transfer_alignment.product.parameters import PairAssumptions
 from robins.systems.transfer_alignment.product.study import product_contender
 from robins.systems.transfer_alignment.velocity_attitude.study import of_product
 
@@ -105,7 +105,7 @@ def told_structure(given: Any) -> Contender:
     """The product filter that believes in the flexure that is there, or in none."""
     structure = given.flexure if any(given.flexure.sigma) else None
     if given.study == "velocity-attitude":
-        return of_product(given, "product", Believed(flexure=structure))
+        return of_product(given, "product", PairAssumptions(flexure=structure))
     believed = given.believed.model_copy(update={"flexure": structure})
     return product_contender(given, "product", believed)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from robins import scenario
 from robins.dataset import Dataset
-from robins.systems.ins_gnss import SYSTEM, Drive, Replay, drive_dataset, replay
+from robins.systems.ins_gnss import SYSTEM, Drive, InsGnssReplay, drive_dataset, replay
 
 FILTERS = "ekf", "robust"
 RADIUS_M = 6.37e6
@@ -36,7 +36,7 @@ def without_velocities(seeds: list[int]) -> None:
     head("fixes", "seed", "filter", "error RMS [m]", "NIS", "refused", "zero velocities")
     for sigma in ("0.3 m", "1 m", "3 m"):
         given = drive(f"gnss.sigma={sigma}")
-        parameters = Replay.model_validate({"start": {"known_heading": given.place.heading}})
+        parameters = InsGnssReplay.model_validate({"start": {"known_heading": given.place.heading}})
         for seed in seeds:
             log = drive_dataset(given, seed=seed)
             log = replace(log, gnss=replace(log.gnss, v_n=None, sigma_v=None))
@@ -51,7 +51,7 @@ def without_velocities(seeds: list[int]) -> None:
 
 def track(log: Dataset) -> np.ndarray:
     """(filters, E, 2) latitude and longitude [rad] of the antenna."""
-    found = replay(log, Replay(), FILTERS).solution
+    found = replay(log, InsGnssReplay(), FILTERS).solution
     return np.stack([found["lat_rad"].values, found["lon_rad"].values], axis=-1)
 
 

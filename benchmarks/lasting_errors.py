@@ -20,7 +20,7 @@ from strange_drive import antenna_ecef, legs
 from robins import logs, scenario
 from robins.dataset import Dataset
 from robins.earth import dcm_en, ecef_from_geodetic, geodetic_from_ecef
-from robins.systems.ins_gnss import Drive, Replay, drive_dataset
+from robins.systems.ins_gnss import Drive, InsGnssReplay, drive_dataset
 from robins.systems.ins_gnss import replay as replayed
 
 SIGMA_M = np.array([2.0, 2.0, 4.0])
@@ -54,7 +54,9 @@ def lasting(drive: Drive, seed: int, run: int, share: float, time_s: float) -> D
     return replace(log, gnss=replace(g, lat_rad=lat, lon_rad=lon, alt_m=alt))
 
 
-def nees(drive: Drive, log: Dataset, parameters: Replay) -> tuple[list[float], list[float], bool]:
+def nees(
+    drive: Drive, log: Dataset, parameters: InsGnssReplay
+) -> tuple[list[float], list[float], bool]:
     """NEES and error [m] of each filter after 20 s, and whether a lasting part was found."""
     outcome = replayed(logs.clean(log), parameters, FILTERS)
     assert log.truth is not None
@@ -81,8 +83,8 @@ def main() -> None:
     asked = options.parse_args()
     arm = 'lever_arm = ["-0.6 m", "0.3 m", "-0.9 m"]'
     told = {
-        "found": scenario.parse(Replay, f"[gnss]\n{arm}\n"),
-        "white": scenario.parse(Replay, f"[gnss]\n{arm}\nlasting_share = 0.0\n"),
+        "found": scenario.parse(InsGnssReplay, f"[gnss]\n{arm}\n"),
+        "white": scenario.parse(InsGnssReplay, f"[gnss]\n{arm}\nlasting_share = 0.0\n"),
     }
     print("share  time [s]  rate [Hz]  replay  found in   NEES (smoothed)   error [m] (smoothed)")
     for rate in (1, 4):

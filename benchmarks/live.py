@@ -21,8 +21,8 @@ from marg import RATE_HZ, made_log
 from robins import scenario
 from robins.filters import Belief, Model, Motion, OnlineFilter, Sensor, kalman, taylor, unscented
 from robins.systems.ins_gnss import SYSTEM, Drive, LiveInsGnss, drive_dataset
-from robins.systems.ins_gnss import Replay as Navigated
-from robins.systems.marg import LiveMarg, Replay
+from robins.systems.ins_gnss import InsGnssReplay as Navigated
+from robins.systems.marg import LiveMarg, MargReplay
 from robins.systems.streaming import Flag
 
 SAMPLES = 6_000
@@ -100,7 +100,7 @@ def called(call: Any) -> tuple[float, float, bool]:
 
 def orientation(machine: str) -> None:
     """Nine axes at 286 Hz."""
-    log, live = made_log(), made(LiveMarg, Replay(), RATE_HZ, machine=machine)
+    log, live = made_log(), made(LiveMarg, MargReplay(), RATE_HZ, machine=machine)
     assert log.mag is not None
     stamps, imu, field = log.imu.time_ns.tolist(), log.imu, log.mag.field_t
     rows = [

@@ -16,7 +16,7 @@ from timing import best_of, show
 from robins.dataset import Dataset, ImuTable, MagTable
 from robins.filters import OnlineFilter, rts_smoother, run
 from robins.manifold import Angle
-from robins.systems.marg import Replay, model_of, one_prior, prepare
+from robins.systems.marg import MargReplay, model_of, one_prior, prepare
 from robins.systems.marg.model import causal_attitudes, smoothed_attitudes
 from robins.systems.replaying import kept
 
@@ -46,7 +46,7 @@ def made_log() -> Dataset:
 
 def main():
     """Print the times."""
-    log, parameters = made_log(), Replay()
+    log, parameters = made_log(), MargReplay()
     filter_, model = one_prior(parameters), model_of(parameters)
     ready = prepare(log, parameters).world
     inputs = (filter_, model, ready.start, ready.y, ready.u, ready.aux)

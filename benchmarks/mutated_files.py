@@ -36,10 +36,10 @@ from mcap.writer import CompressionType
 
 from robins.bench.recording import Entry, Event, Recorder, read_record
 from robins.bench.rigs.satellite.messages import WIRE
-from robins.campaign.plan import Plan, read, write
+from robins.campaign.plan import CampaignPlan, read, write
 from robins.campaign.shards import pack, unpack
 from robins.campaign.statistics import Statistics
-from robins.campaign.store import Folder
+from robins.campaign.store import FolderStore
 from robins.cli import main
 from robins.errors import RobinsError
 from robins.logs import FORMATS, open_log
@@ -126,8 +126,8 @@ def _record() -> bytes:
 
 def _plan() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
-        plan = Plan("walk", "walk", "runs = 4\n", 0, 4, ("kf",), "jax", 4, "0")
-        write(Folder(folder), plan)
+        plan = CampaignPlan("walk", "walk", "runs = 4\n", 0, 4, ("kf",), "jax", 4, "0")
+        write(FolderStore(folder), plan)
         return (Path(folder) / "campaign.json").read_bytes()
 
 
@@ -140,7 +140,7 @@ def _beside(path: Path, name: str) -> Path:
 
 
 def _read_plan(path: Path) -> object:
-    plan = read(Folder(_beside(path, "campaign.json")))
+    plan = read(FolderStore(_beside(path, "campaign.json")))
     return plan if plan is None or plan.runs > 10_000 else plan.shards
 
 

@@ -17,7 +17,7 @@ import argparse
 import numpy as np
 
 from robins import scenario
-from robins.systems.ins_gnss import SYSTEM, Drive, Replay, drive_dataset, replay
+from robins.systems.ins_gnss import SYSTEM, Drive, InsGnssReplay, drive_dataset, replay
 
 SETTINGS = (
     'gnss.sigma=["0.01 m","0.01 m","0.02 m"]',
@@ -44,7 +44,7 @@ def longest(which: np.ndarray) -> int:
 def one(given: Drive, seed: int) -> dict[str, float]:
     """Figures of one run."""
     log = drive_dataset(given, seed=seed)
-    parameters = Replay.model_validate({"outages": OUTAGES})
+    parameters = InsGnssReplay.model_validate({"outages": OUTAGES})
     found = replay(log, parameters, FILTERS)
     s = found.solution.sel(filter=FILTERS[0])
     fix_s = (log.gnss.time_ns - log.imu.time_ns[0]) * 1e-9

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable
-from robins.systems.ins_gnss import Replay, replay
+from robins.systems.ins_gnss import InsGnssReplay, replay
 from robins.systems.ins_gnss.positions import heading_of
 from robins.systems.ins_gnss.recording import on_one_clock
 from robins.systems.ins_gnss.start import find_start
@@ -126,13 +126,15 @@ def without_velocities(log: Dataset) -> Dataset:
 def cases(seed: int, at_rest: bool):
     """Name, log, parameters and truth of each way to navigate one drive."""
     log, truth = log_of(seed, at_rest)
-    headed = Replay.model_validate({"start": {"known_heading": truth.heading[0]}})
-    yield "velocities", log, Replay(), truth
-    yield "positions", without_velocities(log), Replay(), truth
+    headed = InsGnssReplay.model_validate({"start": {"known_heading": truth.heading[0]}})
+    yield "velocities", log, InsGnssReplay(), truth
+    yield "positions", without_velocities(log), InsGnssReplay(), truth
     yield "positions, heading given", without_velocities(log), headed, truth
 
 
-def started(log: Dataset, parameters: Replay, truth: Truth) -> tuple[float, float, float, float]:
+def started(
+    log: Dataset, parameters: InsGnssReplay, truth: Truth
+) -> tuple[float, float, float, float]:
     """Time of the start [s], error of the heading [deg] and its sigma; velocity error in sigmas."""
     one = on_one_clock(log, parameters)
     found = find_start(one, parameters.start, parameters.aids, None, parameters.gnss)
@@ -147,7 +149,7 @@ def started(log: Dataset, parameters: Replay, truth: Truth) -> tuple[float, floa
     return at_s, away, np.degrees(found.heading_sigma_rad), nees
 
 
-def navigated(log: Dataset, parameters: Replay, truth: Truth, name: str) -> list[float]:
+def navigated(log: Dataset, parameters: InsGnssReplay, truth: Truth, name: str) -> list[float]:
     """RMS of the horizontal error [m] ten seconds after the start, NIS, and refused fixes."""
     found = replay(log, parameters, (name,))
     s, m = found.solution, found.metrics[name]
@@ -187,7 +189,9 @@ def verdicts(runs: int, seed: int) -> None:
         for kind, given, parameters in spoilt(without_velocities(log), truth):
             row = found.setdefault(kind, [])
             try:
-                outcome = replay(given, Replay.model_validate(parameters), ("robust", "robust+rts"))
+                outcome = replay(
+                    given, InsGnssReplay.model_validate(parameters), ("robust", "robust+rts")
+                )
             except ValueError:
                 row.append(("none", np.nan))
                 continue

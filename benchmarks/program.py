@@ -39,7 +39,7 @@ from robins.ins.mechanise import Nav
 from robins.ins.mechanise import step as mechanise
 from robins.program import CPP, LANE_FLAGS, build, function, header, to_c, trace_step
 from robins.program.interpreter import interpreted_rounds
-from robins.program.lanes import Rounds
+from robins.program.lanes import CompiledRounds
 from robins.rotation import Rotation
 from robins.systems.ins_gnss import SYSTEM, Drive
 
@@ -236,7 +236,7 @@ def in_c(program, case: Case, runs: int) -> Callable[[], np.ndarray]:
 def by_machine(program, case: Case) -> Callable[[], list[np.ndarray]]:
     """All runs by the interpreter; gives the leaves of the state in the end, for each run."""
     states, rows = jax.tree.leaves(case.states), jax.tree.leaves(case.rows)
-    rounds = Rounds(program, case.steps, len(states), 0, engine=interpreted_rounds)
+    rounds = CompiledRounds(program, case.steps, len(states), 0, engine=interpreted_rounds)
     given = [(np.asarray(x), True) for x in states]
     given += [(np.ascontiguousarray(np.moveaxis(np.asarray(x), 0, 1)), True) for x in rows]
     return lambda: rounds(BATCH, given)[: len(states)]

@@ -26,7 +26,7 @@ import numpy as np
 from robins import logs, rotation, scenario
 from robins.dataset import Dataset, GnssTable, ImuTable, OdometryTable, Trajectory
 from robins.earth import dcm_en, geodetic_from_ecef
-from robins.systems.ins_gnss import Replay, replay
+from robins.systems.ins_gnss import InsGnssReplay, replay
 
 SIGMA_M = 2.1, 2.1, 4.0  # 2.5 m circular error probable
 SIGMA_V = 0.05  # m/s
@@ -109,7 +109,7 @@ def against(truth: Trajectory, time_ns: np.ndarray, lat: Any, lon: Any, alt: Any
 def told(dataset: Dataset, case: str, names: tuple[str, ...]) -> None:
     """Replay and print."""
     outages = case != "all"
-    parameters = scenario.parse(Replay, OUTAGES if outages else "")
+    parameters = scenario.parse(InsGnssReplay, OUTAGES if outages else "")
     heard = dataset if case == "wheels" else replace(dataset, odometry=None)
     outcome = replay(heard, parameters, names)
     assert dataset.truth is not None

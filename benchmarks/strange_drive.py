@@ -27,7 +27,7 @@ from robins import logs, scenario
 from robins.dataset import Dataset, GnssTable
 from robins.earth import dcm_en, ecef_from_geodetic, geodetic_from_ecef
 from robins.rotation import rotate
-from robins.systems.ins_gnss import Drive, Replay, drive_dataset, replay
+from robins.systems.ins_gnss import Drive, InsGnssReplay, drive_dataset, replay
 
 DRIVE = """
 system = "ins-gnss"
@@ -222,7 +222,7 @@ def main() -> None:
     drive = scenario.parse(Drive, legs())
     names = tuple(asked.filters.split(","))
     text = '[gnss]\nlever_arm = ["-0.6 m", "0.3 m", "-0.9 m"]\n'
-    parameters = scenario.parse(Replay, text)
+    parameters = scenario.parse(InsGnssReplay, text)
     found: dict[str, list[dict[str, float]]] = {name: [] for name in names}
     for run in range(asked.runs):
         log, told = strange(drive, asked.seed, run)

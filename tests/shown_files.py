@@ -17,7 +17,7 @@ from robins.results import Outcome
 from robins.systems import SYSTEMS
 from robins.systems.catalogue import configurations
 from robins.systems.ins_gnss import Drive, drive_dataset
-from robins.systems.transfer_alignment.product.parameters import Replay
+from robins.systems.transfer_alignment.product.parameters import PairReplay
 from robins.workbench import campaign_work, plan_campaign, publish
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -86,7 +86,7 @@ def write_files(here):
     logs.write_log(here / "still.csv", ImuTable(stamps, still[0], still[1], "rate"))
     pair = configurations("transfer-alignment")["replay"].read_text()
     (here / "my-pair.toml").write_text(pair)
-    dataset = pair_dataset(scenario.parse(Replay, pair, ["slave.rate=20 Hz"]), seed=3)
+    dataset = pair_dataset(scenario.parse(PairReplay, pair, ["slave.rate=20 Hz"]), seed=3)
     logs.write_log(here / "master.csv", dataset.master)
     logs.write_log(here / "slave.csv", dataset.imu)
     (here / "my_system.py").write_bytes((ROOT / "docs/examples/balloon.py").read_bytes())

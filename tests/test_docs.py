@@ -23,7 +23,7 @@ from plain_docstrings import plain
 from robins import scenario
 from robins.bench.rigs import rig_of
 from robins.bench.run.setup import setup_of
-from robins.cli import Status, app
+from robins.cli import ExitStatus, app
 from robins.filters import Filter
 from robins.filters.rule import Hooks
 from robins.logs import columns_from
@@ -250,7 +250,7 @@ def test_the_contract_names_every_command_option_and_status():
     }
     assert {k: sorted(v) for k, v in options.items()} == {k: sorted(v) for k, v in has.items()}
     statuses = re.findall(r"^\| (\d) \|", contract.read_text("utf-8"), re.MULTILINE)
-    assert [int(status) for status in statuses] == sorted(Status)
+    assert [int(status) for status in statuses] == sorted(ExitStatus)
 
 
 def test_the_configurations_shown_can_be_read(tmp_path):

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from robins.rotation import to_euler
-from robins.systems.marg import LiveMarg, Replay
+from robins.systems.marg import LiveMarg, MargReplay
 from robins.systems.streaming import Flag, LiveError
 
 
@@ -57,7 +57,7 @@ def main() -> None:
     asked.add_argument("--state", type=Path)
     a = asked.parse_args()
     kept = a.state is not None and a.state.exists()
-    live = LiveMarg.load(a.state) if kept else LiveMarg(Replay(), a.rate)
+    live = LiveMarg.load(a.state) if kept else LiveMarg(MargReplay(), a.rate)
     lines = of_serial(a.serial, a.baud, a.silence) if a.serial else of_udp(a.port, a.silence)
     for number, line in enumerate(lines):
         try:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from robins.bench import Judged, Part, Rig, Wire
+from robins.bench import Part, Rig, RunFigures, Wire
 from robins.bench.run.setup import counted_from
 from robins.bench.wire.fields import f64, message, size
 from robins.filters import Belief, Model, Motion, OnlineFilter, Sensor, kalman
@@ -74,28 +74,28 @@ def moves(given: Pendulum) -> Partial:
     return Partial(swing, 9.81 / given.length, given.step)
 
 
-def pendulum(kit: Kit) -> Part:
-    move = moves(kit.given)
+def pendulum(config: Kit) -> Part:
+    move = moves(config.given)
 
     def act(x, step, inputs):
         x = np.asarray(move(jnp.asarray(x), None))
         return x, [("swing", {"angle": x[0], "rate": x[1]})]
 
-    return Part("pendulum", {}, lambda: np.array([kit.given.start, 0.0]), act)
+    return Part("pendulum", {}, lambda: np.array([config.given.start, 0.0]), act)
 
 
-def camera(kit: Kit) -> Part:
+def camera(config: Kit) -> Part:
     pushes = jnp.diag(jnp.array([0.0, 1e-3]))  # rad/s a step, of what the model leaves out
-    sees = Sensor(lambda x, aux: x[:1], jnp.array([kit.given.camera]), name="camera")
+    sees = Sensor(lambda x, aux: x[:1], jnp.array([config.given.camera]), name="camera")
     start = Belief(jnp.array([0.0, 0.0]), jnp.diag(jnp.array([1.0, 1.0])))
-    online = OnlineFilter(kalman(), Model(Motion(moves(kit.given), pushes), (sees,)), start)
+    online = OnlineFilter(kalman(), Model(Motion(moves(config.given), pushes), (sees,)), start)
     first = online.state
 
     def act(state, step, inputs):
         online.state = state
         online.predict()
         if (seen := inputs["swing"]) is not None:
-            online.update(np.array([seen["angle"] + kit.noise[step]]))
+            online.update(np.array([seen["angle"] + config.noise[step]]))
         x, factor = (np.asarray(a) for a in online.belief[:2])
         sigma = np.linalg.norm(factor, axis=1)
         return online.state, [("estimate", {"angle": x[0], "rate": x[1], "sigma": sigma})]
@@ -115,13 +115,13 @@ class PendulumRig(Rig[Pendulum, Kit]):
         noise = np.random.default_rng(setup.seed).normal(size=round(given.duration / given.step))
         return Kit(round(given.step * 1e9), given, given.camera * noise)
 
-    def judge(self, flight, ran):
-        flown, first = ran.flown, counted_from(flight, ran.steps)
-        error = np.degrees(flown["swing.angle"] - flown["estimate.angle"])[:, None]
-        sigma = np.degrees(flown["estimate.sigma"][:, :1])
+    def judge(self, flight, result):
+        series, first = result.series, counted_from(flight, result.steps)
+        error = np.degrees(series["swing.angle"] - series["estimate.angle"])[:, None]
+        sigma = np.degrees(series["estimate.sigma"][:, :1])
         rms = float(np.sqrt(np.nanmean(error[first:] ** 2)))
         about = {"unit": "deg", "frame": "pendulum", "axes": ("angle",)}
-        return Judged(
+        return RunFigures(
             metrics={"angle_rms_deg": rms},
             arrays=array("error", error[None], "angle", **about)
             | array("sigma", sigma[None], "angle", **about),

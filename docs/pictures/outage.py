@@ -43,7 +43,7 @@ def draw(solution: xr.Dataset) -> None:
         ENLARGED * find(solution, role)["position"].values[0, part, 1::-1]
         for role in ("error", "sigma")
     )
-    figure, grid = style.new()
+    figure, grid = style.new_figure()
     figure.set_size_inches(5.6, 3.5)  # beside the live page, of the same shape
     axes = grid[0, 0]
     fine = np.linspace(0.0, len(truth) - 1.0, 40 * len(truth))

@@ -14,7 +14,7 @@ import numpy as np
 from robins.bench.rigs.satellite import RIG, judging
 from robins.bench.rigs.satellite.reference import reference_q_ib
 from robins.bench.run import Session
-from robins.bench.run.outcome import figures, judged
+from robins.bench.run.outcome import figures, run_figures
 from robins.bench.run.setup import changed, read
 
 DEG = math.pi / 180.0
@@ -37,7 +37,7 @@ def flown(case: str, filter_: str, seed: int, seconds: float) -> dict:
     flight = changed(flight, options)
     ran = Session(flight).run()
     assert not ran.failure, ran.failure
-    told = figures(flight, ran, judged(flight, ran), None)
+    told = figures(flight, ran, run_figures(flight, ran), None)
     # As in the specification: peaks and figures of the time from the fault on.
     after = slice(round(600.0 / flight.given.step), None)
     error = judging.attitude_error(ran.flown)

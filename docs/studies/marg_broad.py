@@ -24,7 +24,7 @@ from robins.dataset import Dataset
 from robins.ins.frames import to_ned_frd
 from robins.logs.broad import read_broad
 from robins.rotation import multiply
-from robins.systems.marg import Replay, replay
+from robins.systems.marg import MargReplay, replay
 from robins.systems.marg.replay import orientation_errors, rms_deg, truth_at
 
 # Without the package its columns stay empty.
@@ -138,7 +138,7 @@ def main() -> None:
         table = []
         for number, trial in enumerate(trials):
             log = change(trial, number)
-            found = replay(log, Replay()).metrics
+            found = replay(log, MargReplay()).metrics
             own = [
                 [found[name][f"{which}_rmse_deg"] for which in words]
                 for name in ("marg", "marg-smoothed")

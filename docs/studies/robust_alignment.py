@@ -32,7 +32,7 @@ from robins.filters.rules import huber
 from robins.scenario import load
 from robins.systems import transfer_alignment
 from robins.systems.study import Contender, Problem
-from robins.systems.transfer_alignment.product.parameters import Believed
+from robins.systems.transfer_alignment.product.parameters import PairAssumptions
 from robins.systems.transfer_alignment.product.study import product_contender, reported
 from robins.systems.transfer_alignment.velocity_attitude.study import STUDY, VelocityAttitude
 
@@ -89,7 +89,7 @@ def informed(given: VelocityAttitude, epoch_s: np.ndarray) -> Contender:
     """The product filter that knows it all, but for what is random."""
     d, structure = given.disturbance, given.flexure
     flexes = any(structure.sigma)
-    believed = Believed(flexure=structure if flexes else None)
+    believed = PairAssumptions(flexure=structure if flexes else None)
     base = product_contender(given, "product", believed)
     begin = epoch_s - epoch_s[0] + 1e-9
     gyro, jump = np.ones(len(epoch_s)), np.zeros((len(epoch_s), 3))

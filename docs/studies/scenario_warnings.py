@@ -62,10 +62,13 @@ REASONS = {
 
 def named(name):
     """Names of the filters of a run, the default of the system first."""
-    from robins.workbench.scenarios import beside, read_scenario  # after `cache.enable`
+    from robins.workbench.scenarios import (  # after `cache.enable`
+        read_scenario,
+        with_default_filter,
+    )
 
     one = read_scenario(name, ())
-    filters = dict.fromkeys((one.system.default, *beside(one)))
+    filters = dict.fromkeys((one.system.default, *with_default_filter(one)))
     return [n for n in filters if n in one.study.filters]
 
 

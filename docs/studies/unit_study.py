@@ -34,7 +34,11 @@ from robins.systems.transfer_alignment.attitude_matching.study import (
     central_filter,
     existence,
 )
-from robins.systems.transfer_alignment.attitude_matching.world import World, lay_out, simulate
+from robins.systems.transfer_alignment.attitude_matching.world import (
+    MatchingWorld,
+    lay_out,
+    simulate,
+)
 
 PICTURE = Path(__file__).resolve().parents[1] / "pictures" / "unit_study.png"
 PACKAGED = Path(robins.systems.__file__).parent / "transfer_alignment" / "scenarios" / "s0.toml"
@@ -92,7 +96,7 @@ def worlds(runs):
     return jax.vmap(lambda index: simulate(S0, COURSE, 0, index))(runs)
 
 
-def rms_over_time(row: Row, world: World) -> np.ndarray:
+def rms_over_time(row: Row, world: MatchingWorld) -> np.ndarray:
     """(E, 3) arcmin, over the runs."""
     model, (u, aux) = row.system.model(row.sigma), row.system.inputs()
     filter_, start = with_gamma(row.filter, row.gamma), row.system.start()
@@ -113,7 +117,7 @@ def pooled(rms: np.ndarray) -> str:
     return " ".join(f"{x:.1f}" for x in np.sqrt(np.mean(rms[FROM:] ** 2, axis=0)))
 
 
-def table(world: World) -> dict[str, np.ndarray]:
+def table(world: MatchingWorld) -> dict[str, np.ndarray]:
     """Print it; RMS over time of what exists, by label."""
     print(
         f"{'R = I, L = I, gamma = 50':<28}{'gamma_min':>10}{'ref.':>9}{'RMS E N U':>18}{'ref.':>18}"

@@ -88,17 +88,63 @@ def require_known(kind: str, name: str, among: Iterable[str], where: str = "this
 MOVED: dict[str, dict[str, tuple[str, ...]]] = {
     "robins.linalg": {"steady_state": ("robins.filters", "steady_kalman")},
     "robins.filters": {
+        "Closed": ("robins.filters", "ClosedLoopRun"),
+        "Family": ("robins.filters", "ModeFamily"),
+        "Late": ("robins.filters", "DelayedMeasurement"),
         "constrain": ("robins.filters.limits", "constrain"),
         "information_sum": ("robins.filters", "fuse"),
     },
     "robins.bench.rig": {
-        name: ("robins.bench.evaluation", name)
-        for name in ("Alarms", "Judged", "Offer", "Spoken", "Told", "View")
+        old: ("robins.bench.evaluation", name)
+        for old, name in {
+            **{name: name for name in ("Alarms", "Offer")},
+            **{"Judged": "RunFigures", "Spoken": "OperatorEvent"},
+            **{"Told": "Alert", "View": "PageView"},
+        }.items()
     },
     "robins.systems.marg": {
+        "first_look": ("robins.systems.marg", "initial_alignment"),
+        "Replay": ("robins.systems.marg", "MargReplay"),
         "marg_filter": ("robins.systems.marg.filters", "marg_filter"),
         "causal_attitudes": ("robins.systems.marg.model", "causal_attitudes"),
         "smoothed_attitudes": ("robins.systems.marg.model", "smoothed_attitudes"),
+    },
+    "robins.systems.gnss": {
+        "Replay": ("robins.systems.gnss", "GnssReplay"),
+    },
+    "robins.systems.ins_gnss": {
+        "Replay": ("robins.systems.ins_gnss", "InsGnssReplay"),
+    },
+    "robins.cli": {
+        "Status": ("robins.cli", "ExitStatus"),
+    },
+    "robins.bench.ports": {
+        "Line": ("robins.bench.ports", "SerialLine"),
+    },
+    "robins.bench.live": {
+        "Live": ("robins.bench.live", "LivePage"),
+    },
+    "robins.sim": {
+        "Motion": ("robins.sim", "MotionProfile"),
+    },
+    "robins.bench.broker": {
+        "Table": ("robins.bench.broker", "FaultTable"),
+        "Said": ("robins.bench.broker", "DeviceFault"),
+        "Piece": ("robins.bench.broker", "LineOutput"),
+    },
+    "robins.bench": {
+        "Judged": ("robins.bench", "RunFigures"),
+        "View": ("robins.bench", "PageView"),
+    },
+    "robins.bench.run": {
+        "Ran": ("robins.bench.run", "RunResult"),
+    },
+    "robins.report": {
+        "Origin": ("robins.report", "ReportOrigin"),
+    },
+    "robins.results": {
+        "keeping": ("robins.results", "keep_on_error"),
+        "silent": ("robins.results", "ignore_progress"),
     },
 }
 

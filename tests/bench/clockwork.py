@@ -30,19 +30,19 @@ class Kit(NamedTuple):
     frames: tuple[int, ...] = (0,)
 
 
-def counter(kit):
+def counter(config):
     """Say the number of the step."""
     return Part("counter", {}, lambda: None, lambda state, k, heard: (None, [("count", {"n": k})]))
 
 
-def adder(kit):
+def adder(config):
     """Say the sum of the numbers heard."""
 
     def act(total, k, heard):
         total += heard["count"]["n"] if heard["count"] else 0.0
         return total, [("sum", {"total": total})]
 
-    wait = partial(time.sleep, kit.wait_s)
+    wait = partial(time.sleep, config.wait_s)
     return Part("adder", {"count": 0}, lambda: 0.0, act, {"count": None}, wait)
 
 
@@ -68,7 +68,7 @@ class ClockworkRig(Rig):
     def filters(self):
         return ("exact",)
 
-    def inside(self, kit, steps):
+    def inside(self, config, steps):
         """Numbers of a run, in closed form."""
         n = np.arange(float(steps))
         return {"count.n": n, "sum.total": n * (n + 1.0) / 2.0}

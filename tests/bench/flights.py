@@ -3,13 +3,15 @@
 from stations import parts
 
 from robins.bench.accounting import Latencies
-from robins.bench.evaluation import Ran
+from robins.bench.evaluation import RunResult
 from robins.bench.run.telemetry import Telemetry
 
 
-def ran_of(flown, kit=None):
+def ran_of(series, config=None):
     """The result of a run in which nothing else happened."""
-    return Ran(flown, kit, len(flown.time_s), 0.0, Latencies(), {}, {}, {}, [], 0, "", False)
+    return RunResult(
+        series, config, len(series.time_s), 0.0, Latencies(), {}, {}, {}, [], 0, "", False
+    )
 
 
 def in_order(rig, made):
@@ -24,8 +26,8 @@ def in_order(rig, made):
     return list(done.values())
 
 
-def flown(
-    rig, kit, steps, lost=lambda name, k: False, begin=0, states=None, wrong=lambda name, k, x: x
+def series(
+    rig, config, steps, lost=lambda name, k: False, begin=0, states=None, wrong=lambda name, k, x: x
 ):
     """Messages of the parts, as a bench would note them, and their last states with their inputs.
 
@@ -33,9 +35,9 @@ def flown(
     what others hear is ``wrong(name, step, values)``. From ``begin`` on it continues with the
     states of an earlier run, and notes nothing of the steps before.
     """
-    made = in_order(rig, parts(kit, rig))
+    made = in_order(rig, parts(config, rig))
     states = dict(states or {part.name: part.begin() for part in made})
-    telemetry, heard = Telemetry(rig, steps, kit.step_ns), states.pop("heard", {})
+    telemetry, heard = Telemetry(rig, steps, config.step_ns), states.pop("heard", {})
     for k in range(begin, steps):
         heard, before = {}, heard
         for part in made:
@@ -46,5 +48,5 @@ def flown(
                 assert rig.wire.unsound(name, payload) is None
                 if not lost(name, k):
                     heard[name] = wrong(name, k, rig.wire.decode(name, payload))
-                telemetry.observe(name, (k + 1) * kit.step_ns, payload)
-    return telemetry.flown, {**states, "heard": heard}
+                telemetry.observe(name, (k + 1) * config.step_ns, payload)
+    return telemetry.series, {**states, "heard": heard}

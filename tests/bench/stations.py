@@ -16,17 +16,17 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from robins.bench.parts.kits import put, take
-from robins.bench.parts.station import HELLO_EACH_S, Part, Station, path_of, put_aside, ready
+from robins.bench.parts.config_files import put, take
+from robins.bench.parts.station import HELLO_EACH_S, Part, Station, path_of, ready, save_memory
 from robins.bench.ports.port import address, open_port
 from robins.bench.recording.replay import Start
 from robins.bench.rig import Rig
 from robins.bench.rigs.satellite import RIG
+from robins.bench.rigs.satellite.config import SatelliteConfig, satellite_config
 from robins.bench.rigs.satellite.judging import inside
-from robins.bench.rigs.satellite.kit import Kit, kit_for
 from robins.bench.rigs.satellite.messages import WIRE
-from robins.bench.run.crew import Crew
-from robins.bench.run.setup import Flight, kit_of, read
+from robins.bench.run.processes import PartProcesses
+from robins.bench.run.setup import LoadedRun, config_of, read
 from robins.bench.wire import Frame, Header, Receiver, encode_frame
 
 RUN = 7
@@ -44,15 +44,15 @@ def alive(pid: int) -> bool:
 
 
 @cache
-def kit(name: str = "satellite/s1", filter_: str = "mekf", *settings: str) -> Kit:
+def config(name: str = "satellite/s1", filter_: str = "mekf", *settings: str) -> SatelliteConfig:
     flight = read(name, settings)
-    return kit_for(flight.given, filter_, seed=0)
+    return satellite_config(flight.given, filter_, seed=0)
 
 
 @cache
 def one_program(name: str, filter_: str, *settings: str) -> dict[str, np.ndarray]:
-    """The run of a kit without any wire."""
-    return inside(kit(name, filter_, *settings))
+    """The run of a config without any wire."""
+    return inside(config(name, filter_, *settings))
 
 
 _KITS: dict[int, tuple[Any, Any, str]] = {}
@@ -65,18 +65,18 @@ class Parts(dict[str, Part]):
 
     def __init__(self, rig: Rig, of: Any):
         super().__init__()
-        self.rig, self.kit = rig, of
+        self.rig, self.config = rig, of
 
     def __missing__(self, name: str) -> Part:
-        return self.setdefault(name, ready(self.rig.part(name, self.kit), self.kit.frames))
+        return self.setdefault(name, ready(self.rig.part(name, self.config), self.config.frames))
 
 
 def parts(of: Any, rig: Rig = RIG) -> Mapping[str, Part]:
-    """Parts of a kit as a process would take it; compiled once for all kits with the same bytes.
+    """Parts of a config as a process would take it; compiled once for all kits with the same bytes.
 
     What they remember is with their stations.
     """
-    if id(of) not in _KITS:  # the kit is kept, so that no other has its identity
+    if id(of) not in _KITS:  # the config is kept, so that no other has its identity
         with TemporaryDirectory() as folder:
             put(of, path := Path(folder) / "kit")
             _KITS[id(of)] = of, take(path), sha256(path.read_bytes()).hexdigest()
@@ -137,8 +137,8 @@ class Node(threading.Thread):
         self.join(5.0)
 
 
-class Threads(Crew):
-    """Stand-in for `Crew`: parts of a rig on threads, but for programs and a few.
+class Threads(PartProcesses):
+    """Stand-in for `PartProcesses`: parts of a rig on threads, but for programs and a few.
 
     Attributes:
         stations: of parts that are odd.
@@ -155,20 +155,20 @@ class Threads(Crew):
         given = [parts(self._kit, self._rig)[part], self._rig.wire]
         if self._restarts:
             memory = None if since < 0 else path_of(self._folder, part, since).read_bytes()
-            given += [memory, partial(put_aside, self._folder, part)]
+            given += [memory, partial(save_memory, self._folder, part)]
         self._running[part] = Node(self.stations.get(part, Station)(*given), port)
 
 
 @contextmanager
-def starting(flight: Flight, part: str, program: Path | None) -> Iterator[Start]:
+def starting(flight: LoadedRun, part: str, program: Path | None) -> Iterator[Start]:
     """Stand-in for the function that starts a process for a replay."""
     programs = {} if program is None else {part: program}
-    with Threads(flight.rig, kit_of(flight), programs=programs) as crew:
+    with Threads(flight.rig, config_of(flight), programs=programs) as part_processes:
 
         @contextmanager
         def start(port: str) -> Iterator[Any]:
-            crew.start(part, port)
-            running = crew._running[part]
+            part_processes.start(part, port)
+            running = part_processes._running[part]
             yield running
             running.kill()
             running.wait()
@@ -178,14 +178,14 @@ def starting(flight: Flight, part: str, program: Path | None) -> Iterator[Start]
 
 def on_threads(
     monkeypatch: Any,
-    crew: type[Threads] = Threads,
+    part_processes: type[Threads] = Threads,
     processes: Sequence[str] = (),
     **stations: Any,
 ) -> None:
     """Let sessions and replays start threads, but for some parts; some with other stations."""
-    monkeypatch.setattr(crew, "stations", stations)
-    monkeypatch.setattr(crew, "processes", processes)
-    monkeypatch.setattr("robins.bench.run.session.Crew", crew)
+    monkeypatch.setattr(part_processes, "stations", stations)
+    monkeypatch.setattr(part_processes, "processes", processes)
+    monkeypatch.setattr("robins.bench.run.session.PartProcesses", part_processes)
     monkeypatch.setattr("robins.workbench.bench._starter", starting)
 
 
@@ -195,8 +195,8 @@ class Loop:
     meddle(step, message, taker, payload) -> [(time [ns], payload)], by default that one.
     """
 
-    def __init__(self, of: Kit, meddle: Meddle | None = None):
-        self.kit, self.meddle = of, meddle
+    def __init__(self, of: SatelliteConfig, meddle: Meddle | None = None):
+        self.config, self.meddle = of, meddle
         self.stations = {name: Station(parts(of)[name], WIRE) for name in RIG.parts}
         self.sent = dict.fromkeys(RIG.parts, 0)
         self.receivers = {name: Receiver() for name in RIG.parts}
@@ -213,7 +213,7 @@ class Loop:
 
     def run(self, steps: int) -> "Loop":
         for k in range(self.step, self.step + steps):
-            now = (k + 1) * self.kit.step_ns
+            now = (k + 1) * self.config.step_ns
             for part in ORDER:
                 answer = self.to(part, "tick", WIRE.encode("tick", {"step": k}), now)
                 for frame in self.receivers[part].feed(answer):

@@ -17,11 +17,11 @@ from clockwork import CLOCKWORK
 
 from robins.bench.accounting import EDGES_US, RECENT, Histogram, Latencies
 from robins.bench.broker.link import BenchError
-from robins.bench.evaluation import Ran
+from robins.bench.evaluation import RunResult
 from robins.bench.recording import Event
 from robins.bench.rigs import RIGS
 from robins.bench.run.outcome import outcome
-from robins.bench.run.setup import Flight, built_in, changed, kit_of, read, steps_of
+from robins.bench.run.setup import LoadedRun, built_in, changed, config_of, read, steps_of
 from robins.bench.run.telemetry import Telemetry
 from robins.bench.run.untested import doubts
 
@@ -176,11 +176,11 @@ def test_the_table_has_the_numbers_of_the_summary():
 # ------------------------------------------------------------------------------ what came of a run
 
 
-def ran_of(of: Flight, steps: int, **more: Any) -> Ran:
+def ran_of(of: LoadedRun, steps: int, **more: Any) -> RunResult:
     """A run of so many steps in which nothing was heard."""
     step_ns = round(1e9 * of.timing.step_s)
-    flown, kit = Telemetry(of.rig, 1 + steps, step_ns).flown, SimpleNamespace(step_ns=step_ns)
-    return flights.ran_of(flown.until(steps), kit)._replace(**more)
+    series, config = Telemetry(of.rig, 1 + steps, step_ns).series, SimpleNamespace(step_ns=step_ns)
+    return flights.ran_of(series.until(steps), config)._replace(**more)
 
 
 @pytest.mark.parametrize("name", [*RIGS, CLOCKWORK, PENDULUM])
@@ -198,7 +198,7 @@ def test_a_run_without_a_step_has_its_reason_and_no_figures(name, tmp_path):
 @pytest.mark.parametrize("wrong", ["judge", "inside"])
 def test_what_a_judge_cannot_judge_is_a_result_all_the_same(wrong):
     of = read(CLOCKWORK)
-    of = of._replace(rig=of.rig.varied(**{wrong: lambda given, ran, *said: [][-1]}))
+    of = of._replace(rig=of.rig.varied(**{wrong: lambda given, result, *said: [][-1]}))
     for failure in ("", "'adder' died"):
         found = outcome(of, ran_of(of, 3, failure=failure), None)
         said = rf"the {wrong} of the rig 'clockwork' fails \(IndexError: "
@@ -212,7 +212,7 @@ def test_what_a_rig_cannot_prepare_is_named():
     of = read(CLOCKWORK)
     of = of._replace(rig=of.rig.varied(prepare=lambda setup, given: given["length"]))
     with pytest.raises(BenchError, match=r"line \d+: the prepare of the rig 'clockwork' fails"):
-        kit_of(of)
+        config_of(of)
 
 
 def test_what_a_run_does_not_test_is_said():
@@ -224,18 +224,18 @@ def test_what_a_run_does_not_test_is_said():
         make(kind="delay", delay=1.0),
     )
     short = changed(of, {"faults": faults})
-    ran = ran_of(of, 20, injected={("delay", "counter"): 3})
+    result = ran_of(of, 20, injected={("delay", "counter"): 3})
     nothing = "the run tests nothing of it"
     after = f"after the end of the run at 2 s: {nothing}"
-    assert doubts(short, ran) == [
+    assert doubts(short, result) == [
         f"The fault 'loss' at all links begins at 600 s, {after}",
         f"The fault 'silent' at adder, from 0.5 s on, met nothing: {nothing}",
     ]
-    assert outcome(short, ran, None).warnings == doubts(short, ran)
+    assert outcome(short, result, None).warnings == doubts(short, result)
     late = [Event(k, "behind", f"the run is {k}.0 s behind", {"time_s": 4.0}) for k in (33, 66)]
     behind = ["At 4 s the run is 66.0 s behind"]
-    assert doubts(of, ran._replace(events=late)) == behind
-    assert doubts(short, ran._replace(events=late, failure="'adm' died")) == behind
+    assert doubts(of, result._replace(events=late)) == behind
+    assert doubts(short, result._replace(events=late, failure="'adm' died")) == behind
     inner = read("satellite/star-stuck")
     (found,) = doubts(inner, ran_of(inner, 20))
     assert found == f"'star.faults' of what flies begins at 600 s, {after}"

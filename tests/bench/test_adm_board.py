@@ -9,7 +9,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stations import Loop, kit, on_threads, parts
+from stations import Loop, config, on_threads, parts
 from test_firmware import SANITISERS, Board, build, sanitised, unpacked
 
 from robins.bench.ports.cable import cable
@@ -33,7 +33,7 @@ RESET = 147  # by the operator, before this step
 
 @pytest.fixture(scope="module")
 def of():
-    return kit("satellite/s1", "mekf", *SETTINGS)._replace(machine="vm")
+    return config("satellite/s1", "mekf", *SETTINGS)._replace(machine="vm")
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def program(tmp_path_factory):
     return build(folder / "c", *sources, extra=("-O0", "-ffp-contract=off", *extra))
 
 
-def flown(of, meddled):
+def series(of, meddled):
     """Inputs of the filter in each step, and the answers of the part in Python."""
     reached = [{} for _ in range(STEPS)]
 
@@ -97,7 +97,7 @@ def all_of(rows, field):
 
 
 def test_it_says_what_the_part_says_whatever_is_missing(program, of):
-    reached, loop = flown(of, meddled=True)
+    reached, loop = series(of, meddled=True)
     told = answers(program, of, reached)
     fields_of = {"estimate": ("q_ib", "gyro_bias", "sigma"), "innovation": ("ratio", "sigma")}
     for name, fields in fields_of.items():
@@ -114,7 +114,7 @@ def test_it_says_what_the_part_says_whatever_is_missing(program, of):
 
 def test_one_that_comes_late_waits_for_a_star_frame_as_the_part_does(program, of):
     """As after a loss of power: its state is not that of the run."""
-    reached, _ = flown(of, meddled=False)
+    reached, _ = series(of, meddled=False)
     told, part = answers(program, of, reached, first=52)["estimate"], parts(of)["adm"]
     state, wanted = part.begin(), []
     for k in range(52, STEPS):
@@ -130,7 +130,7 @@ def test_one_that_comes_late_waits_for_a_star_frame_as_the_part_does(program, of
 
 
 def test_it_has_the_bits_of_the_same_filter_in_c_on_the_host(program, of):
-    reached, loop = flown(of, meddled=False)
+    reached, loop = series(of, meddled=False)
     told = answers(program, of, reached)["estimate"]
     host = OnlineFilter(of.filter, of.model, of.start, partial(NativeState, unroll=SMALL))
     for k, inputs in enumerate(reached):
@@ -158,8 +158,8 @@ def test_from_a_design_to_a_board_in_three_commands(tmp_path, capsys):
     folder, out = tmp_path / "adm", tmp_path / "out"
     assert main(["export", *of, "--to", str(folder), "--board", "--json"]) == 0
     built = json.loads(capsys.readouterr().out)["program"]
-    flown = ["bench", "up", *of, "--node", f"adm={built}", "--seconds", "20"]
-    assert main([*flown, "--out", str(out), "--json"]) == 0
+    series = ["bench", "up", *of, "--node", f"adm={built}", "--seconds", "20"]
+    assert main([*series, "--out", str(out), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert (said["steps"], said["failure"]) == (200, "")
     # the closed loop with the C on its line is that of the same filter inside one program

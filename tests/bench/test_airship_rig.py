@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from flights import flown, ran_of
+from flights import ran_of, series
 
 from robins.bench.broker.faults import LinkFault
 from robins.bench.rigs import rig_of
@@ -20,14 +20,14 @@ def run():
     return flight, RIG.prepare(flight.setup, flight.given)
 
 
-def judged(flight, kit, of):
-    return RIG.judge(flight, ran_of(of, kit))
+def judged(flight, config, of):
+    return RIG.judge(flight, ran_of(of, config))
 
 
 def test_it_is_right_about_the_flight(run):
-    flight, kit = run
-    assert flight.timing.steps == len(kit.u.dt) == 60
-    said = judged(flight, kit, flown(RIG, kit, 60)[0])
+    flight, config = run
+    assert flight.timing.steps == len(config.u.dt) == 60
+    said = judged(flight, config, series(RIG, config, 60)[0])
     error, sigma = (said.arrays[f"{what}_velocity"].values[0] for what in ("error", "sigma"))
     assert 0.1 < np.sqrt(np.mean((error / sigma) ** 2)) < 3.0
     assert 0.0 < said.metrics["attitude_rms_arcsec"] < 200.0
@@ -35,18 +35,18 @@ def test_it_is_right_about_the_flight(run):
 
 
 def test_what_does_not_come_is_missing(run):
-    flight, kit = run
-    whole = flown(RIG, kit, 40)[0]
-    blind = flown(RIG, kit, 40, lambda name, k: name == "attitude" and 20 <= k < 30)[0]
+    flight, config = run
+    whole = series(RIG, config, 40)[0]
+    blind = series(RIG, config, 40, lambda name, k: name == "attitude" and 20 <= k < 30)[0]
     place = slice(6, 9)
     np.testing.assert_array_equal(blind["state.sigma"][:20], whole["state.sigma"][:20])
     assert np.all(blind["state.sigma"][29, :3] > 1.1 * whole["state.sigma"][29, :3])
-    nothing = flown(RIG, kit, 40, lambda name, k: name in ("fix", "attitude", "wind") and k >= 20)[
-        0
-    ]
+    nothing = series(
+        RIG, config, 40, lambda name, k: name in ("fix", "attitude", "wind") and k >= 20
+    )[0]
     assert np.all(nothing["state.sigma"][39, place] > whole["state.sigma"][39, place])
-    dark = flown(RIG, kit, 40, lambda name, k: name == "increment" and k == 30)[0]
-    assert judged(flight, kit, dark).counts["steps_without_increment"] == 1
+    dark = series(RIG, config, 40, lambda name, k: name == "increment" and k == 30)[0]
+    assert judged(flight, config, dark).counts["steps_without_increment"] == 1
     assert np.isfinite(dark["state.lat"]).all()
 
 
@@ -59,7 +59,7 @@ def test_filters_that_take_more_than_the_wire_carries_are_not_offered():
 
 def test_faults_of_its_instruments():
     fault: type[LinkFault] = RIG.fault
-    said = RIG.said()[0]
+    said = RIG.device_faults()[0]
     place = {"place": np.array([1.0, 2.0]), "heading": 0.1, "alt": 3.0}
     off = said["shifted"].act(place, fault(kind="shifted", begin=0.0, shift=50.0), 0)
     np.testing.assert_array_equal(off["place"], [51.0, 2.0])

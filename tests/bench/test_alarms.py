@@ -11,7 +11,7 @@ BETWEEN = [0] * 4  # estimates without a star frame
 def heard(*flags: int) -> list[tuple[int, str, str]]:
     """Number of the estimate, level and text of all that is said."""
     alarms = Alarms()
-    return [(k, *said) for k, one in enumerate(flags) for said in alarms.said(one)]
+    return [(k, *said) for k, one in enumerate(flags) for said in alarms.alerts_of(one)]
 
 
 RUNS = {

@@ -18,18 +18,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from clockwork import CLOCKWORK
-from stations import Station, alive, kit, on_threads, one_program
+from stations import Station, alive, config, on_threads, one_program
 
 from robins.bench.broker import BenchError
-from robins.bench.evaluation import Ran
+from robins.bench.evaluation import RunResult
 from robins.bench.ports.cable import cable
 from robins.bench.recording import read_record
 from robins.bench.rigs.satellite import RIG
 from robins.bench.rigs.satellite.judging import flag
 from robins.bench.rigs.satellite.messages import WIRE
-from robins.bench.run import Flight
+from robins.bench.run import LoadedRun
 from robins.bench.run.session import Session
-from robins.bench.run.setup import built_in, changed, kit_of, read, setup_of
+from robins.bench.run.setup import built_in, changed, config_of, read, setup_of
 from robins.bench.run.telemetry import difference
 from robins.bench.wire.frames import Frame
 from robins.bench.wire.receiver import Receiver
@@ -39,7 +39,7 @@ LOOP = "duration=60 s", "counted_from=10 s"
 PARTS = ("plant", "table", "gyro", "star", "adm", "acm", "actuators")
 
 
-def flight(**options: Any) -> Flight:
+def flight(**options: Any) -> LoadedRun:
     return changed(read("satellite/s1", LOOP), {"seconds": 20.0, **options})
 
 
@@ -53,7 +53,7 @@ class Watch:
         self.events.append((kind, time_s, text))
 
     def step(self, session: Session, step: int) -> None:
-        pids = {part: session.crew.process(part) for part in session.rig.parts}
+        pids = {part: session.part_processes.process(part) for part in session.rig.parts}
         self.pids |= {part: pid for part, pid in pids.items() if pid is not None}
         if (do := self.at.pop(step, None)) is not None:
             do(session)
@@ -66,18 +66,18 @@ class Watch:
 
 
 class Done(NamedTuple):
-    ran: Ran
+    result: RunResult
     off: float  # from the same inside one program
     watch: Watch
 
 
-def run(of: Flight, at: dict[int, Any] | None = None, record: Any = None) -> Done:
+def run(of: LoadedRun, at: dict[int, Any] | None = None, record: Any = None) -> Done:
     watch, what = Watch(at), ("satellite/s1", of.setup.filter, *LOOP)
-    made = kit(*what) if of.rig is RIG else kit_of(of)
-    ran = Session(of, record, watch, kit=made).run()
+    made = config(*what) if of.rig is RIG else config_of(of)
+    result = Session(of, record, watch, config=made).run()
     assert not any(alive(pid) for pid in watch.pids.values()), "a process was left over"
-    inside = one_program(*what) if of.rig is RIG else of.rig.inside(made, ran.steps)
-    return Done(ran, difference(ran.flown, inside), watch)
+    inside = one_program(*what) if of.rig is RIG else of.rig.inside(made, result.steps)
+    return Done(result, difference(result.series, inside), watch)
 
 
 @pytest.fixture
@@ -90,7 +90,7 @@ def plain(tmp_path_factory):
     """A run in lock-step: one part is stopped for two seconds, two are killed and started anew."""
 
     def stop(session):
-        pid = session.crew.process("adm")
+        pid = session.part_processes.process("adm")
         os.kill(pid, signal.SIGSTOP)
         threading.Timer(2.0, os.kill, (pid, signal.SIGCONT)).start()
 
@@ -104,18 +104,18 @@ def plain(tmp_path_factory):
 
 
 def kill(part):
-    return lambda session: os.kill(session.crew.process(part), signal.SIGKILL)
+    return lambda session: os.kill(session.part_processes.process(part), signal.SIGKILL)
 
 
 def test_lock_step_has_the_bits_of_one_program_even_if_a_part_is_stopped(plain):
     done, _ = plain
-    assert done.ran.failure == ""
-    assert done.ran.steps == 280
+    assert done.result.failure == ""
+    assert done.result.steps == 280
     assert done.off == 0.0
-    assert max(h.wrong + h.lost + h.late + h.strange for h in done.ran.health.values()) == 0
-    assert np.sum(flag(done.ran.flown, "star used")) == 56
-    assert done.ran.deaths == 2
-    told = [e.text.split(" told ")[1] for e in done.ran.events if e.kind == "restarted"]
+    assert max(h.wrong + h.lost + h.late + h.strange for h in done.result.health.values()) == 0
+    assert np.sum(flag(done.result.series, "star used")) == 56
+    assert done.result.deaths == 2
+    told = [e.text.split(" told ")[1] for e in done.result.events if e.kind == "restarted"]
     assert told == ["all again", "all since step 255 again"]
 
 
@@ -127,12 +127,12 @@ def test_it_has_the_bits_of_a_campaign_of_one_run(plain):
     problem = STUDY.problem(flight().given, ("mekf",), 0)
     ((world, count),) = worlds(problem, 1)
     found = record(problem, "mekf", world, count)
-    for flown, wanted in (
-        (done.ran.flown["estimate.q_ib"], found["mean"].attitude.wxyz),
-        (done.ran.flown["estimate.gyro_bias"], found["mean"].gyro_bias),
-        (done.ran.flown["wheels.momentum"], found["outputs"]["wheel_momentum"]),
+    for series, wanted in (
+        (done.result.series["estimate.q_ib"], found["mean"].attitude.wxyz),
+        (done.result.series["estimate.gyro_bias"], found["mean"].gyro_bias),
+        (done.result.series["wheels.momentum"], found["outputs"]["wheel_momentum"]),
     ):
-        np.testing.assert_array_equal(flown, wanted[0, :280])
+        np.testing.assert_array_equal(series, wanted[0, :280])
 
 
 def test_the_record_holds_all_that_went_over_the_links(plain):
@@ -151,7 +151,7 @@ def test_the_record_holds_all_that_went_over_the_links(plain):
         if f.header.type == WIRE.message("estimate").number
     }
     q = np.array([WIRE.decode("estimate", estimates[time])["q_ib"] for time in sorted(estimates)])
-    np.testing.assert_array_equal(q, done.ran.flown["estimate.q_ib"])
+    np.testing.assert_array_equal(q, done.result.series["estimate.q_ib"])
     ticks = [f for f in said["adm", "to"] if f.header.type == WIRE.message("tick").number]
     # the one that was not answered for two seconds was sent again
     assert 280 < len(ticks) <= 283
@@ -174,10 +174,10 @@ def test_each_part_is_killed_in_turn_and_started_anew_to_the_last_bit(tmp_path):
     # four of them after they have put their memory aside
     at = {10 * (k + 1) + 250 * (k > 2): note(part) for k, part in enumerate(PARTS)}
     done = run(flight(on_death="restart", seconds=33.0), at, tmp_path / "r.mcap")
-    assert done.ran.failure == ""
-    assert done.ran.deaths == 7
+    assert done.result.failure == ""
+    assert done.result.deaths == 7
     assert done.off == 0.0
-    died = {e.text.split("'")[1]: e for e in done.ran.events if e.kind == "died"}
+    died = {e.text.split("'")[1]: e for e in done.result.events if e.kind == "died"}
     assert list(died) == list(PARTS)
     for part, event in died.items():
         assert event.received_ns - killed_at[part] < 2e9
@@ -194,7 +194,9 @@ def failed(tmp_path_factory):
     schedulers, of = {}, changed(read(CLOCKWORK), {"fifo": True})
 
     def look(session):
-        numbers = {part: session.crew.process(part) for part in of.rig.parts} | {"bench": 0}
+        numbers = {part: session.part_processes.process(part) for part in of.rig.parts} | {
+            "bench": 0
+        }
         if hasattr(os, "SCHED_FIFO"):
             schedulers.update({who: os.sched_getscheduler(n) for who, n in numbers.items()})
 
@@ -207,8 +209,8 @@ def failed(tmp_path_factory):
 
 def test_a_death_fails_the_run_that_says_so_and_leaves_no_process(failed):
     done, path, _ = failed
-    assert "'counter' was killed by SIGKILL, at 3." in done.ran.failure
-    assert done.ran.steps == 31
+    assert "'counter' was killed by SIGKILL, at 3." in done.result.failure
+    assert done.result.steps == 31
     assert done.off == 0.0  # as far as it went
     assert done.watch.events[-1][0] == "failed"
     record = read_record(path)
@@ -219,7 +221,7 @@ def test_a_death_fails_the_run_that_says_so_and_leaves_no_process(failed):
 @pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="this system has no SCHED_FIFO")
 def test_a_better_scheduler_is_had_or_its_refusal_told(failed):
     done, _, schedulers = failed
-    refused = [event.text for event in done.ran.events if event.kind == "scheduler"]
+    refused = [event.text for event in done.result.events if event.kind == "scheduler"]
     if refused:
         assert refused[0].startswith("no real-time scheduler: ")
         assert set(schedulers.values()) == {os.SCHED_OTHER}
@@ -268,13 +270,13 @@ def test_a_disk_that_fills_up_fails_the_run_and_keeps_what_was_written(tmp_path,
 
     ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
-        ran = run(flight(), {100: fill}, path).ran
+        result = run(flight(), {100: fill}, path).result
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, ignored)
-    assert "the record cannot be written" in ran.failure
-    assert "File too large" in ran.failure
-    assert 100 <= ran.steps < 200
+    assert "the record cannot be written" in result.failure
+    assert "File too large" in result.failure
+    assert 100 <= result.steps < 200
     record = read_record(path)
     assert not record.whole
     assert len(record.entries) > 100
@@ -284,16 +286,16 @@ def test_a_disk_that_fills_up_fails_the_run_and_keeps_what_was_written(tmp_path,
 
 
 def test_real_time_keeps_its_deadlines_and_counts_those_it_misses(threads):
-    ran = run(flight(clock="realtime", rate=25.0, seconds=6.0)).ran
-    assert ran.steps == 60
-    assert ran.failure == ""
+    result = run(flight(clock="realtime", rate=25.0, seconds=6.0)).result
+    assert result.steps == 60
+    assert result.failure == ""
     # never sleep(1/f): 60 steps take 60 periods, however late each was
-    assert ran.seconds > 59 / 25.0
-    told = ran.latencies.summary()
+    assert result.seconds > 59 / 25.0
+    told = result.latencies.summary()
     assert told["cycles"] == 60
     assert sum(told["histogram"]["counts"]) == 60
     assert told["cycle"]["lateness_us"]["count"] == 60
-    assert told["missed"] == sum(e.kind == "missed" for e in ran.events)
+    assert told["missed"] == sum(e.kind == "missed" for e in result.events)
 
 
 def test_a_part_that_is_stopped_in_real_time_is_not_waited_for(monkeypatch):
@@ -308,18 +310,18 @@ def test_a_part_that_is_stopped_in_real_time_is_not_waited_for(monkeypatch):
     on_threads(monkeypatch, star=Stopped)
     of = flight(clock="realtime", rate=25.0, seconds=10.0, patience=0.5, filter="mekf-gate")
     done = run(of, {20: lambda _: goes.clear(), 60: lambda _: goes.set()})
-    assert done.ran.steps == 100
-    assert done.ran.silent["star"] >= 30
-    assert np.any(flag(done.ran.flown, "star silent"))
+    assert done.result.steps == 100
+    assert done.result.silent["star"] >= 30
+    assert np.any(flag(done.result.series, "star silent"))
     # what it says afterwards is of steps that are over
-    assert done.ran.health["star"].late + done.ran.health["star"].frames > 0
+    assert done.result.health["star"].late + done.result.health["star"].frames > 0
 
 
 def test_overrun_may_abort_the_run(threads):
     of = flight(clock="realtime", rate=25.0, overrun="abort", seconds=10.0)
-    ran = run(of, dict.fromkeys(range(20, 25), lambda _: time.sleep(0.3))).ran
-    assert 'overrun = "abort"' in ran.failure
-    assert ran.steps < 40
+    result = run(of, dict.fromkeys(range(20, 25), lambda _: time.sleep(0.3))).result
+    assert 'overrun = "abort"' in result.failure
+    assert result.steps < 40
 
 
 # --------------------------------------------------------------------------------------- faults
@@ -328,11 +330,11 @@ def test_overrun_may_abort_the_run(threads):
 @pytest.mark.parametrize("name", built_in())
 def test_every_scenario_of_the_bench_flies(threads, name):
     of = changed(read(name), {"seconds": 2.0})
-    ran = Session(of).run()
-    assert (ran.failure, ran.steps) == ("", round(2.0 / of.timing.step_s))
-    assert sum(health.frames for health in ran.health.values()) >= ran.steps
+    result = Session(of).run()
+    assert (result.failure, result.steps) == ("", round(2.0 / of.timing.step_s))
+    assert sum(health.frames for health in result.health.values()) >= result.steps
     if of.rig.truth:
-        true = [x for key, x in ran.flown.items() if key.startswith(f"{of.rig.truth}.")]
+        true = [x for key, x in result.series.items() if key.startswith(f"{of.rig.truth}.")]
         assert len(true) >= 2
         assert all(np.isfinite(x).all() for x in true)
 
@@ -349,19 +351,23 @@ def test_faults_are_the_same_however_fast_it_goes(threads):
         run(flight(filter="mekf-gate", seconds=12.0, faults=faults, **more))
         for more in ({}, {"baud": 460_800})
     )
-    np.testing.assert_array_equal(fast.ran.flown["estimate.q_ib"], slow.ran.flown["estimate.q_ib"])
-    np.testing.assert_array_equal(fast.ran.flown["motion.q_ib"], slow.ran.flown["motion.q_ib"])
-    assert fast.ran.injected == slow.ran.injected
-    assert {kind for kind, _ in fast.ran.injected} == {f.kind for f in faults}
-    health = fast.ran.health.values()
-    damaged = sum(n for (kind, _), n in fast.ran.injected.items() if kind == "bit errors")
+    np.testing.assert_array_equal(
+        fast.result.series["estimate.q_ib"], slow.result.series["estimate.q_ib"]
+    )
+    np.testing.assert_array_equal(
+        fast.result.series["motion.q_ib"], slow.result.series["motion.q_ib"]
+    )
+    assert fast.result.injected == slow.result.injected
+    assert {kind for kind, _ in fast.result.injected} == {f.kind for f in faults}
+    health = fast.result.health.values()
+    damaged = sum(n for (kind, _), n in fast.result.injected.items() if kind == "bit errors")
     # one that is doubled is wrong twice, and one with a new zero in it too
     assert damaged <= sum(h.wrong for h in health) <= 2 * damaged
-    held = sum(n for (kind, _), n in fast.ran.injected.items() if kind in ("delay", "reorder"))
+    held = sum(n for (kind, _), n in fast.result.injected.items() if kind in ("delay", "reorder"))
     assert damaged <= sum(h.lost for h in health) <= damaged + held  # a number that never came
     assert sum(h.repeated for h in health) > 0
     assert fast.off > 0.0
-    assert slow.ran.seconds > fast.ran.seconds
+    assert slow.result.seconds > fast.result.seconds
 
 
 # --------------------------------------------------------------------------------------- boards
@@ -386,10 +392,10 @@ def test_a_part_may_be_a_board_on_a_real_port(threads, tmp_path):
     whole = read(str(scenario))
     with cable() as ends, board("gyro", ends.board, str(scenario)) as process:
         of = changed(whole, {"ports": {"gyro": ends.bench}})
-        ran = Session(of).run()
-        assert ran.failure == ""
-        assert ran.steps == 50
-        assert difference(ran.flown, one_program("satellite/s1", "mekf", *LOOP)) == 0.0
+        result = Session(of).run()
+        assert result.failure == ""
+        assert result.steps == 50
+        assert difference(result.series, one_program("satellite/s1", "mekf", *LOOP)) == 0.0
         said, _ = process.communicate(timeout=20.0)
         assert "The bench has said stop." in said
 
@@ -411,9 +417,9 @@ def test_a_board_that_says_nothing_is_named(monkeypatch, threads):
     monkeypatch.setattr("robins.bench.run.session.HELLO_S", 0.2)
     with cable() as ends:
         of = flight(ports={"gyro": ends.bench})
-        ran = Session(of, kit=kit("satellite/s1", "mekf", *LOOP)).run()
-    assert "no hello from" in ran.failure
-    assert "gyro" in ran.failure
-    assert ran.steps == 0
+        result = Session(of, config=config("satellite/s1", "mekf", *LOOP)).run()
+    assert "no hello from" in result.failure
+    assert "gyro" in result.failure
+    assert result.steps == 0
     assert isinstance(BenchError("x"), RuntimeError)
     assert setup_of(RIG)().clock == "lockstep"

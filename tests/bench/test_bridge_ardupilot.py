@@ -140,7 +140,7 @@ def fly_by_wire(port, frames, first=0):
             told = json.loads(peer.line())
 
 
-def flown(physics, frames):
+def series(physics, frames):
     """The physics: a craft that begins anew when ArduPilot does."""
     craft, time_us, attitudes = Craft(), 0, []
     for _ in range(frames):
@@ -164,7 +164,7 @@ def flown(physics, frames):
 def test_the_loop_over_the_line_is_that_inside_one_program(physics):
     one = threading.Thread(target=fly_by_wire, args=(physics.port, 300), daemon=True)
     one.start()
-    attitudes = flown(physics, 300)
+    attitudes = series(physics, 300)
     one.join(10.0)
     inside = fly(300, lambda gyro: gyro, lambda c: controls(pulses(c)))
     np.testing.assert_array_equal(attitudes, inside)
@@ -179,7 +179,7 @@ def test_ardupilot_goes_and_comes_back_and_the_physics_begin_anew(physics, monke
     for flight in range(2):
         one = threading.Thread(target=fly_by_wire, args=(physics.port, 20), daemon=True)
         one.start()
-        attitudes = flown(physics, 20)
+        attitudes = series(physics, 20)
         one.join(10.0)
         np.testing.assert_array_equal(
             attitudes, fly(20, lambda gyro: gyro, lambda c: controls(pulses(c)))

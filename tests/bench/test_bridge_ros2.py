@@ -87,7 +87,7 @@ def until_heard(topics, topic, time_ns):
     """The other side needs a moment to subscribe; what is sent before is not kept."""
     end = time.monotonic() + 20.0
     topics.publish(topic, imu(), time_ns)
-    while not topics.heard(topic):
+    while not topics.has_subscriber(topic):
         assert time.monotonic() < end, "nobody subscribed"
         time.sleep(0.01)
 

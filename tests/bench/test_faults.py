@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from robins.bench import wire
 from robins.bench.broker.faults import LinkFault
-from robins.bench.broker.injector import Injector, Piece
+from robins.bench.broker.injector import Injector, LineOutput
 from robins.bench.broker.link import Link
 from robins.bench.ports.port import open_pair
 from robins.bench.rigs.satellite import RIG
@@ -22,8 +22,8 @@ from robins.bench.wire import Frame, Header, Receiver
 from robins.rotation import from_rotvec, multiply
 from robins.scenario import Parameters, ScenarioError, parse
 from robins.systems.satellite import nodes
-from robins.systems.satellite.nodes import Step
-from robins.systems.satellite.parameters import Star
+from robins.systems.satellite.nodes import NoiseFreeInputs
+from robins.systems.satellite.parameters import StarSensor
 from robins.systems.satellite.world import _star_says
 
 S = 10**9
@@ -54,17 +54,17 @@ def star(q, time_ns: int = 0, stars: int = 5) -> Frame:
     return frame("star", {"q_ib": q, "factor": np.arange(9.0), "stars": stars}, time_ns)
 
 
-def put(injector: Injector, link: str, direction: str, one: Frame, now_ns: int) -> list[Piece]:
+def put(injector: Injector, link: str, direction: str, one: Frame, now_ns: int) -> list[LineOutput]:
     return injector.pass_on(link, direction, one, wire.encode_frame(*one), now_ns)
 
 
-def said(pieces: list[Piece]) -> dict:
+def said(pieces: list[LineOutput]) -> dict:
     (piece,) = pieces
     assert piece.raw is None
     return WIRE.decode(WIRE.message(piece.frame.header.type).name, piece.frame.payload)
 
 
-def numbers(pieces: list[Piece]) -> list[int]:
+def numbers(pieces: list[LineOutput]) -> list[int]:
     return [p.frame.header.sequence for p in pieces if p.frame is not None]
 
 
@@ -298,7 +298,7 @@ def test_the_clock_is_spared():
     for m in WIRE.messages:
         one = Frame(Header(m.number, 7, 0, 0), bytes(WIRE.size_of(m.name)))
         for direction in ("to", "from"):
-            kept = put(injector, "gyro", direction, one, 0) == [Piece(None, one)]
+            kept = put(injector, "gyro", direction, one, 0) == [LineOutput(None, one)]
             assert kept is (m.number < 16)
 
 
@@ -367,7 +367,7 @@ def test_one_fault_is_taken_away():
 def test_a_wheel_without_torque():
     injector = injecting(faults('kind = "wheel"; begin = "1 s"; wheel = 2'))
     one = frame("actuation", {"wheel_torque": WORKING, "dipole_b": [7.0, 8.0, 9.0]})
-    assert put(injector, "actuators", "from", one, S - 1) == [Piece(None, one)]
+    assert put(injector, "actuators", "from", one, S - 1) == [LineOutput(None, one)]
     now = said(put(injector, "actuators", "from", one, S))
     np.testing.assert_array_equal(now["wheel_torque"], [1.0, 2.0, 0.0, 4.0])
     np.testing.assert_array_equal(now["dipole_b"], [7.0, 8.0, 9.0])
@@ -412,7 +412,7 @@ def test_damaged_and_strange_payloads_pass_as_they_are():
     """A board may send what is no `star`; who takes it refuses it."""
     injector = injecting(faults('kind = "turned"; begin = "0 s"'))
     short = Frame(Header(WIRE.message("star").number, 7, 0, 0), b"abc")
-    assert put(injector, "star", "from", short, 0) == [Piece(None, short)]
+    assert put(injector, "star", "from", short, 0) == [LineOutput(None, short)]
 
 
 def test_a_frame_of_an_earlier_run_goes_no_further():
@@ -451,7 +451,7 @@ def test_the_star_sensor_lies_as_in_one_program():
     times = np.arange(1, 201) * 0.1
     due = np.arange(1, 201) % 5 == 0
     says = _star_says(
-        Star.model_validate(
+        StarSensor.model_validate(
             {
                 "faults": tuple({"kind": k, "begin": b, "end": e} for k, b, e in spans),
                 "lost": tuple({"begin": b, "end": e} for b, e in lost),
@@ -466,12 +466,12 @@ def test_the_star_sensor_lies_as_in_one_program():
 
     @jax.jit
     def run(q, says):
-        given = nodes.Given(*[jnp.zeros(())] * 5)
+        given = nodes.LoopConstants(*[jnp.zeros(())] * 5)
 
         def step(before, xs):
             one, say = xs
-            course = Step(*[jnp.zeros(())] * 8, say, jnp.zeros(()))
-            row = nodes.Row(course, jnp.zeros(3), jnp.zeros(3), jnp.zeros(3))
+            course = NoiseFreeInputs(*[jnp.zeros(())] * 8, say, jnp.zeros(()))
+            row = nodes.StepInputs(course, jnp.zeros(3), jnp.zeros(3), jnp.zeros(3))
             out = nodes.star(given, one, one, before, row)
             return out.seen_q_ib, out.q_ib
 

@@ -251,9 +251,9 @@ def test_it_ends_with_the_line(board):
 
 
 def test_a_path_that_is_no_line(program):
-    ran = subprocess.run([program, "/nowhere"], capture_output=True, text=True, check=False)
-    assert ran.returncode == 1
-    assert "/nowhere: No such file" in ran.stderr
+    result = subprocess.run([program, "/nowhere"], capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert "/nowhere: No such file" in result.stderr
 
 
 @pytest.mark.parametrize("count", [1_500, 10_000])
@@ -393,7 +393,7 @@ def compiled(folder: Path, text: str) -> Path:
     return build(folder, "main.c", extra=tuple(SANITISERS) if sanitised(folder) else ())
 
 
-def ran(program: Path, given: bytes = b"") -> tuple[bytes, str]:
+def result(program: Path, given: bytes = b"") -> tuple[bytes, str]:
     one = subprocess.run([program], input=given, capture_output=True, check=False)
     assert one.returncode == 0, one.stderr
     return one.stdout, one.stderr.decode()
@@ -421,7 +421,7 @@ def test_its_receiver_finds_what_ours_finds(tmp_path):
         for f in receiver.feed(stream)
         for h in [f.header]
     )
-    found, counts = ran(compiled(tmp_path, STREAM), stream)
+    found, counts = result(compiled(tmp_path, STREAM), stream)
     assert counts == f"{receiver.counts.frames} {receiver.counts.wrong}"
     assert receiver.counts.frames > 4000
     assert receiver.counts.wrong > 3000
@@ -437,17 +437,17 @@ def test_its_order_is_ours(tmp_path):
     ours = Sequence()
     expected = bytes(ours.take(int(n)) for n in numbers)
     program = compiled(tmp_path, ORDER)
-    found, counts = ran(program, numbers.tobytes())
+    found, counts = result(program, numbers.tobytes())
     assert found == expected
     jumps = np.array([7, 8, 8 - 2**31, 9 - 2**31, 5000, 1, 1, 2]).astype("<u4")
-    assert ran(program, jumps.tobytes())[0] == bytes([1, 1, 1, 1, 1, 1, 0, 1])
+    assert result(program, jumps.tobytes())[0] == bytes([1, 1, 1, 1, 1, 1, 0, 1])
     assert 0 in expected
     # it does not remember what is missing, so a late frame is an old one
     assert counts == f"{(ours.lost + ours.late) % 2**32} {ours.repeated + ours.late}"
 
 
 def test_it_knows_the_length_of_every_message(tmp_path):
-    found, _ = ran(compiled(tmp_path, SIZES))
+    found, _ = result(compiled(tmp_path, SIZES))
     known = {m.number: WIRE.size_of(m.name) for m in WIRE.messages}
     assert [int(n) for n in found.split()] == [known.get(k, -1) for k in range(256)]
 
@@ -480,7 +480,7 @@ def test_it_refuses_the_numbers_that_we_refuse(tmp_path):
                     payload = WIRE.encode(m.name, {**blank, f.name: values})
                     given += bytes([m.number]) + payload.ljust(longest, b"\0")
                     expected += bytes([WIRE.unsound(m.name, payload) is None])
-    assert ran(compiled(tmp_path, SOUND), given)[0] == expected
+    assert result(compiled(tmp_path, SOUND), given)[0] == expected
     assert 0.1 < np.mean(np.frombuffer(expected, "u1")) < 0.6
 
 
@@ -488,7 +488,7 @@ def test_a_receiver_for_a_small_board_is_small(tmp_path):
     text = SIZES.replace("return 0;", 'printf("%u", (unsigned)sizeof(robins_receiver)); return 0;')
     (unpacked(tmp_path) / "main.c").write_text(text)
     small = build(tmp_path, "main.c", extra=("-DROBINS_MOST_PAYLOAD=ROBINS_LONGEST_MESSAGE",))
-    assert int(ran(small)[0].split()[-1]) < 200
+    assert int(result(small)[0].split()[-1]) < 200
 
 
 def test_buffers_too_small_for_a_message_do_not_compile(tmp_path):

@@ -37,12 +37,12 @@ def fuzz(tmp_path: Path, runs: int, seconds: int, bug: str = "") -> subprocess.C
 
 
 def test_nothing_is_found(tmp_path):
-    ran = fuzz(tmp_path, 4000, 10)
-    assert ran.returncode == 0, ran.stdout + ran.stderr
+    result = fuzz(tmp_path, 4000, 10)
+    assert result.returncode == 0, result.stdout + result.stderr
     assert list(tmp_path.glob("found-*")) == []
-    runs = re.search(r"Done (\d+) runs", ran.stderr)
+    runs = re.search(r"Done (\d+) runs", result.stderr)
     assert int(runs[1]) > len(fuzz_receiver.seeds())
-    covered = [int(n) for n in re.findall(r"cov: (\d+)", ran.stderr)]
+    covered = [int(n) for n in re.findall(r"cov: (\d+)", result.stderr)]
     assert covered[-1] > 20  # branches of the receiver that it saw, so it was guided by them
 
 
@@ -56,7 +56,7 @@ def test_nothing_is_found(tmp_path):
     ],
 )
 def test_what_is_planted_is_found(tmp_path, bug, words):
-    ran = fuzz(tmp_path, 100_000, 30, bug)
-    assert ran.returncode != 0
-    assert words in ran.stdout + ran.stderr
+    result = fuzz(tmp_path, 100_000, 30, bug)
+    assert result.returncode != 0
+    assert words in result.stdout + result.stderr
     assert len(list(tmp_path.glob("found-crash-*"))) == 1

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flights import flown
+from flights import series
 from short_drive import DRIVE
 from stations import on_threads, parts
 from test_firmware import SANITISERS, Board, sanitised
@@ -64,14 +64,14 @@ def program(scenario, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def kit(scenario):
+def config(scenario):
     flight = changed(read(scenario), {"filter": "ekf"})
     return RIG.prepare(flight.setup, flight.given)
 
 
-def sensed(kit, steps):
+def sensed(config, steps):
     """Inputs of the part in each step, by message."""
-    parts, found = [RIG.part(name, kit) for name in ("imu", "gnss")], []
+    parts, found = [RIG.part(name, config) for name in ("imu", "gnss")], []
     states = [part.begin() for part in parts]
     for k in range(steps):
         found.append({})
@@ -81,9 +81,9 @@ def sensed(kit, steps):
     return found
 
 
-def of_the_part(kit, reached):
+def of_the_part(config, reached):
     """Answers of the part in Python, by step."""
-    part, told = parts(kit, RIG)["navigation"], []
+    part, told = parts(config, RIG)["navigation"], []
     state = part.begin()
     for k, inputs in enumerate(reached):
         heard = {
@@ -102,7 +102,7 @@ class Navigator(Board):
         self.put(WIRE.message(name).number, WIRE.encode(name, values), time_ns)
 
 
-def of_the_board(program, kit, reached, runs=1):
+def of_the_board(program, config, reached, runs=1):
     """Answers of the program, by step; in the last of some runs."""
     told = []
     with open_pair() as pair:
@@ -111,7 +111,7 @@ def of_the_board(program, kit, reached, runs=1):
             for run in range(5, 5 + runs):
                 board.begin(run)
                 told = [
-                    asked(board, k, (k + 1) * kit.step_ns, row) for k, row in enumerate(reached)
+                    asked(board, k, (k + 1) * config.step_ns, row) for k, row in enumerate(reached)
                 ]
                 board.send("stop")
         finally:
@@ -189,9 +189,9 @@ def meddled(reached):
     return rows
 
 
-def test_it_says_what_the_part_says_whatever_goes_wrong(program, kit):
-    reached = meddled(sensed(kit, 740))
-    wanted, told = of_the_part(kit, reached), of_the_board(program, kit, reached, runs=2)
+def test_it_says_what_the_part_says_whatever_goes_wrong(program, config):
+    reached = meddled(sensed(config, 740))
+    wanted, told = of_the_part(config, reached), of_the_board(program, config, reached, runs=2)
     for name in ("state", "epoch"):
         compare(told, wanted, name)
     flags = np.array([row["state"]["flags"] for row in told if "state" in row])
@@ -199,11 +199,11 @@ def test_it_says_what_the_part_says_whatever_goes_wrong(program, kit):
     assert 0 < np.count_nonzero(flags & Flag.STARTING) < 500
 
 
-def test_after_a_long_pause_it_begins_anew_as_the_part_does(program, kit):
-    reached = [dict(row) for row in sensed(kit, 790)]
+def test_after_a_long_pause_it_begins_anew_as_the_part_does(program, config):
+    reached = [dict(row) for row in sensed(config, 790)]
     for k in range(500, 600):
         reached[k].pop("sample")
-    wanted, told = of_the_part(kit, reached), of_the_board(program, kit, reached)
+    wanted, told = of_the_part(config, reached), of_the_board(program, config, reached)
     for name in ("state", "epoch"):
         compare(told, wanted, name)
     flags = [row["state"]["flags"] if "state" in row else 0 for row in told]
@@ -225,7 +225,7 @@ def test_its_library_agrees_with_jax_and_all_compiles_as_c_plus_plus(program):
 
 
 def test_it_flies_on_the_bench_and_its_record_is_heard_again(
-    scenario, program, kit, tmp_path, monkeypatch
+    scenario, program, config, tmp_path, monkeypatch
 ):
     """As docs/from-design-to-board.md does it, against the part in Python."""
     on_threads(monkeypatch)  # the other parts
@@ -239,7 +239,7 @@ def test_it_flies_on_the_bench_and_its_record_is_heard_again(
     assert outcome.failure == ""
     assert np.isfinite(outcome.solution["lat_rad"].values[0][-1])
     assert bench_replay(record, node="navigation").same
-    told, of = replayed_epochs(record), flown(RIG, kit, outcome.solution.sizes["time"])[0]
+    told, of = replayed_epochs(record), series(RIG, config, outcome.solution.sizes["time"])[0]
     rows = epochs_of(of)
     assert len(rows) > 30
     assert list(told) == list(of["epoch.time"][rows])
@@ -294,13 +294,13 @@ def test_the_walk_on_a_line_has_the_epochs_of_its_replay(data_dir, tmp_path, mon
         "ins-gnss/walk", tmp_path / "c", filter_name="ekf", settings=settings, board=True
     )
     flight = changed(read("ins-gnss/walk", settings), {"filter": "ekf"})
-    kit = RIG.prepare(flight.setup, flight.given)
-    told = of_the_board(made.program, kit, sensed(kit, 150 * 60))
+    config = RIG.prepare(flight.setup, flight.given)
+    told = of_the_board(made.program, config, sensed(config, 150 * 60))
     configuration = SYSTEM.replay_default.parent / "walk.toml"
     wanted = replay_log([*paths, configuration], filters=("ekf",)).solution
     last = {row["epoch"]["time"]: row["epoch"] for row in told if "epoch" in row}
     rows = [last[time] for time in sorted(last)]
-    first_ns = int(kit.dataset.imu.time_ns[0])
+    first_ns = int(config.dataset.imu.time_ns[0])
     told_s = np.array([(row["time"] - first_ns) * 1e-9 for row in rows])
     at = np.searchsorted(wanted["time"].values, told_s - 1e-6)
     np.testing.assert_allclose(wanted["time"].values[at], told_s, atol=1e-6)

@@ -4,7 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
-from flights import flown, ran_of
+from flights import ran_of, series
 from short_drive import DRIVE
 
 from robins.bench.rig import RigError
@@ -34,32 +34,32 @@ def scenario(tmp_path_factory):
 def run(scenario):
     flight = read(scenario)
     flight = flight._replace(setup=flight.setup.model_copy(update={"filter": "ekf"}))
-    kit = RIG.prepare(flight.setup, flight.given)
+    config = RIG.prepare(flight.setup, flight.given)
     steps = flight.timing.steps
-    return flight, kit, steps, flown(RIG, kit, steps)[0]
+    return flight, config, steps, series(RIG, config, steps)[0]
 
 
-def judged(flight, kit, of):
-    return RIG.judge(flight, ran_of(of, kit))
+def judged(flight, config, of):
+    return RIG.judge(flight, ran_of(of, config))
 
 
-def as_replayed(kit):
+def as_replayed(config):
     """Figures and epochs of a replay of what the sensors say, by the code of the replay."""
-    outcome = SYSTEM.replay(kit.dataset, kit.given, ("ekf",))
+    outcome = SYSTEM.replay(config.dataset, config.given, ("ekf",))
     return outcome.metrics["ekf"], outcome.solution
 
 
 def test_its_figures_are_those_of_a_replay_with_outages(run):
-    flight, kit, _, of = run
-    wanted, solution = as_replayed(kit)
-    said = judged(flight, kit, of).metrics
+    flight, config, _, of = run
+    wanted, solution = as_replayed(config)
+    said = judged(flight, config, of).metrics
     # the last fixes are waited for
     assert wanted["outage_fixes"] == said["outage_fixes"] == 6
     assert 0 <= wanted["aided_fixes"] - said["aided_fixes"] <= 2
     for name in ("outage_horizontal_rms_m", "outage_horizontal_max_m", "outage_vertical_rms_m"):
         np.testing.assert_allclose(said[name], wanted[name], rtol=0.0, atol=5e-9)
     rows = epochs_of(of)
-    told_s = (of["epoch.time"][rows] - int(kit.dataset.imu.time_ns[0])) * 1e-9
+    told_s = (of["epoch.time"][rows] - int(config.dataset.imu.time_ns[0])) * 1e-9
     at = np.searchsorted(solution["time"].values, told_s - 1e-6)
     np.testing.assert_allclose(solution["time"].values[at], told_s, atol=1e-6)
     assert len(at) >= solution.sizes["time"] - 3
@@ -68,8 +68,8 @@ def test_its_figures_are_those_of_a_replay_with_outages(run):
 
 
 def test_it_is_right_about_the_drive(run):
-    flight, kit, _, of = run
-    said = judged(flight, kit, of)
+    flight, config, _, of = run
+    said = judged(flight, config, of)
     assert said.metrics["heading_rms_deg"] < 3.0
     error, sigma = (said.arrays[f"{what}_velocity"].values[0] for what in ("error", "sigma"))
     known = np.all(np.isfinite(error), axis=1)
@@ -79,17 +79,17 @@ def test_it_is_right_about_the_drive(run):
     assert said.counts["steps_refused"] == 6  # each fix of the outage has no number
     view = RIG.shown
     named = [signal.name for signal in view.signals(flight.given)]
-    values = dict(zip(named, view.sample(of, kit, 0, len(of.time_s) - 1), strict=True))
-    truth = kit.dataset.truth
+    values = dict(zip(named, view.sample(of, config, 0, len(of.time_s) - 1), strict=True))
+    truth = config.dataset.truth
     north = 6.37e6 * (truth.lat_rad[-1] - truth.lat_rad[0])
     assert abs(values["position from the start north"] - north) < 5.0
 
 
 def test_the_computer_goes_on_from_its_memory_to_the_bit(run):
-    _, kit, steps, whole = run
+    _, config, steps, whole = run
     half = steps // 2
-    _, states = flown(RIG, kit, half)
-    again, _ = flown(RIG, kit, steps, begin=half, states=pickle.loads(pickle.dumps(states)))
+    _, states = series(RIG, config, half)
+    again, _ = series(RIG, config, steps, begin=half, states=pickle.loads(pickle.dumps(states)))
     for name in ("state.q_nb", "state.v_n", "state.lat", "epoch.q_nb"):
         np.testing.assert_array_equal(again[name][half:], whole[name][half:])
 
@@ -106,11 +106,11 @@ def test_without_samples_it_says_what_to_give():
         read("ins-gnss/walk", ("imu_rate=0 Hz",))
     boards = read("ins-gnss/walk", ("imu_rate=20 Hz", "duration=5 s"))
     setup = boards.setup.model_copy(update={"ports": {"imu": "a", "gnss": "b"}, "filter": "ekf"})
-    kit = RIG.prepare(setup, boards.given)
-    assert (kit.rates_hz, boards.timing.steps) == ((20.0, 1.0), 100)
-    silent, _ = flown(RIG, kit, 3)
+    config = RIG.prepare(setup, boards.given)
+    assert (config.rates_hz, boards.timing.steps) == ((20.0, 1.0), 100)
+    silent, _ = series(RIG, config, 3)
     assert np.isnan(silent["state.lat"]).all()
-    assert judged(boards, kit, silent).metrics == {}
+    assert judged(boards, config, silent).metrics == {}
 
 
 @pytest.mark.parametrize("machine", ["jax", "c"])
@@ -121,12 +121,12 @@ def test_the_walk_has_the_figures_of_its_replay(data_dir, machine):
     files = ", ".join(f'"{path}"' for path in paths)
     flight = read("ins-gnss/walk", (f"log=[{files}]",))
     setup = flight.setup.model_copy(update={"filter": "ekf", "machine": machine})
-    kit = RIG.prepare(setup, flight.given)
+    config = RIG.prepare(setup, flight.given)
     configuration = SYSTEM.replay_default.parent / "walk.toml"
     whole, off = machine == "c", {"jax": 1e-12, "c": 1e-9}[machine]
     steps = flight.timing.steps if whole else 150 * 40
-    of, _ = flown(RIG, kit, steps)
-    said = judged(flight, kit, of).metrics
+    of, _ = series(RIG, config, steps)
+    said = judged(flight, config, of).metrics
     outcome = replay_log([*paths, configuration], filters=("ekf",))
     if whole:
         wanted = outcome.metrics["ekf"]
@@ -134,7 +134,7 @@ def test_the_walk_has_the_figures_of_its_replay(data_dir, machine):
             np.testing.assert_allclose(said[name], wanted[name], rtol=0.0, atol=1e-6)
     solution = outcome.solution
     rows = epochs_of(of)
-    told_s = (of["epoch.time"][rows] - int(kit.dataset.imu.time_ns[0])) * 1e-9
+    told_s = (of["epoch.time"][rows] - int(config.dataset.imu.time_ns[0])) * 1e-9
     at = np.searchsorted(solution["time"].values, told_s - 1e-6)
     np.testing.assert_allclose(solution["time"].values[at], told_s, atol=1e-6)
     assert np.sum(np.asarray(solution["outage"].values)[at]) >= 40  # epochs without fixes

@@ -1,4 +1,4 @@
-"""A kit goes to processes through a file that they map, to the last bit."""
+"""A config goes to processes through a file that they map, to the last bit."""
 
 import subprocess
 import sys
@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import pytest
-from stations import kit
+from stations import config
 
-from robins.bench.parts import kits
-from robins.bench.parts.kits import held_folder, put, take
-from robins.bench.rigs.satellite import kit as satellite
+from robins.bench.parts import config_files
+from robins.bench.parts.config_files import private_folder, put, take
+from robins.bench.rigs.satellite import config as satellite
 
 SHORT = ("satellite/s1", "mekf", "duration=60 s", "counted_from=10 s")
 
@@ -22,7 +22,7 @@ class Of(NamedTuple):
 
 
 def test_what_is_taken_is_what_was_put(tmp_path):
-    of = kit(*SHORT)
+    of = config(*SHORT)
     put(of, tmp_path / "kit")
     back = take(tmp_path / "kit")
     pairs = [jax.tree_util.tree_flatten(x) for x in (of, back)]
@@ -45,8 +45,8 @@ def test_there_may_be_no_arrays_and_empty_ones(tmp_path):
 
 
 def test_what_a_killed_bench_has_left_is_removed_by_the_next(tmp_path, monkeypatch):
-    monkeypatch.setattr(kits.tempfile, "tempdir", str(tmp_path))
-    with held_folder() as mine, held_folder() as other:
+    monkeypatch.setattr(config_files.tempfile, "tempdir", str(tmp_path))
+    with private_folder() as mine, private_folder() as other:
         assert mine != other
         assert mine.stat().st_mode & 0o077 == 0
         dead, making, precious = (tmp_path / f"robins-parts-{k}" for k in "abc")
@@ -56,7 +56,7 @@ def test_what_a_killed_bench_has_left_is_removed_by_the_next(tmp_path, monkeypat
         (dead / "locked").touch()
         (tmp_path / "goal" / "locked").touch()
         precious.symlink_to(tmp_path / "goal")
-        with held_folder():
+        with private_folder():
             there = {path.name for path in tmp_path.iterdir()}
             assert {mine.name, other.name, making.name, "goal"} < there
             assert dead.name not in there
@@ -69,7 +69,7 @@ def test_a_process_takes_no_memory_of_its_own_for_it(tmp_path):
     script = """if True:
         import sys
         from pathlib import Path
-        from robins.bench.parts.kits import take
+        from robins.bench.parts.config_files import take
         def mb():
             status = Path("/proc/self/status").read_text().splitlines()
             return int(next(x for x in status if x.startswith("RssAnon")).split()[1]) / 1024
@@ -79,15 +79,15 @@ def test_a_process_takes_no_memory_of_its_own_for_it(tmp_path):
         print(float(rows.sum()), mb() - before)
     """
     command = [sys.executable, "-c", script, str(tmp_path / "kit")]
-    ran = subprocess.run(command, capture_output=True, text=True, check=True)
-    total, more = map(float, ran.stdout.split())
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    total, more = map(float, result.stdout.split())
     assert total == 8e6 * (8e6 - 1) / 2
     assert more < 16.0
 
 
 def test_rows_are_those_of_the_run_beyond_a_block(monkeypatch):
     monkeypatch.setattr(satellite, "_BLOCK", 17)
-    of = kit(*SHORT)
+    of = config(*SHORT)
     row, last = satellite.driven(of, lambda given, row: row), len(of.due) - 1
     for step in (0, 16, 17, 18, 33, 34, 300, last, last + 50, 5):
         for got, rows in zip(*map(jax.tree.leaves, (row(step), of.rows)), strict=True):

@@ -31,18 +31,18 @@ def flight():
 
 
 @pytest.fixture(scope="module")
-def kit(flight):
+def config(flight):
     return RIG.prepare(flight.setup, flight.given)
 
 
 @pytest.fixture(scope="module")
-def inside(kit):
-    return RIG.inside(kit)
+def inside(config):
+    return RIG.inside(config)
 
 
 @pytest.fixture(scope="module")
-def parts(kit):
-    return {part.name: part for part in in_order(RIG, stations.parts(kit, RIG))}
+def parts(config):
+    return {part.name: part for part in in_order(RIG, stations.parts(config, RIG))}
 
 
 @pytest.fixture(scope="module")
@@ -74,16 +74,16 @@ def fly(parts):
 
 
 @pytest.fixture(scope="module")
-def flown(fly):
+def series(fly):
     return fly()
 
 
-def rows(flown, message, field):
-    return np.array([said[field] for said in flown[message] if said is not None])
+def rows(series, message, field):
+    return np.array([said[field] for said in series[message] if said is not None])
 
 
-def error_arcsec(flown):
-    off = judging.turn(rows(flown, "estimate", "q_ib"), rows(flown, "motion", "q_ib"))
+def error_arcsec(series):
+    off = judging.turn(rows(series, "estimate", "q_ib"), rows(series, "motion", "q_ib"))
     return np.linalg.norm(off, axis=1) / ARCSEC
 
 
@@ -117,21 +117,21 @@ def test_without_a_camera_there_is_nothing_to_show_a_sky():
 # ------------------------------------------------------------------------------ equality
 
 
-def test_the_parts_have_the_bits_of_one_program(inside, flown):
+def test_the_parts_have_the_bits_of_one_program(inside, series):
     for name in ("motion.q_ib", "estimate.q_ib", "estimate.gyro_bias", "wheels.momentum"):
-        np.testing.assert_array_equal(rows(flown, *name.split(".")), inside[name][:STEPS])
+        np.testing.assert_array_equal(rows(series, *name.split(".")), inside[name][:STEPS])
 
 
-def test_it_is_the_run_of_the_satellite(kit, inside):
-    theirs = satellite.RIG.inside(kit)
+def test_it_is_the_run_of_the_satellite(config, inside):
+    theirs = satellite.RIG.inside(config)
     assert inside.keys() == theirs.keys()
     for name, values in inside.items():
         np.testing.assert_array_equal(values, theirs[name], err_msg=name)
 
 
-def test_kinematics_turns_as_dynamics_says(flown):
+def test_kinematics_turns_as_dynamics_says(series):
     """SciPy composes the turns: a Gibbs vector g is the quaternion (1, g) but for its length."""
-    q, gibbs = rows(flown, "motion", "q_ib"), rows(flown, "turn", "gibbs_b")
+    q, gibbs = rows(series, "motion", "q_ib"), rows(series, "turn", "gibbs_b")
     turns = Rotation.from_quat(np.c_[np.ones(STEPS), gibbs], scalar_first=True)
     now = Rotation.from_quat(q[0], scalar_first=True)
     for k in range(1, STEPS):
@@ -139,7 +139,7 @@ def test_kinematics_turns_as_dynamics_says(flown):
     off = now.inv() * Rotation.from_quat(q[-1], scalar_first=True)
     assert off.magnitude() < 1e-13
     # and the rate is that with which it turns, as the mean of a step's beginning and end
-    omega = rows(flown, "turn", "omega_b")
+    omega = rows(series, "turn", "omega_b")
     mean = turns[1:].as_rotvec() / 0.1
     np.testing.assert_allclose(mean, 0.5 * (omega[1:] + omega[:-1]), atol=1e-8)
 
@@ -147,14 +147,14 @@ def test_kinematics_turns_as_dynamics_says(flown):
 # ------------------------------------------------------------------------------ the sky
 
 
-def test_stars_are_where_the_true_attitude_puts_them(flown, flight):
+def test_stars_are_where_the_true_attitude_puts_them(series, flight):
     camera, sky = flight.given.star.camera, synthetic(flight.given.star.camera.magnitude)
     edge = 0.5 * camera.field + MARGIN_RAD
-    frames = [k for k in range(STEPS) if flown["stars"][k] is not None]
+    frames = [k for k in range(STEPS) if series["stars"][k] is not None]
     assert len(frames) == STEPS // 5
     counts = set()
     for k in frames[::7]:
-        said, q = flown["stars"][k], flown["motion"][k]["q_ib"]
+        said, q = series["stars"][k], series["motion"][k]["q_ib"]
         unit_s = Rotation.from_quat(q, scalar_first=True).inv().apply(sky.unit_i)
         seen = np.flatnonzero(np.arccos(unit_s[:, 2]) < edge)[:STARS]
         count = len(seen)
@@ -165,7 +165,7 @@ def test_stars_are_where_the_true_attitude_puts_them(flown, flight):
         np.testing.assert_array_equal(said["magnitude"][:count], sky.magnitude[seen])
         assert np.all(np.isnan(said["magnitude"][count:]))
         assert np.all(np.isnan(said["vectors_s"][3 * count :]))
-        assert flown["star"][k]["stars"] <= count
+        assert series["star"][k]["stars"] <= count
     assert min(counts) > 5
 
 
@@ -178,8 +178,8 @@ def test_an_error_of_all_stars_is_the_sensors():
     """
     settings = ("duration=20 s", "counted_from=10 s", "star.low_frequency=100 arcsec")
     of = read("laboratory/stars", settings)
-    kit = RIG.prepare(of.setup, of.given)
-    ours, theirs = RIG.inside(kit), satellite.RIG.inside(kit)
+    config = RIG.prepare(of.setup, of.given)
+    ours, theirs = RIG.inside(config), satellite.RIG.inside(config)
     error = judging.turn(ours["estimate.q_ib"], ours["motion.q_ib"])
     assert np.max(np.linalg.norm(error, axis=1)) > 50.0 * ARCSEC
     for name, values in ours.items():
@@ -191,7 +191,7 @@ def test_an_error_of_all_stars_is_the_sensors():
 
 def fault(kind, **more):
     one = RIG.fault(kind=kind, begin=0.0, **more)
-    act = RIG.said()[0][kind].act
+    act = RIG.device_faults()[0][kind].act
     return lambda name, k, said: act(said, one, 0) if name == "stars" and k >= 100 else said
 
 
@@ -205,9 +205,9 @@ def test_under_a_dark_sky_the_gyro_carries_on(fly):
     assert error_arcsec(dark)[-1] < 60.0
 
 
-def test_a_hidden_star_is_one_star_less(fly, flown):
+def test_a_hidden_star_is_one_star_less(fly, series):
     without = fly(200, fault("hidden", stars=3))
-    before, after = ([f["stars"] for f in x["star"][100:200] if f] for x in (flown, without))
+    before, after = ([f["stars"] for f in x["star"][100:200] if f] for x in (series, without))
     # some of the three are missed anyway, and the camera misses others in their place
     assert 2.0 < np.mean(np.array(before) - after) < 4.0
     assert error_arcsec(without)[-1] < 60.0
@@ -261,10 +261,10 @@ def test_a_part_without_power_has_lost_its_state_and_its_history(
         RIG.fault(kind="killed", link="adm", begin=8.0),
     )
     of = changed(flight, {"seconds": 10.0, "faults": faults, "on_death": "restart"})
-    ran = Session(of, tmp_path / "r.mcap").run()
-    assert (ran.failure, ran.steps, ran.deaths) == ("", 100, 1)
-    assert ran.injected == {("power", "adm"): 1, ("killed", "adm"): 1}
-    assert [e.text for e in ran.events if e.kind == "power"] == [
+    result = Session(of, tmp_path / "r.mcap").run()
+    assert (result.failure, result.steps, result.deaths) == ("", 100, 1)
+    assert result.injected == {("power", "adm"): 1, ("killed", "adm"): 1}
+    assert [e.text for e in result.events if e.kind == "power"] == [
         "'adm' is switched off, as a fault",
         "'adm' is switched on, and begins anew",
     ]
@@ -272,7 +272,7 @@ def test_a_part_without_power_has_lost_its_state_and_its_history(
     for message, field in (("motion", "q_ib"), ("estimate", "q_ib"), ("estimate", "flags")):
         there = [k for k in range(100) if wanted[message][k] is not None]
         assert len(there) == (100 if message == "motion" else 80)
-        values = ran.flown[f"{message}.{field}"][there]
+        values = result.series[f"{message}.{field}"][there]
         np.testing.assert_array_equal(values, rows(wanted, message, field))
     again = bench_replay(tmp_path / "r.mcap", node="adm")
     assert (again.same, again.whole) == (True, True)

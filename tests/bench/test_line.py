@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robins.bench.ports.line import Line, load
+from robins.bench.ports.line import SerialLine, load
 
 BAUDS = st.sampled_from([300, 9600, 115_200, 460_800, 921_600, 999_983])
 
@@ -37,7 +37,7 @@ class Exact:
     st.lists(st.tuples(st.integers(0, 3_000_000), st.binary(max_size=12), st.booleans())),
 )
 def test_bytes_get_through_at_their_instant(baud, bits, steps):
-    line, exact, now = Line(baud, bits), Exact(baud, bits), 0
+    line, exact, now = SerialLine(baud, bits), Exact(baud, bits), 0
     for pause_ns, data, takes in steps:
         now += pause_ns
         line.send(data, now)
@@ -54,7 +54,7 @@ def test_bytes_get_through_at_their_instant(baud, bits, steps):
 
 
 def test_a_second_of_bytes_takes_a_second():
-    line = Line(115_200)
+    line = SerialLine(115_200)
     data = bytes(k % 251 for k in range(11_520))
     line.send(data, 5)
     assert line.take(10**9 + 4) == data[:-1]
@@ -64,7 +64,7 @@ def test_a_second_of_bytes_takes_a_second():
 
 def test_nothing_adds_up():
     """A byte takes 21701.388... ns: bursts on end for an hour end where one division says."""
-    line, burst, bursts = Line(460_800, most=10**6), bytes(10**6), 170
+    line, burst, bursts = SerialLine(460_800, most=10**6), bytes(10**6), 170
     for _ in range(bursts):
         line.send(burst, 0)
         assert len(line.take(10**13)) == len(burst)
@@ -73,7 +73,7 @@ def test_nothing_adds_up():
 
 
 def test_what_does_not_fit_is_dropped_and_counted():
-    line = Line(9600, most=10)
+    line = SerialLine(9600, most=10)
     line.send(b"01234567", 0)
     line.send(b"89abc", 0)
     assert (line.backlog, line.dropped) == (10, 3)
@@ -88,7 +88,7 @@ def test_what_does_not_fit_is_dropped_and_counted():
 @pytest.mark.parametrize("wrong", [{"baud": 0}, {"baud": 1, "bits_per_byte": 0}, {"most": -1}])
 def test_lines_that_cannot_be(wrong):
     with pytest.raises(ValueError, match="must be at least 1, got"):
-        Line(**({"baud": 9600} | wrong))
+        SerialLine(**({"baud": 9600} | wrong))
 
 
 def test_load():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect, sync_playwright
 
-from robins.bench.live import Live, Signal
+from robins.bench.live import LivePage, Signal
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 SIGNALS = [
@@ -24,7 +24,7 @@ def page():
     if path is None:
         pytest.skip(f"needs a Chromium: none of {', '.join(BROWSERS)} is on the path")
     with (
-        Live(SIGNALS, "a bench", 1) as live,
+        LivePage(SIGNALS, "a bench", 1) as live,
         sync_playwright() as play,
         play.chromium.launch(executable_path=path, args=["--no-sandbox"]) as browser,
     ):

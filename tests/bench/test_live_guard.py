@@ -16,7 +16,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from robins.bench import live as package
-from robins.bench.live import Live, Signal
+from robins.bench.live import LivePage, Signal
 from robins.bench.live.commands import CommandError, read
 from robins.bench.live.feed import check
 from robins.bench.live.guard import known_host, same_origin
@@ -32,11 +32,11 @@ FAULTS = [
 
 @pytest.fixture(scope="module")
 def live():
-    with Live(SIGNALS, "a bench", 1, faults=FAULTS, says=SAYS) as made:
+    with LivePage(SIGNALS, "a bench", 1, faults=FAULTS, says=SAYS) as made:
         yield made
 
 
-def page_of(live: Live, **options):
+def page_of(live: LivePage, **options):
     """A websocket to the server, as a page opens it; it takes in all that comes."""
     return connect(live.url.replace("http", "ws") + "live", max_queue=None, **options)
 
@@ -301,13 +301,13 @@ def test_attitudes_are_four_signals_each():
 )
 def test_signals_that_cannot_be_drawn(signals, says):
     with pytest.raises(ValueError, match=re.escape(says)):
-        Live(signals, "a bench", 1)
+        LivePage(signals, "a bench", 1)
 
 
 @pytest.mark.parametrize("faults", [[{"label": "a"}], [{"label": 1, "fault": {}}], FAULTS + FAULTS])
 def test_faults_that_cannot_be_offered(faults):
     with pytest.raises(ValueError, match="label"):
-        Live(SIGNALS, "a bench", 1, faults=faults)
+        LivePage(SIGNALS, "a bench", 1, faults=faults)
 
 
 def test_a_sample_of_another_length(live):
@@ -318,15 +318,15 @@ def test_a_sample_of_another_length(live):
 def test_a_port_that_is_taken(live):
     port = live._at.getsockname()[1]
     with pytest.raises(OSError, match=rf"cannot listen at 127\.0\.0\.1:{port}: .*; choose another"):
-        Live(SIGNALS, "a bench", 1, port=port)
+        LivePage(SIGNALS, "a bench", 1, port=port)
     with pytest.raises(OSError, match=r"cannot listen at no\.such\.host\.invalid:0"):
-        Live(SIGNALS, "a bench", 1, host="no.such.host.invalid")
+        LivePage(SIGNALS, "a bench", 1, host="no.such.host.invalid")
 
 
 def test_listening_to_others_is_warned_of():
     with (
         pytest.warns(UserWarning, match="everybody who reaches it can stop this bench"),
-        Live(SIGNALS, "a bench", 1, host="0.0.0.0") as live,
+        LivePage(SIGNALS, "a bench", 1, host="0.0.0.0") as live,
     ):
         assert socket.gethostname() in live.url
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from robins.bench.live import history as module
 from robins.bench.live.feed import pack_sample
-from robins.bench.live.history import History
+from robins.bench.live.history import SampleHistory
 
 RUN = 77
 
@@ -46,7 +46,7 @@ def test_buckets_have_the_least_and_the_greatest_of_their_samples(many, monkeypa
     values[draw.uniform(size=values.shape) < 0.3] = np.nan
     values[0, 0] = np.inf  # as good as missing: nothing can draw it
     values[:, 2] = np.nan
-    kept = History(3)
+    kept = SampleHistory(3)
     for k in range(many):
         kept.add(pack_sample(RUN, k, time_s[k], values[k]))
         if k == many // 2:
@@ -63,16 +63,16 @@ def test_a_server_that_comes_anew_goes_on_where_the_one_before_it_was(before, af
         for k in range(begin, begin + many):
             kept.add(pack_sample(RUN, k, 0.1 * k, [np.sin(k), np.nan if k % 3 else float(k)]))
 
-    whole, first = History(2), History(2)
+    whole, first = SampleHistory(2), SampleHistory(2)
     add(whole, 0, before + after)
     add(first, 0, before)
-    second = History.unpack(first.pack(RUN)) if before else History(2)
+    second = SampleHistory.unpack(first.pack(RUN)) if before else SampleHistory(2)
     add(second, before, after)
     assert second.pack(RUN) == whole.pack(RUN)
 
 
 def test_nothing_is_sent_of_nothing():
-    assert History(3).pack(RUN) == b""
+    assert SampleHistory(3).pack(RUN) == b""
 
 
 def test_a_day_is_flat_in_memory_and_a_spike_of_one_sample_stays():
@@ -80,7 +80,7 @@ def test_a_day_is_flat_in_memory_and_a_spike_of_one_sample_stays():
     minute, spike = 1200, 1_000_003
     kind = np.dtype([("run", "<u4"), ("sequence", "<u4"), ("time_s", "<f8"), ("x", "<f8", 40)])
     rows = np.zeros(minute, kind)
-    kept = History(40)
+    kept = SampleHistory(40)
     tracemalloc.start()  # NumPy's arrays are counted; other threads' memory is not the history's
     for begin in range(0, 24 * 60 * minute, minute):
         number = begin + np.arange(minute)
@@ -102,7 +102,7 @@ def test_a_day_is_flat_in_memory_and_a_spike_of_one_sample_stays():
 
 
 def test_a_sample_costs_some_microseconds():
-    sample, kept = bytes(336), History(40)
+    sample, kept = bytes(336), SampleHistory(40)
     began = time.process_time()
     for _ in range(10_000):  # with one halving
         kept.add(sample)

@@ -11,7 +11,7 @@ import pytest
 from browsing import a_browser, browse
 from playwright.sync_api import expect
 
-from robins.bench.live import Live, Signal
+from robins.bench.live import LivePage, Signal
 
 AXES = "xyz"
 SIGNALS = [
@@ -55,7 +55,7 @@ def chromium():
 
 @pytest.fixture(scope="module")
 def server():
-    with Live(SIGNALS, "satellite/test", RUN, faults=FAULTS) as made:
+    with LivePage(SIGNALS, "satellite/test", RUN, faults=FAULTS) as made:
         yield made
 
 
@@ -67,7 +67,7 @@ def live(server):
     return server
 
 
-def push(live: Live, page, many: int, first: int = 0) -> None:
+def push(live: LivePage, page, many: int, first: int = 0) -> None:
     """Samples, until they are drawn."""
     before = page.evaluate("bench.shown")
     for k in range(first, first + many):
@@ -87,7 +87,7 @@ def state(page, wanted: str, within_s: float) -> float:
     return time.monotonic() - began
 
 
-def go_on(live: Live, page, k: int, wanted: str, within_s: float) -> int:
+def go_on(live: LivePage, page, k: int, wanted: str, within_s: float) -> int:
     """Samples at 10 Hz until the page says what is wanted; the number of the next one."""
     began = time.monotonic()
     while page.evaluate("bench.state") != wanted:
@@ -98,7 +98,7 @@ def go_on(live: Live, page, k: int, wanted: str, within_s: float) -> int:
     return k
 
 
-def command(live: Live) -> dict:
+def command(live: LivePage) -> dict:
     """The next command that reaches the bench."""
     until = time.monotonic() + 3.0
     while time.monotonic() < until:
@@ -260,7 +260,7 @@ def test_health_of_the_bench_is_told(chromium, live):
 
 
 def test_a_killed_server_is_noticed_and_its_return_too(chromium):
-    with Live(SIGNALS, "satellite/test", RUN) as live, browse(chromium, live.url) as page:
+    with LivePage(SIGNALS, "satellite/test", RUN) as live, browse(chromium, live.url) as page:
         expect(page.locator(".plot")).to_have_count(5)
         push(live, page, 20)
         state(page, "live", 1.0)
@@ -277,7 +277,7 @@ def test_a_killed_server_is_noticed_and_its_return_too(chromium):
 
 
 def test_a_server_that_hangs_is_noticed(chromium):
-    with Live(SIGNALS, "satellite/test", RUN) as live, browse(chromium, live.url) as page:
+    with LivePage(SIGNALS, "satellite/test", RUN) as live, browse(chromium, live.url) as page:
         push(live, page, 3)
         os.kill(live._process.pid, signal.SIGSTOP)
         try:
@@ -358,7 +358,7 @@ def test_the_buttons_reach_the_bench(chromium, live):
 def test_what_the_operator_may_say_is_a_button_each(chromium, live):
     says = ["slew 10 deg", 'back to "the course"']
     with (
-        Live(SIGNALS, "a bench", 5, says=says) as made,
+        LivePage(SIGNALS, "a bench", 5, says=says) as made,
         browse(chromium, made.url) as page,
     ):
         made.status({"state": "running"})
@@ -388,7 +388,7 @@ def test_a_fault_is_injected_with_the_keyboard_alone(chromium, live):
 
 def test_a_chosen_fault_stays_chosen_when_the_server_returns(chromium):
     with (
-        Live(SIGNALS, "satellite/test", RUN, faults=FAULTS) as live,
+        LivePage(SIGNALS, "satellite/test", RUN, faults=FAULTS) as live,
         browse(chromium, live.url) as page,
     ):
         page.get_by_test_id("fault").select_option("gyro noise")

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from browsing import a_browser
 
-from robins.bench.live import Live, Signal
+from robins.bench.live import LivePage, Signal
 from robins.bench.live.feed import pack_sample
-from robins.bench.live.history import History
+from robins.bench.live.history import SampleHistory
 
 
 @pytest.fixture(scope="module")
 def page():
-    with Live([Signal("a", "1", "A")], "a bench", 1) as live, a_browser() as browser:
+    with LivePage([Signal("a", "1", "A")], "a bench", 1) as live, a_browser() as browser:
         opened = browser.new_page()
         opened.goto(live.url)
         opened.wait_for_selector(".plot")
@@ -31,7 +31,7 @@ def drawn(seed: int, many: int, share: float = 0.7) -> tuple[np.ndarray, np.ndar
 
 def packed(time_s: np.ndarray, values: np.ndarray) -> bytes:
     """The history of the server."""
-    kept = History(values.shape[1])
+    kept = SampleHistory(values.shape[1])
     for k in range(len(time_s)):
         kept.add(pack_sample(1, k, float(time_s[k]), values[k]))
     return kept.pack(1)

@@ -18,7 +18,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from robins.bench import live as package
-from robins.bench.live import Live, Signal
+from robins.bench.live import LivePage, Signal
 from robins.bench.live.feed import to_json
 from robins.bench.live.hub import QUEUE, Client
 
@@ -38,13 +38,13 @@ RUN = 41
 @pytest.fixture
 def live():
     """A server for a test that is rough with it."""
-    with Live(SIGNALS, "a bench", RUN, faults=FAULTS) as made:
+    with LivePage(SIGNALS, "a bench", RUN, faults=FAULTS) as made:
         yield made
 
 
 @pytest.fixture(scope="module")
 def server():
-    with Live(SIGNALS, "a bench", RUN, faults=FAULTS) as made:
+    with LivePage(SIGNALS, "a bench", RUN, faults=FAULTS) as made:
         yield made
 
 
@@ -55,7 +55,7 @@ def shared(server):
     return server
 
 
-def page_of(live: Live, **options):
+def page_of(live: LivePage, **options):
     """A websocket to the server, as a page opens it; it takes in all that comes."""
     return connect(live.url.replace("http", "ws") + "live", max_queue=None, **options)
 
@@ -262,7 +262,7 @@ def test_the_bench_never_waits_for_a_server_that_does_not_read(live):
 
 
 @contextmanager
-def deaf_page(live: Live):
+def deaf_page(live: LivePage):
     """A page that asks for samples and does not read them, with the least buffer there is."""
     at = live._at.getsockname()
     with socket.socket() as raw:
@@ -279,7 +279,7 @@ def deaf_page(live: Live):
 
 def test_a_slow_page_loses_its_oldest_samples_and_slows_nobody():
     many = [Signal(f"s{k}", "1", "Many") for k in range(400)]  # 3 kB each, so that buffers fill
-    with Live(many, "a bench", RUN) as live, deaf_page(live) as deaf, page_of(live) as page:
+    with LivePage(many, "a bench", RUN) as live, deaf_page(live) as deaf, page_of(live) as page:
         texts(page, "hello")
         seen: list[bytes] = []
         for k in range(2000):
@@ -421,7 +421,7 @@ def test_ctrl_c_at_the_terminal_does_not_reach_the_server(shared):
 
 def test_close_ends_the_server_though_a_page_does_not_read():
     many = [Signal(f"s{k}", "1", "Many") for k in range(400)]
-    with Live(many, "a bench", RUN) as live, deaf_page(live):
+    with LivePage(many, "a bench", RUN) as live, deaf_page(live):
         for k in range(200):
             live.push(0.1 * k, np.zeros(400))
         pid = live._process.pid

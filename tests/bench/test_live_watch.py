@@ -12,8 +12,8 @@ from browsing import a_browser, browse, installed
 from playwright.sync_api import expect
 from scipy.spatial.transform import Rotation
 
-from robins.bench.live import Live, Signal
-from robins.bench.live.history import History
+from robins.bench.live import LivePage, Signal
+from robins.bench.live.history import SampleHistory
 
 SIGNALS = [
     *[Signal(f"error {a}", "arcsec", "Error") for a in "xyz"],
@@ -30,7 +30,7 @@ def chromium():
 
 @pytest.fixture(scope="module")
 def server():
-    with Live(SIGNALS, "a long run", 1, faults=FAULTS) as made:
+    with LivePage(SIGNALS, "a long run", 1, faults=FAULTS) as made:
         yield made
 
 
@@ -41,7 +41,7 @@ def live(server):
     return server
 
 
-def push(live: Live, begin: int, end: int, spikes: tuple[int, ...] = ()) -> None:
+def push(live: LivePage, begin: int, end: int, spikes: tuple[int, ...] = ()) -> None:
     """Samples at 20 Hz, as fast as the server takes them."""
     for k in range(begin, end):
         live.push(0.05 * (k + 1), [np.sin(0.01 * k), 0.5, 90.0 if k in spikes else -0.5, 0.1])
@@ -89,7 +89,7 @@ def test_a_late_page_sees_the_whole_run_and_its_spike(chromium, live):
 
 
 def test_a_page_that_was_away_for_long_gets_what_it_missed(chromium):
-    with Live(SIGNALS, "a long run", 1) as live, browse(chromium, live.url) as page:
+    with LivePage(SIGNALS, "a long run", 1) as live, browse(chromium, live.url) as page:
         push(live, 0, 400)
         reached(page, 20.0)
         os.kill(live._process.pid, signal.SIGKILL)
@@ -121,8 +121,8 @@ def a_day(signals: int) -> bytes:
 def test_a_day_of_forty_signals_is_light_for_the_page(chromium):
     """The page shows all of it, goes on, and no picture takes long."""
     signals = [Signal(f"s{k}", "m", f"plot {k // 4}") for k in range(40)]
-    with Live(signals, "a day", 1) as live:
-        live._history = History.unpack(a_day(40))
+    with LivePage(signals, "a day", 1) as live:
+        live._history = SampleHistory.unpack(a_day(40))
         live.restart()
         with browse(chromium, live.url) as page:
             live.push(86400.05, np.zeros(40))
@@ -378,7 +378,10 @@ def scalar_first(turned: Rotation) -> np.ndarray:
 
 @contextmanager
 def attitude_page(chromium):
-    with Live([*ATTITUDES, *SIGNALS], "attitudes", 1) as live, browse(chromium, live.url) as page:
+    with (
+        LivePage([*ATTITUDES, *SIGNALS], "attitudes", 1) as live,
+        browse(chromium, live.url) as page,
+    ):
         yield live, page
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from stations import Loop, kit
+from stations import Loop, config
 
 from robins.bench.rigs.satellite.judging import Alarms, inside
 from robins.bench.rigs.satellite.messages import FLAGS
@@ -30,7 +30,7 @@ def test_over_bytes_it_has_the_bits_of_one_program(monkeypatch):
         return real(self, plant)
 
     monkeypatch.setattr(EveryStep, "__call__", call)
-    of = kit(*ONE)
+    of = config(*ONE)
     loop = Loop(of).run(STEPS)
     with pytest.warns(StepWarning, match="did not pass the test"):
         wanted = inside(of, STEPS)
@@ -41,5 +41,5 @@ def test_over_bytes_it_has_the_bits_of_one_program(monkeypatch):
     np.testing.assert_array_equal(loop.flags() & ~(1 << KEPT), of.due[:STEPS])
     assert not np.any(told & ~of.due[:STEPS])
     alarms = Alarms()
-    said = [one for flags in loop.flags() for one in alarms.said(int(flags))]
+    said = [one for flags in loop.flags() for one in alarms.alerts_of(int(flags))]
     assert [one.level for one in said if one.text == FLAGS[KEPT]]

@@ -8,10 +8,10 @@ import time
 from functools import partial
 
 import pytest
-from stations import RUN, Loop, kit
+from stations import RUN, Loop, config
 
 from robins.bench.broker import BenchError, Injector, Link
-from robins.bench.broker.revive import History, beginning, catch_up
+from robins.bench.broker.restart import SentFrames, beginning, catch_up
 from robins.bench.parts import station as memory
 from robins.bench.parts.idle import idleness
 from robins.bench.parts.station import Station
@@ -27,7 +27,7 @@ class Told(Loop):
     """Remembers what each part was told since its memory, as the bench does."""
 
     def __init__(self, *given):
-        self.histories = {name: History(LAST.__ge__) for name in RIG.parts}
+        self.histories = {name: SentFrames(LAST.__ge__) for name in RIG.parts}
         super().__init__(*given)
 
     def to(self, part, name, payload, time_ns):
@@ -42,9 +42,9 @@ class Told(Loop):
 
 def test_every_part_goes_on_from_its_memory_to_the_last_bit(monkeypatch, tmp_path):
     monkeypatch.setattr(memory, "EVERY", 23)
-    loop = Told(kit("satellite/s1", "mekf", *SHORT))
+    loop = Told(config("satellite/s1", "mekf", *SHORT))
     for name, station in loop.stations.items():
-        station._put_aside = lambda k, m, name=name: memory.put_aside(tmp_path, name, k, m)
+        station._put_aside = lambda k, m, name=name: memory.save_memory(tmp_path, name, k, m)
     loop.run(99)
     # the two latest of each part are kept
     kept = sorted(f"{name}.{k}.memory" for name in loop.stations for k in (LAST, LAST + 23))
@@ -53,11 +53,11 @@ def test_every_part_goes_on_from_its_memory_to_the_last_bit(monkeypatch, tmp_pat
         saved = memory.path_of(tmp_path, name, LAST).read_bytes()
         new, receiver = Station(loop.stations[name].part, WIRE, saved), Receiver()
         assert not new.begun
-        assert new.feed(beginning(RUN, loop.kit.step_ns)) == b""
+        assert new.feed(beginning(RUN, loop.config.step_ns)) == b""
         assert new.begun
         assert history.since == LAST
-        again = [f for _, raw in history.told for f in receiver.feed(new.feed(raw))]
-        end_ns = (LAST + 1) * loop.kit.step_ns
+        again = [f for _, raw in history.sent_frames for f in receiver.feed(new.feed(raw))]
+        end_ns = (LAST + 1) * loop.config.step_ns
         said = [f for who, f in loop.said if who == name and f.header.time_ns > end_ns]
         assert [f.header for f in again] == [f.header for f in said]
         done = WIRE.message("done").number  # tells how long computing took
@@ -104,7 +104,7 @@ def test_a_process_that_computes_is_known_from_one_that_waits():
 
 def test_what_is_kept_for_a_part_is_bounded():
     there = {255, 767}
-    history, most = History(there.__contains__), 0
+    history, most = SentFrames(there.__contains__), 0
     for step in range(1000):
         for raw in (b"data", b"more"):
             history.add(None, raw)
@@ -113,9 +113,9 @@ def test_what_is_kept_for_a_part_is_bounded():
             history.add(None, b"late")
             history.add(step, b"tick again")
         history.answered(step)
-        most = max(most, len(history.told))
+        most = max(most, len(history.sent_frames))
         if step == 255:
-            assert (history.since, [raw for _, raw in history.told]) == (
+            assert (history.since, [raw for _, raw in history.sent_frames]) == (
                 255,
                 [b"late", b"tick again"],
             )
@@ -123,4 +123,4 @@ def test_what_is_kept_for_a_part_is_bounded():
             assert history.since == 255
     assert history.since == 767
     assert most <= 3 * 2 * memory.EVERY + 2
-    assert [at for at, _ in history.told if at is not None] == list(range(768, 1000))
+    assert [at for at, _ in history.sent_frames if at is not None] == list(range(768, 1000))

@@ -9,14 +9,14 @@ import time
 
 import numpy as np
 import pytest
-from flights import flown, ran_of
+from flights import ran_of, series
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from stations import on_threads
 
 from robins.bench.bridges import BridgeClosed, BridgeTimeout
 from robins.bench.parts import node
-from robins.bench.parts.kits import put
+from robins.bench.parts.config_files import put
 from robins.bench.rigs import rig_of
 from robins.bench.rigs.multirotor import MOTORS, autopilots
 from robins.bench.rigs.multirotor.craft import at_rest, moved
@@ -55,14 +55,14 @@ def judged(flight, of):
 
 @pytest.fixture(scope="module")
 def run():
-    flight, kit = kit_of(*SHORT)
-    return flight, kit, flown(RIG, kit, STEPS)[0]
+    flight, config = kit_of(*SHORT)
+    return flight, config, series(RIG, config, STEPS)[0]
 
 
 @pytest.fixture(scope="module")
 def hovering(run):
     """States after 5 s, when it counts."""
-    return flown(RIG, run[1], HOVERS)[1]
+    return series(RIG, run[1], HOVERS)[1]
 
 
 # ------------------------------------------------------------------------------------ physics
@@ -158,8 +158,8 @@ def test_its_motion_is_that_of_its_differential_equation():
 
 
 def test_instruments_measure_what_is_true(run):
-    _, kit, of = run
-    given = kit.given
+    _, config, of = run
+    given = config.given
     fixes = np.isfinite(of["fix.lat"])
     assert np.sum(fixes) == STEPS // 50
     origin = np.asarray(ecef_from_geodetic(given.lat, given.lon, given.alt))
@@ -191,12 +191,12 @@ def test_instruments_measure_what_is_true(run):
 
 
 def test_noise_is_that_of_the_seed_and_the_step(run):
-    _, kit, of = run
-    part = RIG.part("imu", kit)
+    _, config, of = run
+    part = RIG.part("imu", config)
     motion = {name: of[f"motion.{name}"][40] for name in ("q_nb", "omega_b", "p_n", "v_n", "f_b")}
     _, [(_, said)] = part.act(None, 40, {"motion": motion})
     np.testing.assert_array_equal(said["omega_b"], of["sample.omega_b"][40])
-    _, [(_, other)] = RIG.part("imu", kit._replace(seed=6)).act(None, 40, {"motion": motion})
+    _, [(_, other)] = RIG.part("imu", config._replace(seed=6)).act(None, 40, {"motion": motion})
     assert np.all(other["omega_b"] != said["omega_b"])
     assert part.act(None, 40, {"motion": None}) == (None, [])
 
@@ -224,39 +224,39 @@ def test_it_hovers_in_wind(run):
 
 
 def test_a_sample_that_does_not_come_is_the_one_before(run, hovering):
-    flight, kit, whole = run
-    again = flown(RIG, kit, HOVERS + 60, begin=HOVERS, states=hovering)[0]
+    flight, config, whole = run
+    again = series(RIG, config, HOVERS + 60, begin=HOVERS, states=hovering)[0]
     np.testing.assert_array_equal(again["motion.p_n"][HOVERS:], whole["motion.p_n"][HOVERS:][:60])
 
     def lost(name, k):
         return name == "sample" and k % 50 == 7
 
-    of = flown(RIG, kit, STEPS, lost, HOVERS, hovering)[0]
+    of = series(RIG, config, STEPS, lost, HOVERS, hovering)[0]
     assert judged(flight, of).metrics["position_rms_m"] < 0.5
 
 
-def disturbed(kit, hovering, kind, **more):
+def disturbed(config, hovering, kind, **more):
     """A flight with a fault of a sensor or a motor from 5 s on."""
-    one, of = RIG.fault(kind=kind, begin=0.0, **more), RIG.said()[0][kind]
+    one, of = RIG.fault(kind=kind, begin=0.0, **more), RIG.device_faults()[0][kind]
 
     def wrong(name, k, said):
         return of.act(said, one, 0) if name == of.message else said
 
-    return flown(RIG, kit, STEPS, begin=HOVERS, states=hovering, wrong=wrong)[0]
+    return series(RIG, config, STEPS, begin=HOVERS, states=hovering, wrong=wrong)[0]
 
 
 def test_faults_of_its_sensors_and_motors(run, hovering):
-    flight, kit, whole = run
-    weak = judged(flight, disturbed(kit, hovering, "motor", motor=0, left=0.8)).metrics
+    flight, config, whole = run
+    weak = judged(flight, disturbed(config, hovering, "motor", motor=0, left=0.8)).metrics
     assert weak["position_rms_m"] < 0.6
-    dead = disturbed(kit, hovering, "motor", motor=2)
+    dead = disturbed(config, hovering, "motor", motor=2)
     assert judged(flight, dead).metrics["tilt_max_deg"] > 45.0
     assert dead["motion.p_n"][-1, 2] > -0.1  # it has come down
     np.testing.assert_array_equal(dead["motion.v_n"][-1], np.zeros(3))
-    blind = disturbed(kit, hovering, "blind")
+    blind = disturbed(config, hovering, "blind")
     assert judged(flight, blind).metrics["position_max_m"] < 2.0  # its accelerometers carry it on
     assert np.any(blind["motion.p_n"][1300] != whole["motion.p_n"][1300])
-    magnet = judged(flight, disturbed(kit, hovering, "magnet", field=20e-6)).metrics
+    magnet = judged(flight, disturbed(config, hovering, "magnet", field=20e-6)).metrics
     assert magnet["heading_rms_deg"] > 15.0
     assert magnet["position_rms_m"] < 1.0
     with pytest.raises(ValueError, match="needs it"):
@@ -279,11 +279,11 @@ def free(kind):
         return one.getsockname()[1]
 
 
-def px4(port, kit, until=None):
+def px4(port, config, until=None):
     """A stand-in for PX4: our autopilot, which hears what MAVLink carries."""
     from px4_peer import Peer, controls_frame
 
-    part, fix = autopilots.own(kit), None
+    part, fix = autopilots.own_autopilot(config), None
     part.rare()
     state = part.begin()
     for _ in range(1200):
@@ -307,7 +307,7 @@ def px4(port, kit, until=None):
                 "field_b": field_T if one.fields_updated & 0x1C0 else np.full(3, np.nan),
                 "pressure": one.abs_pressure * 100.0,
             }
-            k = one.time_usec * 1000 // kit.step_ns - 1
+            k = one.time_usec * 1000 // config.step_ns - 1
             if until is not None and k >= until:
                 return
             state, [(_, asked)] = part.act(state, k, {"sample": sample, "fix": fix})
@@ -323,8 +323,8 @@ def beside(target, *given):
 
 def test_px4_flies_it_over_tcp(tmp_path):
     pytest.importorskip("pymavlink", reason="needs pymavlink, of the extra 'autopilot'")
-    port, (_, kit) = free(socket.SOCK_STREAM), kit_of(*CALM)
-    other = beside(px4, port, kit)
+    port, (_, config) = free(socket.SOCK_STREAM), kit_of(*CALM)
+    other = beside(px4, port, config)
     path = scenario(tmp_path, autopilot="px4", port=port)
     outcome = bench_up(str(path), record=tmp_path / "record.mcap")
     other.join(10.0)
@@ -333,7 +333,7 @@ def test_px4_flies_it_over_tcp(tmp_path):
     assert outcome.metrics["multirotor"]["position_rms_m"] < 0.5
     # but for rounding in MAVLink, 1 cm and 1 cm/s of a fix, it is the flight with ours
     p_n = outcome.solution["value_motion_p_n"].values[0]
-    off = np.abs(p_n - flown(RIG, kit, 1000)[0]["motion.p_n"])
+    off = np.abs(p_n - series(RIG, config, 1000)[0]["motion.p_n"])
     assert 0.0 < off.max() < 0.05
     for part in ("craft", "gnss"):
         assert bench_replay(tmp_path / "record.mcap", node=part).same
@@ -403,8 +403,8 @@ def test_nobody_at_the_other_end_is_told(monkeypatch):
         port = free(kind)
         if name == "px4":
             pytest.importorskip("pymavlink")
-        _, kit = kit_of(autopilot=name, port=port)
-        part = RIG.part("autopilot", kit)
+        _, config = kit_of(autopilot=name, port=port)
+        part = RIG.part("autopilot", config)
         with pytest.raises(
             BridgeTimeout, match=rf"{program} at port {port}: .*; start {program}'s SITL"
         ):
@@ -431,8 +431,8 @@ def test_an_ardupilot_that_is_started_anew_is_told():
 def test_an_autopilot_that_goes_fails_the_run_and_says_what_to_do(tmp_path, monkeypatch):
     on_threads(monkeypatch, processes=("autopilot",))
     pytest.importorskip("pymavlink", reason="needs pymavlink, of the extra 'autopilot'")
-    port, (_, kit) = free(socket.SOCK_STREAM), kit_of(*CALM)
-    other = beside(px4, port, kit, 100)
+    port, (_, config) = free(socket.SOCK_STREAM), kit_of(*CALM)
+    other = beside(px4, port, config, 100)
     outcome = bench_up(str(scenario(tmp_path, autopilot="px4", port=port)))
     other.join(10.0)
     assert f"'autopilot' ended with status 2: PX4 at port {port}: PX4 has gone:" in outcome.failure

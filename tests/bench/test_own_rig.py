@@ -14,10 +14,10 @@ from mcap.reader import make_reader
 
 from robins import bench
 from robins.bench.recording import read_record
-from robins.bench.rig import Flight, Rig, RigError
+from robins.bench.rig import LoadedRun, Rig, RigError
 from robins.bench.rigs import RIGS, UnknownRig, rig_of
 from robins.bench.run.session import Session
-from robins.bench.run.setup import kit_of, read, setup_of
+from robins.bench.run.setup import config_of, read, setup_of
 from robins.bench.run.telemetry import Telemetry
 from robins.report import figures
 from robins.results import read as read_result
@@ -34,15 +34,15 @@ def test_it_is_as_short_as_promised():
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory):
+def series(tmp_path_factory):
     """A run by two processes, with a page's eye on it."""
     where = tmp_path_factory.mktemp("pendulum")
     outcome = bench_up(RIG, record=where / "record.mcap", seconds=6.0)
     return outcome, publish(outcome, where / "out").path
 
 
-def test_it_flies_by_the_document_alone(flown):
-    outcome, folder = flown
+def test_it_flies_by_the_document_alone(series):
+    outcome, folder = series
     told = outcome.metrics["pendulum"]
     assert (outcome.failure, outcome.scenario) == ("", "bench/pendulum:rig")
     # the camera's noise is 1 deg; a filter with the right model is several times better
@@ -74,8 +74,8 @@ def test_a_swing_by_hand():
     np.testing.assert_allclose(np.mean(np.diff(through)) * 2e-3, period, rtol=1e-5)
 
 
-def test_viewers_decode_every_message_of_its_record(flown):
-    _, folder = flown
+def test_viewers_decode_every_message_of_its_record(series):
+    _, folder = series
     with (folder / "record.mcap").open("rb") as file:
         found = [
             (channel.topic, json.loads(one.data))
@@ -101,12 +101,12 @@ def test_the_page_of_any_rig_offers_faults_that_it_has(name):
     if name in ("airship", "multirotor", RIG):  # they offer none themselves
         lines = {(one.kind, one.link) for one in made}
         assert lines >= {(k, p) for k in ("silent", "loss", "bit errors") for p in rig.parts}
-        needless = {kind for kind, one in rig.table.said.items() if not one.needs}
+        needless = {kind for kind, one in rig.table.device_faults.items() if not one.needs}
         assert needless == {one.kind for one in made} - {"silent", "loss", "bit errors"}
 
 
-def test_its_record_is_heard_again(flown):
-    _, folder = flown
+def test_its_record_is_heard_again(series):
+    _, folder = series
     header = read_record(folder / "record.mcap").header
     assert header["rig"] == f"{EXAMPLE.resolve()}:rig"
     assert bench_replay(folder / "record.mcap", node="camera").same
@@ -137,9 +137,9 @@ def test_all_numbers_are_drawn_where_a_rig_says_nothing():
     assert names[:3] == ["swing angle", "swing rate", "estimate angle"]
     telemetry = Telemetry(rig, 3, 10)
     telemetry.observe("swing", 20, rig.wire.encode("swing", {"angle": 0.5, "rate": -1.0}))
-    assert view.sample(telemetry.flown, None, 0, 2)[:2] == [0.5, -1.0]
-    assert np.isnan(view.sample(telemetry.flown, None, 2, 2)).all()
-    judged = Rig.judge(rig, None, ran_of(telemetry.flown))
+    assert view.sample(telemetry.series, None, 0, 2)[:2] == [0.5, -1.0]
+    assert np.isnan(view.sample(telemetry.series, None, 2, 2)).all()
+    judged = Rig.judge(rig, None, ran_of(telemetry.series))
     assert {"value_swing_angle", "value_estimate_sigma"} <= set(judged.arrays)
 
 
@@ -165,14 +165,14 @@ def test_a_rig_is_given_by_its_class_or_in_one_call():
     tables = {name: getattr(of, name) for name in ("wire", "sends", "takes", "prepare", "judge")}
     build = {name: partial(of.part, name) for name in of.parts}
     made = Rig(name="pendulum", build=build, parameters=lambda: of.given, **tables)
-    kit = kit_of(Flight("", made, setup_of(made)(), made.given(), ""))
-    assert made.part("camera", kit).takes == {"swing": 0}
+    config = config_of(LoadedRun("", made, setup_of(made)(), made.given(), ""))
+    assert made.part("camera", config).takes == {"swing": 0}
     with pytest.raises(RigError, match="the rig Rig has no parameters and no prepare; define it"):
         Rig(name="pendulum", **{name: tables[name] for name in ("wire", "sends", "takes")})
     with pytest.raises(RigError, match="no function makes the part 'camera'; define one of its"):
         made.varied(build={"pendulum": build["pendulum"]})
     with pytest.raises(RigError, match=r"there is no 'camera' in the module robins\.bench\.rig"):
-        made.varied(build={}, code="robins.bench.rig").part("camera", kit)
+        made.varied(build={}, code="robins.bench.rig").part("camera", config)
 
 
 @pytest.mark.parametrize(

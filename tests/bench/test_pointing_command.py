@@ -6,20 +6,20 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from stations import Loop, kit, on_threads
+from stations import Loop, config, on_threads
 
-from robins.bench.evaluation import Spoken
+from robins.bench.evaluation import OperatorEvent
 from robins.bench.recording import read_record
 from robins.bench.rigs.satellite import RIG
 from robins.bench.rigs.satellite.judging import SAYS, inside, judge, sample
 from robins.bench.rigs.satellite.messages import SAFE, USED, WIRE
 from robins.bench.rigs.satellite.reference import (
-    followed,
+    attitude_target,
     limits,
+    plan_after_command,
     reference_q_ib,
-    told,
-    wanted,
-    wanted_after,
+    target_after,
+    target_attitudes,
 )
 from robins.bench.run.session import Session
 from robins.bench.run.setup import changed, read
@@ -43,7 +43,7 @@ def away(q_ib: Any, of: Any) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def of():
-    return kit("satellite/s1", "mekf", *LOOP)
+    return config("satellite/s1", "mekf", *LOOP)
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ class Watch:
 
 
 @pytest.fixture(scope="module")
-def flown(of, asked, tmp_path_factory):
+def series(of, asked, tmp_path_factory):
     """An attitude at 5 s, the course again at 70 s; control is killed on its way to the first."""
 
     says = (
@@ -85,44 +85,47 @@ def flown(of, asked, tmp_path_factory):
     )
     flight = changed(read("satellite/s1", LOOP), {"says": says, "on_death": "restart"})
     record = tmp_path_factory.mktemp("pointing") / "record.mcap"
-    watch = Watch({150: lambda session: session.crew.kill("acm")})
+    watch = Watch({150: lambda session: session.part_processes.kill("acm")})
     with pytest.MonkeyPatch.context() as patch:
         on_threads(patch)
-        ran = Session(flight, record, watch, kit=of).run()
-    assert (ran.failure, ran.steps, ran.deaths) == ("", 1300, 1)
-    return flight, ran, record
+        result = Session(flight, record, watch, config=of).run()
+    assert (result.failure, result.steps, result.deaths) == ("", 1300, 1)
+    return flight, result, record
 
 
-def test_the_craft_comes_to_the_attitude_that_was_asked_and_back_to_its_course(of, asked, flown):
-    _, ran, _ = flown
-    true = ran.flown["motion.q_ib"]
+def test_the_craft_comes_to_the_attitude_that_was_asked_and_back_to_its_course(of, asked, series):
+    _, result, _ = series
+    true = result.series["motion.q_ib"]
     assert abs(away(true[49], asked) - 30.0) < 0.1
     assert np.max(away(true[620:700], asked)) < 0.1
     # the course has gone on meanwhile, by a part of its orbit
     course = np.asarray(of.rows.course.ref_end_q_ib)
     assert away(true[699], course[699]) > 20.0
     assert np.max(away(true[1250:], course[1250:1300])) < 0.1
-    speed = np.linalg.norm(ran.flown["motion.omega_b"], axis=1)
+    speed = np.linalg.norm(result.series["motion.omega_b"], axis=1)
     orbit = np.linalg.norm(of.rows.course.ref_omega_b[0])
     assert 0.5 * DEG < np.max(speed[:700]) < 1.0 * DEG + 1.1 * orbit
 
 
-def test_it_has_the_bits_of_one_program_with_the_same_words(of, flown):
-    _, ran, _ = flown
-    assert [(one.step, one.message) for one in ran.said] == [(50, "reference"), (700, "reference")]
-    assert difference(ran.flown, inside(of, said=ran.said)) == 0.0
-    assert difference(ran.flown, inside(of)) > 0.1  # it was another run
+def test_it_has_the_bits_of_one_program_with_the_same_words(of, series):
+    _, result, _ = series
+    assert [(one.step, one.message) for one in result.operator_events] == [
+        (50, "reference"),
+        (700, "reference"),
+    ]
+    assert difference(result.series, inside(of, said=result.operator_events)) == 0.0
+    assert difference(result.series, inside(of)) > 0.1  # it was another run
 
 
-def test_an_estimate_that_is_not_to_be_steered_by_is_not_in_the_figures(flown):
-    flight, ran, _ = flown
-    plain, unfit = judge(flight, ran), np.arange(1300) % 100 >= 60
+def test_an_estimate_that_is_not_to_be_steered_by_is_not_in_the_figures(series):
+    flight, result, _ = series
+    plain, unfit = judge(flight, result), np.arange(1300) % 100 >= 60
     counts = np.arange(1300) >= 100
-    arrays = {name: x.copy() for name, x in ran.flown.items()}
+    arrays = {name: x.copy() for name, x in result.series.items()}
     arrays["estimate.flags"][unfit] |= SAFE
     arrays["estimate.q_ib"][unfit] = [0.5, 0.5, 0.5, 0.5]  # far from any
-    marked = judge(flight, ran._replace(flown=replace(ran.flown, arrays=arrays)))
-    error_arcsec = away(ran.flown["estimate.q_ib"], ran.flown["motion.q_ib"]) * 3600.0
+    marked = judge(flight, result._replace(series=replace(result.series, arrays=arrays)))
+    error_arcsec = away(result.series["estimate.q_ib"], result.series["motion.q_ib"]) * 3600.0
     of = error_arcsec[counts & ~unfit]
     found = marked.metrics
     np.testing.assert_allclose(found["attitude_peak_arcsec"], np.max(of), rtol=1e-6)
@@ -136,11 +139,11 @@ def test_an_estimate_that_is_not_to_be_steered_by_is_not_in_the_figures(flown):
     ]
 
 
-def test_its_pointing_is_judged_by_what_was_asked(of, asked, flown):
-    flight, ran, _ = flown
-    pointing = judge(flight, ran).metrics["pointing_peak_arcsec"]
+def test_its_pointing_is_judged_by_what_was_asked(of, asked, series):
+    flight, result, _ = series
+    pointing = judge(flight, result).metrics["pointing_peak_arcsec"]
     assert pointing < 360.0  # while it turns, too
-    reference = reference_q_ib(of, ran.flown, 1300)
+    reference = reference_q_ib(of, result.series, 1300)
     course = np.asarray(of.rows.course.ref_end_q_ib)
     np.testing.assert_array_equal(
         reference[:49], course[:49]
@@ -148,15 +151,15 @@ def test_its_pointing_is_judged_by_what_was_asked(of, asked, flown):
     np.testing.assert_allclose(away(reference[620:700], asked), 0.0, atol=1e-5)
     np.testing.assert_array_equal(reference[1250:], course[1250:1300])
     for step in (10, 49, 50, 300, 699, 700, 1000, 1299):
-        at = wanted_after(of, ran.flown, step + 1).q_ib
+        at = target_after(of, result.series, step + 1).q_ib
         np.testing.assert_array_equal(at, reference[step])
-        shown = np.array(sample(ran.flown, of, step, step))[14:17]
+        shown = np.array(sample(result.series, of, step, step))[14:17]
         size = np.linalg.norm(shown) / 3600.0
-        np.testing.assert_allclose(size, away(ran.flown["motion.q_ib"][step], at), atol=1e-6)
+        np.testing.assert_allclose(size, away(result.series["motion.q_ib"][step], at), atol=1e-6)
 
 
-def test_the_record_has_it_and_control_hears_it_again(flown, monkeypatch):
-    _, _, path = flown
+def test_the_record_has_it_and_control_hears_it_again(series, monkeypatch):
+    _, _, path = series
     on_threads(monkeypatch)
     record = read_record(path)
     heard, receiver = [], Receiver()
@@ -189,9 +192,9 @@ def test_a_slew_keeps_its_greatest_rate_and_what_the_wheels_can(of):
     moments = np.linalg.eigvalsh(np.asarray(of.given.craft.inertia_b))
     assert 0.45 < acceleration * moments[-1] / np.min(torque) <= 0.5
     for rate in (0.0, 0.2 * DEG, 100.0):
-        plan = told(of, None, 100, np.array([0.5, 0.5, 0.5, -0.5]), rate)
+        plan = plan_after_command(of, None, 100, np.array([0.5, 0.5, 0.5, -0.5]), rate)
         angle = np.linalg.norm(plan.turn)
-        ways = [wanted(of, plan, edge) for edge in range(100, len(of.due))]
+        ways = [attitude_target(of, plan, edge) for edge in range(100, len(of.due))]
         turning = [np.linalg.norm(at.omega_b) for at in ways]
         orbit = np.linalg.norm(of.rows.course.ref_omega_b[0])
         allowed = {0.0: 0.5 * most, 100.0: most}.get(rate, rate)
@@ -203,7 +206,7 @@ def test_a_slew_keeps_its_greatest_rate_and_what_the_wheels_can(of):
 def test_another_attitude_on_the_way_goes_on_without_a_jump(of, asked):
     """Check by differences of the target attitudes."""
     said = [(50, asked, 0.0), (200, np.array([1.0, 0, 0, 0]), 0.0), (350, NONE, 0.0)]
-    ways = followed(of, said)
+    ways = target_attitudes(of, said)
     q, omega = np.stack([at.q_ib for at in ways]), np.stack([at.omega_b for at in ways])
     turn = (rotation(q[:-1]).inv() * rotation(q[1:])).as_rotvec() / 0.1
     np.testing.assert_allclose(turn, 0.5 * (omega[:-1] + omega[1:]), atol=2e-5)
@@ -211,9 +214,9 @@ def test_another_attitude_on_the_way_goes_on_without_a_jump(of, asked):
 
 
 def test_a_quaternion_of_another_length_is_not_followed(of, asked):
-    plan = told(of, None, 50, asked, 0.0)
-    assert told(of, plan, 60, 1.01 * asked, 0.0) is plan
-    near = told(of, plan, 60, 1.0005 * asked, 0.0)
+    plan = plan_after_command(of, None, 50, asked, 0.0)
+    assert plan_after_command(of, plan, 60, 1.01 * asked, 0.0) is plan
+    near = plan_after_command(of, plan, 60, 1.0005 * asked, 0.0)
     np.testing.assert_allclose(np.linalg.norm(near.q_ib), 1.0, atol=1e-15)
 
 
@@ -234,7 +237,7 @@ def test_control_follows_what_it_hears_alone(of, asked):
 
 def mode(loop: Loop, **values: int) -> None:
     for part in ("adm", "acm"):
-        loop.to(part, "mode", RIG.desk.payload("mode", values), loop.step * loop.kit.step_ns)
+        loop.to(part, "mode", RIG.desk.payload("mode", values), loop.step * loop.config.step_ns)
 
 
 def test_control_stands_by_while_the_determination_goes_on(of):
@@ -275,7 +278,7 @@ def test_a_reset_filter_begins_anew_with_the_next_star_frame(of):
     np.testing.assert_array_equal(before, plainly)
     assert np.all(sigma[again, :3] > 1.5 * sigma[100, :3])  # it knows as much as at the start
     np.testing.assert_allclose(sigma[again, 3:], sigma[0, 3:], rtol=0.2)
-    assert inside(of, said=[Spoken(101, "mode", {"mode": 0, "reset": 1})]) is None
+    assert inside(of, said=[OperatorEvent(101, "mode", {"mode": 0, "reset": 1})]) is None
 
 
 # ----------------------------------------------------------------------------- scripts and pages
@@ -296,27 +299,42 @@ def test_what_is_pressed_and_what_a_script_says(of, asked, monkeypatch):
     }
     labels = [f"say {one['label']}" for one in given.values()]
     watch = Watch({99: twice}, given)
-    ran = Session(flight, None, watch, kit=of).run()
-    assert ran.failure == ""
-    assert [one.step for one in ran.said] == [1, 20, 100, 100, 150]
+    result = Session(flight, None, watch, config=of).run()
+    assert result.failure == ""
+    assert [one.step for one in result.operator_events] == [1, 20, 100, 100, 150]
     commands = [text for kind, text in watch.events if kind == "command"]
     assert commands == labels
     assert not [text for kind, text in watch.events if kind == "said"]  # it was shown as pressed
-    assert len([one for one in ran.events if one.kind == "said"]) == 5  # and is in the record
-    first, second = ran.said[0].values["q_ib"], ran.said[1].values["q_ib"]
+    assert len([one for one in result.events if one.kind == "said"]) == 5  # and is in the record
+    first, second = (
+        result.operator_events[0].values["q_ib"],
+        result.operator_events[1].values["q_ib"],
+    )
     np.testing.assert_allclose(away(first, of.rows.course.ref_q_ib[0]), 0.0, atol=1e-5)
-    by = (rotation(wanted_after(of, ran.flown, 19).q_ib).inv() * rotation(second)).as_rotvec()
+    by = (rotation(target_after(of, result.series, 19).q_ib).inv() * rotation(second)).as_rotvec()
     np.testing.assert_allclose(np.degrees(by), [0.0, 10.0, 0.0], atol=0.01)
     # of two in one step the later one stands, in the loop and in what it is judged by
-    assert difference(ran.flown, inside(of, said=ran.said)) == 0.0
-    assert difference(ran.flown, inside(of, said=[*ran.said[:2], *ran.said[3:]])) == 0.0
-    assert difference(ran.flown, inside(of, said=[*ran.said[:3], *ran.said[4:]])) > 0.0
+    assert difference(result.series, inside(of, said=result.operator_events)) == 0.0
+    assert (
+        difference(
+            result.series,
+            inside(of, said=[*result.operator_events[:2], *result.operator_events[3:]]),
+        )
+        == 0.0
+    )
+    assert (
+        difference(
+            result.series,
+            inside(of, said=[*result.operator_events[:3], *result.operator_events[4:]]),
+        )
+        > 0.0
+    )
 
 
 def test_all_that_the_page_offers_can_be_said(of):
-    flown = Telemetry(RIG, 4, of.step_ns).flown
+    series = Telemetry(RIG, 4, of.step_ns).series
     for label, says in SAYS.items():
-        message, values = says(flown, of, 2)
+        message, values = says(series, of, 2)
         said = WIRE.decode(message, RIG.desk.payload(message, values))
         if message == "mode":
             continue

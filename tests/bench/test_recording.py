@@ -366,9 +366,9 @@ def test_a_killed_recorder_loses_a_quarter_of_a_second(tmp_path):
 
 def test_a_full_disk_is_said_once(tmp_path):
     path = tmp_path / "a.mcap"
-    ran = run_child(path, "full")
-    assert ran.returncode == 0, ran.stderr
-    text, counts = ran.stdout.splitlines()
+    result = run_child(path, "full")
+    assert result.returncode == 0, result.stderr
+    text, counts = result.stdout.splitlines()
     assert "File too large; the record ends here, and can be read so far" in text
     assert str(path) in text
     told, count, lost = map(int, counts.split())

@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from flights import flown
+from flights import series
 from short_drive import DRIVE
 from stations import on_threads
 
-from robins.bench.evaluation import Ran
+from robins.bench.evaluation import RunResult
 from robins.bench.recording import read_record
 from robins.bench.rig import Rig
 from robins.bench.run import outcome
-from robins.bench.run.setup import Flight
+from robins.bench.run.setup import LoadedRun
 from robins.bench.run.telemetry import difference
 from robins.logs import load_dataset
 from robins.results import Outcome
@@ -75,7 +75,7 @@ class Done(NamedTuple):
     """A flight over lines."""
 
     rig: Rig
-    ran: Ran
+    result: RunResult
     inside: Any
     outcome: Outcome
     folder: Any
@@ -85,23 +85,23 @@ class Done(NamedTuple):
 def fly(tmp_path_factory):
     @cache
     def now(name: str) -> Done:
-        folder, seen = tmp_path_factory.mktemp(name), list[tuple[Flight, Ran, Any]]()
+        folder, seen = tmp_path_factory.mktemp(name), list[tuple[LoadedRun, RunResult, Any]]()
         compare = outcome.in_one_program
         drive = DRIVE.replace(PLACE, PLACE + ARM)
         (folder / "drive.toml").write_text(f'system = "ins-gnss"\n{drive}{OUTAGE}')
         scenario = folder / "bench.toml"
         scenario.write_text(TABLE[name].scenario.replace("{folder}", str(folder)))
 
-        def see(flight, ran):
-            seen.append((flight, ran, compare(flight, ran)))
+        def see(flight, result):
+            seen.append((flight, result, compare(flight, result)))
             return seen[0][-1]
 
         with pytest.MonkeyPatch.context() as patch:
             on_threads(patch)
             patch.setattr(outcome, "in_one_program", see)
             done = bench_up(str(scenario), record=folder / "record.mcap")
-        flight, ran, inside = seen[0]
-        return Done(flight.rig, ran, inside, done, publish(done, folder / "out").path)
+        flight, result, inside = seen[0]
+        return Done(flight.rig, result, inside, done, publish(done, folder / "out").path)
 
     return now
 
@@ -109,8 +109,8 @@ def fly(tmp_path_factory):
 @pytest.mark.parametrize("name", TABLE)
 def test_it_flies_over_its_lines_and_its_result_can_be_read(fly, name):
     flight, row = fly(name), TABLE[name]
-    assert (flight.outcome.failure, flight.ran.deaths) == ("", row.deaths)
-    assert max(h.wrong + h.lost + h.late + h.refused for h in flight.ran.health.values()) == 0
+    assert (flight.outcome.failure, flight.result.deaths) == ("", row.deaths)
+    assert max(h.wrong + h.lost + h.late + h.refused for h in flight.result.health.values()) == 0
     (figures,) = flight.outcome.metrics.values()
     assert figures["cycles_per_s"] > 0.0
     assert len(figures) > 2
@@ -121,16 +121,16 @@ def test_it_flies_over_its_lines_and_its_result_can_be_read(fly, name):
 @pytest.mark.parametrize("name", TABLE)
 def test_it_flies_as_its_parts_do_in_a_row_and_inside_one_program(fly, name):
     flight, row = fly(name), TABLE[name]
-    wanted = flown(flight.rig, flight.ran.kit, flight.ran.steps)[0]
-    assert list(wanted) == list(flight.ran.flown)
+    wanted = series(flight.rig, flight.result.config, flight.result.steps)[0]
+    assert list(wanted) == list(flight.result.series)
     sound = slice(0, row.faulty_from)
-    for field, values in flight.ran.flown.items():
+    for field, values in flight.result.series.items():
         np.testing.assert_array_equal(values[sound], wanted[field][sound], err_msg=field)
-    faulty = (not np.array_equal(x, wanted[of], True) for of, x in flight.ran.flown.items())
+    faulty = (not np.array_equal(x, wanted[of], True) for of, x in flight.result.series.items())
     assert any(faulty) == (row.faulty_from is not None)
     assert (flight.inside is None) == (type(flight.rig).inside is Rig.inside)
     if flight.inside is not None:
-        off = difference(flight.ran.flown, flight.inside)
+        off = difference(flight.result.series, flight.inside)
         assert off <= row.off
         same = "bit for bit the same as" if off == 0.0 else f"up to {off:.3g} off"
         assert (
@@ -143,7 +143,7 @@ def test_its_record_is_replayed(fly, name, monkeypatch):
     flight = fly(name)
     record = flight.folder / "record.mcap"
     header = read_record(record).header
-    assert (header["rig"], header["steps"]) == (flight.rig.name, flight.ran.steps)
+    assert (header["rig"], header["steps"]) == (flight.rig.name, flight.result.steps)
     on_threads(monkeypatch)
     for part in TABLE[name].replays:
         found = bench_replay(record, node=part)
@@ -153,8 +153,8 @@ def test_its_record_is_replayed(fly, name, monkeypatch):
 
 def test_the_record_of_ins_gnss_is_a_log_as_ros_has_them(fly):
     flight = fly("ins-gnss")
-    heard, dataset = load_dataset([flight.folder / "record.mcap"]), flight.ran.kit.dataset
-    steps = flight.ran.steps
+    heard, dataset = load_dataset([flight.folder / "record.mcap"]), flight.result.config.dataset
+    steps = flight.result.steps
     np.testing.assert_array_equal(heard.imu.time_ns, dataset.imu.time_ns[:steps])
     np.testing.assert_allclose(heard.imu.gyro, dataset.imu.gyro[:steps], rtol=1e-15)
     shown = np.isfinite(heard.gnss.lat_rad)

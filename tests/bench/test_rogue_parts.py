@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 from clockwork import CLOCKWORK, adder
-from stations import Threads, kit, on_threads
+from stations import Threads, config, on_threads
 
 from robins.bench.broker import Broker
 from robins.bench.parts.station import Part, Station
@@ -15,7 +15,7 @@ from robins.bench.recording import Event
 from robins.bench.rigs.satellite import RIG
 from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.run import outcome
-from robins.bench.run.crew import Death
+from robins.bench.run.processes import ProcessExit
 from robins.bench.run.session import Session
 from robins.bench.run.setup import changed, read
 from robins.bench.wire import Wire
@@ -58,11 +58,11 @@ def fly(monkeypatch):
 
 
 def session(of):
-    return Session(of, kit=kit("satellite/s1", "mekf-gate", *SHORT))
+    return Session(of, config=config("satellite/s1", "mekf-gate", *SHORT))
 
 
-def figures(ran):
-    return outcome.figures(FLIGHT, ran, outcome.judged(FLIGHT, ran), None)
+def figures(result):
+    return outcome.figures(FLIGHT, result, outcome.run_figures(FLIGHT, result), None)
 
 
 ALL = ("long", "1e308", "inf", "nan")
@@ -73,38 +73,40 @@ ALL = ("long", "1e308", "inf", "nan")
     {"gyro": 3, "star": 3, "adm": 7, "acm": 4, "actuators": 8, "table": 4}.items(),
 )
 def test_what_cannot_be_goes_no_further(fly, name, refused):
-    ran = fly(name, *ALL)
-    told = figures(ran)
-    assert ran.failure == ""
-    assert np.isfinite(ran.flown["motion.q_ib"]).all()
+    result = fly(name, *ALL)
+    told = figures(result)
+    assert result.failure == ""
+    assert np.isfinite(result.series["motion.q_ib"]).all()
     assert np.isfinite(told["attitude_rms_arcsec"])
-    assert {k: h.refused for k, h in ran.health.items() if h.refused} == {name: refused}
+    assert {k: h.refused for k, h in result.health.items() if h.refused} == {name: refused}
     assert told["counts"]["refused_frames"] == refused
     assert told["warnings"][0].startswith(f"'{name}': {refused} frames were refused")
     # each message is told of once
     messages = {"adm": 2, "actuators": 2}.get(name, 1)
-    assert [e.text.split(":")[0] for e in ran.events] == [f"'{name}'"] * messages
-    assert max(h.lost + h.repeated for h in ran.health.values()) == 0
+    assert [e.text.split(":")[0] for e in result.events] == [f"'{name}'"] * messages
+    assert max(h.lost + h.repeated for h in result.health.values()) == 0
 
 
 @pytest.mark.parametrize(("mode", "words"), [("nan", "q_ib[3] is nan"), ("1e308", "q_ib[3] is 1e")])
 def test_a_run_whose_truth_cannot_be_has_failed(fly, mode, words):
-    ran = fly("plant", mode)
-    assert f"at {(WRONG + 1) * 0.1:.1f} s 'plant' says a true motion that cannot be" in ran.failure
-    assert words in ran.failure
-    assert ran.steps == WRONG
-    assert np.isfinite(ran.flown["motion.q_ib"]).all()
+    result = fly("plant", mode)
+    assert (
+        f"at {(WRONG + 1) * 0.1:.1f} s 'plant' says a true motion that cannot be" in result.failure
+    )
+    assert words in result.failure
+    assert result.steps == WRONG
+    assert np.isfinite(result.series["motion.q_ib"]).all()
 
 
 def test_a_true_motion_of_a_wrong_length_is_refused_and_the_right_one_taken(fly):
-    ran = fly("plant", "long")
-    assert (ran.failure, ran.health["plant"].refused) == ("", 1)
-    assert np.isfinite(ran.flown["motion.q_ib"]).all()
+    result = fly("plant", "long")
+    assert (result.failure, result.health["plant"].refused) == ("", 1)
+    assert np.isfinite(result.series["motion.q_ib"]).all()
 
 
 def test_a_part_that_counts_anew_is_heard(fly):
     honest, jumped = fly(), fly("gyro", "jump")
-    np.testing.assert_array_equal(jumped.flown["estimate.q_ib"], honest.flown["estimate.q_ib"])
+    np.testing.assert_array_equal(jumped.series["estimate.q_ib"], honest.series["estimate.q_ib"])
     assert (jumped.health["gyro"].repeated, jumped.health["gyro"].lost) == (0, 0)
     # and what happens once is told, whatever happens often
     often = [Event(k, "missed", f"step {k}", {"time_s": 0.0}) for k in range(500)]
@@ -143,11 +145,11 @@ def clockwork(monkeypatch, lag: int = 0, counter=Station, **more):
     build = {"adder": lambda of: adder(of)._replace(takes={"count": lag})}
     of = CLOCK._replace(rig=CLOCK.rig.varied(name=f"clockwork {lag}", build=build))
     on_threads(monkeypatch, counter=partial(counter, **more) if more else counter)
-    ran = Session(of).run()
-    assert (ran.failure, ran.steps) == ("", STEPS)
-    told = outcome.figures(of, ran, outcome.judged(of, ran), None)["counts"]
+    result = Session(of).run()
+    assert (result.failure, result.steps) == ("", STEPS)
+    told = outcome.figures(of, result, outcome.run_figures(of, result), None)["counts"]
     told = {name.removesuffix("_frames"): n for name, n in told.items() if n and name != "frames"}
-    return ran, told
+    return result, told
 
 
 @pytest.mark.parametrize(
@@ -166,25 +168,25 @@ def clockwork(monkeypatch, lag: int = 0, counter=Station, **more):
 )
 def test_neither_past_nor_future_can_be_written(monkeypatch, lag, after, steps, counted):
     later_ns = round(steps * STEP_NS)
-    ran, told = clockwork(monkeypatch, lag, Untimely, after=after, later_ns=later_ns)
+    result, told = clockwork(monkeypatch, lag, Untimely, after=after, later_ns=later_ns)
     assert told == {counted: 1}
     wanted = CLOCK.rig.inside(None, STEPS)
-    np.testing.assert_array_equal(ran.flown["count.n"], wanted["count.n"])
+    np.testing.assert_array_equal(result.series["count.n"], wanted["count.n"])
     wanted = np.r_[np.zeros(lag), wanted["sum.total"][: STEPS - lag]]
-    np.testing.assert_array_equal(ran.flown["sum.total"], wanted)
+    np.testing.assert_array_equal(result.series["sum.total"], wanted)
 
 
 @pytest.mark.parametrize("lag", [0, 1])
 def test_a_step_is_filled_in_later_only_where_a_part_takes_its_message_so(monkeypatch, lag):
     late = {"after": "count", "later_ns": -STEP_NS, "leaves_out": True}
-    ran, told = clockwork(monkeypatch, lag, Untimely, **late)
+    result, told = clockwork(monkeypatch, lag, Untimely, **late)
     assert told == {"late": 1}
     n = np.arange(float(STEPS))
     n[ODD - 1] = 777.0 if lag else np.nan
-    np.testing.assert_array_equal(ran.flown["count.n"], n)
+    np.testing.assert_array_equal(result.series["count.n"], n)
     n[ODD - 1] = 0.0  # the adder was ticked before it came
     sums = np.cumsum(n)[: STEPS - lag]
-    np.testing.assert_array_equal(ran.flown["sum.total"], np.r_[np.zeros(lag), sums])
+    np.testing.assert_array_equal(result.series["sum.total"], np.r_[np.zeros(lag), sums])
 
 
 @pytest.mark.parametrize(("ahead", "lost", "jumps"), [(7, 7, 0), (10**9, 0, 1), (2**31 + 5, 0, 1)])
@@ -195,9 +197,9 @@ def test_a_jump_of_a_number_is_no_loss_of_frames(monkeypatch, ahead, lost, jumps
                 self._sent += ahead
             return super()._frame(name, payload, time_ns)
 
-    ran, told = clockwork(monkeypatch, 0, Jumps)
+    result, told = clockwork(monkeypatch, 0, Jumps)
     assert (told.pop("lost", 0), told.pop("sequence_jumps", 0), told) == (lost, jumps, {})
-    np.testing.assert_array_equal(ran.flown["count.n"], np.arange(float(STEPS)))
+    np.testing.assert_array_equal(result.series["count.n"], np.arange(float(STEPS)))
 
 
 def test_a_frame_that_no_part_may_send_is_strange_and_not_lost(monkeypatch):
@@ -210,8 +212,8 @@ def test_a_frame_that_no_part_may_send_is_strange_and_not_lost(monkeypatch):
                 frame += super()._frame("tick", tick, time_ns)
             return frame
 
-    ran, told = clockwork(monkeypatch, 0, Strange)
-    assert (ran.health["counter"].strange, told) == (2, {})
+    result, told = clockwork(monkeypatch, 0, Strange)
+    assert (result.health["counter"].strange, told) == (2, {})
 
 
 @pytest.mark.parametrize("works", [True, False])
@@ -230,21 +232,21 @@ def test_a_part_that_computes_is_waited_for_and_named(monkeypatch, works):
     told, step = [], Broker.step
     short = {"again_ns": 50_000_000, "most_ns": 200_000_000}
     monkeypatch.setattr(Broker, "step", lambda *args: step(*args, **short))
-    monkeypatch.setattr(Threads, "idle_s", lambda crew, part: 0.0 if works else math.inf)
+    monkeypatch.setattr(Threads, "idle_s", lambda part_processes, part: 0.0 if works else math.inf)
     for name in ("session.HELLO_S", "session._LONG_S"):
         monkeypatch.setattr(f"robins.bench.run.{name}", 0.2 if works else 1.0)
     monkeypatch.setattr("robins.bench.broker.broker._REPORT_S", 0.1)
     on_threads(monkeypatch, counter=Slow)
-    ran = Session(CLOCK, progress=lambda share, what: told.append(what)).run()
+    result = Session(CLOCK, progress=lambda share, what: told.append(what)).run()
     assert "counter: starting, compiling" in told
-    said = [event.text for event in ran.events if event.kind == "waiting"]
+    said = [event.text for event in result.events if event.kind == "waiting"]
     assert bool(said) == works
     if works:
-        assert (ran.failure, ran.steps) == ("", STEPS)
+        assert (result.failure, result.steps) == ("", STEPS)
         assert all(": counter: starting, compiling" in text for text in said)
     else:
         words = f"'counter' does not answer the tick of step {ODD} (for 0.2 s)"
-        assert (ran.failure, ran.steps) == (words, ODD)
+        assert (result.failure, result.steps) == (words, ODD)
 
 
 @pytest.mark.parametrize(
@@ -253,7 +255,7 @@ def test_a_part_that_computes_is_waited_for_and_named(monkeypatch, works):
 def test_a_part_that_dies_again_and_again_fails_the_run(monkeypatch, restarts, why):
     class Mortal(Threads):
         def deaths(self, among=None):
-            return [Death("adm", -9, "")]
+            return [ProcessExit("adm", -9, "")]
 
         def start(self, name, port, since=-1):
             if len(self._running) < len(RIG.parts):  # nobody comes in the place of the dead
@@ -261,9 +263,9 @@ def test_a_part_that_dies_again_and_again_fails_the_run(monkeypatch, restarts, w
 
     on_threads(monkeypatch, Mortal)
     mortal = session(changed(FLIGHT, {"on_death": "restart", "restarts": restarts}))
-    monkeypatch.setattr(mortal, "_glance", lambda: mortal.done > 2 and mortal._bury())
-    ran = mortal.run()
-    assert ran.failure.startswith("'adm' was killed by SIGKILL, at 0.4 s of the run; that is ")
-    assert ran.failure.endswith(why)
-    assert ran.deaths == 3
-    assert [e.kind for e in ran.events] == ["died"] * 3 + ["failed"]
+    monkeypatch.setattr(mortal, "_poll", lambda: mortal.done > 2 and mortal._bury())
+    result = mortal.run()
+    assert result.failure.startswith("'adm' was killed by SIGKILL, at 0.4 s of the run; that is ")
+    assert result.failure.endswith(why)
+    assert result.deaths == 3
+    assert [e.kind for e in result.events] == ["died"] * 3 + ["failed"]

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stations import kit, on_threads
+from stations import config, on_threads
 
 from robins.bench.rigs.satellite import RIG
-from robins.bench.run import room
+from robins.bench.run import number_store
 from robins.bench.run.session import Session
 from robins.bench.run.setup import changed, read
 from robins.bench.run.telemetry import Telemetry
@@ -24,7 +24,7 @@ STEP_NS, LOOP = 100_000_000, ("duration=60 s", "counted_from=10 s")
 
 @pytest.fixture
 def on_disk(monkeypatch):
-    monkeypatch.setattr(room, "LARGE", 0)
+    monkeypatch.setattr(number_store, "LARGE", 0)
 
 
 def maps(folder):
@@ -50,17 +50,17 @@ def heard(steps, record, said=()):
 
 def test_on_disk_are_the_same_arrays_and_no_file(tmp_path, monkeypatch):
     said = [0, 3, 4, 98]
-    wanted = heard(100, None, said).flown
-    monkeypatch.setattr(room, "LARGE", 0)
+    wanted = heard(100, None, said).series
+    monkeypatch.setattr(number_store, "LARGE", 0)
     it = heard(100, tmp_path / "record.mcap", said)
     assert len(maps(tmp_path)) == 1
-    assert list(it.flown) == list(wanted)
+    assert list(it.series) == list(wanted)
     for name, array in wanted.items():
-        assert it.flown[name].dtype == array.dtype
-        np.testing.assert_array_equal(it.flown[name], array)
+        assert it.series[name].dtype == array.dtype
+        np.testing.assert_array_equal(it.series[name], array)
     assert np.all(np.isnan(wanted["estimate.q_ib"][1]))
     assert not list(tmp_path.iterdir())  # while it is used
-    part = it.flown.until(50)["estimate.q_ib"]
+    part = it.series.until(50)["estimate.q_ib"]
     del it
     gc.collect()
     np.testing.assert_array_equal(part, wanted["estimate.q_ib"][:50])  # it goes with the last array
@@ -72,13 +72,13 @@ def test_on_disk_are_the_same_arrays_and_no_file(tmp_path, monkeypatch):
 def test_small_runs_stay_in_memory(tmp_path):
     it = heard(1000, tmp_path / "record.mcap")
     assert not maps(tmp_path)
-    assert it.flown["estimate.q_ib"].base is None
+    assert it.series["estimate.q_ib"].base is None
 
 
 def test_the_memory_of_a_long_run_does_not_grow(on_disk, tmp_path):
     steps, one = 60_000, payload(1)
     it = heard(steps, tmp_path / "record.mcap")
-    size = sum(x.nbytes for x in it.flown.values())
+    size = sum(x.nbytes for x in it.series.values())
     assert size > 15e6
     most = 0
     for k in range(steps):
@@ -86,7 +86,7 @@ def test_the_memory_of_a_long_run_does_not_grow(on_disk, tmp_path):
         if k % 5000 == 4999:
             most = max(most, *maps(tmp_path))
     assert most < 2e3  # kB; the estimates alone are 7 MB
-    assert np.all(it.flown["estimate.flags"] == 1)
+    assert np.all(it.series["estimate.flags"] == 1)
 
 
 def test_a_disk_without_room_is_told_with_its_folder(on_disk, tmp_path):
@@ -124,11 +124,11 @@ def test_an_interrupted_process_leaves_nothing(tmp_path):
 def test_a_run_on_disk_is_that_in_memory(on_disk, tmp_path, monkeypatch):
     on_threads(monkeypatch)
     of = changed(read("satellite/s1", LOOP), {"seconds": 4.0})
-    made = kit("satellite/s1", "mekf", *LOOP)
-    ran = Session(of, tmp_path / "record.mcap", kit=made).run()
+    made = config("satellite/s1", "mekf", *LOOP)
+    result = Session(of, tmp_path / "record.mcap", config=made).run()
     assert [path.name for path in tmp_path.iterdir()] == ["record.mcap"]
-    monkeypatch.setattr(room, "LARGE", 64 << 20)
-    again = Session(of, kit=made).run()
-    assert ran.failure == again.failure == ""
-    for name, array in again.flown.items():
-        np.testing.assert_array_equal(ran.flown[name], array)
+    monkeypatch.setattr(number_store, "LARGE", 64 << 20)
+    again = Session(of, config=made).run()
+    assert result.failure == again.failure == ""
+    for name, array in again.series.items():
+        np.testing.assert_array_equal(result.series[name], array)

@@ -4,12 +4,12 @@ import jax
 import numpy as np
 import pytest
 import stations
-from stations import Loop, kit, one_program
+from stations import Loop, config, one_program
 
 from robins.bench.parts.station import Station
-from robins.bench.rigs.satellite import RIG, Carrier
+from robins.bench.rigs.satellite import RIG, RateTableParameters
+from robins.bench.rigs.satellite.config import satellite_config
 from robins.bench.rigs.satellite.judging import turn
-from robins.bench.rigs.satellite.kit import kit_for
 from robins.bench.rigs.satellite.messages import FLAGS, WIRE
 from robins.bench.run.setup import changed, read
 from robins.bench.wire import Header, encode_frame
@@ -22,7 +22,7 @@ SHORT = "duration=60 s", "counted_from=10 s"
 @pytest.fixture
 def of():
     """The numbers of a short run; its parts are programs that are interpreted."""
-    return kit("satellite/s1", "mekf", *SHORT)._replace(machine="vm")
+    return config("satellite/s1", "mekf", *SHORT)._replace(machine="vm")
 
 
 def bit(flags, text):
@@ -36,7 +36,7 @@ def reference(name, steps):
 
 @pytest.mark.parametrize("name", ["mekf", "mekf-gate", "mixed-bias"])
 def test_over_bytes_the_loop_has_the_bits_of_one_program(name):
-    of = kit("satellite/s1", name, *SHORT)
+    of = config("satellite/s1", name, *SHORT)
     loop = Loop(of).run(300)
     wanted = reference(name, 300)
     np.testing.assert_array_equal(loop.all("motion", "q_ib"), wanted["motion.q_ib"])
@@ -50,7 +50,7 @@ def test_over_bytes_the_loop_has_the_bits_of_one_program(name):
 
 def test_the_additive_filter_is_the_same_to_rounding():
     # XLA multiplies its matrices in another order where it is not in a scan.
-    of = kit("satellite/s1", "ekf-quaternion", *SHORT)
+    of = config("satellite/s1", "ekf-quaternion", *SHORT)
     loop, wanted = Loop(of).run(100), reference("ekf-quaternion", 100)
     np.testing.assert_allclose(loop.all("estimate", "q_ib"), wanted["estimate.q_ib"], atol=1e-13)
     np.testing.assert_allclose(
@@ -60,7 +60,7 @@ def test_the_additive_filter_is_the_same_to_rounding():
 
 def test_a_camera_is_told_where_to_look():
     settings = "duration=30 s", "counted_from=10 s", "star.camera.magnitude=5.0"
-    of = kit("satellite/stars", "mekf", *settings)
+    of = config("satellite/stars", "mekf", *settings)
     loop = Loop(of).run(100)
     inside = one_program("satellite/stars", "mekf", *settings)
     np.testing.assert_array_equal(loop.all("estimate", "q_ib"), inside["estimate.q_ib"][:100])
@@ -133,7 +133,7 @@ def test_a_gyro_that_stays_away_leads_to_safe_mode_and_back(of):
 
 def test_a_bank_begins_anew_with_all_its_modes():
     """A mode that kept its attitude of the start would pull the mixture back to it."""
-    of = kit("satellite/s1", "adaptive", *SHORT)._replace(machine="vm")
+    of = config("satellite/s1", "adaptive", *SHORT)._replace(machine="vm")
     loop = Loop(of, without("gyro", "adm acm", range(50, 60))).run(120)
     safe = np.flatnonzero(bit(loop.flags(), FLAGS[3]))
     again = int(safe[-1]) + 1
@@ -148,7 +148,7 @@ def test_a_bank_begins_anew_with_all_its_modes():
 
 @pytest.mark.parametrize("name", ["mekf-gate", "mixed-bias"])
 def test_by_c_the_loop_is_the_same_to_rounding_and_comes_back_from_safe_mode(name):
-    of = kit("satellite/s1", name, *SHORT)
+    of = config("satellite/s1", name, *SHORT)
     lost = without("gyro", "adm acm", range(50, 60))
     by_jax, by_c = (Loop(of._replace(machine=m), lost).run(120) for m in ("jax", "c"))
     np.testing.assert_array_equal(by_c.flags(), by_jax.flags())
@@ -166,7 +166,7 @@ def test_by_c_the_loop_is_the_same_to_rounding_and_comes_back_from_safe_mode(nam
 
 def test_a_camera_is_played_by_jax_when_the_rest_is_interpreted():
     settings = "duration=30 s", "counted_from=10 s", "star.camera.magnitude=5.0"
-    of = kit("satellite/stars", "mekf", *settings)._replace(machine="vm")
+    of = config("satellite/stars", "mekf", *settings)._replace(machine="vm")
     inside = one_program("satellite/stars", "mekf", *settings)
     found = Loop(of).run(40).all("estimate", "q_ib")
     np.testing.assert_allclose(found, inside["estimate.q_ib"][:40], atol=1e-12)
@@ -174,7 +174,7 @@ def test_a_camera_is_played_by_jax_when_the_rest_is_interpreted():
 
 def test_whatever_is_lost_nothing_is_compiled_while_it_runs():
     # In real time a step that waits for the compiler misses its deadline, and some after it.
-    of = kit("satellite/s1", "mekf-gate", *SHORT)
+    of = config("satellite/s1", "mekf-gate", *SHORT)
     carried = [name for part in RIG.parts for name in RIG.part(part, of).takes]
     lost_at = {name: range(10 * k, 10 * k + 6) for k, name in enumerate(dict.fromkeys(carried), 2)}
 
@@ -264,7 +264,7 @@ def test_a_gyro_reports_what_it_missed_with_its_next_sample(of):
 
 def test_a_table_that_lags_is_where_the_craft_was():
     flight = read("satellite/s2", ("duration=200 s", "counted_from=10 s"))
-    of = kit_for(flight.given, "mekf", 0, table=Carrier(lag=0.02).table())
+    of = satellite_config(flight.given, "mekf", 0, table=RateTableParameters(lag=0.02).table())
     loop = Loop(of).run(300)
     behind = turn(loop.all("mounted", "q_ib"), loop.all("motion", "q_ib"))
     change = np.linalg.norm(np.diff(loop.all("motion", "omega_b"), axis=0), axis=1)
@@ -277,7 +277,7 @@ def test_a_table_that_lags_is_where_the_craft_was():
 def test_more_wheels_than_the_wire_has_are_refused():
     flight = read("satellite/s1", ("wheels.axes=[[1,0,0],[0,1,0],[0,0,1],[1,1,1],[1,1,0]]",))
     with pytest.raises(ValueError, match=r"the wire carries 4 wheels, this craft has 5"):
-        kit_for(flight.given, "mekf", 0)
+        satellite_config(flight.given, "mekf", 0)
 
 
 def test_a_part_of_another_run_hears_nothing(of):

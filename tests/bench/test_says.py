@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from robins.bench.broker.console import Console, OperatorMessageError, operator_messages_of
 from robins.bench.broker.injector import Injector
-from robins.bench.broker.says import Desk, SayError, sayings_of
 from robins.bench.rig import RigError
 from robins.bench.rigs import rig_of
 from robins.bench.rigs.satellite import RIG
@@ -27,10 +27,10 @@ def flight(tmp_path, *entries: str, seconds="20 s"):
 
 
 def test_what_is_left_out_is_missing_or_nothing():
-    said = WIRE.decode("reference", RIG.desk.payload("reference", {"rate": 0.02}))
+    said = WIRE.decode("reference", RIG.operator_console.payload("reference", {"rate": 0.02}))
     assert said["rate"] == 0.02
     assert np.all(np.isnan(said["q_ib"]))
-    said = WIRE.decode("reference", RIG.desk.payload("reference", {"q_ib": Q}))
+    said = WIRE.decode("reference", RIG.operator_console.payload("reference", {"q_ib": Q}))
     np.testing.assert_array_equal(said["q_ib"], Q)
     assert said["rate"] == 0.0
 
@@ -52,8 +52,8 @@ WRONG = [
 
 @pytest.mark.parametrize(("name", "values", "words"), WRONG)
 def test_what_cannot_be_said_is_told_with_field_and_limit(name, values, words):
-    with pytest.raises(SayError, match=words):
-        RIG.desk.payload(name, values)
+    with pytest.raises(OperatorMessageError, match=words):
+        RIG.operator_console.payload(name, values)
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_a_scenario_says_with_units_and_at_boundaries_of_steps(tmp_path):
     out = {k: orders.due(k) for k in range(20)}
     assert [len(found) for found in out.values()] == [0, 2, *[0] * 11, 2, *[0] * 6]
     assert [planned for *_, planned in out[1]] == [True, False]
-    assert [one.step for one in orders.said] == [1, 1, 13, 13]
+    assert [one.step for one in orders.operator_events] == [1, 1, 13, 13]
     last = [WIRE.decode("reference", out[k][-1][1]) for k in (1, 13)]
     assert last[0]["rate"] == 0.5
     assert np.all(np.isnan(last[1]["q_ib"]))
@@ -99,8 +99,8 @@ def test_a_scenario_says_with_units_and_at_boundaries_of_steps(tmp_path):
 
 
 def test_a_rig_without_a_console_says_nothing():
-    with pytest.raises(SayError, match=r"does not say 'state'.* It says nothing"):
-        rig_of("airship").desk.payload("state", {})
+    with pytest.raises(OperatorMessageError, match=r"does not say 'state'.* It says nothing"):
+        rig_of("airship").operator_console.payload("state", {})
 
 
 @pytest.mark.parametrize(
@@ -122,11 +122,11 @@ def test_fields_are_typed_by_the_wire():
     )
     other = message(17, "other", "", f64("turn", 2, "rad", "", 9.0))
     wire = Wire(("part",), (say, other))
-    made = sayings_of(Desk(wire, ("say",)))
+    made = operator_messages_of(Console(wire, ("say",)))
     one = made.model_validate({"at": 1.0, "message": "say", "turn": (0.1, 0.2, 0.3), "way": 2})
     np.testing.assert_array_equal(wire.decode("say", one.payload)["turn"], [0.1, 0.2, 0.3])
     assert wire.decode("say", one.payload)["way"] == 2
     with pytest.raises(ValueError, match="less than or equal to 3"):
         made.model_validate({"at": 1.0, "message": "say", "way": 4})
-    with pytest.raises(SayError, match="field 'turn' of the console is there twice"):
-        sayings_of(Desk(wire, ("say", "other")))
+    with pytest.raises(OperatorMessageError, match="field 'turn' of the console is there twice"):
+        operator_messages_of(Console(wire, ("say", "other")))

@@ -313,8 +313,8 @@ def test_a_killed_recorder_leaves_topics_that_can_be_decoded(tmp_path):
     path, some = tmp_path / "a.mcap", run(300)
     command = [sys.executable, "-c", CHILD, str(path)]
     environment = {"PYTHONPATH": ":".join([str(Path(__file__).parent), *sys.path])}
-    ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert ran.returncode == -signal.SIGKILL, ran.stderr
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == -signal.SIGKILL, result.stderr
     back = read_record(path)
     entries = [one for one in some if isinstance(one, Entry)]
     assert not back.whole

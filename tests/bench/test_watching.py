@@ -9,8 +9,8 @@ from robins.bench.live.feed import check, latest
 from robins.bench.rigs.satellite.judging import signals
 from robins.bench.run import watching
 from robins.bench.run.spans import FaultSpans
-from robins.bench.run.watching import Looking
-from robins.bench.status import Status, running
+from robins.bench.run.watching import PageObserver
+from robins.bench.status import BenchStatus, running
 from robins.errors import RobinsError
 from robins.systems.satellite.parameters import AttitudeLoop
 
@@ -41,7 +41,7 @@ def test_a_flood_of_commands_hides_nothing_else(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(watching.time, "monotonic", lambda: now[0])
     page = Page()
-    looking = Looking(page, Status())
+    looking = PageObserver(page, BenchStatus())
     looking.event("died", 1.0, "'adm' was killed")
     for k in range(1000):
         looking.event("command", 2.0, f"pause {k}")
@@ -57,7 +57,7 @@ def test_a_flood_of_commands_hides_nothing_else(monkeypatch):
 
 def test_a_run_that_falls_behind_its_clock_is_an_alarm():
     page = Page()
-    looking = Looking(page, Status())
+    looking = PageObserver(page, BenchStatus())
     for kind in ("behind", "waiting", "restarted"):
         looking.event(kind, 1.0, kind)
     assert page.shown == [("alarm", "behind"), ("warning", "waiting"), ("info", "restarted")]
@@ -77,7 +77,7 @@ def test_a_command_that_comes_again_and_again_is_shown_each_time(monkeypatch):
     """The page counts what is the same in one line, so it hides nothing."""
     monkeypatch.setattr(watching.time, "monotonic", lambda: 100.0)
     page = Page()
-    looking = Looking(page, Status())
+    looking = PageObserver(page, BenchStatus())
     for text in ("pause", *["clear"] * 50, "pause"):
         looking.event("command", 1.0, text)
     assert [text for _, text in page.shown] == ["pause", *["clear"] * 50, "pause"]
@@ -88,15 +88,15 @@ def test_spans_of_faults_are_told_though_they_are_short():
     spans = FaultSpans()
     for k in range(100):
         on = [("star: lost", 1.0)] * (10 <= k < 12) + [("gyro: silent", 2.0)] * (20 <= k < 50)
-        spans.hear(on + [("star: lost", 7.0)] * (k >= 70), 0.1 * k)
-    assert spans.told == [
+        spans.observe(on + [("star: lost", 7.0)] * (k >= 70), 0.1 * k)
+    assert spans.for_page == [
         {"label": "star: lost", "begin_s": 1.0, "end_s": 0.1 * 12},
         {"label": "gyro: silent", "begin_s": 2.0, "end_s": 5.0},
         {"label": "star: lost", "begin_s": 7.0, "end_s": None},
     ]
     for k in range(150):
-        spans.hear([("again", float(k))], float(k))
-    assert [one["begin_s"] for one in spans.told] == [float(k) for k in range(50, 150)]
+        spans.observe([("again", float(k))], float(k))
+    assert [one["begin_s"] for one in spans.for_page] == [float(k) for k in range(50, 150)]
 
 
 def test_true_and_estimated_attitude_are_signals_of_the_page():
@@ -118,7 +118,7 @@ def place(tmp_path, monkeypatch):
 
 
 def test_a_report_is_a_file_of_its_own_that_nobody_else_reads(place):
-    with Status() as status:
+    with BenchStatus() as status:
         status.tell({"state": "running"})
         (path,) = place.iterdir()
         assert (place.stat().st_mode & 0o777, path.stat().st_mode & 0o777) == (0o700, 0o600)
@@ -148,7 +148,7 @@ def _linked(place, goal):
 def test_a_folder_of_others_is_refused_and_the_run_goes_on_without(place, tmp_path, spoil, why):
     goal = tmp_path / "goal"
     spoil(place, goal)
-    with Status() as status:
+    with BenchStatus() as status:
         status.tell({"state": "running"})
         assert re.search(f"does not show this run: {place}: .* {why}", status.refused)
     with pytest.raises(RobinsError, match=why) as caught:
@@ -172,7 +172,7 @@ def test_links_among_the_reports_lead_nowhere(place, tmp_path):
     place.mkdir(mode=0o700)
     (place / f"{os.getpid()}.json").symlink_to(target)
     (place / f"{os.getpid()}.new").symlink_to(target)
-    with Status() as status:
+    with BenchStatus() as status:
         assert running() == []
         (place / f"{os.getpid()}.json").symlink_to(target)
         status.tell({"state": "running"})

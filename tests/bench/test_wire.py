@@ -312,13 +312,15 @@ def test_firmware_makes_the_same_bytes(tmp_path):
     payloads += [bytes(n) for n in (1, 254, 300)]
     payloads += [rng.integers(0, 3, n, dtype=np.uint8).tobytes() for n in (50, 300)]
     given_bytes = b"".join(struct.pack("<I", len(p)) + p for p in payloads)
-    ran = subprocess.run([tmp_path / "echo"], input=given_bytes, capture_output=True, check=False)
-    assert ran.returncode == 0
+    result = subprocess.run(
+        [tmp_path / "echo"], input=given_bytes, capture_output=True, check=False
+    )
+    assert result.returncode == 0
     expected = b"".join(
         struct.pack("<I", len(made)) + made
         for made in (frame(p, k) for k, p in enumerate(payloads))
     )
-    assert ran.stdout == expected
+    assert result.stdout == expected
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")

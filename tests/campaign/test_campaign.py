@@ -14,7 +14,7 @@ from robins.filters import Belief, Model, Motion, Sensor, kalman, run, taylor
 from robins.filters.rules import h_infinity
 from robins.results import Probability
 from robins.sim.random import Component, stream
-from robins.systems.judgement import Claim, judging, ratio
+from robins.systems.judgement import Claim, claim_judge, ratio
 from robins.systems.study import Case, Contender, Limit, Problem, SensorAxes, StateBlock
 
 STEPS = 60
@@ -151,7 +151,7 @@ def test_a_claim_of_few_runs_is_undecided_and_one_of_many_is_not(problem):
     judged = replace(
         problem,
         metrics=lambda s: {"rms_m": float(s.pooled_rms[0])},
-        claims=judging({"better": claim}),
+        claims=claim_judge({"better": claim}),
     )
     few, many = simulate(judged, 3), simulate(judged, 100)
     assert (few.claims[0]["verdict"], many.claims[0]["verdict"]) == ("undecided", "reproduced")

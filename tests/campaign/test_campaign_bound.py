@@ -11,7 +11,7 @@ import xarray as xr
 from jaxtyping import Array
 
 from robins.campaign.bound import bound, bound_sigma
-from robins.campaign.monte_carlo import whole_case
+from robins.campaign.monte_carlo import complete_case
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run
 from robins.manifold import Angle
 from robins.results import solution as stored
@@ -176,4 +176,4 @@ def test_the_bound_of_a_report_is_that_of_jax(problem, run):
 def test_a_case_that_no_run_takes_is_refused(problem, change, says):
     case = simulate(jnp.asarray(0))._replace(**change)
     with pytest.raises(ValueError, match=says):
-        whole_case(problem.contenders["kf"].filter, MODEL, case)
+        complete_case(problem.contenders["kf"].filter, MODEL, case)

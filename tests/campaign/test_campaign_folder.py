@@ -17,10 +17,10 @@ import pytest
 from robins.campaign import plan as plans
 from robins.campaign import simulate
 from robins.campaign.gather import gather
-from robins.campaign.plan import needed, write
+from robins.campaign.plan import require_plan, write
 from robins.campaign.retention import content_of
 from robins.campaign.store import GOES_ON, open_store
-from robins.campaign.work import Missing, Worker, missing
+from robins.campaign.work import MissingShards, Worker, missing
 from robins.cli import campaign as coordinating
 from robins.cli import main
 from robins.errors import RobinsError
@@ -33,9 +33,9 @@ from robins.workbench.campaign import (
     campaign_status,
     campaign_verify,
     campaign_work,
-    mend,
     plan_campaign,
     problem_of,
+    remove_damaged,
 )
 from robins.workbench.errors import InputError
 from robins.workbench.workers import work_here
@@ -65,7 +65,7 @@ def undisturbed(tmp_path_factory):
 
 
 def test_it_is_the_campaign_that_is_run_at_once(undisturbed):
-    _, plan = open_store(undisturbed), needed(open_store(undisturbed))
+    _, plan = open_store(undisturbed), require_plan(open_store(undisturbed))
     want = simulate(problem_of(plan), RUNS, 8, machine="jax")
     mine = campaign_report(undisturbed)
     assert mine.summary["filters"] == want.summary["filters"]
@@ -105,7 +105,7 @@ def test_what_was_claimed_by_the_dead_is_computed(undisturbed, tmp_path, monkeyp
 def test_damage_is_told_and_mended(undisturbed, tmp_path):
     begun(tmp_path)
     list(campaign_work(tmp_path))
-    plan = needed(open_store(tmp_path))
+    plan = require_plan(open_store(tmp_path))
     first, *_, last = plan.shards.values()
     path = tmp_path / last[0].name
     path.write_bytes(path.read_bytes()[:-1000])
@@ -119,7 +119,7 @@ def test_damage_is_told_and_mended(undisturbed, tmp_path):
     (tmp_path / first[0].name).write_bytes(b"")
     with pytest.raises(RobinsError, match="has no first run"):
         campaign_report(tmp_path)
-    assert mend(tmp_path) == 2
+    assert remove_damaged(tmp_path) == 2
     list(campaign_work(tmp_path))
     assert campaign_status(tmp_path).digest == campaign_status(undisturbed).digest
 
@@ -132,7 +132,7 @@ def test_a_shard_that_another_code_made_is_told(undisturbed, tmp_path):
     worker = Worker(store, plan, problem_of(plan))
     wrong = worker.found(chunk, [shards[0].filter])[shards[0].filter]
     wrong.sums["square"] = np.nextafter(wrong.sums["square"], 1e9)
-    store.put(shards[0].name, worker.packed(shards[0], chunk, wrong), anew=True)
+    store.put(shards[0].name, worker.packed(shards[0], chunk, wrong), overwrite=True)
     found = campaign_verify(tmp_path, share=1.0)
     assert (found.shards, found.damaged, found.different) == (2, [], [shards[0].name])
     assert len(found.recomputed) == 2
@@ -155,7 +155,7 @@ def test_more_runs_and_filters_compute_what_is_new(undisturbed, tmp_path):
 @pytest.mark.parametrize("run", [0, 37, RUNS - 1])
 def test_a_run_shown_alone_is_that_of_the_campaign(undisturbed, run):
     store = open_store(undisturbed)
-    plan = needed(store)
+    plan = require_plan(store)
     problem = problem_of(plan)
     whole = gather(store, plan, problem).found
     shown = campaign_show(undisturbed, run)
@@ -196,7 +196,7 @@ def test_a_run_in_lanes_is_that_of_the_campaign(tmp_path, monkeypatch):
     )
     keeps = plans.replace(keeps, width=8)
     worker = Worker(open_store(tmp_path / "keeps"), keeps, problem)
-    worker.compute(Missing(chunks[1], [shard]))
+    worker.compute(MissingShards(chunks[1], [shard]))
     assert open_store(tmp_path / "keeps").get(shard.name) == store.get(shard.name)
     kept = content_of(worker.store, shard, 13)
     assert kept == worker.packed(shard, chunks[1], alone[13])
@@ -230,7 +230,7 @@ def test_another_campaign_is_refused(undisturbed, change, sentence):
     asked = {"runs": RUNS, "settings": SHORT} | change
     with pytest.raises(RobinsError, match=sentence):
         plan_campaign(undisturbed, BALLOON, **asked)
-    assert needed(open_store(undisturbed)).runs == RUNS
+    assert require_plan(open_store(undisturbed)).runs == RUNS
 
 
 def test_other_code_is_refused(tmp_path, monkeypatch):

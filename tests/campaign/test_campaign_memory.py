@@ -17,7 +17,7 @@ from test_campaign import problem as three  # noqa: F401 a fixture
 
 from robins.campaign import machine as machines
 from robins.campaign import memory, simulate
-from robins.campaign.machine import ByJax, InLanes
+from robins.campaign.machine import JaxMachine, LaneMachine
 from robins.program import CPP, LANE_FLAGS
 from robins.systems.study import Limit, Norm
 
@@ -104,7 +104,7 @@ def test_statistics_are_taken_where_a_chunk_was_computed(problem):
         where.append(threading.current_thread())
         return len(record["error"])
 
-    got = [(world, n, of("right")) for world, n, of in InLanes(problem).chunks(RUNS, 8, taken)]
+    got = [(world, n, of("right")) for world, n, of in LaneMachine(problem).chunks(RUNS, 8, taken)]
     assert [n for _, n, _ in got] == [8] * 6 + [5] == [n for _, _, n in got]
     assert threading.current_thread() not in where
     assert [world is None for world, _, _ in got] == [False] + [True] * 6
@@ -114,7 +114,7 @@ def test_statistics_are_taken_where_a_chunk_was_computed(problem):
 
 @needs_compiler
 def test_lanes_give_all_that_statistics_need_and_show_the_first_run(problem):
-    by_lanes, by_jax = (machine(problem).chunks(8) for machine in (InLanes, ByJax))
+    by_lanes, by_jax = (machine(problem).chunks(8) for machine in (LaneMachine, JaxMachine))
     got, want = (of("right") for _, _, of in (next(by_lanes), next(by_jax)))
     assert len(got["mean"]) == len(got["updates"]["y"].code) == 1
     np.testing.assert_allclose(got["mean"][0], want["mean"][0], atol=1e-12)
@@ -131,12 +131,12 @@ def test_the_width_of_a_chunk_is_that_which_fits():
     assert memory.width_of(3 * kib, 128 * kib) == 32  # 40 would, and take longer for a run
     assert memory.width_of(5 * kib, 128 * kib) == 24  # 25 would
     assert memory.width_of(100 * kib, 128 * kib) == 8
-    assert memory.at_once(memory.MEMORY // 64, 8, cores=64) == 8
-    assert memory.at_once(memory.MEMORY, 8, cores=64) == 1
-    assert memory.at_once(1, 8, cores=3) == 3
+    assert memory.concurrent_chunks(memory.MEMORY // 64, 8, cores=64) == 8
+    assert memory.concurrent_chunks(memory.MEMORY, 8, cores=64) == 1
+    assert memory.concurrent_chunks(1, 8, cores=3) == 3
 
 
-@pytest.mark.parametrize("machine", [ByJax, pytest.param(InLanes, marks=needs_compiler)])
+@pytest.mark.parametrize("machine", [JaxMachine, pytest.param(LaneMachine, marks=needs_compiler)])
 def test_the_width_depends_on_the_problem_alone(problem, machine, monkeypatch):
     by = machine(problem)
     assert by.width(1000) == 64
@@ -152,7 +152,7 @@ def test_the_width_depends_on_the_problem_alone(problem, machine, monkeypatch):
 
 def test_one_width_serves_any_number_of_runs_and_a_few_pay_for_no_more(problem):
     assert [memory.filled(n) for n in (1, 2, 16, 32, 33, 50, 1000)] == [1, 2, 16, 32, 64, 64, 64]
-    by = ByJax(problem)
+    by = JaxMachine(problem)
     (fifty,) = (of("right") for _, n, of in by.chunks(50) if n == 50)
     for begin, first in (("", 0), ("later", 1)):
         (many,) = (of("right") for k, (_, _, of) in enumerate(by.chunks(90)) if k == first)
@@ -201,6 +201,6 @@ def test_what_threads_have_freed_is_given_back():
     with ThreadPoolExecutor(1) as pool:
         last = pool.submit(hold, 120_000).result()
         before = resident()
-        memory.give_back()
+        memory.release_memory()
         assert resident() < before - 20_000_000
     assert len(last) == 120_000

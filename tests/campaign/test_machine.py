@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from test_campaign import problem as three  # noqa: F401 a fixture
 
-from robins.campaign import handover, simulate
+from robins.campaign import compilation, simulate
 from robins.campaign import machine as machines
-from robins.campaign.machine import ByJax, InLanes, machine_for
+from robins.campaign.machine import JaxMachine, LaneMachine, machine_for
 from robins.errors import RobinsError
 from robins.filters import Belief
 from robins.program import CPP, LANE_FLAGS, BuildError
@@ -54,16 +54,16 @@ def test_lanes_have_the_results_of_jax(problem):
 
 @needs_compiler
 def test_chunks_in_lanes_come_in_order_and_without_what_fills_them(problem):
-    records = [(n, of("right")) for _, n, of in InLanes(problem).chunks(RUNS, 8)]
+    records = [(n, of("right")) for _, n, of in LaneMachine(problem).chunks(RUNS, 8)]
     assert sum(n for n, _ in records) == RUNS == sum(len(r["error"]) for _, r in records)
     found = np.concatenate([r["error"] for _, r in records])
-    want = np.concatenate([of("right")["error"] for _, _, of in ByJax(problem).chunks(RUNS)])
+    want = np.concatenate([of("right")["error"] for _, _, of in JaxMachine(problem).chunks(RUNS)])
     np.testing.assert_allclose(found, want, atol=1e-12)
 
 
 @needs_compiler
 def test_a_failure_in_a_chunk_comes_out(problem, monkeypatch):
-    lanes = InLanes(problem)
+    lanes = LaneMachine(problem)
 
     def failing(*_):
         raise RuntimeError("no more")
@@ -84,7 +84,7 @@ def test_what_computes_is_the_interpreter_where_it_can_be(problem, monkeypatch):
 
     monkeypatch.setattr(machines, "interpreter_of_many", missing)
     by = machine_for(problem)
-    assert isinstance(by, ByJax)
+    assert isinstance(by, JaxMachine)
     by.width(9)
     (note,) = by.notes
     assert "JAX computed" in note
@@ -100,9 +100,9 @@ def test_what_computes_is_the_interpreter_where_it_can_be(problem, monkeypatch):
 def test_a_long_campaign_goes_over_to_compiled_lanes_with_the_same_bits(problem, monkeypatch):
     want = simulate(problem, 80, 8, machine="vm")
     for name in ("LOOP_S", "NODE_S"):
-        monkeypatch.setattr(handover, name, 0.0)
+        monkeypatch.setattr(compilation, name, 0.0)
     monkeypatch.setattr(machines, "available_cores", lambda: 1)
-    lanes = InLanes(problem)
+    lanes = LaneMachine(problem)
     by, scans = lanes._hand_over, []
     took = by.took
 
@@ -122,7 +122,7 @@ def test_a_long_campaign_goes_over_to_compiled_lanes_with_the_same_bits(problem,
 
 
 def test_compiling_has_to_pay(problem):
-    by = InLanes(problem)._hand_over
+    by = LaneMachine(problem)._hand_over
     for left in (10_000_000, 1, 0):  # the first may have traced, the others are too few
         by.took(8, 1e-3, left)
     assert by.compiling is None

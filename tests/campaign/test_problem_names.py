@@ -78,14 +78,14 @@ def test_statistics_that_nothing_can_be_made_of_are_kept(tmp_path):
 def test_a_disk_that_takes_nothing_is_told_as_it_is(tmp_path, monkeypatch):
     monkeypatch.setattr(np, "savez", lambda *a, **k: (_ for _ in ()).throw(OSError("disk full")))
     kept = {"a": np.ones(2)}
-    with pytest.raises(KeyError), results.rescued(tmp_path / "out"), results.keeping(kept):
+    with pytest.raises(KeyError), results.rescued(tmp_path / "out"), results.keep_on_error(kept):
         raise KeyError("first")
 
 
 def test_an_interrupt_takes_along_what_was_computed(tmp_path):
     kept = {"a": np.ones(2)}
     with pytest.raises(KeyboardInterrupt) as stop:  # noqa: SIM117
-        with results.rescued(tmp_path / "out"), results.keeping(kept):
+        with results.rescued(tmp_path / "out"), results.keep_on_error(kept):
             raise KeyboardInterrupt
     (found,) = tmp_path.rglob("arrays.npz")
     assert str(found) in "".join(stop.value.__notes__)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_campaign_folder import BALLOON, RUNS, SHORT, begun
 
-from robins.campaign.machine import ByJax, whole
+from robins.campaign.machine import JaxMachine, whole_record
 from robins.campaign.store import open_store
 from robins.campaign.work import Worker, missing
 from robins.errors import RobinsError
@@ -14,9 +14,9 @@ from robins.workbench.campaign import (
     campaign_status,
     campaign_verify,
     campaign_work,
-    mend,
     plan_campaign,
     problem_of,
+    remove_damaged,
 )
 from robins.workbench.run import run
 
@@ -27,9 +27,9 @@ KEPT = ("keep=[0, 13, 40]", "keep_diverged=2")
 @pytest.fixture(autouse=True, scope="module")
 def diverging():
     """Some runs diverge."""
-    compute = ByJax.compute
+    compute = JaxMachine.compute
 
-    def broken(self, chunk, width, names, taken=whole, left=0):
+    def broken(self, chunk, width, names, taken=whole_record, left=0):
         def taken_of(name, record):
             error = record["error"].copy()
             for lost in LOST:
@@ -40,7 +40,7 @@ def diverging():
         return compute(self, chunk, width, names, taken_of, left)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ByJax, "compute", broken)
+        patch.setattr(JaxMachine, "compute", broken)
         yield
 
 
@@ -127,7 +127,7 @@ def test_a_damaged_history_is_told_and_mended(tmp_path):
     path.write_bytes(whole_[:-100])
     digest = campaign_status(tmp_path).digest
     assert campaign_verify(tmp_path).damaged == [f"diverged/{path.name}"]
-    assert mend(tmp_path) == 1
+    assert remove_damaged(tmp_path) == 1
     list(campaign_work(tmp_path))
     assert campaign_verify(tmp_path).damaged == []
     assert campaign_status(tmp_path).digest == digest

@@ -83,15 +83,15 @@ def test_a_run_that_diverged_is_beyond_all(statistics):
 
 def test_what_is_beyond_the_bins_is_told_as_such():
     values = np.array([[0.0, 1e-19, EDGES[0], EDGES[7], 1.0, EDGES[-1], np.inf]])
-    got = histogram.percentiles(histogram.counted(values), values.shape[1], (1, 100))
+    got = histogram.percentiles(histogram.histogram_of(values), values.shape[1], (1, 100))
     np.testing.assert_array_equal(got[:, 0], got[:, 1])
     np.testing.assert_array_equal(got[[0, 1, 5, 6], 0], [0.0, 0.0, np.inf, np.inf])
     np.testing.assert_allclose(got[2:5, 0], values[0, 2:5], rtol=WORST * (1.0 + 1e-12))
 
 
 def test_memory_grows_neither_with_runs_nor_with_epochs():
-    one = histogram.counted(np.exp(RNG.normal(size=(500, THIN))))
-    many = histogram.counted(np.exp(RNG.normal(size=(20_000, THIN))))
+    one = histogram.histogram_of(np.exp(RNG.normal(size=(500, THIN))))
+    many = histogram.histogram_of(np.exp(RNG.normal(size=(20_000, THIN))))
     assert many.shape[1] < 2 * one.shape[1]
     for epochs in (1, 2, THIN, THIN + 1, 10**6):
         at = thinned(epochs)

@@ -20,7 +20,7 @@ from robins.systems.ins_gnss.model import POSITION, Fix
 from robins.systems.ins_gnss.world import DriveBelief, as_believed
 from robins.workbench import publish, run
 from robins.workbench.scenarios import read_scenario
-from robins.workbench.sensitivity import Uncertain, sensitivity, uncertain
+from robins.workbench.sensitivity import UncertainParameter, sensitivity, uncertain
 
 HERE = Path(__file__).parent
 PAIR = f"{HERE / 'budget_world.py'}:study"
@@ -38,15 +38,15 @@ def budget_of(name, filter_, vary, settings=(), seed=0):
         ends = (read.parsed((*settings, end)) for end in one.ends)
         ranges.append(sobol.between(*ends))
     parts = study.view(given, course), study.contender(given, course, filter_)
-    return sobol.Budget(study, given, course, *parts, seed, tuple(ranges))
+    return sobol.SensitivityRuns(study, given, course, *parts, seed, tuple(ranges))
 
 
 # ------------------------------------------------------------------------- what is asked
 
 
 def test_a_range_has_two_ends_in_one_unit():
-    assert uncertain("a.b = 1 m to 2.5 m") == Uncertain("a.b", 1.0, 2.5, "m")
-    assert uncertain("a=1 to 10 deg/h") == Uncertain("a", 1.0, 10.0, "deg/h")
+    assert uncertain("a.b = 1 m to 2.5 m") == UncertainParameter("a.b", 1.0, 2.5, "m")
+    assert uncertain("a=1 to 10 deg/h") == UncertainParameter("a", 1.0, 10.0, "deg/h")
     assert uncertain("a=-1e-3 to 0.2").ends == ("a=-0.001", "a=0.2")
     assert uncertain("a=1 m to 2 m").ends == ("a=1 m", "a=2 m")
 
@@ -84,7 +84,7 @@ def test_samples_are_a_power_of_two(samples, fix):
 
 def test_ends_far_apart_are_drawn_by_their_logarithm():
     def law(low, high):
-        return sobol.Between((("a",),), (low,), (high,))
+        return sobol.ParameterRange((("a",),), (low,), (high,))
 
     assert [law(1.0, x).by_logarithm for x in (10.0, 10.1, -100.0)] == [False, True, False]
     assert not law(0.0, 5.0).by_logarithm
@@ -97,7 +97,7 @@ def test_numbers_are_placed_where_the_key_points():
     whole = budget_of(PAIR, "kf", ["noise.both=1 m to 3 m", LEFT])
     axes, left = whole.ranges
     assert axes.paths == (("noise", "both", 0), ("noise", "both", 1))
-    placed = sobol.placed(whole.given, axes.at(0.5) | left.at(0.0))
+    placed = sobol.with_numbers(whole.given, axes.at(0.5) | left.at(0.0))
     assert placed.noise.both == (2.0, 2.0)
     assert (placed.noise.left, placed.noise.right) == (0.5, 1.0)
     assert whole.given.noise.both == (1.0, 1.0)
@@ -105,12 +105,12 @@ def test_numbers_are_placed_where_the_key_points():
 
 def test_a_course_that_differs_is_seen_and_what_never_compares_is_not():
     course = {"at": np.array([1.0, np.nan]), "count": 3}
-    assert not sobol.depends(course, course, {"at": np.array([1.0, np.nan]), "count": 3})
-    assert sobol.depends(course, course, course | {"count": 4})
-    assert sobol.depends(course, course, {"at": np.array([1.0, 2.0]), "count": 3})
-    assert sobol.depends(course, course, course | {"more": 1.0})
+    assert not sobol.course_differs(course, course, {"at": np.array([1.0, np.nan]), "count": 3})
+    assert sobol.course_differs(course, course, course | {"count": 4})
+    assert sobol.course_differs(course, course, {"at": np.array([1.0, 2.0]), "count": 3})
+    assert sobol.course_differs(course, course, course | {"more": 1.0})
     first, again, other = ([lambda: None, 1.0] for _ in range(3))
-    assert not sobol.depends(first, again, other)
+    assert not sobol.course_differs(first, again, other)
 
 
 # ----------------------------------------------------------------- points against runs
@@ -151,7 +151,7 @@ def test_worlds_take_numbers_that_are_traced(name):
             value = getattr(getattr(given, path[0]), path[1])
             axes = [(*path, k) for k in range(len(value))] if isinstance(value, tuple) else [path]
             placed |= dict.fromkeys(axes, number)
-        study.simulate(sobol.placed(given, placed), course, 0, jnp.asarray(0))
+        study.simulate(sobol.with_numbers(given, placed), course, 0, jnp.asarray(0))
         return jnp.zeros(())
 
     jax.eval_shape(simulated, [jax.ShapeDtypeStruct((), float)] * len(TRACED[name]))

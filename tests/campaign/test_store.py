@@ -18,9 +18,9 @@ import pytest
 from robins import foreign
 from robins.campaign import shards
 from robins.campaign import store as stores
-from robins.campaign.shards import Damaged, digest, pack, tables, unpack
+from robins.campaign.shards import DamagedShardError, digest, pack, tables, unpack
 from robins.campaign.statistics import Statistics
-from robins.campaign.store import Folder, open_store
+from robins.campaign.store import FolderStore, open_store
 from robins.errors import RobinsError
 
 
@@ -58,7 +58,7 @@ def test_the_first_object_under_a_name_stays(store):
     assert store.put("shards/a", b"one")
     assert not store.put("shards/a", b"two")
     assert store.get("shards/a") == b"one"
-    assert store.put("shards/a", b"three", anew=True)
+    assert store.put("shards/a", b"three", overwrite=True)
     assert store.get("shards/a") == b"three"
     assert store.names("shards") == {"a"}
     store.drop("shards/a")
@@ -77,10 +77,10 @@ def test_a_writer_that_is_killed_leaves_no_object(tmp_path):
     code = (
         "import os, sys; from robins.campaign import store\n"
         "os.fsync = lambda _: os.kill(os.getpid(), 9)\n"
-        f"store.Folder({str(tmp_path)!r}).put('shards/a', b'content')"
+        f"store.FolderStore({str(tmp_path)!r}).put('shards/a', b'content')"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == -9
-    folder = Folder(tmp_path)
+    folder = FolderStore(tmp_path)
     assert folder.names("shards") == set()
     left = next((tmp_path / ".partial").iterdir())
     folder.sweep()
@@ -91,7 +91,7 @@ def test_a_writer_that_is_killed_leaves_no_object(tmp_path):
 
 
 def test_a_full_disk_leaves_what_is_there(tmp_path, monkeypatch):
-    folder = Folder(tmp_path)
+    folder = FolderStore(tmp_path)
     folder.put("shards/a", b"one")
 
     def full(_descriptor):
@@ -110,7 +110,7 @@ def test_where_files_have_one_name_only(tmp_path, monkeypatch):
         raise OSError(errno.EPERM, os.strerror(errno.EPERM))
 
     monkeypatch.setattr(stores.os, "link", refused)
-    folder = Folder(tmp_path)
+    folder = FolderStore(tmp_path)
     assert folder.put("shards/a", b"one")
     assert folder.get("shards/a") == b"one"
 
@@ -146,13 +146,13 @@ def test_a_shard_is_read_as_it_was_written():
 def test_a_flipped_bit_or_a_cut_is_seen(part):
     content = bytearray(pack({"filter": "kf"}, statistics(0)))
     at = int(part * len(content))
-    with pytest.raises(Damaged):
+    with pytest.raises(DamagedShardError):
         unpack(bytes(content[:at]), Statistics(()))
     content[at] ^= 4
     try:
         read = Statistics(())
         unpack(bytes(content), read)
-    except Damaged:
+    except DamagedShardError:
         return
     # A bit of the archive that says nothing of the numbers, such as a date, may be flipped unseen.
     assert digest({"kf": read}) == digest({"kf": statistics(0)})
@@ -167,7 +167,7 @@ def test_a_bit_of_the_flags_of_an_archive_is_damage():
             spoilt[content.index(magic) + at] ^= 1 << bit
             try:
                 unpack(bytes(spoilt), Statistics(()))
-            except Damaged:
+            except DamagedShardError:
                 continue
             assert (magic, bit) != (b"PK\x01\x02", 0)
 
@@ -178,14 +178,14 @@ def test_sizes_that_an_archive_declares_are_not_believed(monkeypatch):
         np.save(packed := BytesIO(), np.zeros(3 << 17))
         archive.writestr("sum x.npy", packed.getvalue())
     monkeypatch.setattr(foreign, "FREE", 1 << 20)
-    with pytest.raises(Damaged, match="'sum x' it would take 3145856 bytes"):
+    with pytest.raises(DamagedShardError, match="'sum x' it would take 3145856 bytes"):
         unpack(file.getvalue(), Statistics(()))
     header = {"descr": "<f8", "fortran_order": False, "shape": (10**15, 3)}
     for name, fill in (("sum x.npy", bytes(64)), ("sum x.npy", b"")):
         np.lib.format.write_array_header_1_0(lie := BytesIO(), header)
         with zipfile.ZipFile(file := BytesIO(), "w") as archive:
             archive.writestr(name, lie.getvalue() + fill)
-        with pytest.raises(Damaged, match="where its header declares 24000000000000000"):
+        with pytest.raises(DamagedShardError, match="where its header declares 24000000000000000"):
             unpack(file.getvalue(), Statistics(()))
 
 
@@ -195,11 +195,11 @@ def test_shards_of_others_with_a_checksum_that_fits():
     told = statistics(0)
     told.example = {"error": np.zeros(3)}
     content = pack(about, told)
-    with pytest.raises(Damaged, match="its record has 1 arrays, not 2"):
+    with pytest.raises(DamagedShardError, match="its record has 1 arrays, not 2"):
         unpack(content, Statistics(()), {"error": 0, "mean": 0})
     arrays = {"about": np.array(json.dumps({"sha256": shards._seal({}, {})}))}
     np.savez(file := BytesIO(), **arrays)
-    with pytest.raises(Damaged, match="does not state 'runs'"):
+    with pytest.raises(DamagedShardError, match="does not state 'runs'"):
         unpack(file.getvalue(), Statistics(()))
 
 
@@ -224,5 +224,5 @@ def test_damaged_files_of_every_kind_are_read_or_refused(tmp_path):
 def test_paths_are_told(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(RobinsError, match="cannot write shards/a: Not a directory; name"):
-        Folder(tmp_path / "file").put("shards/a", b"")
-    assert isinstance(open_store(Path("a")), Folder)
+        FolderStore(tmp_path / "file").put("shards/a", b"")
+    assert isinstance(open_store(Path("a")), FolderStore)

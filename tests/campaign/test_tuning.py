@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robins.campaign.many_runs import ManyRuns
-from robins.campaign.tuning import Data, Objective, TooLittle, Trial, choose
+from robins.campaign.tuning import Data, Objective, Trial, UndeterminedError, choose
 
 KEYS = ["a", "b"]
 
@@ -100,7 +100,7 @@ def test_what_may_leap_or_is_compiled_is_searched(way):
     ids=["a product", "an idle one"],
 )
 def test_it_refuses_what_the_data_do_not_tell(trial, says):
-    with pytest.raises(TooLittle, match=says):
+    with pytest.raises(UndeterminedError, match=says):
         choose(
             Objective(trial, likelihood, first), KEYS, Data(spread(30, 2.0)), Data(spread(30, 2.0))
         )
@@ -108,16 +108,16 @@ def test_it_refuses_what_the_data_do_not_tell(trial, says):
 
 def test_it_refuses_a_parameter_that_runs_away():
     z = np.zeros((10, 50))
-    with pytest.raises(TooLittle, match="a would become small without end"):
+    with pytest.raises(UndeterminedError, match="a would become small without end"):
         choose(ONE, ["a"], Data(z), Data(z))
 
 
 def test_it_refuses_few_parts_and_a_lost_filter():
-    with pytest.raises(TooLittle, match="3 runs or segments"):
+    with pytest.raises(UndeterminedError, match="3 runs or segments"):
         choose(ONE, ["a"], Data(spread(3, 2.0)), Data(spread(3, 2.0)))
     z = spread(10, 2.0)
     z[0, 0] = np.inf
-    with pytest.raises(TooLittle, match="lost as it is written"):
+    with pytest.raises(UndeterminedError, match="lost as it is written"):
         choose(ONE, ["a"], Data(z), Data(spread(10, 2.0)))
 
 

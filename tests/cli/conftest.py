@@ -99,8 +99,8 @@ def systems(monkeypatch):
     study = Study(Scenario, ("ekf", "ukf"), print, print, print, claims=claims)
     car = System("car", {"drive": study}, default="ukf", replay=print)
     kite = System("kite", {"fly": replace(study, filters=("ekf",), claims={})})
-    its = {"town": catalogue.Listed(Path("town.toml"), "A car in town", "")}
-    its["road"] = catalogue.Listed(Path("road.toml"), "A car on the road", "")
+    its = {"town": catalogue.ListedScenario(Path("town.toml"), "A car in town", "")}
+    its["road"] = catalogue.ListedScenario(Path("road.toml"), "A car on the road", "")
     monkeypatch.setattr("robins.systems.SYSTEMS", {"car": car, "kite": kite})
     monkeypatch.setattr(catalogue, "SUMMARIES", {"car": "a car", "kite": "a kite"})
     monkeypatch.setattr(catalogue, "listed", lambda system: its if system == "car" else {})

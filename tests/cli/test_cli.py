@@ -14,7 +14,7 @@ import pytest
 
 from robins import cli, report, results
 from robins.bench.rigs import RIGS
-from robins.cli import Status, cache, running
+from robins.cli import ExitStatus, cache, running
 from robins.logs import Finding, LogError
 from robins.results.errors import cannot
 from robins.scenario import ScenarioError
@@ -27,7 +27,7 @@ PACKAGE = Path(cli.__file__).parents[1]
 
 def test_json_is_the_summary_and_nothing_else(robins, workbench):
     answer = robins("run", "car/town", "--json", "--out", "drive")
-    assert answer.status == Status.DONE == 0
+    assert answer.status == ExitStatus.DONE == 0
     assert answer.out == Path("drive/summary.json").read_text("utf-8")
     told = json.loads(answer.out)
     assert list(told) == [
@@ -105,13 +105,13 @@ def test_exports_are_asked_for_by_name(robins, workbench):
     assert workbench.asked["exports"] == ("csv", "kml")
     assert robins("replay", "imu.csv").status == 0
     assert workbench.asked["exports"] == ()
-    assert robins("replay", "imu.csv", "--export", "csv,").status == Status.BAD_INPUT
+    assert robins("replay", "imu.csv", "--export", "csv,").status == ExitStatus.BAD_INPUT
 
 
 def test_a_log_is_one_run(robins, workbench):
     assert robins("replay", "imu.csv", "--runs", 1).status == 0
     answer = robins("replay", "imu.csv", "--runs", 5)
-    assert answer.status == Status.BAD_INPUT
+    assert answer.status == ExitStatus.BAD_INPUT
     assert answer.err == "robins: --runs 5: a recorded log is one run; omit the option.\n"
 
 
@@ -121,7 +121,7 @@ def test_the_demonstration_tells_its_claims_and_is_done_whatever_they_came_to(
 ):
     workbench.verdict = verdict
     answer = robins("demo", "--runs", 2, "--filters", "ekf,adaptive")
-    assert answer.status == Status.DONE
+    assert answer.status == ExitStatus.DONE
     held = {"reproduced": "1 of 1 claim reproduced.", "not": "0 of 1 claim reproduced, 1 not."}
     assert [text in answer.out for text in held.values()] == [verdict == name for name in held]
     assert "Report: results/demo/report.html" in answer.out
@@ -149,7 +149,7 @@ def test_what_nobody_reads_is_written_all_the_same(robins, workbench, monkeypatc
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("click.echo", full)
-    assert robins("run", "car/town").status == Status.FAILED
+    assert robins("run", "car/town").status == ExitStatus.FAILED
     assert results.read("results/car-town").summary["scenario"] == "car/town"
 
 
@@ -205,7 +205,7 @@ def test_an_interrupt_is_told_and_leaves_the_earlier_result(robins, workbench):
     robins("run", "car/town", "--out", "out", "--seed", 1)
     workbench.error = KeyboardInterrupt()
     answer = robins("run", "car/town", "--out", "out", "--seed", 2)
-    assert answer.status == Status.INTERRUPTED == 3
+    assert answer.status == ExitStatus.INTERRUPTED == 3
     assert answer.err.strip().startswith("robins: interrupted.")
     assert results.read("out").summary["seed"] == 1
     assert os.listdir() == ["out"]
@@ -233,7 +233,7 @@ def test_an_interrupt_is_told_and_leaves_the_earlier_result(robins, workbench):
 )
 def test_bad_usage_is_refused_in_a_line_or_two(robins, arguments, message):
     answer = robins(*arguments)
-    assert answer.status == Status.BAD_INPUT == 2
+    assert answer.status == ExitStatus.BAD_INPUT == 2
     assert message in answer.err
     assert len(answer.err.splitlines()) <= 2
     assert all(line.startswith("robins: ") for line in answer.err.splitlines())
@@ -322,7 +322,7 @@ def test_people_get_a_line_a_scenario_and_the_details_of_a_system(robins, system
     assert "robins replay LOG --system kite" in robins("list", "kite").out
     assert "Next:   robins bench up laboratory" in robins("list", "laboratory").out
     refused = robins("list", "boat")
-    assert refused.status == Status.BAD_INPUT
+    assert refused.status == ExitStatus.BAD_INPUT
     assert refused.err.startswith("robins: no system 'boat'. There are car, kite; for one of your ")
 
 
@@ -439,7 +439,7 @@ def test_the_cache_keeps_out_of_the_way(monkeypatch, tmp_path, why):
 
 
 def test_statuses_are_those_of_the_contract():
-    told = {s.name: int(s) for s in Status}
+    told = {s.name: int(s) for s in ExitStatus}
     assert told == {"DONE": 0, "FAILED": 1, "BAD_INPUT": 2, "INTERRUPTED": 3}
     assert running.main is cli.main
 
@@ -447,6 +447,6 @@ def test_statuses_are_those_of_the_contract():
 def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_computed(robins, workbench):
     Path("out").write_text("a thesis")
     answer = robins("run", "car/town", "--out", "out")
-    assert answer.status == Status.BAD_INPUT
+    assert answer.status == ExitStatus.BAD_INPUT
     assert answer.err == "robins: out: is a file, not a folder; choose a new folder\n"
     assert workbench.asked == {}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from robins import results
-from robins.cli import Status
+from robins.cli import ExitStatus
 from robins.systems import SYSTEMS
 
 pytestmark = pytest.mark.usefixtures("unchecked")
@@ -32,7 +32,7 @@ def robins_at(robins, car):
 
 def test_people_get_the_bound_what_is_seen_and_what_a_sensor_buys(robins_at, tmp_path):
     answer = robins_at("--at", "10 s", "--at", "0.5 min", "--out", "seen", "--seed", 3)
-    assert (answer.status, answer.err) == (Status.DONE, "")
+    assert (answer.status, answer.err) == (ExitStatus.DONE, "")
     lines = answer.out.splitlines()
     head = lines[0]
     assert re.search(r"prior +10 s +30 s +of prior +verdict +without GNSS position", head)
@@ -83,7 +83,7 @@ def test_scripts_get_the_summary(robins):
 )
 def test_bad_input_is_named_with_what_there_is(robins_at, tmp_path, arguments, sentence):
     answer = robins_at(*arguments)
-    assert answer.status == Status.BAD_INPUT
+    assert answer.status == ExitStatus.BAD_INPUT
     assert sentence in answer.err
     assert answer.out == ""
     assert not (tmp_path / "results").exists() or not any((tmp_path / "results").iterdir())
@@ -91,7 +91,7 @@ def test_bad_input_is_named_with_what_there_is(robins_at, tmp_path, arguments, s
 
 def test_an_unknown_scenario_is_named(robins):
     answer = robins("bound", "ins-gnss/drove")
-    assert answer.status == Status.BAD_INPUT
+    assert answer.status == ExitStatus.BAD_INPUT
     assert "no scenario 'ins-gnss/drove'; did you mean 'ins-gnss/drive'?" in answer.err
 
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from robins import logs, results, scenario, units
-from robins.cli import Status
+from robins.cli import ExitStatus
 from robins.dataset import ImuTable
 from robins.ins import allan
 from robins.ins.allan_noise import moments
 from robins.report import numbers
 from robins.workbench import allan as find_noise
 from robins.workbench.allan import expected as expected_deviation
-from robins.workbench.allan import still
+from robins.workbench.allan import resting_imu
 
 RATE_HZ = 100.0
 GYRO_NOISE = np.deg2rad(0.3) / 60.0  # rad/sqrt(s), 0.3 deg/sqrt(h)
@@ -248,7 +248,7 @@ def test_increments_give_what_rates_give(tmp_path):
     rates, increments = tmp_path / "rates.csv", tmp_path / "increments.csv"
     logs.write_log(rates, a_still_imu(10.0), "pyins-imu")
     logs.write_log(increments, a_still_imu(10.0, kind="increment"), "pyins-imu")
-    one, other = still(rates), still(increments)
+    one, other = resting_imu(rates), resting_imu(increments)
     np.testing.assert_allclose(one.rates["gyro"], other.rates["gyro"], rtol=1e-9)
     np.testing.assert_allclose(one.rates["accel"], other.rates["accel"], rtol=1e-9)
 
@@ -260,7 +260,7 @@ def test_all_stretches_between_gaps_are_used_and_it_is_said(tmp_path, kind):
     keep[1000:1050] = False
     gapped = ImuTable(table.time_ns[keep], table.gyro[keep], table.accel[keep], kind)
     logs.write_log(tmp_path / "gapped.csv", gapped, "pyins-imu")
-    found = still(tmp_path / "gapped.csv")
+    found = resting_imu(tmp_path / "gapped.csv")
     per = 1.0 if kind == "rate" else 1.0 / RATE_HZ
     np.testing.assert_allclose(found.rates["gyro"], table.gyro[keep] / per, atol=1e-9)
     (note,) = found.notes
@@ -274,7 +274,7 @@ def test_a_moving_sensor_is_noticed(tmp_path):
     turning[400:600, 2] += 0.2
     for gyro, turned in ((turning, True), (table.gyro, False)):
         imu = ImuTable(table.time_ns, gyro, table.accel, "rate")
-        notes = still(written(tmp_path / "log.csv", imu)).notes
+        notes = resting_imu(written(tmp_path / "log.csv", imu)).notes
         assert any("turned" in note for note in notes) == turned
 
 
@@ -308,7 +308,7 @@ def curve():
 
 @pytest.mark.parametrize("terms", ["Q", "N", "B", "K", "QNBKR"])
 def test_the_parts_of_the_fit_are_those_it_was_fitted_with(terms, curve):
-    ones = allan.Coefficients(*(np.full(3, 1.0 + k) for k in range(5)))
+    ones = allan.NoiseCoefficients(*(np.full(3, 1.0 + k) for k in range(5)))
     dof = np.ones(3, int)
     fitted = allan.AllanFit(ones, ones, ones, np.zeros(3), dof, terms, 0.95, curve.tau_s[:1])
     parts = expected_deviation(fitted, curve.tau_s)
@@ -358,24 +358,24 @@ def test_declared_columns_are_read_by_the_commands_and_refused_with_their_key(ro
     declared.write_text(LOGGER)
     table = a_still_imu(20.0)
     logs.write_log(log, table, logs.columns_from(declared))
-    np.testing.assert_allclose(still(log, [declared]).rates["gyro"], table.gyro, rtol=1e-12)
+    np.testing.assert_allclose(resting_imu(log, [declared]).rates["gyro"], table.gyro, rtol=1e-12)
     answer = robins("doctor", log, "--columns", declared)
-    assert answer.status == Status.DONE, answer.err
+    assert answer.status == ExitStatus.DONE, answer.err
     assert f"robins replay {log} --columns {declared}" in answer.out
     answer = robins("calibrate", log, "--columns", declared)
     assert "holds no magnetic field" in answer.err
     answer = robins("run", "transfer-alignment/s0", "--columns", declared)
-    assert answer.status == Status.BAD_INPUT
+    assert answer.status == ExitStatus.BAD_INPUT
     said = f"--columns {declared}: the option is for logs; give --master and --slave too."
     assert said in " ".join(answer.err.split())
     slave = ("--master", log, "--slave", log)
     answer = robins("run", "transfer-alignment/replay", *slave, "--columns", declared)
-    assert answer.status == Status.BAD_INPUT
+    assert answer.status == ExitStatus.BAD_INPUT
     assert "holds no path of a master INS" in answer.err
     declared.write_text(LOGGER.replace("gyro_y", "gyro_w"))
     for command in (("doctor",), ("allan",), ("replay",), ("calibrate",)):
         answer = robins(*command, log, "--columns", declared)
-        assert answer.status == Status.BAD_INPUT
+        assert answer.status == ExitStatus.BAD_INPUT
         assert f"{declared} columns.gyro_w: is no quantity" in answer.err.replace("\n", " ")
         assert "did you mean gyro_" in answer.err
 
@@ -387,21 +387,21 @@ def test_a_table_is_guessed_declared_and_examined_and_a_path_named(robins, tmp_p
     lines = [";".join(map(repr, row)) for row in rows]
     log.write_text("\n".join(["t;ax;ay;az;wx (rad/s);wy (rad/s);wz (rad/s)", *lines]) + "\n")
     answer = robins("guess", log)
-    assert answer.status == Status.DONE, answer.err
+    assert answer.status == ExitStatus.DONE, answer.err
     assert 'unit = "g" }   # proved by gravity: median size 1' in answer.out
     assert f"robins doctor '{log}' --columns columns.toml" in answer.err
     (tmp_path / "columns.toml").write_text(answer.out)
     answer = robins("doctor", log, "--columns", "columns.toml")
-    assert answer.status == Status.DONE, answer.out
+    assert answer.status == ExitStatus.DONE, answer.out
     assert json.loads(robins("guess", log, "--json").out)["toml"].startswith("# my own.csv")
     path = tmp_path / "path.txt"
     path.write_text(
         "".join(f"{k}00000000,0,0,{k},0,0,0,1,9\n" for k in range(30)).replace(",", " ")
     )
     answer = robins("doctor", path, "--format", "orbslam-euroc")
-    assert answer.status == Status.DONE, answer.err
+    assert answer.status == ExitStatus.DONE, answer.err
     assert "30 rows" in answer.out
     assert "Next:   give the log of an IMU too" in answer.out  # no replay of a path alone
     answer = robins("doctor", path, "--format", "orbslam")
-    assert answer.status == Status.BAD_INPUT
+    assert answer.status == ExitStatus.BAD_INPUT
     assert "no format is called 'orbslam'; choose one of gnss-imu" in answer.err.replace("\n", " ")

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from robins import results
-from robins.cli import Status, interrupts
+from robins.cli import ExitStatus, interrupts
 
 
 def start(code, *arguments, **settings):
@@ -38,7 +38,9 @@ def test_what_computes_nothing_is_there_in_a_blink(argument):
     """
     process = start(code, argument)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == (Status.BAD_INPUT if argument == "nonsense" else Status.DONE)
+    assert process.returncode == (
+        ExitStatus.BAD_INPUT if argument == "nonsense" else ExitStatus.DONE
+    )
     seconds, loaded = err.splitlines()[-1].split(maxsplit=1)
     assert float(seconds) < 0.5  # of processor time, which other work on the machine does not touch
     assert loaded.strip() == "[]"
@@ -93,9 +95,9 @@ def test_a_terminal_that_is_closed_is_an_interrupt(tmp_path):
 def test_nohup_is_respected():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with interrupts.heeded():
+        with interrupts.interruptible():
             signal.raise_signal(signal.SIGHUP)
-            interrupts.obey()
+            interrupts.raise_if_interrupted()
     finally:
         signal.signal(signal.SIGHUP, before)
 

@@ -23,11 +23,11 @@ from shown_files import write_files
 
 from robins import results, scenario
 from robins.campaign.monte_carlo import _each, _records, contender
-from robins.cli import Status, app, main
+from robins.cli import ExitStatus, app, main
 from robins.program import BuildError
 from robins.report import numbers
 from robins.systems import SYSTEMS
-from robins.workbench.scenarios import beside, read_scenario
+from robins.workbench.scenarios import read_scenario, with_default_filter
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -102,14 +102,14 @@ def test_every_system_has_a_default_that_runs_beside_what_a_scenario_names(name)
     for one in (one for one in PACKAGED if one.startswith(f"{name}/")):
         read = read_scenario(one, ())
         default = {system.default} & set(read.study.filters)
-        assert set(beside(read)) == {*read.own, *default}
+        assert set(with_default_filter(read)) == {*read.own, *default}
 
 
 def test_a_configuration_of_what_is_recorded_is_not_simulated(robins):
     for name in ("transfer-alignment/replay", "ins-gnss/walk"):
         for command in ("run", "bound"):
             answer = robins(command, name)
-            assert answer.status == Status.BAD_INPUT
+            assert answer.status == ExitStatus.BAD_INPUT
             assert f"{name} describes what is recorded and simulates nothing" in answer.err
     assert not list(Path().iterdir())
 
@@ -117,7 +117,7 @@ def test_a_configuration_of_what_is_recorded_is_not_simulated(robins):
 @pytest.mark.parametrize("command", ["run", "bound"])
 def test_more_runs_than_anyone_waits_for_are_refused_at_once(robins, command):
     answer = robins(command, "rocket/a1", "--runs", 10**20)
-    assert answer.status == Status.BAD_INPUT
+    assert answer.status == ExitStatus.BAD_INPUT
     assert "runs = 100000000000000000000" in answer.err
     assert "1000000" in answer.err.replace("100000000000000000000", "")
 
@@ -138,7 +138,7 @@ def runs(robins, name, filters):
         *("run", name, "--runs", 1, "--filters", ",".join(filters), "--out", "out"),
         *settings_of(kind),
     )
-    assert answer.status == Status.DONE, answer.err
+    assert answer.status == ExitStatus.DONE, answer.err
     summary = results.read("out").summary
     assert list(summary["filters"]) == filters
     for found in summary["filters"].values():
@@ -309,7 +309,7 @@ BEGINS = {
     ("tune",): "robins.workbench.tune:choose",
     ("sensitivity",): "robins.workbench.sensitivity:simulate_points",
     ("bench", "up"): "robins.bench.run.session:Session.run",
-    ("bench", "replay"): "robins.workbench.bench:kit_of",
+    ("bench", "replay"): "robins.workbench.bench:config_of",
     ("export",): "robins.workbench.export:files_of",
     ("export", "--adjust"): "robins.workbench.export:files_of",
     ("export", "--board"): "robins.workbench.export:files_of",
@@ -382,9 +382,9 @@ def computes(folder, sketched, unchecked, monkeypatch, capsys):
         status = main(as_short_as_can_be(list(words)))
         told = capsys.readouterr()
         if words[0] == "tune" and TOO_SHORT in told.err:
-            assert status == Status.BAD_INPUT
+            assert status == ExitStatus.BAD_INPUT
             return
-        assert status == Status.DONE, told.out + told.err  # so the demo has passed
+        assert status == ExitStatus.DONE, told.out + told.err  # so the demo has passed
         assert "fault of robins" not in told.err
 
     return to_the_end

@@ -15,7 +15,7 @@ import pytest
 import robins as package
 from robins.bench.recording import layout, read_record
 from robins.bench.wire.frames import VERSION
-from robins.campaign.plan import Plan, code_of
+from robins.campaign.plan import CampaignPlan, code_of
 from robins.cli import app
 from robins.systems import trust
 
@@ -43,7 +43,7 @@ def record_of(path: Path, rig: str, ports: dict[str, str]) -> None:
 
 def campaign_of(folder: Path, asked: str, text: str) -> None:
     folder.mkdir()
-    plan = Plan(asked, "x", text, 0, 2, ("kf",), "jax", 2, code_of(asked, text))
+    plan = CampaignPlan(asked, "x", text, 0, 2, ("kf",), "jax", 2, code_of(asked, text))
     (folder / "campaign.json").write_text(json.dumps({"schema": 1} | asdict(plan)))
 
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from robins.filters import Belief, Model, Motion, Sensor, adaptive, kalman, run
-from robins.filters.composite.adaptive import changes, excited
-from robins.filters.composite.bank import EVERY, lasting, transitions
+from robins.filters.composite.adaptive import excited, scale_changes
+from robins.filters.composite.bank import EVERY, stationary, transitions
 from robins.filters.linearise import Transition
 from robins.filters.rules import huber
 
@@ -86,7 +86,7 @@ def test_one_scale_is_a_filter_with_hubers_rule():
     [((1, 8), 0.1, 0.3), ((1, 8, 64), 1e-4, 1e-2), ((1, 8, 64, 8, 64), 0.1, 0.01)],
 )
 def test_scales_change_as_stated_and_begin_where_they_last(scales, up, back):
-    change = changes(scales, up, back)
+    change = scale_changes(scales, up, back)
     np.testing.assert_allclose(change.sum(axis=1), 1.0, rtol=1e-14)
     assert change[0, -1] == up
     assert change[-1, 0] == back
@@ -94,7 +94,7 @@ def test_scales_change_as_stated_and_begin_where_they_last(scales, up, back):
         assert change[2, 4] == up  # as loud, of the other part
         assert change[4, 1] == back
     far = np.linalg.matrix_power(change, 10**6)
-    np.testing.assert_allclose(lasting(change), far[0], rtol=1e-6)
+    np.testing.assert_allclose(stationary(change), far[0], rtol=1e-6)
 
 
 def test_edges_are_probabilities_and_what_is_left_goes_where_it_is_told():

@@ -11,7 +11,7 @@ from two_sensors import SYSTEMS, N, Y, by_sensor, model_of
 from robins import linalg
 from robins.filters import (
     Belief,
-    Family,
+    ModeFamily,
     Model,
     OnlineFilter,
     Rule,
@@ -79,7 +79,7 @@ EVEN = np.full((2, 2), 0.5)
 # The filter, who in it is asked, in order, and how many predictions and updates of a step it makes.
 FILTERS = {
     "two rules": (kalman(rules=[gate(), counting(0), only("a", counting(1))]), [(0, 2), (1, 2)]),
-    "family": (imm(Family(asked, jnp.arange(2)), EVEN), [(0, 2), (1, 2)]),
+    "family": (imm(ModeFamily(asked, jnp.arange(2)), EVEN), [(0, 2), (1, 2)]),
     "guarded": (guarded(asked(0), asked(1), "a", ["b"], [(0, 1)]), [(0, 2), (1, 1)]),
     "master": (at_master(distributed(LOCALS[:1]), "held", asked(2)), [(0, 2), (2, 1)]),
     "delayed": (delayed(asked(0), MODEL, 2), [(0, 2)]),

@@ -21,7 +21,7 @@ from robins.filters import (
     normalised,
     run,
 )
-from robins.filters.composite.delayed import Late, delayed
+from robins.filters.composite.delayed import DelayedMeasurement, delayed
 from robins.filters.rules import gate
 from robins.filters.values import Numbers, value
 from robins.manifold import Angle
@@ -96,7 +96,9 @@ def drive(seed: int) -> dict:
 
     def late(value, made):
         row = np.where(made < 0, T, made)  # row T holds nothing
-        return Late(value[row], np.where(made < 0, 0, np.arange(T + SHIFT) - made).astype(float))
+        return DelayedMeasurement(
+            value[row], np.where(made < 0, 0, np.arange(T + SHIFT) - made).astype(float)
+        )
 
     made = {"bearing": arrivals(3.0, SHIFT), "place": arrivals(1.9, 2)}
     seen, known = late(bearing, made["bearing"]), late(place, made["place"])
@@ -104,7 +106,7 @@ def drive(seed: int) -> dict:
         "u": u,
         "in order": {"bearing": Angle(bearing), "place": place},
         "beacon": {"bearing": beacon},
-        "as it comes": {"bearing": Late(Angle(seen.value), seen.age), "place": known},
+        "as it comes": {"bearing": DelayedMeasurement(Angle(seen.value), seen.age), "place": known},
         "beacon as it comes": {
             "bearing": beacon[np.where(made["bearing"] < 0, T, made["bearing"])]
         },
@@ -216,7 +218,7 @@ Y = {"a": RNG.normal(size=(8, 1)), "b": RNG.normal(size=(8, 2))}
 
 
 def in_time(value):
-    return value if isinstance(value, Late) else Late(value, 0)
+    return value if isinstance(value, DelayedMeasurement) else DelayedMeasurement(value, 0)
 
 
 def streamed(filter_, *events) -> OnlineFilter:
@@ -235,10 +237,10 @@ def test_several_late_ones_in_one_step():
         BACK,
         ("b", Y["b"][0]),  # before the first prediction
         *(None, None, ("b", Y["b"][2]), None),
-        ("a", Late(Y["a"][2], 1)),
-        ("a", Late(Y["a"][1], 2)),
-        ("b", Late(Y["b"][1], 2)),
-        ("a", Late(Y["a"][0], 3)),  # to the very start
+        ("a", DelayedMeasurement(Y["a"][2], 1)),
+        ("a", DelayedMeasurement(Y["a"][1], 2)),
+        ("b", DelayedMeasurement(Y["b"][1], 2)),
+        ("a", DelayedMeasurement(Y["a"][0], 3)),  # to the very start
         ("b", Y["b"][3]),
         ("a", Y["a"][3]),  # of this step, but after one whose turn is later
     )
@@ -280,7 +282,7 @@ def test_plain_measurements_in_order_give_the_filter_itself():
 def test_what_cannot_be_placed_is_refused_and_changes_nothing(sensor, value, age, code):
     live = streamed(BACK, *[None] * 5, ("b", Y["b"][0]), None, None)
     before = live.belief
-    info = live.update(Late(np.array(value), age), sensor)
+    info = live.update(DelayedMeasurement(np.array(value), age), sensor)
     assert int(info.code) == code
     used = code in (Code.DONE, Code.PARTLY_MISSING)
     assert bool(jnp.all(live.belief.mean == before.mean)) is not used
@@ -289,7 +291,7 @@ def test_what_cannot_be_placed_is_refused_and_changes_nothing(sensor, value, age
         assert float(info.log_likelihood) == 0.0
         assert not np.any(info.used)
     # and it leaves the buffer as it was: what comes next is put in its place all the same
-    live.update(Late(Y["a"][1], 1), "a")
+    live.update(DelayedMeasurement(Y["a"][1], 1), "a")
     events = [None] * 5 + [("b", Y["b"][0]), None, ("a", Y["a"][1]), None]
     if not used:
         close(live.belief, streamed(PLAIN, *events).belief, 1e-14)
@@ -297,8 +299,8 @@ def test_what_cannot_be_placed_is_refused_and_changes_nothing(sensor, value, age
 
 def test_older_than_the_start_is_too_old():
     live = streamed(BACK, None, None)
-    assert int(live.update(Late(Y["a"][0], 3), "a").code) == Code.TOO_OLD
-    assert int(live.update(Late(Y["a"][0], 2), "a").code) == Code.DONE
+    assert int(live.update(DelayedMeasurement(Y["a"][0], 3), "a").code) == Code.TOO_OLD
+    assert int(live.update(DelayedMeasurement(Y["a"][0], 2), "a").code) == Code.DONE
 
 
 def test_an_earlier_reading_that_makes_a_later_one_impossible_is_told():
@@ -308,7 +310,7 @@ def test_an_earlier_reading_that_makes_a_later_one_impossible_is_told():
     live.predict()
     assert int(live.update(in_time(np.zeros(2)), "b").code) == Code.DONE
     # From 1 the way to 0 would take a rate, and the rate was found to be 0.
-    info = live.update(Late(np.ones(1), 1), "a")
+    info = live.update(DelayedMeasurement(np.ones(1), 1), "a")
     assert int(info.code) == Code.CONTRADICTED
     assert float(info.log_likelihood) == -np.inf
 
@@ -316,16 +318,16 @@ def test_an_earlier_reading_that_makes_a_later_one_impossible_is_told():
 def test_after_a_reset_there_is_no_way_back():
     state = streamed(BACK, None, None, ("a", Y["a"][0])).state
     live = OnlineFilter(BACK, LINEAR, BACK.reset(state, BEGIN))
-    assert int(live.update(Late(Y["b"][0], 1), "b").code) == Code.TOO_OLD
+    assert int(live.update(DelayedMeasurement(Y["b"][0], 1), "b").code) == Code.TOO_OLD
     live.predict()
-    assert int(live.update(Late(Y["b"][0], 1), "b").code) == Code.DONE
+    assert int(live.update(DelayedMeasurement(Y["b"][0], 1), "b").code) == Code.DONE
     close(live.belief, streamed(PLAIN, ("b", Y["b"][0]), None).belief, 1e-14)
 
 
 def test_numbers_of_the_model_are_those_of_the_run():
     # The buffer was made for other noise; what is filtered again uses that of the run, and forward
     # derivatives go through it.
-    y = {"a": Late(Y["a"], np.array([0.0, 1, 2, 0, 1, 3, 1, 2]))}
+    y = {"a": DelayedMeasurement(Y["a"], np.array([0.0, 1, 2, 0, 1, 3, 1, 2]))}
     place = np.arange(8) - np.array([0, 1, 2, 0, 1, 3, 1, 2])
     first = np.unique(place, return_index=True)[1]
     ordered = np.full((8, 1), np.nan)

@@ -10,7 +10,7 @@ from scipy import optimize, signal, stats
 from robins.filters import Belief, Code, Model, Motion, Observation, Sensor, kalman, run, unscented
 from robins.filters.rules._fading import chance_levels
 from robins.filters.rules._robust import MOST, scale_to_quantile
-from robins.filters.rules.discriminator import PUBLISHED, Verdict, discriminator
+from robins.filters.rules.discriminator import PUBLISHED, DiscriminatorVerdict, discriminator
 from robins.manifold import Angle
 
 T, PATIENCE, RHO = 60, 4, 0.9
@@ -115,13 +115,15 @@ def test_is_its_recursion(name):
     np.testing.assert_allclose(solution.mean, want["mean"], rtol=1e-8, atol=1e-9)
     # every verdict was passed: the bursts outlasted nobody's patience, the lasting fault did
     state = want["state"]
-    assert set(state[[10, 12, 20]]) == {Verdict.OUTLIER}
-    assert np.count_nonzero(state[30:48] == Verdict.MODEL) > 5
-    assert np.count_nonzero(state == Verdict.CLEAN) > 10
+    assert set(state[[10, 12, 20]]) == {DiscriminatorVerdict.OUTLIER}
+    assert np.count_nonzero(state[30:48] == DiscriminatorVerdict.MODEL) > 5
+    assert np.count_nonzero(state == DiscriminatorVerdict.CLEAN) > 10
     # and a burst goes on behind a measurement that is missing
     assert info.notes["discriminator.counter"][9:14].tolist() == [0, 1, 1, 2, 0]
     refused = np.asarray(info.code) == Code.REFUSED
-    np.testing.assert_array_equal(refused, (state == Verdict.OUTLIER) & ("gate" in name))
+    np.testing.assert_array_equal(
+        refused, (state == DiscriminatorVerdict.OUTLIER) & ("gate" in name)
+    )
 
 
 def test_clean_data_is_left_alone():
@@ -129,7 +131,7 @@ def test_clean_data_is_left_alone():
     y = simulate(SYSTEM, 8, 4000)[1]
     strict = kalman(rules=[discriminator(30)])
     notes = run(strict, MODEL, START, y).steps.info["y"].notes
-    outliers = np.mean(np.asarray(notes["discriminator.state"]) == Verdict.OUTLIER)
+    outliers = np.mean(np.asarray(notes["discriminator.state"]) == DiscriminatorVerdict.OUTLIER)
     assert abs(outliers - 0.001) < 4 * np.sqrt(0.001 / 4000)
     assert np.all(np.asarray(notes["discriminator.lambda"]) == 1.0)
 

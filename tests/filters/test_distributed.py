@@ -7,7 +7,7 @@ from dense_kalman import System
 from two_sensors import CHANNELS, ROWS, SYSTEMS, Y, added, centralised, corrected, one_run, split
 
 from robins.filters import Belief, Code
-from robins.filters.composite.channels import are_apart
+from robins.filters.composite.channels import disagree
 from robins.filters.composite.distributed import distributed, intersecting
 from robins.filters.composite.fusion import common_information_sum, covariance_intersection
 from robins.manifold import Angle
@@ -59,9 +59,9 @@ def test_local_filters_that_differ_are_reported():
 
 def test_which_components_of_local_filters_are_compared():
     beliefs = [Belief(jnp.array([0.0, x]), jnp.diag(jnp.array([0.0, s]))) for x, s in DIFFERENT]
-    apart = [bool(are_apart([beliefs[0], other], 1, None)) for other in beliefs[1:]]
+    apart = [bool(disagree([beliefs[0], other], 1, None)) for other in beliefs[1:]]
     assert apart == [False, True, True]  # of 4.9, 5.1 and 8 with a standard deviation of 0.6, 0.8
-    assert not are_apart(beliefs, 0, 1)
+    assert not disagree(beliefs, 0, 1)
 
 
 # ------------------------------------------------------------------------- states of one local

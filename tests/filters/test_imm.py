@@ -14,7 +14,7 @@ from scipy.stats import multivariate_normal
 from robins.filters import (
     Belief,
     Code,
-    Family,
+    ModeFamily,
     Model,
     Motion,
     Rule,
@@ -222,13 +222,13 @@ def test_a_family_is_the_modes_one_by_one(solution):
     rows = list(zip(*numbers, strict=True))
     change = np.array([[0.9, 0.1], [0.0, 1.0]])
     each = run(imm([scaled(row) for row in rows], change), MODEL, START, y)
-    once = run(imm(Family(scaled, numbers), change), MODEL, START, y)
+    once = run(imm(ModeFamily(scaled, numbers), change), MODEL, START, y)
     for name in ("steps", "log_likelihood", "tally"):
         one, other = (getattr(x, name) for x in (once, each))
         for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
     assert "imm.1.gate.ratio" in once.steps.info["y"].notes
-    settled = imm(Family(scaled, numbers), change).reset(once.final, START)
+    settled = imm(ModeFamily(scaled, numbers), change).reset(once.final, START)
     np.testing.assert_array_equal(settled.memory.states.belief.factor[1], START.factor)
 
 
@@ -260,7 +260,9 @@ def told(who):
 @pytest.mark.parametrize("family", [False, True], ids=["modes", "family"])
 def test_every_mode_reports_a_run_with_its_own_rule_exchanged(family):
     who = np.array([7.0, 8.0])
-    bank = imm(Family(told, who) if family else [told(w) for w in who], [[0.9, 0.1], [0.2, 0.8]])
+    bank = imm(
+        ModeFamily(told, who) if family else [told(w) for w in who], [[0.9, 0.1], [0.2, 0.8]]
+    )
     start = bank.init(START, MODEL.dims)
 
     def ended(one):
@@ -275,7 +277,7 @@ def test_every_mode_reports_a_run_with_its_own_rule_exchanged(family):
 
 def test_another_change_or_number_is_another_leaf_of_the_same_structure():
     def bank(scale, p):
-        return imm(Family(scaled, (scale * np.ones(2), np.ones(2))), [[p, 1.0 - p], [0.2, 0.8]])
+        return imm(ModeFamily(scaled, (scale * np.ones(2), np.ones(2))), [[p, 1.0 - p], [0.2, 0.8]])
 
     one, other = (jax.tree_util.tree_flatten(bank(*a)) for a in ((1.0, 0.9), (3.0, 0.7)))
     assert one[1] == other[1]
@@ -298,9 +300,9 @@ def test_the_likelihood_has_a_slope_by_the_chance_of_a_change(solution):
 
 def test_families_that_are_none_are_refused():
     with pytest.raises(ValueError, match="one row a mode; their shapes begin with"):
-        imm(Family(scaled, (np.ones(2), np.ones(3))), np.eye(2))
+        imm(ModeFamily(scaled, (np.ones(2), np.ones(3))), np.eye(2))
     with pytest.raises(ValueError, match="one row a mode"):
-        imm(Family(scaled, 1.0), np.eye(2))
+        imm(ModeFamily(scaled, 1.0), np.eye(2))
 
 
 def test_a_mode_that_fails_is_out_and_comes_back():

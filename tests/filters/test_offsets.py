@@ -9,9 +9,14 @@ from scipy.stats import multivariate_normal
 from robins import linalg
 from robins.filters import Belief, Model, Motion, Sensor, adaptive, imm, kalman, run
 from robins.filters.composite import offsets
-from robins.filters.composite.adaptive import changes
-from robins.filters.composite.bank import lasting
-from robins.filters.composite.offsets import narrowed, sensors_off, supposing, with_offsets
+from robins.filters.composite.adaptive import scale_changes
+from robins.filters.composite.bank import stationary
+from robins.filters.composite.offsets import (
+    marginal,
+    offset_hypotheses,
+    offset_transitions,
+    under_hypothesis,
+)
 from robins.filters.rules import huber
 from robins.manifold import Angle
 
@@ -140,11 +145,11 @@ def test_an_offset_turns_an_angle_about():
 
 
 def test_another_belief_leaves_what_is_known_of_offsets():
-    change = with_offsets(np.ones((1, 1)), 1)
-    of = sensors_off(1, 1)
+    change = offset_transitions(np.ones((1, 1)), 1)
+    of = offset_hypotheses(1, 1)
     rows = [type(of)(*(jnp.asarray(a[i]) for a in of)) for i in range(3)]
-    modes = [supposing(kalman(), (RATE,), row, Partial(lambda N: N)) for row in rows]
-    bank = narrowed(imm(modes, change, lasting(change)), (RATE,))
+    modes = [under_hypothesis(kalman(), (RATE,), row, Partial(lambda N: N)) for row in rows]
+    bank = marginal(imm(modes, change, stationary(change)), (RATE,))
     m, y = model(), data(np.random.default_rng(4), 30, off=1.0, since=0)
     state = bank.init(START, m.dims)
     for k in range(30):
@@ -163,15 +168,15 @@ def test_another_belief_leaves_what_is_known_of_offsets():
 
 
 def test_each_sensor_begins_lasts_and_ends():
-    plain = changes((1, 8), 1e-5, 1e-2)
-    p = with_offsets(plain, 2)
+    plain = scale_changes((1, 8), 1e-5, 1e-2)
+    p = offset_transitions(plain, 2)
     np.testing.assert_allclose(p.sum(axis=1), 1.0, rtol=1e-14)
     assert np.all(p >= 0.0)
     np.testing.assert_array_equal(p[:, [2, 4]], offsets.BEGIN)
     np.testing.assert_array_equal(p[2:, 0], offsets.END)
     assert p[2, 3] == p[3, 3] == 1.0 - offsets.END - 2.0 * offsets.BEGIN
     assert p[0, 3] == p[0, 5] == p[3, 5] == 0.0  # nothing lasts that has not begun
-    of = sensors_off(2, 2)
+    of = offset_hypotheses(2, 2)
     np.testing.assert_array_equal(of.off, [[0, 0], [0, 0], [1, 0], [1, 0], [0, 1], [0, 1]])
     np.testing.assert_array_equal(of.lasts, [[0, 0], [0, 0], [0, 0], [1, 0], [0, 0], [0, 1]])
 

@@ -9,7 +9,7 @@ from jax.tree_util import Partial
 from scipy import integrate, stats
 
 from robins.filters import Belief, Code, Model, Motion, OnlineFilter, Sensor, kalman, run
-from robins.filters.composite.particle import Cloud, _systematic, particle, reseed
+from robins.filters.composite.particle import ParticleCloud, _systematic, particle, reseed
 from robins.filters.values import content
 from robins.manifold import Angle
 
@@ -292,7 +292,7 @@ def test_one_at_a_time_is_the_run_and_other_keys_are_other_draws(y):
     np.testing.assert_array_equal(again.memory.particles.mean, start.memory.particles.mean)
     other = one.reset(reseed(start, 12), START)
     assert np.all(other.memory.particles.mean != start.memory.particles.mean)
-    assert isinstance(other.memory, Cloud)
+    assert isinstance(other.memory, ParticleCloud)
 
 
 def test_its_numbers_are_data_and_its_key_has_a_gradient_of_zero():

@@ -29,7 +29,7 @@ from robins.filters import (
     run,
     whiteness,
 )
-from robins.filters.composite.delayed import Late
+from robins.filters.composite.delayed import DelayedMeasurement
 
 LOST, STEPS = 2, 6  # the step that cannot be predicted, and all
 
@@ -93,7 +93,7 @@ def test_a_missing_measurement_stays_missing_and_a_new_belief_is_of_its_time():
 
 def test_what_is_late_is_used_though_the_last_prediction_was_lost():
     live, plain = (OnlineFilter(FILTERS[f], MODEL, START) for f in ("delayed", "kalman"))
-    late = [Late(np.array([0.4]), jnp.array(age)) for age in (0.0, 1.0)]
+    late = [DelayedMeasurement(np.array([0.4]), jnp.array(age)) for age in (0.0, 1.0)]
     live.predict(U[0])
     live.predict(jnp.nan)
     assert int(live.update(late[0], "a").code) == Code.NOT_PREDICTED
@@ -202,7 +202,7 @@ def tracked(runs, seed, too_small=1.0, change=lambda k, y: y):
 
 def doubted(numbers):
     """The sentences on each run alone."""
-    table = whiteness.looked(*numbers)
+    table = whiteness.innovation_sums(*numbers)
     return [whiteness.suspicions({"y": row}) for row in table], table
 
 
@@ -223,8 +223,8 @@ def test_the_order_of_innovations_is_not_hidden_by_gaps_weights_or_outliers():
     (e, sigma, nis, dof, _), _ = tracked(20, 4, too_small=10.0)
     gone = np.arange(LONG) % 3 > 0
     e, sigma = np.where(gone[:, None], np.nan, e), np.where(gone[:, None], np.nan, sigma)
-    alone = whiteness.looked(e[:, ~gone], sigma[:, ~gone], nis[:, ~gone], dof[:, ~gone])
-    np.testing.assert_allclose(whiteness.looked(e, sigma, nis, dof), alone, rtol=1e-12)
+    alone = whiteness.innovation_sums(e[:, ~gone], sigma[:, ~gone], nis[:, ~gone], dof[:, ~gone])
+    np.testing.assert_allclose(whiteness.innovation_sums(e, sigma, nis, dof), alone, rtol=1e-12)
     (e, sigma, nis, dof, _), _ = tracked(20, 5, too_small=10.0)
     e[:, 7] = 1e30
     sigma[:, 150:] = np.nan  # refused
@@ -238,10 +238,12 @@ def test_the_order_of_innovations_is_not_hidden_by_gaps_weights_or_outliers():
 def test_one_lasting_error_counts_as_one_innovation():
     e = 1.7 * np.ones((LONG, 1))
     e[1::2] *= -1.0
-    table = whiteness.looked(e, np.ones_like(e), e[:, 0] ** 2, np.ones(LONG, int))
+    table = whiteness.innovation_sums(e, np.ones_like(e), e[:, 0] ** 2, np.ones(LONG, int))
     assert any("mean NIS" in one for one in whiteness.suspicions({"y": table}))
     assert not whiteness.suspicions({"y": table}, ("y",))
-    table = whiteness.looked(10.0 * e, np.ones_like(e), 100.0 * e[:, 0] ** 2, np.ones(LONG, int))
+    table = whiteness.innovation_sums(
+        10.0 * e, np.ones_like(e), 100.0 * e[:, 0] ** 2, np.ones(LONG, int)
+    )
     assert any("mean NIS" in one for one in whiteness.suspicions({"y": table}, ("y",)))
 
 
@@ -265,7 +267,7 @@ def test_what_a_sequence_shows(change, said):
 
 def test_pieces_of_a_log_are_judged_as_one():
     numbers, _ = tracked(2, 7, change=lambda k, y: y if k % 40 > 12 else 0.125 + 0.0 * y)
-    table = whiteness.looked(*numbers)
+    table = whiteness.innovation_sums(*numbers)
     whole = whiteness.joined(list(table))
     assert whole[0, 0] == table[:, 0, 0].sum()
     (said,) = [one for one in whiteness.suspicions({"y": whole}, ("y",)) if "same" in one]

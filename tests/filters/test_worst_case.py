@@ -12,7 +12,7 @@ from dense_kalman import SPLIT_W, random_system, simulate, split
 
 from robins.filters import Belief, Model, Motion, Sensor, checks, kalman, run, unscented
 from robins.filters.analysis.worst_case import (
-    Channel,
+    SensorChannel,
     error_operator,
     existence_margin,
     gamma_min,
@@ -122,7 +122,7 @@ def operator(solution, scale=None):
     def all_steps(a):
         return np.tile(a, (T, 1, 1))
 
-    channel = Channel(np.asarray(info.gain), all_steps(SYSTEM.H), all_steps(SYSTEM.W))
+    channel = SensorChannel(np.asarray(info.gain), all_steps(SYSTEM.H), all_steps(SYSTEM.W))
     weight = np.where(HERE[:, None, None], L, 0.0)
     if scale is not None:
         weight = weight / np.asarray(scale)[:, None, None]

@@ -8,7 +8,7 @@ from scipy.stats import norm
 
 from robins.ins.allan import (
     AllanFit,
-    Coefficients,
+    NoiseCoefficients,
     deviation,
     fit,
     in_field_units,
@@ -301,7 +301,7 @@ def test_field_units():
 
 def test_term_curves_add_up_to_the_model():
     tau = np.array([0.1, 3.0, 200.0])
-    terms = Coefficients(*(np.array([x, 2.0 * x]) for x in (0.1, 1.0, 0.3, 0.02, 1e-3)))
+    terms = NoiseCoefficients(*(np.array([x, 2.0 * x]) for x in (0.1, 1.0, 0.3, 0.02, 1e-3)))
     curves = term_curves(terms, tau)
     assert curves.shape == (5, 3, 2)
     for axis, factor in enumerate((1.0, 2.0)):
@@ -372,8 +372,8 @@ def test_terms_that_make_no_sense_are_refused(terms):
 
 
 def some_fit(axes=3):
-    value = Coefficients(*(np.full(axes, x) for x in (0.1, 0.2, 0.3, 0.4, 0.0)))
-    lower = Coefficients(*(0.9 * x for x in value))
+    value = NoiseCoefficients(*(np.full(axes, x) for x in (0.1, 0.2, 0.3, 0.4, 0.0)))
+    lower = NoiseCoefficients(*(0.9 * x for x in value))
     lower.K[1:2] = 0.0  # not resolved on this axis
     lower.Q[:] = 0.0
     none = np.zeros(axes)

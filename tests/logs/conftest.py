@@ -22,7 +22,7 @@ def walk_files(data_dir):
 def told(monkeypatch):
     """Which check found what in this test; one that its row does not declare fails the test."""
     heard = []
-    ask = Check.ask
+    ask = Check.run
 
     def checked(check, things):
         found = ask(check, things)
@@ -31,5 +31,5 @@ def told(monkeypatch):
         heard.extend((check.find.__name__, f) for f in found)
         return found
 
-    monkeypatch.setattr(Check, "ask", checked)
+    monkeypatch.setattr(Check, "run", checked)
     return heard

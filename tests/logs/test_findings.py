@@ -223,7 +223,7 @@ def test_what_is_asked_beside_what():
     """Two sensors are compared only where neither is known to be wrong, and by the better judge."""
 
     def asked(things, *found):
-        asked = [c for c in TOGETHER if c.is_asked(dict.fromkeys(things.split()), set(found))]
+        asked = [c for c in TOGETHER if c.applies(dict.fromkeys(things.split()), set(found))]
         return [c.find.__name__.removeprefix("check_") for c in asked]
 
     whole = "imu gnss mag attitude others"

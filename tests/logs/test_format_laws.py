@@ -14,7 +14,7 @@ from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable
 from robins.ins.frames import to_enu_rfu
 from robins.logs import FORMATS, LogError, Origin, open_log, write_log
 from robins.logs.quantities import CLOCKS, QUANTITIES
-from robins.logs.registry import fitting, recognise
+from robins.logs.registry import matching_formats, recognise
 from robins.logs.tables import kind_in_text, tables_of
 from robins.logs.text_format import ANY
 from robins.logs.text_formats import TEXT_FORMATS
@@ -66,7 +66,7 @@ def tables_for(row):
         fields = {"trajectory": "truth"}
         return [Dataset("log", **{fields.get(k, k): made[k][0] for k in row.kinds})]
     tables = made[row.kinds[0]]
-    return [*tables, *map(to_enu_rfu, tables)] if row.says_frames else tables
+    return [*tables, *map(to_enu_rfu, tables)] if row.states_frames else tables
 
 
 def assert_same(back, table, row):
@@ -132,7 +132,7 @@ def test_what_is_written_is_recognised_and_read_as_it_was(tmp_path, row):
     for table in tables_for(row):
         path = tmp_path / "log.txt"
         written(row, table, path)
-        assert [f.name for f in fitting(path)[1]] == [row.name]
+        assert [f.name for f in matching_formats(path)[1]] == [row.name]
         findings = []
         assert_same(open_log(path, findings=findings), table, row)
         assert findings == []
@@ -148,7 +148,7 @@ def test_a_row_writes_nothing_but_what_it_holds(tmp_path, row):
         if kind not in row.kinds:
             with pytest.raises(LogError, match=f"{row.name} holds .*, not "):
                 written(row, tables_for(other)[0], tmp_path / "log.txt")
-    for table in tables_for(row) if not row.says_frames else ():
+    for table in tables_for(row) if not row.states_frames else ():
         turned = to_enu_rfu(table) if not isinstance(table, Dataset) else None
         if turned is not None and not isinstance(turned, GnssTable):
             with pytest.raises(LogError, match=r"wants (body|nav) frame ..., this table is in "):

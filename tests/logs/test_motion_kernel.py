@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from robins.logs import motion, motion_fit
 from robins.logs.checks_motion import estimates
-from robins.logs.gnss_motion import lateness, lowest, steps_of, track_of
+from robins.logs.gnss_motion import lowest, steps_of, track_of, velocity_delay
 from robins.logs.motion_fit import start_of, trimmed
 from robins.logs.motion_models import judge
 from robins.logs.quiet import signal_of, windows_of
@@ -133,7 +133,7 @@ def test_steps_over_a_second_and_their_lateness(drive):
     track = track_of(drive.gnss)
     t = track.time_s
     late = track._replace(v_n=velocity_ned(t - 0.25))
-    assert lateness(late) == pytest.approx(0.25, abs=0.02)
+    assert velocity_delay(late) == pytest.approx(0.25, abs=0.02)
     steps = steps_of(late, 0.25)
     assert np.sqrt(np.mean((steps.of_position - steps.of_velocity) ** 2)) < 1.5 * 0.02 * np.sqrt(2)
 

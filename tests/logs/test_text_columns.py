@@ -14,9 +14,9 @@ from robins import foreign
 from robins.logs import open_log
 from robins.logs.findings import LogError, LogWarning
 from robins.logs.opening import _FOREIGN
-from robins.logs.text import Layout, peek, read_columns
+from robins.logs.text import TextLayout, peek, read_columns
 
-LAYOUT = Layout(("time", "x", "y"), ",")
+LAYOUT = TextLayout(("time", "x", "y"), ",")
 
 
 def lines(n, first=1):

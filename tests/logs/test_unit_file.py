@@ -7,8 +7,8 @@ import pytest
 
 from robins import scenario
 from robins.logs.mounting import Mounting
-from robins.logs.unit_file import Found, find_unit, toml_of
-from robins.systems.ins_gnss import Drive, Replay, drive_dataset
+from robins.logs.unit_file import UnitProperties, find_unit, toml_of
+from robins.systems.ins_gnss import Drive, InsGnssReplay, drive_dataset
 
 TURNS = "".join(
     f'[[legs]]\ndo = "turn"\nangle = "{angle} deg"\nrate = "15 deg/s"\n'
@@ -82,12 +82,12 @@ def test_the_mounting_is_that_of_a_turned_unit(log, angles):
 
 
 def test_what_is_written_is_a_whole_configuration():
-    found = Found((180.0, 0.0, -90.0), 0.15, 0.25, (1e-4, 2e-4, 3e-4), None, (0.5, 0.02))
-    parameters = scenario.parse(Replay, toml_of(found, "drive"))
+    found = UnitProperties((180.0, 0.0, -90.0), 0.15, 0.25, (1e-4, 2e-4, 3e-4), None, (0.5, 0.02))
+    parameters = scenario.parse(InsGnssReplay, toml_of(found, "drive"))
     assert np.degrees(parameters.imu.orientation) == pytest.approx((180.0, 0.0, -90.0))
     assert parameters.imu.gyro_noise == pytest.approx((1e-4, 2e-4, 3e-4), rel=5e-3)
-    assert parameters.imu.accel_noise == Replay().imu.accel_noise
+    assert parameters.imu.accel_noise == InsGnssReplay().imu.accel_noise
     assert parameters.gnss.latency == pytest.approx(0.15)
     assert parameters.gnss.velocity_window == pytest.approx(0.25)
-    nothing = scenario.parse(Replay, toml_of(Found(), "drive"))
-    assert nothing == Replay()
+    nothing = scenario.parse(InsGnssReplay, toml_of(UnitProperties(), "drive"))
+    assert nothing == InsGnssReplay()

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from robins.export.harness import Recorded, check_c, makefile, recorded_h
-from robins.export.library import Entry, Library
+from robins.export.harness import RecordedSteps, check_c, makefile, recorded_h
+from robins.export.library import EntryPoint, Library
 from robins.export.runs import BoardRun, by_jax, entry_functions, reset_function
 from robins.filters import Belief, Model, Motion, Sensor, kalman
 from robins.filters.rules import huber, sage_husa
@@ -61,13 +61,15 @@ def made():
         (UPDATE, ("reading", "about"), "Uses a reading."),
         ("reset", ("belief",), "Begins again."),
     ]
-    entries = [Entry(n, p, takes, text) for (n, takes, text), p in zip(told, programs, strict=True)]
+    entries = [
+        EntryPoint(n, p, takes, text) for (n, takes, text), p in zip(told, programs, strict=True)
+    ]
     calls = by_jax(functions, run, dict)
     last = jax.tree.map(lambda a: a[-1], calls[UPDATE][0])
     calls["reset"] = jax.tree.map(lambda a: np.asarray(a)[None], jax.jit(anew)(last, belief))
     result = f"{entries[1].symbol}_result"
     sizes = {(result, "nis"): 1.0, (result, "innovation"): 0.3}
-    return entries, start, Recorded(run.given, calls, sizes=sizes, ends={"reset": (belief,)})
+    return entries, start, RecordedSteps(run.given, calls, sizes=sizes, ends={"reset": (belief,)})
 
 
 def write_boat(folder, precision=DOUBLE, name="boat"):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from machines import runs_the_same
 
-from robins.campaign.monte_carlo import contender, solved
+from robins.campaign.monte_carlo import contender, run_case
 from robins.program import BuildError, ProgramError
 from robins.workbench.scenarios import read_scenario
 
@@ -46,7 +46,7 @@ def check(name, filter_):
     def given(world):
         case = one.case(world)
         if case.loop is not None:  # its readings are known when it has run
-            case = solved(one.filter, one.model, case, lambda step: ())[1]
+            case = run_case(one.filter, one.model, case, lambda step: ())[1]
         rows = case.u, dict(case.y), dict(case.aux)
         return case.start, jax.tree.map(lambda x: x[:EPOCHS], rows)
 

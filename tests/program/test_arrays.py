@@ -11,7 +11,7 @@ from jax import lax
 from machines import apart
 
 from robins.program import CPP, arrays, stages
-from robins.program.stages import Staged
+from robins.program.stages import StagedFunction
 
 pytestmark = pytest.mark.skipif(
     not any(map(shutil.which, CPP.names)), reason="the interpreter needs a C++ compiler"
@@ -63,14 +63,14 @@ def by_run(x):
 
 
 def kind(step):
-    if isinstance(step, arrays.Written):
+    if isinstance(step, arrays.ArrayProgram):
         return "entries" if step._entries else "written"
     return "moved"
 
 
 def alike(function, within=1e-13):
     x = RNG.normal(size=(RUNS, 6, 4))
-    one = Staged(function, jax.ShapeDtypeStruct((6, 4), float))
+    one = StagedFunction(function, jax.ShapeDtypeStruct((6, 4), float))
     want, got = jax.vmap(function)(x), one(x)
     for (path, a), b in zip(
         jax.tree_util.tree_leaves_with_path(want), jax.tree.leaves(got), strict=True
@@ -127,7 +127,7 @@ def test_what_is_too_long_to_be_written_out_stays_with_jax(monkeypatch):
     monkeypatch.setattr(arrays, "MOST", 100)
     _, stage, *_ = alike(lambda x: (x @ x.T, 2.0 * x))
     assert stage.refused == []
-    written = [step for *_, step in stage._steps if isinstance(step, arrays.Written)]
+    written = [step for *_, step in stage._steps if isinstance(step, arrays.ArrayProgram)]
     by_jax = [one for one in written if "by_jax" in one._compute.__qualname__]
     assert [e.primitive.name for one in by_jax for e in one._equations] == ["dot_general"]
 

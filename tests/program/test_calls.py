@@ -10,7 +10,7 @@ import pytest
 
 from robins.program import Graph, Native, calls, interpreted_step, trace, trace_steps
 from robins.program.nodes import COMMUTING
-from robins.program.walk import Walk
+from robins.program.walk import JaxprWriter
 
 
 def trees(program):
@@ -138,7 +138,7 @@ def with_matrices(x):
 )
 def test_what_a_template_writes_has_the_nodes_of_a_walk(function, templates, monkeypatch):
     x, written = np.array([0.3, 0.7, 1.9]), []
-    write = calls.written
+    write = calls.write_template
     monkeypatch.setattr(calls, "written", lambda *all_: written.append(1) or write(*all_))
     program = trace(function, x)
     assert len(written) >= templates
@@ -154,11 +154,11 @@ def test_graphs_of_earlier_attempts_are_not_held():
     given = [np.array(graph.input(0, "real"))]
     calls.results_of(held, graph, jaxpr, given, lambda: given)
     gone = weakref.ref(graph)
-    calls.forget(held, [graph])
+    calls.drop_templates(held, [graph])
     del graph
     gc.collect()
     assert gone() is not None
-    calls.forget(held, [other])
+    calls.drop_templates(held, [other])
     gc.collect()
     assert gone() is None
 
@@ -177,8 +177,8 @@ def test_a_call_with_a_loop_is_walked_each_time():
 def test_attempts_share_their_calls(monkeypatch):
     """Zeros that a step loses one after another cost an attempt each, no walk through a call."""
     walks = []
-    written = Walk._written
-    monkeypatch.setattr(Walk, "_written", lambda *all_: walks.append(1) or written(*all_))
+    written = JaxprWriter._written
+    monkeypatch.setattr(JaxprWriter, "_written", lambda *all_: walks.append(1) or written(*all_))
 
     def step(x, u):
         return jnp.concatenate([u[None], x[:-1]]), negated(u, 3.0)

@@ -11,7 +11,7 @@ from two_sensors import Y as OF_TWO
 
 from robins.filters import (
     Code,
-    Family,
+    ModeFamily,
     Model,
     Sensor,
     adaptive,
@@ -102,7 +102,7 @@ MADE = {
     "guarded": guarded(kalman(), kalman(), "a", "b"),
     "mixture": imm([kalman(), kalman(unscented())], [[0.9, 0.1], [0.2, 0.8]]),
     "mixture of a family": imm(
-        Family(
+        ModeFamily(
             lambda g: kalman(rules=[excited((slice(None),), g)]), jnp.array([[1.0], [3.0], [9.0]])
         ),
         [[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]],

@@ -9,7 +9,7 @@ import pytest
 from jax import lax
 
 from robins.program import CPP, LANE_FLAGS, kept, stages
-from robins.program.stages import Staged
+from robins.program.stages import StagedFunction
 
 pytestmark = pytest.mark.skipif(
     not any(map(shutil.which, CPP.names)), reason="the interpreter needs a C++ compiler"
@@ -38,7 +38,7 @@ def function(gain, x, reverse=False):
 
 
 def of(gain, reverse=False):
-    one = Staged(lambda x: function(gain, x, reverse), SHAPE)
+    one = StagedFunction(lambda x: function(gain, x, reverse), SHAPE)
     return jax.tree.leaves(one(X)), one
 
 
@@ -60,8 +60,8 @@ def test_the_second_time_no_program_is_written(cache, monkeypatch):
     want, first = of(0.5)
     files = sorted(cache.iterdir())
     assert files
-    monkeypatch.setattr("robins.program.loops.Body.program", never)
-    monkeypatch.setattr("robins.program.arrays.Written._program", never)
+    monkeypatch.setattr("robins.program.loops.LoopBody.program", never)
+    monkeypatch.setattr("robins.program.arrays.ArrayProgram._program", never)
     found, second = of(0.5)
     for a, b in zip(want, found, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -105,7 +105,7 @@ def test_what_other_packages_made_serves_from_a_wheel_alone(cache, monkeypatch):
     for file in files:
         file.rename(cache / f"{file.name.partition('.')[0]}.npz")
     monkeypatch.setattr(kept, "IN_WHEEL", cache)
-    monkeypatch.setattr("robins.program.loops.Body.program", never)
+    monkeypatch.setattr("robins.program.loops.LoopBody.program", never)
     for a, b in zip(want, of(0.5)[0], strict=True):
         np.testing.assert_array_equal(a, b)
 

@@ -13,7 +13,7 @@ from rule_table import RULES, START, Y, line
 from robins.filters import kalman
 from robins.program import CPP, LANE_FLAGS, Native, build, function, header, interpreted_step, trace
 from robins.program.interpreter import interpreted_rounds
-from robins.program.lanes import Rounds
+from robins.program.lanes import CompiledRounds
 
 FOUND = any(map(shutil.which, CPP.names))
 pytestmark = pytest.mark.skipif(not FOUND, reason="lanes need a C++ compiler")
@@ -57,7 +57,7 @@ def check(step, cases, unroll=None):
 def in_one_round(program, cases):
     """The results of some runs at a time on the machine, with axes of runs and of one round."""
     given = [np.stack(rows) for rows in zip(*map(jax.tree.leaves, cases), strict=True)]
-    rounds = Rounds(program, 1, 0, len(given), engine=interpreted_rounds)
+    rounds = CompiledRounds(program, 1, 0, len(given), engine=interpreted_rounds)
     return rounds(len(cases), [(a, True) for a in given])
 
 

@@ -3,8 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from robins.program.liveness import Touched, bytes_of_jaxpr, last_uses, most_bytes
-from robins.program.stages import flattened
+from robins.program.liveness import StageMemory, bytes_of_jaxpr, last_uses, most_bytes
+from robins.program.stages import as_jaxpr
 
 ROW = jax.ShapeDtypeStruct((1000,), float)  # 8000 bytes
 
@@ -16,8 +16,8 @@ def chain(x):
 
 
 def test_a_value_is_dropped_after_its_last_use():
-    flat = flattened(chain, ROW)[0].jaxpr
-    stages = [Touched(e.invars, e.outvars) for e in flat.eqns]
+    flat = as_jaxpr(chain, ROW)[0].jaxpr
+    stages = [StageMemory(e.invars, e.outvars) for e in flat.eqns]
     y, z = (e.outvars[0] for e in flat.eqns[:2])
     dropped = last_uses(stages, {*flat.invars, *flat.outvars})
     assert dropped == [[], [y], [z]]
@@ -26,8 +26,8 @@ def test_a_value_is_dropped_after_its_last_use():
 
 
 def test_what_nothing_needs_is_dropped_where_it_is_made():
-    flat = flattened(lambda x: (jnp.sin(x), jnp.cos(x)), ROW)[0].jaxpr
-    stages = [Touched(e.invars, e.outvars) for e in flat.eqns]
+    flat = as_jaxpr(lambda x: (jnp.sin(x), jnp.cos(x)), ROW)[0].jaxpr
+    stages = [StageMemory(e.invars, e.outvars) for e in flat.eqns]
     sine, cosine = flat.outvars
     assert last_uses(stages, {cosine}) == [[sine], [*flat.invars]]
     assert most_bytes(stages, flat.invars, [cosine]) == 2 * 8000  # x and one of both

@@ -62,9 +62,9 @@ def moved(row):
 def test_a_function_is_computed_on_each_row_with_an_interpreter_and_without(monkeypatch):
     q = RNG.normal(size=(30, 4))
     rows = q / np.linalg.norm(q, axis=1)[:, None], RNG.normal(size=(30, 3))
-    found = scanned.on_each(moved, rows)
+    found = scanned.mapped_rows(moved, rows)
     monkeypatch.setattr(scanned, "_can_interpret", lambda: False)
-    want = scanned.on_each(moved, rows)
+    want = scanned.mapped_rows(moved, rows)
     assert jax.tree.structure(found) == jax.tree.structure(want)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
         assert isinstance(a, np.ndarray)

@@ -10,7 +10,7 @@ from jax import lax
 from machines import apart
 
 from robins.program import CPP, LANE_FLAGS
-from robins.program.stages import Staged, flattened
+from robins.program.stages import StagedFunction, as_jaxpr
 
 FOUND = any(map(shutil.which, CPP.names))
 pytestmark = pytest.mark.skipif(not FOUND, reason="lanes need a C++ compiler")
@@ -70,7 +70,7 @@ def close(want, got, within=1e-13):
 
 @pytest.fixture(scope="module")
 def staged(quick):
-    return Staged(world, NUMBER)
+    return StagedFunction(world, NUMBER)
 
 
 def test_a_simulation(staged):
@@ -95,7 +95,7 @@ def some_of_one_run(number):
 
 def test_what_is_wanted_of_one_run_is_kept_of_the_first():
     runs = jnp.arange(5, 5 + N)
-    many, one = Staged(some_of_one_run, NUMBER, named=True)(runs)
+    many, one = StagedFunction(some_of_one_run, NUMBER, named=True)(runs)
     want, first = some_of_one_run(5)
     close(jax.tree.map(lambda x: np.asarray(x)[None], first), one)
     close(want, jax.tree.map(lambda x: np.asarray(x)[0], many))
@@ -135,7 +135,7 @@ def test_what_goes_along_one_axis_is_one_loop():
         total, sums = lax.scan(lambda s, r: (s + r, s), jnp.zeros(3), rows)
         return jnp.cos(sums) + 1.0, total
 
-    one = Staged(function, jax.ShapeDtypeStruct((T, 3), float))
+    one = StagedFunction(function, jax.ShapeDtypeStruct((T, 3), float))
     x = np.random.default_rng(0).normal(size=(N, T, 3))
     close(jax.vmap(function)(x), one(x))
     (loop,) = one.loops
@@ -147,7 +147,7 @@ def test_zeros_that_do_not_hold_are_not_taken_for_granted():
     def function(x):
         return lax.scan(lambda s, r: (0.5 * s, s @ s), x, jnp.arange(100.0))[1]
 
-    one = Staged(function, jax.ShapeDtypeStruct((2, 2), float))
+    one = StagedFunction(function, jax.ShapeDtypeStruct((2, 2), float))
     zeros = np.zeros((N, 2, 2)) + np.diag([1.0, 2.0])
     close(jax.vmap(function)(zeros), one(zeros))
     before = one.loops[0].rounds.program
@@ -161,7 +161,7 @@ def test_what_has_no_place_stays_with_jax_and_says_why():
     def function(x):
         return lax.scan(lambda s, r: (s, lax.digamma(s + r)), 1.0, x)[1] + 1.0
 
-    one = Staged(function, jax.ShapeDtypeStruct((T,), float))
+    one = StagedFunction(function, jax.ShapeDtypeStruct((T,), float))
     x = np.random.default_rng(0).uniform(size=(N, T))
     close(jax.vmap(function)(x), one(x))
     (loop,) = [loop for loop in one.loops if loop.refused]
@@ -170,7 +170,7 @@ def test_what_has_no_place_stays_with_jax_and_says_why():
 
 
 def test_calls_are_written_out():
-    flat, _ = flattened(jax.jit(lambda x: jax.jit(jnp.cos)(jax.jit(jnp.sin)(x))), NUMBER)
+    flat, _ = as_jaxpr(jax.jit(lambda x: jax.jit(jnp.cos)(jax.jit(jnp.sin)(x))), NUMBER)
     assert [e.primitive.name for e in flat.eqns][-2:] == ["sin", "cos"]
 
 
@@ -180,7 +180,7 @@ def test_rows_of_every_kind(kind):
         return lax.scan(lambda s, r: (r, s), x[0], x, reverse=True)
 
     # Trivial rounds, which are worth nothing: all the more of them.
-    one = Staged(function, jax.ShapeDtypeStruct((50, 2), kind))
+    one = StagedFunction(function, jax.ShapeDtypeStruct((50, 2), kind))
     x = np.random.default_rng(0).integers(0, 2**31, (3, 50, 2)).astype(kind)
     close(jax.vmap(function)(x), one(x), 0.0)
     assert one.loops

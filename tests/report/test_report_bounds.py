@@ -103,7 +103,7 @@ def test_rows_tell_what_is_seen_and_what_it_is_worth(told):
     ],
 )
 def test_a_verdict_takes_the_start_and_the_end(sigma, start, unaided, verdict):
-    assert bounds.Row("x", "m", 1.0, [sigma], unaided, [], start).verdict == verdict
+    assert bounds.BoundRow("x", "m", 1.0, [sigma], unaided, [], start).verdict == verdict
 
 
 def test_the_table_and_its_sentences(told):

@@ -65,7 +65,7 @@ def test_no_text_covers_another_or_leaves_the_figure(drawn):
 
 
 def test_planted_collisions_are_found():
-    figure, grid = style.new(1, 1)
+    figure, grid = style.new_figure(1, 1)
     figure.set_layout_engine("none")  # it would make room for what sticks out
     for x in (0.5, 0.51, 1.2):
         grid[0, 0].text(x, 0.5, f"at {x}", transform=grid[0, 0].transAxes)

@@ -16,7 +16,7 @@ from PIL import Image
 from robins import report, results
 from robins.report import embed, style
 
-ORIGIN = report.Origin(
+ORIGIN = report.ReportOrigin(
     command="robins run 'a b' --seed 7",
     scenario_text='name = "<town>"',
     device="cpu",
@@ -121,7 +121,7 @@ def test_hostile_names_are_printed_and_not_obeyed(town):
         "warnings": [hostile],
     }
     said = hostile, f"</pre>{hostile}", hostile, {hostile: hostile}, hostile, (hostile,)
-    reader = Reader(report.page(summary, [], report.Origin(*said)))
+    reader = Reader(report.page(summary, [], report.ReportOrigin(*said)))
     assert "script" not in reader.tags
     assert reader.words.count("alert(1)") >= 11
     assert hostile in reader.text
@@ -169,7 +169,7 @@ def test_embedded_pictures_can_be_read(text):
 
 
 def test_a_simple_figure_is_embedded_as_lines_and_a_crowded_one_as_dots(shots):
-    figure, grid = style.new()
+    figure, grid = style.new_figure()
     grid[0, 0].plot([1.0, 2.0, 1.0])
     grid[0, 0].set_xlabel("averaging time [s] & \"'<>#%")
     simple = report.draw(report.Picture("simple", "Simple", "", figure))

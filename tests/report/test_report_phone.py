@@ -10,7 +10,9 @@ from robins import report
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WIDTH = 375  # CSS pixels
-ORIGIN = report.Origin("robins run x --seed 7", 'name = "x"', "cpu", {"robins": "0.1.0"}, "2030")
+ORIGIN = report.ReportOrigin(
+    "robins run x --seed 7", 'name = "x"', "cpu", {"robins": "0.1.0"}, "2030"
+)
 
 # Where the cells of a row of numbers lie, the first of a scrolling box first.
 CELLS = """[...document.querySelectorAll("tbody tr")].map(

@@ -10,12 +10,12 @@ from robins.sim.attitude_reference import (
     PEAK_ACCELERATION,
     PEAK_RATE,
     Reference,
-    handed_over,
+    handover_reference,
     inertial,
     nadir,
     slews,
 )
-from robins.sim.orbit import Orbit, circular_orbit
+from robins.sim.orbit import OrbitStates, circular_orbit
 
 DEG = np.pi / 180.0
 COUNT = 12000
@@ -72,7 +72,9 @@ def test_nadir_of_an_ellipse_speeds_up_where_it_is_low():
     speed = n / (1.0 - e * np.cos(anomaly))
     vx, vy = -a * np.sin(anomaly) * speed, a * np.sqrt(1 - e * e) * np.cos(anomaly) * speed
     place, velocity = np.stack([x, y, 0 * x], -1), np.stack([vx, vy, 0 * x], -1)
-    reference = numbers(nadir(Orbit(jnp.asarray(time), jnp.asarray(place), jnp.asarray(velocity))))
+    reference = numbers(
+        nadir(OrbitStates(jnp.asarray(time), jnp.asarray(place), jnp.asarray(velocity)))
+    )
     C = Rotation.from_quat(reference.q_ib, scalar_first=True).as_matrix()
     turned = np.unwrap(np.arctan2(-C[:, 1, 2], -C[:, 0, 2]))
     omega, alpha = reference.omega_b[:, 1], reference.alpha_b[:, 1]
@@ -129,7 +131,7 @@ TURN, LENGTH = np.array([0.3, -0.5, 0.2]), 40.0  # rad, s
 
 
 def way(base, rate, turn=TURN):
-    return numbers(handed_over(base, turn, np.asarray(rate, float), LENGTH, TIME))
+    return numbers(handover_reference(base, turn, np.asarray(rate, float), LENGTH, TIME))
 
 
 def test_the_way_between_two_attitudes_turns_about_one_axis_from_rest_to_rest():

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation as SciRotation
 
 from robins.earth import OMEGA_E, Geodetic, dcm_en, ecef_from_geodetic
-from robins.sim.manoeuvres import Bank, fly
+from robins.sim.manoeuvres import BankedTurn, fly
 from robins.sim.trajectory import at_lever_arm
 
 LEVER = np.array([-1.5, 4.0, 0.6])
@@ -14,7 +14,13 @@ LEVER = np.array([-1.5, 4.0, 0.6])
 @pytest.fixture(scope="module")
 def motion():
     start = Geodetic(np.deg2rad(50.0), np.deg2rad(179.999), 2000.0)  # flies over 180 deg
-    return fly(start, [Bank(0.6, 20.0), Bank(-0.4, 10.0)], 90.0, heading_rad=1.5, pitch_rad=0.05)
+    return fly(
+        start,
+        [BankedTurn(0.6, 20.0), BankedTurn(-0.4, 10.0)],
+        90.0,
+        heading_rad=1.5,
+        pitch_rad=0.05,
+    )
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,18 @@ from scipy.spatial.transform import Rotation as SciRotation
 from robins.earth import OMEGA_E, Geodetic, gravity
 from robins.sim import commands as do
 from robins.sim.commands import from_commands
-from robins.sim.manoeuvres import MODERATE_SEA, Bank, Sea, Wave, fly, roughen, sail
+from robins.sim.manoeuvres import MODERATE_SEA, BankedTurn, SeaMotion, Wave, fly, roughen, sail
 
 DEG = np.pi / 180.0
 START = Geodetic(32.0 * DEG, 118.0 * DEG, 3000.0)
 G = float(np.asarray(gravity(START.lat, START.alt)))
 SPEED, PITCH, ROLL_S = 100.0, 2.0 * DEG, 2.0
-S_TURN = [Bank(0.0, 10.0), Bank(30.0 * DEG, 31.0), Bank(-30.0 * DEG, 30.0), Bank(0.0, 49.0)]
+S_TURN = [
+    BankedTurn(0.0, 10.0),
+    BankedTurn(30.0 * DEG, 31.0),
+    BankedTurn(-30.0 * DEG, 30.0),
+    BankedTurn(0.0, 49.0),
+]
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +30,7 @@ def s_turn():
 @pytest.fixture(scope="module")
 def hard_turn():
     """3 g to the side: spec 1.2 of transfer alignment, by attitude matching."""
-    return fly(START, [Bank(np.arctan(3.0), 12.0), Bank(0.0, 8.0)], 240.0, roll_s=1.0)
+    return fly(START, [BankedTurn(np.arctan(3.0), 12.0), BankedTurn(0.0, 8.0)], 240.0, roll_s=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +150,7 @@ def test_a_ship_sways_as_told(ship):
 
 
 def test_amplitudes_of_a_single_swell():
-    swell = Sea(roll=[Wave(10.0 * DEG, 9.0)], heave=[Wave(1.5, 8.0, np.pi / 2)])
+    swell = SeaMotion(roll=[Wave(10.0 * DEG, 9.0)], heave=[Wave(1.5, 8.0, np.pi / 2)])
     k = sail(START, 72.0, sea=swell).at(np.linspace(0.0, 72.0, 7201))
     roll, pitch, _ = euler(k)
     assert roll.max() == pytest.approx(10.0 * DEG, rel=1e-5)
@@ -176,15 +181,21 @@ def test_a_rough_road_shakes_the_body_and_leaves_the_path(road, rough):
     ("make", "message"),
     [
         (lambda: fly(START, [], 100.0), "the list is empty"),
-        (lambda: fly(START, [Bank(0.1, 1.0)], 100.0), r"bank 0 lasts 1 s, less than the 2 s"),
-        (lambda: fly(START, [Bank(1.5, 9.0)], 100.0), r"bank 0 is 85\.9.* less than 85 deg"),
-        (lambda: fly(START, [Bank(np.nan, 9.0)], 100.0), "bank 0 is nan deg"),
-        (lambda: fly(START, [Bank(0.1, 9.0)], 0.0), "speed_mps is 0.0; it must be positive"),
-        (lambda: fly(START, [Bank(0.1, 9.0)], 9.0, roll_s=-1.0), "roll_s is -1.0"),
+        (lambda: fly(START, [BankedTurn(0.1, 1.0)], 100.0), r"bank 0 lasts 1 s, less than the 2 s"),
+        (lambda: fly(START, [BankedTurn(1.5, 9.0)], 100.0), r"bank 0 is 85\.9.* less than 85 deg"),
+        (lambda: fly(START, [BankedTurn(np.nan, 9.0)], 100.0), "bank 0 is nan deg"),
+        (lambda: fly(START, [BankedTurn(0.1, 9.0)], 0.0), "speed_mps is 0.0; it must be positive"),
+        (lambda: fly(START, [BankedTurn(0.1, 9.0)], 9.0, roll_s=-1.0), "roll_s is -1.0"),
         (lambda: sail(START, 0.0), "duration_s is 0.0"),
         (lambda: sail(START, 9.0, speed_mps=-1.0), "a ground speed is not negative"),
-        (lambda: sail(START, 9.0, sea=Sea(yaw=[Wave(0.1, 0.0)])), "the period must be positive"),
-        (lambda: fly(Geodetic(1.57, 0.0, 0.0), [Bank(0.0, 9.0)], 9.0), "north turns ever faster"),
+        (
+            lambda: sail(START, 9.0, sea=SeaMotion(yaw=[Wave(0.1, 0.0)])),
+            "the period must be positive",
+        ),
+        (
+            lambda: fly(Geodetic(1.57, 0.0, 0.0), [BankedTurn(0.0, 9.0)], 9.0),
+            "north turns ever faster",
+        ),
     ],
 )
 def test_what_cannot_be_moved_is_refused(make, message):

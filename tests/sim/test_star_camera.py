@@ -18,8 +18,8 @@ from robins.sim.star_sensor import (
     index_for,
     measure_attitude,
     photograph,
-    show,
     turned,
+    visible_stars,
 )
 
 POINTINGS, HALF = 200, np.radians(10.0)
@@ -135,7 +135,7 @@ def test_a_camera_that_is_turned_before_a_sky_sees_what_it_sees_there():
 
     def seen(margin_rad):
         def one(key, q_is):
-            shown = show(INDEX, q_is, CAMERA, 60, margin_rad)
+            shown = visible_stars(INDEX, q_is, CAMERA, 60, margin_rad)
             return expose(key, turned(shown, CAMERA, turn), CAMERA)
 
         return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(KEYS, q_is))

@@ -10,14 +10,14 @@ from robins.earth import OMEGA_E, Geodetic, dcm_en, ecef_from_geodetic, gravity_
 from robins.rotation import to_euler
 from robins.sim import commands as do
 from robins.sim.commands import from_commands
-from robins.sim.trajectory import Motion, from_waypoints, sine_velocity
+from robins.sim.trajectory import MotionProfile, from_waypoints, sine_velocity
 
 START = Geodetic.from_degrees(55.0, 37.0, 150.0)
 SPIN = np.array([0.0, 0.0, OMEGA_E])
 
 
 @pytest.fixture(scope="module")
-def drive() -> Motion:
+def drive() -> MotionProfile:
     manoeuvres = [
         do.stand(5.0),
         do.accelerate(15.0, 8.0),
@@ -34,7 +34,7 @@ def drive() -> Motion:
 
 
 @pytest.fixture(scope="module")
-def waypoints() -> Motion:
+def waypoints() -> MotionProfile:
     """Westward over the 180 deg meridian."""
     t = np.arange(12) * 10.0
     lat = np.deg2rad(-17.0) + 1e-4 * np.sin(0.05 * t)
@@ -43,12 +43,12 @@ def waypoints() -> Motion:
 
 
 @pytest.fixture(scope="module")
-def sine() -> Motion:
+def sine() -> MotionProfile:
     return sine_velocity(START, duration_s=120.0)
 
 
 @pytest.fixture(params=["drive", "waypoints", "sine"])
-def motion(request) -> Motion:
+def motion(request) -> MotionProfile:
     return request.getfixturevalue(request.param)
 
 

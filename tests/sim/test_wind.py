@@ -14,7 +14,7 @@ from robins.sim.wind import gusts, wind_at
 KEY = stream(5, 0, Component.WIND)
 rng = np.random.default_rng(3)
 
-carry, carried_at = jax.jit(of_wind.carry), jax.jit(of_wind.carried_at)
+carry, carried_at = jax.jit(of_wind.move_in_wind), jax.jit(of_wind.wind_motion_at)
 
 # ------------------------------------------------------------------------------------ the draw
 
@@ -156,7 +156,9 @@ def test_it_runs_inside_a_batch_and_has_gradients():
 
     def moved(key, tau):
         wind = gusts(key, M, 0.0, 1e3, STEP)
-        return of_wind.carried_at(of_wind.carry(wind, STEP, COMMANDED, tau, START), times)
+        return of_wind.wind_motion_at(
+            of_wind.move_in_wind(wind, STEP, COMMANDED, tau, START), times
+        )
 
     alone = jax.jit(moved)
 
@@ -172,7 +174,7 @@ def test_it_runs_inside_a_batch_and_has_gradients():
 
 def carried_by(**wrong):
     good = {"wind": WIND, "step_s": STEP, "commanded_m_s": COMMANDED}
-    return of_wind.carry(**{**good, "tau_s": TAU, "start_m_s": START, **wrong})
+    return of_wind.move_in_wind(**{**good, "tau_s": TAU, "start_m_s": START, **wrong})
 
 
 @pytest.mark.parametrize(
@@ -191,7 +193,7 @@ def carried_by(**wrong):
         (lambda: carried_by(wind=WIND[:0]), "M at least one"),
         (lambda: carried_by(commanded_m_s=COMMANDED[:1]), "commanded_m_s must have shape"),
         (lambda: carried_by(start_m_s=np.zeros(3)), "start_m_s must have shape"),
-        (lambda: of_wind.carried_at(MOTION, -0.1), "time_s must be a finite number from 0"),
+        (lambda: of_wind.wind_motion_at(MOTION, -0.1), "time_s must be a finite number from 0"),
         (lambda: wind_at(WIND, -1.0, 0.0), "step_s must be"),
     ],
 )

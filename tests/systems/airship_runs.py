@@ -17,7 +17,7 @@ from robins.manifold import local
 from robins.systems.airship import SYSTEM
 from robins.systems.airship.instruments import SAR
 from robins.systems.airship.parameters import Airship
-from robins.systems.airship.world import World
+from robins.systems.airship.world import AirshipWorld
 from robins.systems.study import Problem
 
 RUNS, MANY = 8, 20  # of `make test`, and of the specification, by `make certify`
@@ -62,7 +62,7 @@ class Flights(NamedTuple):
 
     name: str
     settings: tuple[str, ...]
-    batch: World  # leading axis: runs
+    batch: AirshipWorld  # leading axis: runs
 
     def problem(self, *filters: str) -> Problem:
         """The scenario with these filters."""
@@ -93,20 +93,20 @@ def flights(name: str, settings: tuple[str, ...] = TO_THE_END, runs: int = RUNS)
     return Flights(name, settings, first_worlds(problem(name, settings, ()), runs))
 
 
-def beginning(batch: World, epochs: int) -> World:
+def beginning(batch: AirshipWorld, epochs: int) -> AirshipWorld:
     """First epochs of runs."""
     count = batch.wind.shape[1]
     return jax.tree.map(lambda x: x[:, :epochs] if x.shape[1:2] == (count,) else x, batch)
 
 
-def without_radar(batch: World, begin: int, end: int) -> World:
+def without_radar(batch: AirshipWorld, begin: int, end: int) -> AirshipWorld:
     """Neither radar nor barometer at the ends of these epochs."""
     gone = np.zeros(batch.wind.shape[1], bool)
     gone[begin:end] = True
     return told_by_radar(batch, lambda x, at: jnp.where(gone[at], jnp.nan, x))
 
 
-def told_by_radar(batch: World, changed: Callable[[Any, Any], Any]) -> World:
+def told_by_radar(batch: AirshipWorld, changed: Callable[[Any, Any], Any]) -> AirshipWorld:
     """Changed reports of radar and barometer: arrays (runs, E, ...), and the lag of the epochs."""
     before = batch.readings[SAR]
     after = jax.tree.map(lambda x: changed(x, (None, slice(None), *[None] * (x.ndim - 2))), before)

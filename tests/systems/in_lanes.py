@@ -12,7 +12,7 @@ import jax
 
 from robins.campaign.machine import with_stack
 from robins.program.interpreter import interpreted_rounds
-from robins.program.stages import Staged
+from robins.program.stages import StagedFunction
 
 
 def each(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -21,7 +21,7 @@ def each(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     @cache
     def staged(tree, leaves):
         shapes = jax.tree.unflatten(tree, leaves)
-        return Staged(function, shapes, engine=interpreted_rounds)
+        return StagedFunction(function, shapes, engine=interpreted_rounds)
 
     def of(batch):
         leaves, tree = jax.tree.flatten(batch)

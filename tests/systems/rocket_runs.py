@@ -13,7 +13,7 @@ from robins.filters import run
 from robins.filters.analysis.consistency import normalised_sq
 from robins.manifold import local
 from robins.systems.rocket import SYSTEM
-from robins.systems.rocket.world import PEAK_S, World
+from robins.systems.rocket.world import PEAK_S, RocketWorld
 from robins.systems.study import Problem
 
 RUNS, MANY = 8, 20  # of `make test`, and of the specification, by `make certify`
@@ -83,7 +83,7 @@ def problem(name: str, settings: tuple[str, ...], filters: tuple[str, ...] = ())
 
 
 @cache
-def flights(name: str, settings: tuple[str, ...], runs: int) -> World:
+def flights(name: str, settings: tuple[str, ...], runs: int) -> RocketWorld:
     """Runs of a packaged scenario, changed; leading axis: runs."""
     return first_worlds(problem(name, settings), runs)
 

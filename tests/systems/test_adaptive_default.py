@@ -12,10 +12,10 @@ from robins.systems.transfer_alignment.attitude_matching.model import ATTITUDE, 
 from robins.systems.transfer_alignment.attitude_matching.parameters import AttitudeMatching
 from robins.systems.transfer_alignment.attitude_matching.structures import (
     START,
-    Supposed,
-    blind,
+    StructureHypothesis,
     hypotheses,
-    supposed,
+    structure_bank,
+    structure_filter,
 )
 from robins.systems.transfer_alignment.product.filters import NOISY, UNKNOWN, VARIANTS
 from robins.systems.transfer_alignment.product.parameters import Product, Structure
@@ -59,7 +59,7 @@ def test_attitude_matching_supposes_structures_and_no_louder_gyros():
     assert count == 2 * len(swings) == 18  # with flutter and without
     given = load(AttitudeMatching, SCENARIOS["s1"])
     system = linear_system(given, 3, START)
-    bank = blind(system, given.master.attitude_noise, given.period)
+    bank = structure_bank(system, given.master.attitude_noise, given.period)
     state = bank.init(system.start(), {ATTITUDE: 3})
     probability = np.exp(state.memory.log_probability)
     np.testing.assert_allclose(probability[np.asarray(rows.sigma) == 0.0].sum(), 0.5)
@@ -71,7 +71,7 @@ def test_attitude_matching_supposes_structures_and_no_louder_gyros():
 
 def test_a_bank_made_again_is_the_same_and_its_numbers_are_leaves():
     system = linear_system(load(AttitudeMatching, SCENARIOS["s1"]), 3, START)
-    one, other = (jax.tree_util.tree_flatten(blind(system, s, 0.1)) for s in (3e-4, 5e-4))
+    one, other = (jax.tree_util.tree_flatten(structure_bank(system, s, 0.1)) for s in (3e-4, 5e-4))
     assert one[1] == other[1]
     assert {leaf.dtype for leaf in one[0]} == {np.dtype(float)}
     differ = [a for a, b in zip(one[0], other[0], strict=True) if np.any(a != b)]
@@ -85,7 +85,7 @@ def test_each_hypothesis_is_the_kalman_filter_of_its_structure():
     told, flutter = Flexure(np.full(3, 2e-3), np.full(3, 4.0)), 3.0
     system, own = linear_system(given, 3, START), linear_system(given, 3, told)
     y = 1e-3 * np.random.default_rng(1).normal(size=(3, 3))
-    mode = supposed(system, noise, T)(Supposed(2e-3, 4.0, flutter))
+    mode = structure_filter(system, noise, T)(StructureHypothesis(2e-3, 4.0, flutter))
     model = own.model(noise)
     u, aux = system.inputs()
     state = mode.filter_.init(system.start(), model.dims)
@@ -107,7 +107,7 @@ def test_each_hypothesis_is_the_kalman_filter_of_its_structure():
 def test_a_stiff_structure_is_forgotten():
     given = load(AttitudeMatching, SCENARIOS["s1"])
     system = linear_system(given, 3, START)
-    mode = supposed(system, 3e-4, given.period)(Supposed(0.0, 1.0, 0.0))
+    mode = structure_filter(system, 3e-4, given.period)(StructureHypothesis(0.0, 1.0, 0.0))
     state = mode.filter_.init(system.start(), {ATTITUDE: 3})
     state, *_ = mode.predict(state, system.model(3e-4).motion, system.inputs()[0][0])
     assert np.all(state.belief.sigma[9:] == 0.0)

@@ -22,7 +22,7 @@ from robins.systems.airship.instruments import (
     STAR,
     STAR_EARLY,
     WIND,
-    Early,
+    EarlySights,
     level,
     read_early,
     read_wind,
@@ -33,7 +33,7 @@ from robins.systems.airship.model import (
     WithWind,
     walk,
 )
-from robins.systems.airship.world import lay_out, present, simulate
+from robins.systems.airship.world import lay_out, sampled_at, simulate
 from robins.workbench import InputError
 from robins.workbench import run as run_scenario
 
@@ -158,7 +158,7 @@ def test_gyros_carry_the_star_sights_of_an_epoch_to_its_end(perfect):
     age = jnp.full((EPOCHS, 1), 0.5)
     zero = jnp.zeros((EPOCHS, 3))
     states = WithWind(as_ins(world.truth, zero, zero), world.wind_error)
-    read = jax.vmap(lambda x, turned, age: read_early(x, Early(turned, age)))
+    read = jax.vmap(lambda x, turned, age: read_early(x, EarlySights(turned, age)))
     angles = np.stack([a.rad for a in read(states, world.since, age)], 1)
     euler = world.readings[STAR]
     there = np.isfinite(euler[:, 0, 0])
@@ -206,10 +206,10 @@ def test_sensors_are_missing_where_they_are_lost_and_nowhere_else(perfect):
 def test_slower_sensors_read_at_the_end_of_their_own_intervals():
     given = parsed("s0", (*SHORT, 'sar.rate="0.25 Hz"', 'star.rate="5 Hz"'))
     course = lay_out(given)
-    there = present(course.epoch_s, given.sar)
+    there = sampled_at(course.epoch_s, given.sar)
     np.testing.assert_array_equal(np.flatnonzero(there) + 1, np.arange(4, EPOCHS + 1, 4))
     assert course.sights == 5
-    assert np.all(present(course.sight_s, given.star))
+    assert np.all(sampled_at(course.sight_s, given.star))
     assert (course.samples, course.parts) == (2, 2)
 
 
@@ -295,7 +295,7 @@ def test_sensors_read_with_the_slope_of_differences(at):
     sigma = jnp.asarray([1e-4] * 3 + [0.1] * 3 + [10.0] * 3 + SIZES["product"])
     aux = None
     if sensor.name == STAR_EARLY:
-        aux = Early(jnp.array([[0.01, -0.02, 0.015]]), jnp.array([0.5]))
+        aux = EarlySights(jnp.array([[0.01, -0.02, 0.015]]), jnp.array([0.5]))
     if sensor.name.startswith("wind"):
         aux = jnp.array([9.0, 1.0, -0.5])
     y = sensor.read(x, aux)

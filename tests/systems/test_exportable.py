@@ -10,7 +10,7 @@ from exported import primitives
 
 import robins.program.primitives  # noqa: F401
 from robins import manifold
-from robins.campaign.monte_carlo import solved
+from robins.campaign.monte_carlo import run_case
 from robins.export.field_notes import field_notes, mean_fields, tangent_axes, tangent_fields
 from robins.export.runs import entry_functions, reset_function
 from robins.filters import Belief
@@ -51,7 +51,7 @@ class Given:
         def given(run):
             case = c.case(self.problem.simulate(run))
             if case.loop is not None:
-                case = solved(c.filter, c.model, case, lambda step: ())[1]
+                case = run_case(c.filter, c.model, case, lambda step: ())[1]
             return case.start, case.rows, case.u, dict(case.y), dict(case.aux)
 
         start, turning, *rows = jax.eval_shape(given, jnp.asarray(0))

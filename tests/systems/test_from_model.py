@@ -37,7 +37,7 @@ def test_without_noise_the_world_is_the_motion():
 
 
 def test_its_covariances_are_those_of_the_model():
-    """Of 4000 runs: a share of 1/sqrt(2000) is the scatter of a variance."""
+    """Scatter of a variance over 4000 runs: a share of 1/sqrt(2000)."""
     runs = jax.vmap(lambda k: drawn(model(0.5, 3.0), start(2.0), 2, partial(stream, 7, k)))
     truth, y = runs(jnp.arange(4000))
     P, Q = 4.0 * np.eye(2), 0.25 * np.eye(2)

@@ -17,21 +17,21 @@ from robins.systems.gnss.filters import contender
 from robins.systems.gnss.model import (
     LIGHT,
     RANGES,
+    GnssModelKind,
     GnssState,
-    Kind,
-    Place,
+    LocalFrame,
+    MotionStep,
     Sky,
-    Travel,
     first_fix,
     pseudoranges,
     sagnac_m,
 )
-from robins.systems.gnss.parameters import Delays, Replay
+from robins.systems.gnss.parameters import Delays, GnssReplay
 from robins.systems.gnss.weights import by_component, huber_weight, student_weight, switch_weight
 from robins.workbench.errors import InputError
 from robins.workbench.replay import replay
 
-BERLIN = Place.at(np.array([3785108.0, 899901.0, 5037234.0]))
+BERLIN = LocalFrame.at(np.array([3785108.0, 899901.0, 5037234.0]))
 RNG = np.random.default_rng(5)
 
 
@@ -78,9 +78,9 @@ def state(delays):
 @pytest.mark.parametrize("delays", [False, True])
 def test_derivatives_by_differences(delays):
     member = (np.arange(6) % 2)[:, None]
-    built = model.gnss_model(Replay(), Kind(delays=delays), BERLIN, member)
+    built = model.gnss_model(GnssReplay(), GnssModelKind(delays=delays), BERLIN, member)
     x, sky = state(delays), Sky(jnp.asarray(sky_of(6)), jnp.ones(6))
-    u = Travel(0.5, 8.0, 0.3, 0.05, 0.002, jnp.full(6, 9.0), jnp.full(6, 20.0))
+    u = MotionStep(0.5, 8.0, 0.3, 0.05, 0.002, jnp.full(6, 9.0), jnp.full(6, 20.0))
     n = len(local(x, x))
     sensor = built.sensor(RANGES)
     for f, unit in (
@@ -99,9 +99,9 @@ def test_derivatives_by_differences(delays):
 
 
 def test_a_turn_goes_to_the_right_and_along_the_arc():
-    built = model.gnss_model(Replay(), Kind(), BERLIN, np.zeros((4, 1)))
+    built = model.gnss_model(GnssReplay(), GnssModelKind(), BERLIN, np.zeros((4, 1)))
     x = state(False)._replace(yaw_bias=jnp.asarray(0.0), direction=jnp.array([1.0, 0.0]))
-    u = Travel(0.1, 10.0, np.pi / 10.0, 0.05, 0.002, jnp.zeros(4), jnp.zeros(4))
+    u = MotionStep(0.1, 10.0, np.pi / 10.0, 0.05, 0.002, jnp.zeros(4), jnp.zeros(4))
     for _ in range(50):  # a quarter turn of radius 10 / (pi / 10)
         x = built.motion.step(x, u)
     radius = 100.0 / np.pi

@@ -11,9 +11,9 @@ from robins.systems import SYSTEMS
 from robins.systems.judgement import (
     RUNS,
     Claim,
+    claim_judge,
     consistency_claims,
     interval_of,
-    judging,
     nees_claim,
     ratio,
     ratio_claims,
@@ -63,10 +63,14 @@ def claim(value, band, partly=None, verdict=None):
     ],
 )
 def test_a_verdict_is_that_of_the_band(one, verdict):
-    (found,) = judging({"c": one})({"a": {}})
+    (found,) = claim_judge({"c": one})({"a": {}})
     assert found["verdict"] == verdict
     assert found["band"] == (None if one.band is None else list(one.band))
-    assert judging({"c": one})({"b": {}}) == judging({"c": one})({"a": {"feasible": False}}) == []
+    assert (
+        claim_judge({"c": one})({"b": {}})
+        == claim_judge({"c": one})({"a": {"feasible": False}})
+        == []
+    )
 
 
 def figures(off, share, nis):
@@ -91,7 +95,7 @@ def figures(off, share, nis):
 def test_of_several_filters_the_worst_is_judged(worse, held):
     claims = consistency_claims(dict.fromkeys(("sigma", "anees", "nis"), "x"))
     metrics = {"right": figures(0.0, 0.99, 1.0), "worse": worse, "again": figures(0.0, 0.99, 1.0)}
-    found = judging(claims)(metrics)
+    found = claim_judge(claims)(metrics)
     assert {c["id"] for c in found if c["verdict"] == "reproduced"} == held
 
 
@@ -166,7 +170,7 @@ def test_a_verdict_holds_for_all_of_the_interval(band, partly, verdict, more):
     squares = np.random.default_rng(4).chisquare(2, (50, 2)) * (1.0, 4.0)
     metrics, every = drawn(squares)
     of = ratio("a", "b", "rms")
-    judge = judging({"c": Claim("x", ("a", "b"), of, band, partly)})
+    judge = claim_judge({"c": Claim("x", ("a", "b"), of, band, partly)})
     (point,), (found,) = judge(metrics), judge(metrics, every)
     assert point["interval"] is None
     assert (found["verdict"], found["more_runs"] is not None) == (verdict, more)
@@ -187,7 +191,7 @@ def test_a_verdict_of_its_own_is_decided_by_most_draws():
         own = Claim(
             "x", ("a", "b"), of, None, verdict=lambda m: "not" if of(m) > limit else "partly"
         )
-        return judging({"c": own})(metrics, every)[0]["verdict"]
+        return claim_judge({"c": own})(metrics, every)[0]["verdict"]
 
     assert [judged(limit) for limit in (0.1, of(metrics), 2.0)] == ["not", "undecided", "partly"]
 
@@ -199,7 +203,7 @@ def test_a_claim_that_states_a_confidence_has_no_interval():
     near = of(metrics) * 1.001
     for tested, verdict in ((False, "undecided"), (True, "reproduced")):
         one = Claim("x", ("a", "b"), of, (0.0, near), tested=tested)
-        (found,) = judging({"c": one})(metrics, every)
+        (found,) = claim_judge({"c": one})(metrics, every)
         assert (found["verdict"], found["interval"] is None) == (verdict, tested)
     claims = consistency_claims(dict.fromkeys(("sigma", "anees", "nis"), "x"))
     assert [claims[key].tested for key in ("sigma", "nis")] == [True, True]

@@ -12,14 +12,14 @@ from robins import logs, scenario
 from robins.dataset import GnssTable
 from robins.earth import curvature_radii
 from robins.manifold import local, retract
-from robins.results import silent
-from robins.systems.ins_gnss import Drive, Replay, drive_dataset
-from robins.systems.ins_gnss.lasting import MOST, scatter, with_lasting
+from robins.results import ignore_progress
+from robins.systems.ins_gnss import Drive, InsGnssReplay, drive_dataset
+from robins.systems.ins_gnss.correlated_errors import MOST, scatter, with_correlated_share
 from robins.systems.ins_gnss.log import WEIGHED, prepare, recorded
 from robins.systems.ins_gnss.model import POSITION, Fix, ins_gnss_model
 from robins.systems.ins_gnss.recording import on_one_clock
-from robins.systems.ins_gnss.robust import AS_TOLD, supposed, widened
-from robins.systems.replaying import navigated
+from robins.systems.ins_gnss.robust import AS_TOLD, augmented_belief, hypothesis_model
+from robins.systems.replaying import run_filters
 
 SIGMA_M, STEP_S, SHARE, TIME_S = 2.0, 0.25, 0.95, 50.0
 
@@ -49,7 +49,7 @@ def driven(log, share, velocities):
     lon = 0.2 + r_n[:, 1] / (transverse * np.cos(lat))
     sigma = np.full_like(r_n, SIGMA_M)
     gnss = GnssTable(np.round(t * 1e9).astype(np.int64), lat, lon, -r_n[:, 2], sigma)
-    shown = on_one_clock(log, Replay())
+    shown = on_one_clock(log, InsGnssReplay())
     v = v_n if velocities else None
     return shown._replace(
         gnss=gnss, gnss_s=t, sigma_m=sigma, v_n=v, sigma_v=v, withheld=np.zeros(len(t), bool)
@@ -63,7 +63,7 @@ def test_the_scatter_is_that_of_the_white_part(log, share, velocities):
     white = np.sqrt(1.0 - share)
     found = scatter(made)
     np.testing.assert_allclose(found, np.hypot(white, np.sqrt(share) * 0.03), rtol=0.08)
-    told, notes = with_lasting(Replay(), made)
+    told, notes = with_correlated_share(InsGnssReplay(), made)
     expected = 0.0 if share == 0.0 else share
     assert told.gnss.lasting_share == pytest.approx(expected, abs=0.09)
     assert len(notes) == (share > 0.0)
@@ -73,18 +73,18 @@ def test_few_fixes_and_a_stated_share_are_left_alone(log):
     made = driven(log, MOST, velocities=False)
     few = made._replace(withheld=np.arange(2000) > 100)
     assert scatter(few) is None
-    assert with_lasting(Replay(), few)[0].gnss.lasting_share == 0.0
-    stated = scenario.parse(Replay, "[gnss]\nlasting_share = 0.2\n")
-    assert with_lasting(stated, made) == (stated, [])
+    assert with_correlated_share(InsGnssReplay(), few)[0].gnss.lasting_share == 0.0
+    stated = scenario.parse(InsGnssReplay, "[gnss]\nlasting_share = 0.2\n")
+    assert with_correlated_share(stated, made) == (stated, [])
 
 
 def test_the_start_shares_the_error_of_its_fix(log):
     """The fix that the start is taken from reads with the white part of its variance alone."""
-    parameters = Replay()
+    parameters = InsGnssReplay()
     whole = on_one_clock(log, parameters)
     start = prepare(whole, parameters, slice(0, len(whole.time_s))).world.start
     own_m, fix_m = parameters.start.position, whole.sigma_m[0]
-    belief = widened(start, True, jnp.array([SHARE, TIME_S]), own_m)
+    belief = augmented_belief(start, True, jnp.array([SHARE, TIME_S]), own_m)
     P, n = np.asarray(belief.factor @ belief.factor.T), len(start.factor)
     np.testing.assert_allclose(np.diag(P)[n : n + 3], 1.0, rtol=1e-12)
     H = np.zeros((3, len(P)))
@@ -94,14 +94,14 @@ def test_the_start_shares_the_error_of_its_fix(log):
 
 
 def test_motion_and_reading_have_the_slopes_of_finite_differences(log):
-    parameters = Replay()
+    parameters = InsGnssReplay()
     own = ins_gnss_model(parameters.imu, parameters.gnss, parameters.aids)
     whole = on_one_clock(log, parameters)
     world = prepare(whole, parameters, slice(0, len(whole.time_s))).world
     u = jax.tree_util.tree_map(lambda a: jnp.asarray(a)[3], world.u)
     lasting = jnp.array([SHARE, TIME_S])
-    model = supposed(own, AS_TOLD, lasting)
-    belief = widened(world.start, True, lasting, parameters.start.position)
+    model = hypothesis_model(own, AS_TOLD, lasting)
+    belief = augmented_belief(world.start, True, lasting, parameters.start.position)
     x = belief.mean._replace(lasting=jnp.array([1.0, -2.0, 0.5]))
     n = len(world.start.factor)
     assert model.motion.linear is not None
@@ -129,9 +129,9 @@ def test_the_stated_sigma_does_not_fall_below_what_lasts(log):
     off = replace(log, gnss=replace(g, lat_rad=g.lat_rad + 1.0 / 6.3644e6))
     sigma, away = [], []
     for share in (0.0, SHARE):
-        parameters = scenario.parse(Replay, f"[gnss]\nlasting_share = {share}\n")
+        parameters = scenario.parse(InsGnssReplay, f"[gnss]\nlasting_share = {share}\n")
         (piece,), of = recorded(off, parameters)
-        answer = navigated([piece], [WEIGHED], of, {}, silent)[WEIGHED]
+        answer = run_filters([piece], [WEIGHED], of, {}, ignore_progress)[WEIGHED]
         sigma.append(float(answer.sigma[-1, 6]))
         truth = np.interp(piece.epoch_s[-1], log.truth.time_ns * 1e-9, log.truth.lat_rad)
         away.append(abs(float(answer.mean.ins.position.lat[-1]) - truth) * 6.3644e6 / sigma[-1])

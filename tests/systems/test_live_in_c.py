@@ -15,7 +15,7 @@ from test_live_marg import played as moved
 
 from robins import scenario
 from robins.program import FLAGS, build
-from robins.systems.ins_gnss import Drive, LiveInsGnss, Replay, drive_dataset
+from robins.systems.ins_gnss import Drive, InsGnssReplay, LiveInsGnss, drive_dataset
 from robins.systems.marg import LiveMarg
 from robins.systems.streaming import Flag
 
@@ -47,7 +47,7 @@ def test_the_navigation_is_that_by_jax():
     log = as_rates(drive_dataset(scenario.parse(Drive, DRIVE), seed=4))
     late = events(log, np.full(len(log.gnss), 0.17))  # so that epochs are gone through again
     (c, at), (jax, of) = (
-        played(LiveInsGnss(Replay(), IMU_HZ, FIX_HZ, "ekf", machine=machine), log, late)
+        played(LiveInsGnss(InsGnssReplay(), IMU_HZ, FIX_HZ, "ekf", machine=machine), log, late)
         for machine in ("c", "jax")
     )
     assert [a.flags for a in c] == [a.flags for a in jax]

@@ -14,14 +14,14 @@ from robins.logs import clean, load_dataset
 from robins.logs.ordering import rows_where
 from robins.results import ResultError
 from robins.systems import replaying
-from robins.systems.ins_gnss import SYSTEM, Drive, LiveInsGnss, Replay, drive_dataset
+from robins.systems.ins_gnss import SYSTEM, Drive, InsGnssReplay, LiveInsGnss, drive_dataset
 from robins.systems.ins_gnss.log import contender, prepare, steps_of
 from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock
 from robins.systems.ins_gnss.robust import navigation
 from robins.systems.streaming import Flag, LiveError
 
 RATE_HZ, FIX_HZ = 50.0, 2.0
-HEADED = Replay.model_validate({"start": {"known_heading": 1.2}})
+HEADED = InsGnssReplay.model_validate({"start": {"known_heading": 1.2}})
 
 
 def as_rates(dataset):
@@ -39,7 +39,7 @@ def log():
 def pieces_of(dataset, parameters):
     """The log on one clock, and its pieces as a replay takes them."""
     log = on_one_clock(in_body_axes(dataset, parameters.imu.orientation), parameters)
-    pieces, _ = replaying.prepared(
+    pieces, _ = replaying.prepare_pieces(
         log.time_s,
         log.increments.dt,
         parameters.update.longest_gap,
@@ -52,7 +52,7 @@ def epochs_of_replay(dataset, parameters, name):
     """Stamps [ns] and vectors (as `vector`) at the epochs of a causal replay."""
     log, pieces = pieces_of(dataset, parameters)
     of = partial(contender, parameters, float(np.median(np.diff(log.gnss_s))))
-    answer = replaying.navigated(pieces, (name,), of)[name]
+    answer = replaying.run_filters(pieces, (name,), of)[name]
     x = navigation(answer.mean)
     place = x.position
     rows = [x.q_nb.wxyz, x.v_n, np.stack([place.lat, place.lon, place.alt], axis=1)]
@@ -113,7 +113,7 @@ def compare(at, stamps, vectors, shortest):
 
 @pytest.fixture(scope="module")
 def made():
-    return LiveInsGnss(Replay(), RATE_HZ, FIX_HZ, "ekf")
+    return LiveInsGnss(InsGnssReplay(), RATE_HZ, FIX_HZ, "ekf")
 
 
 @pytest.fixture
@@ -140,7 +140,7 @@ def test_epochs_are_those_of_the_replay(live, log, order):
     if late_s is None:  # each comes after the next one
         late_s = np.where(np.arange(count) % 2 == 0, 0.72, 0.1)
     answers, at = played(live, log, events(log, late_s))
-    stamps, vectors = epochs_of_replay(log, Replay(), "ekf")
+    stamps, vectors = epochs_of_replay(log, InsGnssReplay(), "ekf")
     compare(at, stamps, vectors, len(stamps) - 3)
     started = [not a.flags & Flag.STARTING for a in answers]
     assert started == sorted(started)
@@ -151,7 +151,7 @@ def test_epochs_are_those_of_the_replay(live, log, order):
 
 @pytest.mark.parametrize(
     ("parameters", "begin_s"),
-    [(None, 0.0), (Replay(), 0.0), (HEADED, 0.0), (HEADED, 6.0)],
+    [(None, 0.0), (InsGnssReplay(), 0.0), (HEADED, 0.0), (HEADED, 6.0)],
     ids=["velocities", "course of positions", "heading given", "heading given, in motion"],
 )
 def test_steps_have_the_bits_of_those_of_a_replay(live, log, parameters, begin_s, monkeypatch):
@@ -162,8 +162,12 @@ def test_steps_have_the_bits_of_those_of_a_replay(live, log, parameters, begin_s
         imu = rows_where(log.imu, log.imu.time_ns >= begin_ns)
         gnss = rows_where(log.gnss, log.gnss.time_ns >= begin_ns)
         log = replace(log, imu=imu, gnss=replace(gnss, v_n=None, sigma_v=None))
-        live = live if parameters == Replay() else LiveInsGnss(parameters, RATE_HZ, FIX_HZ, "ekf")
-    parameters = parameters or Replay()
+        live = (
+            live
+            if parameters == InsGnssReplay()
+            else LiveInsGnss(parameters, RATE_HZ, FIX_HZ, "ekf")
+        )
+    parameters = parameters or InsGnssReplay()
 
     def noted(piece, used, begin_s, epochs, *others):
         last[round(1e9 * epochs[0])] = steps_of(piece, used, begin_s, epochs, *others)
@@ -208,7 +212,9 @@ def test_an_answer_is_the_state_carried_on_over_the_samples_since(live, log):
         np.vstack([g.sigma_m, np.ones(3)]), np.vstack([g.v_n, blank]),
         np.vstack([g.sigma_v, np.ones(3)]),
     )  # fmt: skip
-    stamps, vectors = epochs_of_replay(type(log)(log.name, cut.imu, nothing), Replay(), "ekf")
+    stamps, vectors = epochs_of_replay(
+        type(log)(log.name, cut.imu, nothing), InsGnssReplay(), "ekf"
+    )
     assert stamps[-1] == last.time_ns
     # the mean to rounding; the sigma but for what a rest of a sample more tells
     np.testing.assert_allclose(vector(last)[:10], vectors[-1, :10], atol=1e-9)
@@ -219,7 +225,11 @@ def test_restored_in_between_it_goes_on_to_the_bit(live, log, tmp_path):
     late_s = np.full(len(log.gnss), 0.23)
     whole = events(log, late_s)
     answers, _ = played(live, log, whole)
-    again, path, begun = LiveInsGnss(Replay(), RATE_HZ, FIX_HZ, "ekf"), tmp_path / "v.live", 0
+    again, path, begun = (
+        LiveInsGnss(InsGnssReplay(), RATE_HZ, FIX_HZ, "ekf"),
+        tmp_path / "v.live",
+        0,
+    )
     for end in (100, 420, 501, 760):
         played(again, log, whole[begun:end])
         again.save(path)
@@ -238,7 +248,7 @@ def test_an_outage_is_bridged_as_the_replay_does(live, log):
     given = type(log)(log.name, log.imu, rows_where(
         log.gnss, ~np.isin(np.arange(len(log.gnss)), list(skipped))))  # fmt: skip
     _, at = played(live, log, events(log, np.full(len(log.gnss), 0.1), skipped))
-    stamps, vectors = epochs_of_replay(given, Replay(), "ekf")
+    stamps, vectors = epochs_of_replay(given, InsGnssReplay(), "ekf")
     compare(at, stamps, vectors, len(stamps) - 3)
 
 
@@ -320,7 +330,7 @@ def test_a_fix_that_is_far_off_is_flagged_and_counted_once(live, log, late_s):
 
 def test_a_fix_of_the_future_waits(live, log):
     _, at = played(live, log, events(log, np.full(len(log.gnss), -0.4)))
-    stamps, vectors = epochs_of_replay(log, Replay(), "ekf")
+    stamps, vectors = epochs_of_replay(log, InsGnssReplay(), "ekf")
     compare(at, stamps, vectors, len(stamps) - 3)
     assert live.counts["steps_again"] == 0
 
@@ -341,7 +351,7 @@ def test_the_walk_has_the_epochs_of_its_replay(data_dir, name):
     paths = [data_dir / f"gnssimu_walk_{part}.xz" for part in ("imu.csv", "gnss.pos")]
     if not all(path.exists() for path in paths):
         pytest.skip("the walk is not in the folder of real logs")
-    parameters = scenario.load(Replay, SYSTEM.replay_default.parent / "walk.toml")
+    parameters = scenario.load(InsGnssReplay, SYSTEM.replay_default.parent / "walk.toml")
     parameters = parameters.model_copy(update={"outages": None})
     log = clean(load_dataset(paths))
     end = log.imu.time_ns[0] + 25_000_000_000

@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from robins.logs.broad import read_broad
 from robins.logs.ordering import rows_where
-from robins.systems.marg import LiveMarg, Replay, replay
-from robins.systems.marg.saturation import Range, levels
-from robins.systems.streaming import Door, Flag, LiveError, refuse_units
+from robins.systems.marg import LiveMarg, MargReplay, replay
+from robins.systems.marg.saturation import GyroRange, levels
+from robins.systems.streaming import Flag, LiveError, TimestampGate, refuse_units
 
-PARAMETERS = Replay()
+PARAMETERS = MargReplay()
 RATE_HZ = 100.0
 STARTING, BEHIND, REST = Flag.STARTING, Flag.BEHIND, Flag.REST
 
@@ -182,7 +182,7 @@ def test_levels_found_sample_by_sample_are_those_of_all_samples_so_far():
     rate = np.clip(
         smooth + 12.0 * np.sin(np.arange(400) / 7.0)[:, None], [-9.0, -12.0, -50.0], 11.0
     )
-    seen = Range()
+    seen = GyroRange()
     found = 0
     for k, row in enumerate(rate):
         seen.read(row)
@@ -309,7 +309,7 @@ def test_a_clock_that_was_set_is_a_new_start(live):
 
 
 def test_which_stamps_come_in():
-    door, fine = Door(1.0, 3), np.zeros(6)
+    door, fine = TimestampGate(1.0, 3), np.zeros(6)
     ask = lambda seconds: door.ask(round(seconds * 1e9), fine)  # noqa: E731
     assert [ask(t) for t in (5.0, 5.1, 5.1, 5.0, 9.0, 5.2, 9.1)] == [
         "", "", "duplicate", "backward", "ahead", "", "ahead",

@@ -13,7 +13,7 @@ from satellite_runs import problem
 from scipy.spatial.transform import Rotation as Scipy
 
 from robins.campaign import worlds
-from robins.campaign.machine import ByJax, machine_for
+from robins.campaign.machine import JaxMachine, machine_for
 from robins.errors import RobinsError
 from robins.filters import OnlineFilter, StepWarning, run_closed
 from robins.filters.synthesis import EveryStep, NotCertified, current_form, kalman_design, observer
@@ -230,7 +230,7 @@ def test_in_a_batch_each_run_has_its_own_gain():
 
 def test_it_is_refused_where_no_python_is(tmp_path):
     p, c, (case, _) = prepared()
-    assert isinstance(machine_for(p), ByJax)
+    assert isinstance(machine_for(p), JaxMachine)
     with pytest.raises(RobinsError, match=rf"--machine c: filter '{NAME}' .* an LMI in Python"):
         machine_for(p, "c")
     with pytest.raises(InputError, match=rf"filter '{NAME}' cannot be exported: it solves an LMI"):

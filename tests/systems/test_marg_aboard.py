@@ -7,25 +7,25 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robins.filters import Code, run
-from robins.systems.marg import Replay, filter_of, model, model_of, prepare
+from robins.systems.marg import MargReplay, filter_of, model, model_of, prepare
 from robins.systems.marg.aboard import (
     COUNTED_S,
     FIELD_N,
     MAGNET_S,
     RUNS,
     STILL_S,
-    aboard,
     case_of,
-    hand,
+    export_problem,
     model_on_board,
+    simulated_hand,
 )
 
-PARAMETERS = Replay()
+PARAMETERS = MargReplay()
 BLOCK_S = PARAMETERS.update.block
 
 
 def of(seed=0, number=0):
-    made = hand(PARAMETERS, seed, number)
+    made = simulated_hand(PARAMETERS, seed, number)
     return made, case_of(PARAMETERS, made)
 
 
@@ -104,7 +104,7 @@ def test_the_recorded_steps_rest_move_and_refuse(ran):
 
 
 def test_the_attitude_is_found_as_well_as_the_filter_says():
-    problem = aboard(PARAMETERS, 0)
+    problem = export_problem(PARAMETERS, 0)
     contender = problem.contenders["marg"]
     ratios = []
     for k in jnp.arange(RUNS):
@@ -122,7 +122,11 @@ def test_the_attitude_is_found_as_well_as_the_filter_says():
 
 
 def test_each_run_is_its_own_and_comes_again():
-    one, again, other = hand(PARAMETERS, 0, 0), hand(PARAMETERS, 0, 0), hand(PARAMETERS, 0, 1)
+    one, again, other = (
+        simulated_hand(PARAMETERS, 0, 0),
+        simulated_hand(PARAMETERS, 0, 0),
+        simulated_hand(PARAMETERS, 0, 1),
+    )
     np.testing.assert_array_equal(one.log.imu.gyro, again.log.imu.gyro)
     assert not np.allclose(one.gyro_bias, other.gyro_bias)
-    assert not np.allclose(one.gyro_bias, hand(PARAMETERS, 1, 0).gyro_bias)
+    assert not np.allclose(one.gyro_bias, simulated_hand(PARAMETERS, 1, 0).gyro_bias)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from robins import logs
-from robins.systems.marg import Replay, replay
+from robins.systems.marg import MargReplay, replay
 
 TRIALS = ("01", "07", "15", "24", "28", "33")
 VQF_DEG, VQF_OFFLINE_DEG = 2.56, 2.21  # mean total RMSE of these six, measured with its own code
@@ -25,7 +25,7 @@ def found(data_dir):
         paths = list(data_dir.glob(f"broad_{number}_*.npz"))
         if not paths:
             pytest.skip(f"needs a trial of BROAD, {data_dir} lacks number {number}")
-        return replay(logs.clean(logs.load_dataset(paths)), Replay())
+        return replay(logs.clean(logs.load_dataset(paths)), MargReplay())
 
     return of
 

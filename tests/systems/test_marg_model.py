@@ -11,7 +11,7 @@ from robins import manifold
 from robins.filters import Belief, kalman, run
 from robins.manifold import Angle
 from robins.rotation import Rotation
-from robins.systems.marg import Block, Replay, Samples, integrate, model_of
+from robins.systems.marg import Block, MargReplay, Samples, integrate, model_of
 from robins.systems.marg.model import (
     DIM,
     MAGNETOMETER,
@@ -25,7 +25,7 @@ from robins.systems.marg.model import (
     smoothed_attitudes,
 )
 
-MODEL = model_of(Replay())
+MODEL = model_of(MargReplay())
 
 
 def some_state(seed=0) -> MargState:
@@ -170,7 +170,7 @@ def test_the_declination_fades_in_motion_and_stands_at_rest():
     assert float(persistence(noise, still)) == 1.0
     factor = MODEL.motion.linear(some_state(), moving)[2]
     assert float(factor[24, 24]) == pytest.approx(
-        Replay().magnetometer.declination * np.sqrt(1.0 - share**2)
+        MargReplay().magnetometer.declination * np.sqrt(1.0 - share**2)
     )
     assert float(MODEL.motion.linear(some_state(), still)[2][24, 24]) == 0.0
 

@@ -11,15 +11,15 @@ from test_marg_model import some_state
 from robins.dataset import GnssTable
 from robins.earth.magnetic import field_n, wmm
 from robins.filters import Code
-from robins.systems.marg import Replay
+from robins.systems.marg import MargReplay
 from robins.systems.marg.model import MAGNETOMETER, TRAVEL
 from robins.systems.marg.monitor import doubts_of, of_samples, sentences
 from robins.systems.marg.replay import _turned_north, true_north
-from robins.systems.tables import Update
+from robins.systems.tables import SensorUpdates
 
 BLOCKS = 600
 DT = np.full(BLOCKS, 0.1)
-PARAMETERS = Replay()
+PARAMETERS = MargReplay()
 
 
 def states(declination=0.0, gain=0.0):
@@ -39,7 +39,7 @@ def looks(nis=6.0, dof=6, refused=()):
     code = np.where(seen, int(Code.DONE), int(Code.MISSING))
     code[list(refused)] = int(Code.REFUSED)
     zero = np.zeros((BLOCKS, dof))
-    return Update(zero, zero, np.where(seen, nis, 0.0), np.where(seen, dof, 0), code)
+    return SensorUpdates(zero, zero, np.where(seen, nis, 0.0), np.where(seen, dof, 0), code)
 
 
 def said(mean, updates):

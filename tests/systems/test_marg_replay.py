@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 from robins.dataset import ImuTable
 from robins.filters import OnlineFilter
 from robins.ins.increments import from_imu
-from robins.systems.marg import Replay, filter_of, model_of, prepare, replay
+from robins.systems.marg import MargReplay, filter_of, model_of, prepare, replay
 from robins.systems.marg.log import at_samples
 from robins.systems.marg.model import MAGNETOMETER, TRAVEL
-from robins.systems.marg.path import Pace, as_means
+from robins.systems.marg.path import MeasurementPace, as_means
 
 GAIN = 0.01 * np.array([[0.6, -0.4, 0.2], [0.3, -0.7, 0.5], [-0.2, 0.4, 0.5]])
-PARAMETERS = Replay()
+PARAMETERS = MargReplay()
 
 
 def noisy(seed=0, **wrong):
@@ -270,7 +270,7 @@ def test_readings_go_to_the_interval_they_fall_in_and_looks_are_spaced():
     np.testing.assert_array_equal(found[0], np.eye(5)[2, :3])
     np.testing.assert_array_equal(found[1], np.eye(5)[3, :3])
     assert np.isnan(found[2]).all()
-    taken = Pace().take(TRAVEL, np.arange(1, 31) * 0.1, np.arange(30) > 4, 1.0)
+    taken = MeasurementPace().take(TRAVEL, np.arange(1, 31) * 0.1, np.arange(30) > 4, 1.0)
     assert np.flatnonzero(taken).tolist() == [5, 15, 25]
 
 

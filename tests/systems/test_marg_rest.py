@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robins.systems.marg.parameters import Rest
-from robins.systems.marg.rest import Watch
+from robins.systems.marg.rest import RestDetector
 
 BLOCK_S, GRAVITY = 0.1, 9.81
 NO_FIELD = np.full((200, 3), np.nan)
@@ -21,7 +21,7 @@ def told(rate, field=NO_FIELD, noise=0.0, seed=0):
 
 def at_rest(block_s, rate, field):
     """(K,) bool, whether each block is at rest; and what the first rest shows."""
-    watch, force = Watch(block_s, Rest()), np.array([0.0, 0.0, -GRAVITY])
+    watch, force = RestDetector(block_s, Rest()), np.array([0.0, 0.0, -GRAVITY])
     rows = zip(rate, field, strict=True)
     still = [watch.look(block_s, one, force, field_b)[0] for one, field_b in rows]
     return SimpleNamespace(still=np.array(still), first=watch.first, first_sigma=watch.first_sigma)

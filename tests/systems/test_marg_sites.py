@@ -5,8 +5,8 @@ import pytest
 from marg_logs import RATE_HZ, hand, log_of, with_field, with_imu
 from scipy.spatial.transform import Rotation
 
-from robins.systems.marg import Replay, replay
-from robins.systems.marg.saturation import Range
+from robins.systems.marg import MargReplay, replay
+from robins.systems.marg.saturation import GyroRange
 from robins.systems.marg.sites import NONE, Sites
 
 BLOCK_S = 0.1
@@ -89,7 +89,7 @@ def back_home(alike=0.0):
 
 
 def test_the_heading_comes_home_with_the_unit():
-    metrics, parameters = {}, Replay()
+    metrics, parameters = {}, MargReplay()
     blind = parameters.magnetometer.model_copy(update={"site": np.pi})
     for name, p in (
         ("site", parameters),
@@ -105,7 +105,7 @@ def test_the_heading_comes_home_with_the_unit():
 
 
 def test_a_site_that_looks_alike_and_points_elsewhere_does_not_turn_the_heading():
-    found = replay(back_home(np.radians(40.0)), Replay(), ("marg",))
+    found = replay(back_home(np.radians(40.0)), MargReplay(), ("marg",))
     one = found.solution.isel(time=-1).sel(filter="marg")
     assert abs(np.degrees(one["error_heading"].item())) < 4.0
 
@@ -114,13 +114,15 @@ def test_gyros_of_a_bare_chip_are_found_and_no_others():
     q, p = hand(60.0, seed=2)
     noise = {"gyro_noise": 2e-3, "accel_noise": 0.02, "field_noise": 5e-7}
     off = np.diag([0.07, -0.05, 0.06])
-    sold = Replay(gyro={"bare_gain": "0 ppm"})
+    sold = MargReplay(gyro={"bare_gain": "0 ppm"})
     found = {
         name: replay(log_of(q, p, gyro_gain=gain, **noise), parameters)
         for name, gain, parameters in (
-            ("bare", off, Replay()), ("not asked", off, sold), ("good", 0.05 * off, Replay()),
+            ("bare", off, MargReplay()),
+            ("not asked", off, sold),
+            ("good", 0.05 * off, MargReplay()),
         )
-    }  # fmt: skip
+    }
     for name, one in found.items():
         assert one.solution["wrong"].sel(filter="marg").values[-1, 0] == (name == "bare")
     error = {
@@ -140,7 +142,7 @@ def test_gyros_of_a_bare_chip_are_found_and_no_others():
 def test_a_wrong_scale_of_the_accelerometers_is_read_at_the_first_rest():
     q, p = hand(40.0, seed=2)
     log = log_of(q, p, gyro_noise=2e-3, accel_noise=0.02, field_noise=5e-7)
-    scaled = replay(with_imu(log, accel=0.96 * log.imu.accel), Replay(), ("marg",))
+    scaled = replay(with_imu(log, accel=0.96 * log.imu.accel), MargReplay(), ("marg",))
     gravity = scaled.solution["estimate_gravity"].values[0, 0, 0]
     assert gravity == pytest.approx(0.96 * 9.81, rel=1e-3)
     assert scaled.metrics["marg"]["inclination_rmse_deg"] < 0.6
@@ -150,7 +152,7 @@ def test_a_magnetometer_that_nobody_calibrated_is_not_refused_and_holds_the_firs
     q, p = hand(60.0, seed=4)
     log = log_of(q, p, gyro_noise=2e-3, accel_noise=0.02, field_noise=5e-7)
     soft, hard = np.diag([1.1, 0.9, 1.05]), np.array([6e-6, -7e-6, 5e-6])
-    found = replay(with_field(log, log.mag.field_t @ soft + hard), Replay(), ("marg",))
+    found = replay(with_field(log, log.mag.field_t @ soft + hard), MargReplay(), ("marg",))
     assert found.metrics["marg"]["refused_magnetometer"] < 10  # of 50; by a constant noise 33
     error = found.solution["error_heading"].sel(filter="marg").values
     assert np.degrees(np.max(np.abs(error - error[0]))) < 3.0
@@ -158,7 +160,7 @@ def test_a_magnetometer_that_nobody_calibrated_is_not_refused_and_holds_the_firs
 
 def hanging(rate, accel, before):
     """Blocks in which gyros hang: samples before, then blocks of ten."""
-    watch, found = Range(), []
+    watch, found = GyroRange(), []
     for k in range(0, len(before) - 10, 10):
         assert watch.hanging(before[k : k + 11], np.tile(accel[:11], 1)) == 0
     for k in range(0, len(rate) - 10, 10):
@@ -188,7 +190,7 @@ def test_gyros_that_hang_for_a_while_are_not_believed():
     step = np.radians(0.1)
     gyro = step * np.round(log.imu.gyro / step)
     gyro[2000:2040] = gyro[2000]
-    found = replay(with_imu(log, gyro=gyro), Replay(), ("marg",))
+    found = replay(with_imu(log, gyro=gyro), MargReplay(), ("marg",))
     assert 30 <= found.counts["imu_frozen"] <= 60
     one = found.solution.sel(filter="marg")
     ratio = one["error_inclination"].values / one["sigma_inclination"].values

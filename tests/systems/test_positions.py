@@ -16,12 +16,12 @@ from robins.filters import Code
 from robins.ins.increments import Increments
 from robins.systems.ins_gnss import Drive, drive_dataset, replay
 from robins.systems.ins_gnss.model import POSITION
-from robins.systems.ins_gnss.parameters import Aids, Gnss, Replay, Start
+from robins.systems.ins_gnss.parameters import Aids, Gnss, InsGnssReplay, InsGnssStart
 from robins.systems.ins_gnss.positions import _lines, course_fix, fitted, heading_of
 from robins.systems.ins_gnss.recording import Log, on_one_clock
 from robins.systems.ins_gnss.reported import DIVERGED, verdict
 from robins.systems.ins_gnss.start import UNKNOWN_SPEED, find_start
-from robins.systems.replaying import Answer
+from robins.systems.replaying import FilterEstimates
 
 G, LAT, DT = 9.81, 0.8, 0.005
 NORTH = 6378137.0 * (1 - 0.00669437999014) / (1 - 0.00669437999014 * np.sin(LAT) ** 2) ** 1.5
@@ -120,7 +120,7 @@ def test_velocity_and_place_at_a_fix_are_those_of_the_closed_form(known, late):
     ids=["centimetres", "metres", "at rest", "slower than course_speed"],
 )
 def test_a_course_is_taken_where_positions_prove_the_speed(change, row):
-    found = course_fix(log_of(**change)[0], Start())
+    found = course_fix(log_of(**change)[0], InsGnssStart())
     if row is None:
         assert 2 < found < 12
     else:
@@ -131,13 +131,13 @@ def test_a_position_that_is_far_off_makes_no_course():
     log, *_ = log_of(v0=0.01, push=0.0, sigma=1.0, noise=1.0)
     lat = log.gnss.lat_rad.copy()
     lat[6] += 60.0 / NORTH
-    assert course_fix(log._replace(gnss=replace(log.gnss, lat_rad=lat)), Start()) is None
+    assert course_fix(log._replace(gnss=replace(log.gnss, lat_rad=lat)), InsGnssStart()) is None
 
 
 @pytest.mark.parametrize("given", [True, False], ids=["heading given", "by course"])
 def test_a_log_that_begins_in_motion_starts_with_its_velocity(given):
     log, _, motion = log_of(noise=0.3, sigma=0.3, push=0.3)
-    start = Start(known_heading=0.7) if given else Start()  # that at the first sample
+    start = InsGnssStart(known_heading=0.7) if given else InsGnssStart()  # that at the first sample
     found = find_start(log, start, Aids())
     at = log.gnss_s[found.fix]
     assert at < 4.0
@@ -151,7 +151,7 @@ def test_a_log_that_begins_in_motion_starts_with_its_velocity(given):
 
 def test_a_velocity_is_zero_only_where_rest_is_proved_and_unknown_without_positions():
     rest, *_ = log_of(v0=0.01, push=0.0, turn=1e-9, sigma=0.02, rate_hz=4.0)
-    known = Start(known_heading=0.3)
+    known = InsGnssStart(known_heading=0.3)
     found = find_start(rest, known, Aids())
     assert np.all(found.v_n == 0.0)
     np.testing.assert_allclose(np.sqrt(found.spread[:, 0, 0]), known.velocity)
@@ -168,7 +168,7 @@ def test_a_missing_component_of_a_velocity_comes_from_positions():
     log = log._replace(
         gnss=replace(log.gnss, v_n=v, sigma_v=0.0 * v + 0.1), v_n=v, sigma_v=0.1 + 0 * v
     )
-    found = find_start(log, Start(), Aids())
+    found = find_start(log, InsGnssStart(), Aids())
     np.testing.assert_array_equal(found.v_n[:2], v[found.fix, :2])
     assert abs(found.v_n[2]) < 4.0 * np.sqrt(found.spread[2, 0, 0])
 
@@ -201,7 +201,7 @@ def test_sigmas_are_stated_assumed_or_given(settings, assumed, sigmas):
     imu = ImuTable(np.arange(400) * 10**7, np.zeros((400, 3)), np.zeros((400, 3)), "rate")
     note = [Finding("note", "sigma_assumed", "f", assumed, 4, "f: 4 of 4 assumed.")] * bool(assumed)
     log = on_one_clock(
-        Dataset("f", imu, gnss, findings=note), Replay.model_validate({"gnss": settings})
+        Dataset("f", imu, gnss, findings=note), InsGnssReplay.model_validate({"gnss": settings})
     )
     np.testing.assert_allclose(log.sigma_m[:, 0], sigmas)
 
@@ -237,7 +237,7 @@ def test_a_verdict_says_whether_a_replay_is_good(nis, refused, apart_m, doubts, 
         place = Geodetic(LAT + np.full(40, off_m) / NORTH, np.full(40, 0.2), np.zeros(40))
         updates = {POSITION: update} if off_m == 0.0 else {}
         mean, sigma = SimpleNamespace(position=place), np.full((40, 15), 2.0)
-        return Answer("", mean, sigma, updates, None, 0.0, None, bounds=False)
+        return FilterEstimates("", mean, sigma, updates, None, 0.0, None, bounds=False)
 
     answers = {"ekf": answer(0.0)} | ({} if apart_m is None else {"ekf+rts": answer(apart_m)})
     key = f"nis_{POSITION}"
@@ -255,7 +255,7 @@ def test_a_verdict_says_whether_a_replay_is_good(nis, refused, apart_m, doubts, 
 def test_states_at_every_sample_are_those_of_the_epochs_carried_on():
     """Against Euler steps from epoch to epoch, with the biases of the epoch."""
     log = drive_dataset(scenario.parse(Drive, DRIVE), seed=4)
-    found = replay(log, Replay(every_sample=True), ("ekf", "ekf+rts"))
+    found = replay(log, InsGnssReplay(every_sample=True), ("ekf", "ekf+rts"))
     assert set(found.files) == {"exports/ekf-sample.npz", "exports/ekf+rts-sample.npz"}
     for name in ("ekf", "ekf+rts"):
         with np.load(io.BytesIO(found.files[f"exports/{name}-sample.npz"])) as file:

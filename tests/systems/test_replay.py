@@ -18,7 +18,7 @@ from robins.ins.state import InsState
 from robins.program import BuildError
 from robins.rotation import Rotation as Attitude
 from robins.systems import ins_gnss
-from robins.systems.ins_gnss import SYSTEM, Drive, Replay, drive_dataset
+from robins.systems.ins_gnss import SYSTEM, Drive, InsGnssReplay, drive_dataset
 from robins.systems.ins_gnss import replay as replay_log
 from robins.systems.ins_gnss.model import Mount, read_position
 from robins.systems.ins_gnss.recording import on_one_clock
@@ -95,7 +95,7 @@ def log(drive):
 
 
 def configuration(*settings):
-    return scenario.parse(Replay, CONFIGURATION, settings)
+    return scenario.parse(InsGnssReplay, CONFIGURATION, settings)
 
 
 @pytest.fixture(scope="module")

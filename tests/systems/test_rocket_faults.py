@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation as Turn
 
 from robins import scenario
 from robins.filters import Belief, Code, OnlineFilter, run
-from robins.filters.rules.discriminator import Verdict
+from robins.filters.rules.discriminator import DiscriminatorVerdict
 from robins.rotation import Rotation
 from robins.scenario import ScenarioError
 from robins.systems.rocket import SYSTEM
 from robins.systems.rocket.angles import GYRO, MAGNETIC
 from robins.systems.rocket.field import FIELD, FieldState, plausible
-from robins.systems.rocket.field import Turn as Turned
+from robins.systems.rocket.field import GyroTurn as Turned
 from robins.systems.rocket.parameters import FieldVector, MagneticAttitude
 from robins.systems.rocket.study import FIELD_VECTOR, MAGNETIC_ATTITUDE, PATIENCE
 
@@ -207,22 +207,22 @@ def test_a_saturated_sample_is_an_outlier(flight, replay):
     online = replay.again().online
     (before,) = online.state.memory
     _, notes = replay.take(AT, flight.cases["saturated"][AT])
-    assert notes["discriminator.state"] == Verdict.OUTLIER
+    assert notes["discriminator.state"] == DiscriminatorVerdict.OUTLIER
     assert notes["discriminator.weight"] < 0.01
     (after,) = online.state.memory
     assert same(after.power, before.power)  # what tells of a wrong model has not learnt of it
     _, notes = replay.take(AT + 1)
-    assert notes["discriminator.state"] == Verdict.CLEAN
+    assert notes["discriminator.state"] == DiscriminatorVerdict.CLEAN
 
 
 def test_a_discriminator_tells_of_a_field_that_stays_wrong(flight, replay):
-    assert Verdict.MODEL not in replay.states
+    assert DiscriminatorVerdict.MODEL not in replay.states
     wrong = flight.cases["turned"]
     replay.again()
     state = [
         int(replay.take(k, wrong[k])[1]["discriminator.state"]) for k in range(AT, AT + PATIENCE)
     ]
-    assert state == [Verdict.OUTLIER] * (PATIENCE - 1) + [Verdict.MODEL]
+    assert state == [DiscriminatorVerdict.OUTLIER] * (PATIENCE - 1) + [DiscriminatorVerdict.MODEL]
 
 
 def test_a_gyro_sample_that_is_none_is_not_taken_and_counted(replay):

@@ -23,13 +23,13 @@ from robins.rotation import (
 )
 from robins.sim.free_body import FreeBody, coning_start, free_body
 from robins.systems.rocket import SYSTEM
-from robins.systems.rocket.angles import Coefficients, angle_state, reckon, step
+from robins.systems.rocket.angles import AngleCoefficients, angle_state, dead_reckoned, step
 from robins.systems.rocket.field import (
     FIELD,
     FieldState,
     GyroNoise,
+    GyroTurn,
     ScaledState,
-    Turn,
     bridged,
     observed,
     plausible,
@@ -58,12 +58,12 @@ def flight():
 def test_the_angles_move_as_the_body_does(flight):
     """Euler angles by Runge and Kutta against the closed form on quaternions."""
     q, omega = flight
-    c = Coefficients(*map(jnp.asarray, (*BODY, 1.0, DT)))
+    c = AngleCoefficients(*map(jnp.asarray, (*BODY, 1.0, DT)))
     found = jax.jit(jax.vmap(lambda q, w: step(c, angle_state(q, w), None)))(q[:-1], omega[:-1])
     gone = jax.vmap(local)(found, angle_state(q[1:], omega[1:]))
     # of the fourth order: (0.1 s x 1 rad/s)^5 / 120 and what a pitch near 70 deg makes of it
     assert np.max(np.abs(gone)) < 2e-5
-    half = Coefficients(*map(jnp.asarray, (*BODY, 1.0, DT / 2)))
+    half = AngleCoefficients(*map(jnp.asarray, (*BODY, 1.0, DT / 2)))
     twice = jax.jit(jax.vmap(lambda q, w: step(half, step(half, angle_state(q, w), None), None)))(
         q[:-1], omega[:-1]
     )
@@ -73,7 +73,7 @@ def test_the_angles_move_as_the_body_does(flight):
 
 
 def test_a_wrong_kinematic_row_turns_the_roll_too_fast():
-    c = Coefficients(*map(jnp.asarray, (0.7, 0.0, 0.0, 1.02, DT)))
+    c = AngleCoefficients(*map(jnp.asarray, (0.7, 0.0, 0.0, 1.02, DT)))
     still = angle_state(from_euler(0.1, 0.0, 0.3), jnp.array([60.0 * DEG, 0.0, 0.0]))
     turned = local(still, step(c, still, None))
     np.testing.assert_allclose(turned[0], 1.02 * 6.0 * DEG, rtol=1e-12)
@@ -86,7 +86,7 @@ def test_dead_reckoning_follows_the_angles_of_a_perfect_gyro(flight):
     start = angle_state(q[0], omega[0])
 
     def go(x, u):
-        x = reckon(DT, x, u)
+        x = dead_reckoned(DT, x, u)
         return x, x
 
     end, _ = jax.lax.scan(go, start, theta)
@@ -104,7 +104,7 @@ def a_state(scaled: bool):
 @pytest.mark.parametrize("size", [1e-5, 0.3, 2.5])
 def test_the_jacobian_of_the_motion_is_its_derivative(scaled, size):
     noise = GyroNoise(*map(jnp.asarray, (1e-3, 1e-6, DT)))
-    theta = Turn(size * jnp.array([0.8, -0.5, 0.33]))
+    theta = GyroTurn(size * jnp.array([0.8, -0.5, 0.33]))
     x = a_state(scaled)
     mean, F, _ = propagated(noise, x, theta)
     np.testing.assert_allclose(local(mean, propagate(noise, x, theta)), 0.0, atol=1e-15)
@@ -161,7 +161,7 @@ def test_a_turn_of_the_body_shows_in_the_field_with_the_right_sign():
     moved = propagate(
         GyroNoise(0.0, 0.0, 1.0),
         FieldState(Rotation.identity(), jnp.array([0.0, 0.0, 0.1])),
-        Turn(jnp.array([0.0, 0.0, 90.0 * DEG + 0.1])),
+        GyroTurn(jnp.array([0.0, 0.0, 90.0 * DEG + 0.1])),
     )
     np.testing.assert_allclose(to_euler(moved.q_nb.wxyz)[2], 90.0 * DEG, atol=1e-14)
 
@@ -176,7 +176,7 @@ def test_a_lost_sample_of_the_gyro_is_held_and_doubted():
 
 def test_doubt_adds_to_the_noise_of_the_gyro():
     g = GyroNoise(*map(jnp.asarray, (3e-3, 1e-6, DT)))
-    _, _, noise = propagated(g, a_state(False), Turn(jnp.zeros(3), jnp.asarray(4e-3)))
+    _, _, noise = propagated(g, a_state(False), GyroTurn(jnp.zeros(3), jnp.asarray(4e-3)))
     np.testing.assert_allclose(noise, [5e-3] * 3 + [1e-6] * 3, rtol=1e-12)
 
 

@@ -11,7 +11,7 @@ from robins.dataset import GnssTable
 from robins.earth.magnetic import elements, field_n, wmm
 from robins.ins.increments import Increments
 from robins.ins.rest import moving_statistics, standstill
-from robins.systems.ins_gnss.parameters import Aids, Start
+from robins.systems.ins_gnss.parameters import Aids, InsGnssStart
 from robins.systems.ins_gnss.recording import Log
 from robins.systems.ins_gnss.start import find_start, with_heading
 
@@ -70,7 +70,7 @@ def test_start_carries_the_tilt_by_gyro_and_takes_the_heading_from_the_course():
     still, _ = standstill(log.increments, *Aids().quiet)
     assert np.all(still[100:790])
     assert not np.any(still[900:])
-    found = find_start(log, Start(), Aids())
+    found = find_start(log, InsGnssStart(), Aids())
     assert log.gnss_s[found.fix] == pytest.approx(11.75, abs=0.3)
     _, _, heading = (float(a) for a in rotation.to_euler(jnp.asarray(found.q_nb)))
     assert heading == pytest.approx(course, abs=1e-9)
@@ -85,16 +85,16 @@ def test_start_says_why_it_cannot():
     log = _walk(4.0, 2.0, 0.0, 0.0, 0.0, 1.0)
     with_velocity = lambda v_n: log._replace(gnss=replace(log.gnss, v_n=v_n))  # noqa: E731
     with pytest.raises(ValueError, match=r"fastest fix moves at 0\.00 m/s.*start\.known_heading"):
-        find_start(with_velocity(0.0 * log.gnss.v_n), Start(), Aids())
+        find_start(with_velocity(0.0 * log.gnss.v_n), InsGnssStart(), Aids())
     with pytest.raises(ValueError, match="no GNSS velocity"):
-        find_start(with_velocity(None), Start(), Aids())
+        find_start(with_velocity(None), InsGnssStart(), Aids())
     falling = log.increments._replace(dv=0.01 * log.increments.dv)
     with pytest.raises(ValueError, match="cannot level"):
-        find_start(log._replace(increments=falling), Start(), Aids())
+        find_start(log._replace(increments=falling), InsGnssStart(), Aids())
     lost = replace(log.gnss, alt_m=np.nan * log.gnss.alt_m)
     with pytest.raises(ValueError, match="no whole GNSS fix"):
-        find_start(log._replace(gnss=lost), Start(), Aids())
-    found = find_start(with_velocity(None), Start(known_heading=1.25), Aids())
+        find_start(log._replace(gnss=lost), InsGnssStart(), Aids())
+    found = find_start(with_velocity(None), InsGnssStart(known_heading=1.25), Aids())
     # as given at the first sample, carried by gyros of 1e-5 rad a sample
     assert float(rotation.to_euler(jnp.asarray(found.q_nb))[2]) == pytest.approx(1.25, abs=5e-4)
 
@@ -110,11 +110,11 @@ def test_a_magnetometer_tells_the_heading_where_no_course_does():
     C = np.asarray(rotation.to_dcm(rotation.from_euler(roll, pitch, heading)))
     field = np.tile(C.T @ along, (60, 1))
     seen = slow._replace(field_s=np.arange(60) * 0.1, field_b=field)
-    found = find_start(seen, Start(), Aids())
+    found = find_start(seen, InsGnssStart(), Aids())
     assert float(rotation.to_euler(jnp.asarray(found.q_nb))[2]) == pytest.approx(heading, abs=2e-3)
     assert "from the magnetometer" in found.sentence
     # a course is better than a magnetometer in a vehicle of steel
     moving = log._replace(field_s=seen.field_s, field_b=field)
-    assert "from the course" in find_start(moving, Start(), Aids()).sentence
+    assert "from the course" in find_start(moving, InsGnssStart(), Aids()).sentence
     with pytest.raises(ValueError, match=r"reads 0\.1 of the Earth's field"):
-        find_start(seen._replace(field_b=0.1 * field), Start(), Aids())
+        find_start(seen._replace(field_b=0.1 * field), InsGnssStart(), Aids())

@@ -13,23 +13,23 @@ from robins import logs, manifold, scenario
 from robins.dataset import OdometryTable
 from robins.ins.rest import standstill
 from robins.logs.mounting import Mounting, turned
-from robins.systems.ins_gnss import SYSTEM, Drive, Replay, drive_dataset, replay
+from robins.systems.ins_gnss import SYSTEM, Drive, InsGnssReplay, drive_dataset, replay
 from robins.systems.ins_gnss.log import prepare
 from robins.systems.ins_gnss.model import ins_gnss_model
 from robins.systems.ins_gnss.recording import TYRES, in_body_axes, on_one_clock
-from robins.systems.ins_gnss.rest import Evidence, Usual, at_rest, confirmed, usual_of
+from robins.systems.ins_gnss.rest import Evidence, UsualIntervals, at_rest, confirmed, usual_of
 from robins.systems.ins_gnss.robust import (
     AS_TOLD,
     HYPOTHESES,
     STRAYED,
     WILD_M,
-    Hypothesis,
-    changes,
+    FixHypothesis,
+    augmented_belief,
     fresh,
-    in_hindsight,
+    hypothesis_model,
+    mode_changes,
     robust,
-    supposed,
-    widened,
+    smoothed_probabilities,
 )
 from robins.systems.suspects import spans
 
@@ -95,7 +95,7 @@ def log():
 
 TIME = np.arange(0.0, 40.0, 0.1)
 QUIET = np.ones(len(TIME), bool)
-USUAL = Usual(0.1, 0.5)
+USUAL = UsualIntervals(0.1, 0.5)
 FIXES = np.arange(0.0, 40.0, 0.5)
 # moves from 10 to 20 s, and from 30 s on
 MOVES = ((FIXES >= 10.0) & (FIXES < 20.0)) | (FIXES >= 30.0)
@@ -155,7 +155,7 @@ def test_a_smooth_road_is_not_taken_for_rest(velocities, sigma, share):
     """A path within its noise proves no rest: the share that is found is less, none is wrong."""
     log = drive_dataset(scenario.parse(Drive, SMOOTH, (f"gnss.sigma={sigma}",)), seed=1)
     given = log if velocities else replace(log, gnss=replace(log.gnss, v_n=None, sigma_v=None))
-    whole, aids = on_one_clock(given, Replay()), Replay().aids
+    whole, aids = on_one_clock(given, InsGnssReplay()), InsGnssReplay().aids
     found, _ = at_rest(whole, aids, usual_of(whole))
     speed = np.interp(whole.time_s, log.truth.time_ns * 1e-9, np.linalg.norm(log.truth.v_n, axis=1))
     by_spread, _ = standstill(whole.increments, *aids.quiet)
@@ -177,8 +177,8 @@ def _with_wheels(log, until_s=np.inf):
 
 
 def test_wheels_tell_rest_from_a_smooth_road_where_no_fix_comes(log):
-    given, aids = _with_wheels(log, until_s=14.0), Replay().aids
-    whole = on_one_clock(given, Replay())
+    given, aids = _with_wheels(log, until_s=14.0), InsGnssReplay().aids
+    whole = on_one_clock(given, InsGnssReplay())
     found, _ = at_rest(whole, aids, usual_of(whole))
     alone, _ = at_rest(whole._replace(wheels=None), aids, usual_of(whole))
     speed = np.interp(whole.time_s, log.truth.time_ns * 1e-9, np.linalg.norm(log.truth.v_n, axis=1))
@@ -189,9 +189,9 @@ def test_wheels_tell_rest_from_a_smooth_road_where_no_fix_comes(log):
 
 
 def test_a_speed_of_the_wheels_holds_the_way_where_no_fix_comes(log):
-    heard = on_one_clock(_with_wheels(log), Replay()).wheels
+    heard = on_one_clock(_with_wheels(log), InsGnssReplay()).wheels
     np.testing.assert_allclose(heard.sigma, np.hypot(0.05, TYRES * heard.speed), rtol=1e-12)
-    outage = scenario.parse(Replay, OUTAGE)
+    outage = scenario.parse(InsGnssReplay, OUTAGE)
     given = logs.clean(_with_wheels(log))
     errors = [
         replay(one, outage, ("ekf",)).metrics["ekf"]["outage_horizontal_max_m"]
@@ -205,7 +205,7 @@ def test_a_speed_of_the_wheels_holds_the_way_where_no_fix_comes(log):
 
 @pytest.mark.parametrize("step_s", [0.1, 0.25, 1.0])
 def test_changes_are_probabilities_and_positions_are_off_for_the_patience_in_the_mean(step_s):
-    p = changes(step_s, 10.0)
+    p = mode_changes(step_s, 10.0)
     np.testing.assert_allclose(p.sum(axis=1), 1.0, rtol=1e-12)
     assert np.all(p >= 0.0)
     off = np.flatnonzero((HYPOTHESES.read > 0.0) & (HYPOTHESES.new < WILD_M))
@@ -218,12 +218,12 @@ def test_changes_are_probabilities_and_positions_are_off_for_the_patience_in_the
 
 
 def test_the_linear_motion_of_each_hypothesis_is_the_slope_of_its_step(log):
-    parameters = Replay()
+    parameters = InsGnssReplay()
     own = ins_gnss_model(parameters.imu, parameters.gnss, parameters.aids)
     whole = on_one_clock(log, parameters)
     piece = prepare(whole, parameters, slice(0, len(whole.time_s)))
     u = jax.tree_util.tree_map(lambda a: jnp.asarray(a)[3], piece.world.u)
-    start = widened(piece.world.start, True)
+    start = augmented_belief(piece.world.start, True)
     x = start.mean._replace(offset=jnp.array([3.0, -2.0, 1.0]))
     n = manifold.dim(x)
 
@@ -235,19 +235,22 @@ def test_the_linear_motion_of_each_hypothesis_is_the_slope_of_its_step(log):
         return manifold.local(stepped, new), Phi, noise, wide
 
     for row in zip(*HYPOTHESES, strict=True):
-        off, Phi, noise, wide = both(supposed(own, Hypothesis(*row)).motion)
+        off, Phi, noise, wide = both(hypothesis_model(own, FixHypothesis(*row)).motion)
         assert np.all(np.abs(off) < 1e-9)
         np.testing.assert_allclose(np.asarray(Phi)[:, -4:], np.asarray(wide).T, atol=1e-5)
         assert noise.shape[0] == n
 
 
 def test_a_bank_and_a_model_made_again_have_the_same_structure():
-    parameters = Replay()
+    parameters = InsGnssReplay()
 
     def made(patience_s):
         own = ins_gnss_model(parameters.imu, parameters.gnss, parameters.aids)
         bank = robust(own, 0.25, patience_s)
-        return [jax.tree_util.tree_flatten(x) for x in (bank, supposed(own, AS_TOLD), fresh(own))]
+        return [
+            jax.tree_util.tree_flatten(x)
+            for x in (bank, hypothesis_model(own, AS_TOLD), fresh(own))
+        ]
 
     each = list(zip(made(10.0), made(30.0), strict=True))
     for one, other in each:
@@ -263,7 +266,7 @@ def test_a_wild_position_leaves_the_estimate_where_it_was():
     log = drive_dataset(scenario.parse(Drive, DRIVE), seed=4)
 
     def place(of):
-        track = replay(of, Replay(), ("robust",)).solution
+        track = replay(of, InsGnssReplay(), ("robust",)).solution
         return np.stack([track[f"{x}_rad"].values[0] for x in ("lat", "lon")], axis=1)
 
     usual = place(log)
@@ -276,7 +279,7 @@ def test_a_wild_position_leaves_the_estimate_where_it_was():
 
 def test_hindsight_is_that_of_all_sequences_of_modes():
     rng = np.random.default_rng(5)
-    change = changes(2.0, 5.0)
+    change = mode_changes(2.0, 5.0)
     likely = rng.uniform(0.01, 1.0, (4, len(change)))
     start = np.full(len(change), 1.0 / len(change))
     filtered, now = [], start
@@ -292,7 +295,7 @@ def test_hindsight_is_that_of_all_sequences_of_modes():
             p *= change[path[k - 1], path[k]] * likely[k, path[k]]
         total[np.arange(4), path] += p
     total /= total.sum(axis=1, keepdims=True)
-    found = in_hindsight(np.array(filtered), change)
+    found = smoothed_probabilities(np.array(filtered), change)
     np.testing.assert_allclose(found.off, total[:, HYPOTHESES.read > 0].sum(axis=1), rtol=1e-9)
     np.testing.assert_allclose(found.scale, np.exp(total @ np.log(HYPOTHESES.scale)), rtol=1e-9)
     np.testing.assert_allclose(found.strayed, total[:, STRAYED], rtol=1e-9)
@@ -320,7 +323,7 @@ def test_mean_velocities_and_a_deceived_receiver_cost_little(log, name):
     wrong = (at > 20.0) & (at < 24.0)
     lat = g.lat_rad + np.where(wrong, 3.0 / 6.37e6, 0.0)
     told = replace(log, gnss=replace(g, lat_rad=lat, v_n=mean))
-    outcome = replay(logs.clean(told), Replay(), (name,))
+    outcome = replay(logs.clean(told), InsGnssReplay(), (name,))
     if name == "robust":
         assert outcome.metrics[name]["refused_gnss_position"] == 0
     assert any("means over the 0.25 s since the last fix" in note for note in outcome.notes)
@@ -338,14 +341,14 @@ def test_mean_velocities_and_a_deceived_receiver_cost_little(log, name):
 
 
 def test_without_a_file_a_replay_is_that_of_the_packaged_one():
-    assert Replay() == scenario.load(Replay, SYSTEM.replay_default)
-    assert Replay().filters[0] == SYSTEM.replay_filters[0] == "robust"
+    assert InsGnssReplay() == scenario.load(InsGnssReplay, SYSTEM.replay_default)
+    assert InsGnssReplay().filters[0] == SYSTEM.replay_filters[0] == "robust"
 
 
 def test_a_mounting_alone_is_a_complete_file_and_turns_as_loading_with_it_does(log):
     text = '[imu]\norientation = ["180 deg", "0 deg", "-90 deg"]\n'
-    parameters = scenario.parse(Replay, text)
-    assert parameters.gnss == Replay().gnss
+    parameters = scenario.parse(InsGnssReplay, text)
+    assert parameters.gnss == InsGnssReplay().gnss
     mounting = Mounting(180.0, 0.0, -90.0)
     by_hand, here = turned(log, mounting), in_body_axes(log, parameters.imu.orientation)
     np.testing.assert_array_equal(here.imu.gyro, by_hand.imu.gyro)

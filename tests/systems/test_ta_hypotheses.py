@@ -10,10 +10,10 @@ from robins.ins.state import InsState
 from robins.rotation import Rotation
 from robins.systems.transfer_alignment.product.filters import (
     QUIET,
-    Hypothesis,
-    changes,
-    seven,
-    supposing,
+    NoiseHypothesis,
+    hypothesis_bank,
+    hypothesis_changes,
+    under_hypothesis,
 )
 from robins.systems.transfer_alignment.product.model import ProductState
 
@@ -44,10 +44,12 @@ def covariance(t):
 def test_hypotheses_multiply_the_noise_they_are_about():
     plain = transition_of(STATE)
     N = np.asarray(plain.noise)
-    _, quiet = supposing(QUIET, False).process((), plain)
+    _, quiet = under_hypothesis(QUIET, False).process((), plain)
     np.testing.assert_array_equal(covariance(quiet), covariance(plain))
 
-    _, drifting = supposing(Hypothesis(gyro=20.0, walk=5.0, flexure=3.0), False).process((), plain)
+    _, drifting = under_hypothesis(
+        NoiseHypothesis(gyro=20.0, walk=5.0, flexure=3.0), False
+    ).process((), plain)
     by_gyro, by_rest, by_flexure = N[:, :3], N[:, 3:18], N[:, 18:]
     expected = 400.0 * by_gyro @ by_gyro.T + by_rest @ by_rest.T + 9.0 * by_flexure @ by_flexure.T
     walk = np.zeros((24, 24))
@@ -58,7 +60,7 @@ def test_hypotheses_multiply_the_noise_they_are_about():
 
 def test_a_stiff_structure_has_no_flexure():
     plain = transition_of(STATE)
-    _, stiff = supposing(QUIET, True).process((), plain)
+    _, stiff = under_hypothesis(QUIET, True).process((), plain)
     assert not np.any(stiff.mean.flexure)
     for part in ("spread", "noise"):
         before, after = (np.asarray(getattr(t, part)) for t in (plain, stiff))
@@ -67,7 +69,7 @@ def test_a_stiff_structure_has_no_flexure():
 
 
 def test_changes_are_probabilities_that_hardly_cross():
-    T = changes()
+    T = hypothesis_changes()
     assert T.shape == (7, 7)
     assert np.all(T >= 0.0)
     np.testing.assert_allclose(T.sum(axis=1), 1.0, atol=1e-12)
@@ -76,7 +78,7 @@ def test_changes_are_probabilities_that_hardly_cross():
 
 
 def test_the_bank_made_again_is_the_same_and_its_numbers_are_leaves():
-    one, other = (jax.tree_util.tree_flatten(seven()) for _ in range(2))
+    one, other = (jax.tree_util.tree_flatten(hypothesis_bank()) for _ in range(2))
     assert one[1] == other[1]
     assert {leaf.dtype for leaf in one[0]} == {np.dtype(float)}
     rows = [leaf.tolist() for leaf in one[0] if leaf.shape == (7,)]

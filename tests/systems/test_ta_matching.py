@@ -20,7 +20,7 @@ from robins import rotation, scenario
 from robins.filters import run
 from robins.results import summary
 from robins.scenario import ScenarioError
-from robins.systems.judgement import judging
+from robins.systems.judgement import claim_judge
 from robins.systems.transfer_alignment.attitude_matching.model import (
     ATTITUDE,
     LAMBDA,
@@ -404,13 +404,13 @@ GOOD = {
     ],
 )
 def test_a_claim_can_come_out_otherwise(claim, changed, verdict):
-    (judged,) = judging(CLAIMS, [claim])(GOOD | changed)
+    (judged,) = claim_judge(CLAIMS, [claim])(GOOD | changed)
     assert judged["verdict"] == verdict
 
 
 def test_what_was_not_run_is_not_judged():
-    assert judging(CLAIMS)({"kf": GOOD["kf"]}) == []
-    assert judging(CLAIMS, [])(GOOD) == []
+    assert claim_judge(CLAIMS)({"kf": GOOD["kf"]}) == []
+    assert claim_judge(CLAIMS, [])(GOOD) == []
 
 
 # -------------------------------------------------------------------------------------- bad input

@@ -13,7 +13,7 @@ from robins.ins.mechanise import Nav, nav_at
 from robins.manifold import local
 from robins.rotation import Rotation
 from robins.systems.transfer_alignment.product.log import on_one_clock, pieces_of
-from robins.systems.transfer_alignment.product.parameters import Replay
+from robins.systems.transfer_alignment.product.parameters import PairReplay
 from robins.systems.transfer_alignment.product.world import lay_out, simulate_pair
 
 TEXT = """
@@ -52,7 +52,7 @@ attitude = "0.5 deg"
 
 
 def parameters(*settings):
-    return scenario.parse(Replay, TEXT, settings)
+    return scenario.parse(PairReplay, TEXT, settings)
 
 
 PAIR = parameters()

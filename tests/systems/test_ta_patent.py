@@ -19,8 +19,8 @@ from robins import scenario
 from robins.campaign.statistics import Statistics
 from robins.filters import Code, run
 from robins.systems import transfer_alignment
-from robins.systems.judgement import judging
-from robins.systems.tables import Update
+from robins.systems.judgement import claim_judge
+from robins.systems.tables import SensorUpdates
 from robins.systems.transfer_alignment.product.world import _slave_errors
 from robins.systems.transfer_alignment.velocity_attitude import model as va
 from robins.systems.transfer_alignment.velocity_attitude import study
@@ -159,7 +159,7 @@ def test_the_kalman_filter_is_consistent_where_errors_are_small():
 
     statistics = Statistics(problem.blocks, problem.count_from, problem.limits)
     none = np.zeros((RUNS, 1))
-    blank = Update(none, none, none, none.astype(int), none.astype(int))
+    blank = SensorUpdates(none, none, none, none.astype(int), none.astype(int))
     statistics.add(
         {
             "error": error,
@@ -273,14 +273,14 @@ def test_claims_are_judged_by_ratios_of_the_same_runs():
     }
     metrics = {name: {"attitude_rms_all_arcmin": value} for name, value in rms.items()}
     ids = ("beats-kf", "kf-suffers", "beats-fixed", "compensation")
-    found = {c["id"]: (c["verdict"], c["value"]) for c in judging(CLAIMS, ids)(metrics)}
+    found = {c["id"]: (c["verdict"], c["value"]) for c in claim_judge(CLAIMS, ids)(metrics)}
     assert found["beats-kf"] == ("partly", pytest.approx(0.97))
     assert found["kf-suffers"] == ("reproduced", pytest.approx(2.0))
     assert found["beats-fixed"] == ("not", pytest.approx(9.7 / 9.75))
     assert found["compensation"] == ("reproduced", pytest.approx(0.5))
     del metrics["kf"]
-    assert [c["id"] for c in judging(CLAIMS, ids)(metrics)] == ["beats-fixed", "compensation"]
-    assert judging(CLAIMS, ())(metrics) == []
+    assert [c["id"] for c in claim_judge(CLAIMS, ids)(metrics)] == ["beats-fixed", "compensation"]
+    assert claim_judge(CLAIMS, ())(metrics) == []
 
 
 # ----------------------------------------------------------- what compensation leaves of errors

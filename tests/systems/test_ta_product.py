@@ -21,12 +21,12 @@ from robins.rotation import Rotation
 from robins.scenario import ScenarioError, load, parse
 from robins.sim.flexure import Flexure
 from robins.systems import transfer_alignment
-from robins.systems.judgement import judging
-from robins.systems.parts import Block
-from robins.systems.tables import Update
+from robins.systems.judgement import claim_judge
+from robins.systems.parts import ImuBlock
+from robins.systems.tables import SensorUpdates
 from robins.systems.transfer_alignment.product import model as p
 from robins.systems.transfer_alignment.product.filters import FILTERS, VARIANTS
-from robins.systems.transfer_alignment.product.parameters import Believed, Product
+from robins.systems.transfer_alignment.product.parameters import PairAssumptions, Product
 from robins.systems.transfer_alignment.product.study import (
     CLAIMS,
     STUDY,
@@ -78,7 +78,7 @@ dropouts = [{begin = "100 s", end = "100.5 s"}]
 LOST, HALF = slice(999, 1004), 1050  # epochs without a record, and one without its north velocity
 
 
-def random_state(seed: int, pitch_deg: float = 10.0) -> tuple[p.ProductState, p.Lag]:
+def random_state(seed: int, pitch_deg: float = 10.0) -> tuple[p.ProductState, p.RecordDelay]:
     rng = np.random.default_rng(seed)
     draw = lambda size: jnp.asarray(size * rng.normal(size=3))  # noqa: E731
     ins = InsState(
@@ -90,16 +90,16 @@ def random_state(seed: int, pitch_deg: float = 10.0) -> tuple[p.ProductState, p.
     )
     x = p.ProductState(ins, draw(0.02), jnp.concatenate([draw(0.003), draw(0.002)]))
     age = rng.uniform(0.0, 0.2)
-    lag = p.Lag(age, draw(0.5 * age), draw(15.0 * age), draw(0.5))
+    lag = p.RecordDelay(age, draw(0.5 * age), draw(15.0 * age), draw(0.5))
     return x, jax.tree.map(jnp.asarray, lag)
 
 
-def block(seed: int) -> Block:
+def block(seed: int) -> ImuBlock:
     rng = np.random.default_rng(seed)
     dt = np.array([0.02, 0.02, 0.0, 0.02])
     rate, force = rng.normal(size=(4, 3)), rng.normal(size=(4, 3)) * 3.0 - [0, 0, 10.0]
     arrays = (jnp.asarray(a) for a in (dt, rate * dt[:, None], force * dt[:, None]))
-    return Block(Increments(*arrays), 3.0)
+    return ImuBlock(Increments(*arrays), 3.0)
 
 
 # ------------------------------------------------------------------------------ derivatives
@@ -182,7 +182,7 @@ def flexure_of(name, believed):
 
 
 def test_start_of_the_flexure_is_its_steady_state():
-    believed = Believed.model_validate_json(
+    believed = PairAssumptions.model_validate_json(
         '{"flexure": {"sigma": ["8 arcmin", "5 arcmin", "0 arcmin"], "time": "2 s",'
         ' "damping": 0.3}, "mounting": "0.2 deg"}'
     )
@@ -367,13 +367,15 @@ def test_packaged_scenarios_can_be_read(name):
 
 
 def test_filters_have_flexure_states_where_they_should():
-    believed = Believed.model_validate_json('{"flexure": {"sigma": "8 arcmin", "time": "2 s"}}')
+    believed = PairAssumptions.model_validate_json(
+        '{"flexure": {"sigma": "8 arcmin", "time": "2 s"}}'
+    )
     assert flexure_of("kf", believed) is None
-    assert flexure_of("product", Believed()) is None
+    assert flexure_of("product", PairAssumptions()) is None
     told = flexure_of("product", believed)
     assert told is not None
     assert np.all(told.tau_s == 2.0)
-    assert flexure_of("product-flexure", Believed()) is not None
+    assert flexure_of("product-flexure", PairAssumptions()) is not None
 
 
 def test_reported_rows_in_the_other_frame():
@@ -423,7 +425,7 @@ def statistics(scale, runs=60, epochs=40, seed=0):
         "block_nees": {},
         "mean": {},
         "updates": {
-            p.VELOCITY: Update(
+            p.VELOCITY: SensorUpdates(
                 np.zeros((runs, epochs, 3)),
                 np.ones((runs, epochs, 3)),
                 nis,
@@ -454,7 +456,7 @@ def test_metrics_are_in_their_units_and_order():
     ("scale", "held"), [(1.0, {"sigma", "anees", "nis", "aligned"}), (1.3, {"nis"})]
 )
 def test_claims_hold_for_a_right_filter_only(scale, held):
-    claims = judging(CLAIMS)({"product": product_metrics(statistics(scale, epochs=200))})
+    claims = claim_judge(CLAIMS)({"product": product_metrics(statistics(scale, epochs=200))})
     assert [c["id"] for c in claims] == list(CLAIMS)
     assert {c["id"] for c in claims if c["verdict"] == "reproduced"} == held
-    assert judging(CLAIMS)({"kf": {}}) == []
+    assert claim_judge(CLAIMS)({"kf": {}}) == []

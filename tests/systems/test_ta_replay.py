@@ -26,7 +26,7 @@ from robins.systems.transfer_alignment.product.log import (
     start_belief,
 )
 from robins.systems.transfer_alignment.product.model import ATTITUDE, VELOCITY
-from robins.systems.transfer_alignment.product.parameters import Replay
+from robins.systems.transfer_alignment.product.parameters import PairReplay
 from robins.systems.transfer_alignment.product.study import product_contender
 from robins.systems.transfer_alignment.product.world import lay_out, simulate_pair
 from robins.workbench import InputError, publish
@@ -74,7 +74,7 @@ flexure = { sigma = "3 arcmin", time = "2 s" }
 [recording]
 longest_block = "0.2 s"
 """
-PAIR = scenario.parse(Replay, TEXT)
+PAIR = scenario.parse(PairReplay, TEXT)
 SEVERAL = 8
 
 
@@ -117,7 +117,7 @@ def clean(pairs):
 
 def navigated(pieces):
     names = ("product",)
-    return replaying.navigated(pieces, names, lambda name: contender(PAIR, name))["product"]
+    return replaying.run_filters(pieces, names, lambda name: contender(PAIR, name))["product"]
 
 
 def belief_of(piece):
@@ -325,7 +325,7 @@ def until(answer, epoch):
 def test_a_mounting_far_from_nominal_is_found_and_remarked(runs, pairs):
     """The nominal mounting stated 7 deg wrong: a whole rotation is estimated, not a small angle."""
     settings = ('mounting.nominal=["1 deg", "-2 deg", "97 deg"]', 'believed.mounting="5 deg"')
-    wrong = scenario.parse(Replay, TEXT, settings)
+    wrong = scenario.parse(PairReplay, TEXT, settings)
     outcome = replay(pairs[0], wrong)
     (said,) = [n for n in outcome.notes if "from its nominal mounting" in n]
     assert "Models of first order do not hold beyond 5 deg" in said

@@ -99,7 +99,7 @@ def test_F_is_the_derivative_of_the_navigation_equations():
     for _ in range(50):
         point = random_point(rng)
         lat, _, *v = point.at
-        flight = va.Flight(lat, 0.0, np.append(v, 0.0), point.C @ point.f_b, point.C)
+        flight = va.SlaveFlight(lat, 0.0, np.append(v, 0.0), point.C @ point.f_b, point.C)
         F = np.asarray(va.error_dynamics(flight))
         steps = np.array([1e-4, 1e-4, 10.0, 10.0, *[1e-4] * 3, *[1.0] * 2, *[1e-3] * 3])
         columns = [
@@ -151,7 +151,7 @@ def test_headings_on_both_sides_of_north_differ_by_little():
 def test_transition_is_the_second_order_of_the_exponential():
     point = random_point(np.random.default_rng(6))
     lat, _, *v = point.at
-    flight = va.Flight(lat, 0.0, np.append(v, 0.0), point.C @ point.f_b, point.C)
+    flight = va.SlaveFlight(lat, 0.0, np.append(v, 0.0), point.C @ point.f_b, point.C)
     F = np.asarray(va.error_dynamics(flight))
     Phi = va.transition(va.Interval(flight, np.array(0.1), np.zeros(12)))
     assert_allclose(Phi, np.eye(12) + 0.1 * F + 0.005 * F @ F, rtol=1e-13, atol=1e-18)
@@ -210,7 +210,7 @@ def test_errors_of_the_open_loop_run_as_the_model_says():
     x = np.asarray(va.true_errors(wrong, InsState(*truth, *given)))
     # one interval after the other from the true error, against the model's transition
     for k in range(1, E):
-        flight = va.Flight(*(np.asarray(a)[k] for a in flown))
+        flight = va.SlaveFlight(*(np.asarray(a)[k] for a in flown))
         Phi = np.asarray(va.transition(va.Interval(flight, np.array(0.1), np.zeros(12))))
         assert_allclose(Phi @ x[k - 1] / TYPICAL, x[k] / TYPICAL, rtol=0, atol=2e-6)
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from robins.export.library import Entry, Library
+from robins.export.library import EntryPoint, Library
 from robins.export.runs import board_runs, by_jax, ends, entry_functions
-from robins.export.single_precision import BlockCost, Cost, cost, differences, in_floats
+from robins.export.single_precision import BlockCost, PrecisionCost, cost, differences, in_floats
 from robins.filters import Belief, Model, Motion, Sensor, kalman
 from robins.filters.rules import gate
 from robins.program import SINGLE, trace_steps
@@ -58,7 +58,7 @@ def judged(problem, count=2):
     row = runs[0].row(0)
     programs = trace_steps([(functions[e], row[e]) for e in functions], runs[0].start)
     entries = [
-        Entry(name, program, takes, "")
+        EntryPoint(name, program, takes, "")
         for (name, takes), program in zip(
             [("predict", ("input",)), ("update_fix", ("reading", "about"))], programs, strict=True
         )
@@ -108,7 +108,7 @@ def test_a_filter_of_large_numbers_is_ruined_and_told_so():
 
 def test_each_reason_is_told():
     fine = BlockCost("height", "m", 1.0, 1.0, 0.9, 0.9)
-    base = Cost(1, 10, {"factor": 1e-6}, [fine], 20, 0, True)
+    base = PrecisionCost(1, 10, {"factor": 1e-6}, [fine], 20, 0, True)
     assert base.bearable
     much = base._replace(blocks=[fine, fine._replace(name="heading", rms_single=1.2)])
     assert "heading: RMS 1 becomes 1.2 m" in much.verdict

@@ -14,8 +14,8 @@ from robins.errors import RobinsError
 from robins.report import figures
 from robins.results import find, read
 from robins.workbench import publish, workers
-from robins.workbench.campaign import campaign_status, campaign_work, needed, problem_of
-from robins.workbench.sweep import Varied, report, status, sweep, varied
+from robins.workbench.campaign import campaign_status, campaign_work, problem_of, require_plan
+from robins.workbench.sweep import SweptParameter, report, status, sweep, varied
 
 BALLOON = f"{Path(__file__).parents[2] / 'docs' / 'examples' / 'balloon.py'}:study"
 SHORT = ("duration=20 s",)
@@ -41,7 +41,7 @@ def here(monkeypatch):
 
 
 def test_a_parameter_has_numbers_with_a_unit_or_names():
-    assert varied("a.b = 1 m , 2.5 m") == Varied("a.b", ("1 m", "2.5 m"))
+    assert varied("a.b = 1 m , 2.5 m") == SweptParameter("a.b", ("1 m", "2.5 m"))
     assert varied("a=1 m,2.5 m").coordinate == ([1.0, 2.5], "m")
     assert varied("a=0.1,-2e3").coordinate == ([0.1, -2000.0], "1")
     assert varied("a=1 m,1 km").coordinate == (["1 m", "1 km"], "")
@@ -75,7 +75,7 @@ def test_each_point_is_the_campaign_of_its_values(tmp_path):
     assert rms.shape == (1, 2, 1)
     assert found.solution["sweep_1"].attrs == {"units": "m", "long_name": "barometer"}
     np.testing.assert_array_equal(found.solution["sweep_1"], [1.0, 4.0])
-    problem = problem_of(needed(open_store(tmp_path / "points" / "1")))
+    problem = problem_of(require_plan(open_store(tmp_path / "points" / "1")))
     alone = simulate(problem, RUNS, machine="vm").metrics["kf"]["height_rms_m"]
     assert float(rms[0, 1, 0]) == pytest.approx(alone, rel=1e-12)
     assert np.all((low < rms) & (rms < high))

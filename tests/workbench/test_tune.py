@@ -9,10 +9,10 @@ import pytest
 from jax.tree_util import Partial
 
 from robins import logs, scenario
-from robins.campaign.tuning import TooLittle
+from robins.campaign.tuning import UndeterminedError
 from robins.filters import Belief, Model, Motion, Sensor, kalman
 from robins.scenario import Parameters, Positive
-from robins.systems.replaying import Piece, Recorded
+from robins.systems.replaying import LogPiece, PreparedLog
 from robins.systems.study import Case, Contender
 from robins.workbench import InputError, publish, tune
 from robins.workbench.replay import open_log
@@ -91,8 +91,8 @@ def logged(steps, monkeypatch):
             (Sensor(Partial(read), np.array([parameters.noise]), 1, "z"),),
         )
         case = Case(Belief.of(np.zeros(1), np.eye(1)), np.zeros(steps), {"z": log.y}, {}, None)
-        piece = Piece(world=case, begin_s=0.0, epoch_s=np.arange(1.0, steps + 1.0))
-        return Recorded([piece], lambda name: Contender(kalman(), model))
+        piece = LogPiece(world=case, begin_s=0.0, epoch_s=np.arange(1.0, steps + 1.0))
+        return PreparedLog([piece], lambda name: Contender(kalman(), model))
 
     system = SimpleNamespace(
         name="line",
@@ -120,7 +120,7 @@ def test_a_log_tells_the_noise_of_its_sensor(monkeypatch):
 
 
 def test_a_short_log_is_refused(monkeypatch):
-    with pytest.raises(TooLittle, match="60 components are measured, and 90 are the least"):
+    with pytest.raises(UndeterminedError, match="60 components are measured, and 90 are the least"):
         tune(logged(60, monkeypatch), vary=["noise"], system="line")
 
 

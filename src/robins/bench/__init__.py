@@ -15,9 +15,12 @@ From the ground up:
 Needs the extra "bench"; the page needs "live", bridges "autopilot" and "ros".
 """
 
-from robins.bench.evaluation import Judged, View
+from robins.bench.evaluation import PageView, RunFigures
 from robins.bench.parts import Part
 from robins.bench.rig import Rig, Timing
 from robins.bench.wire import VERSION, Wire
+from robins.errors import moved
 
-__all__ = ["VERSION", "Judged", "Part", "Rig", "Timing", "View", "Wire"]
+__all__ = ["VERSION", "PageView", "Part", "Rig", "RunFigures", "Timing", "Wire"]
+
+__getattr__ = moved(__name__)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from robins.bench.accounting import Latencies
-from robins.bench.broker.faults import Table
+from robins.bench.broker.faults import FaultTable
 from robins.bench.broker.link import Health
 from robins.bench.live.feed import Signal
 from robins.bench.recording.layout import Event
@@ -22,7 +22,7 @@ from robins.results import array
 
 
 @dataclass(frozen=True)
-class Flown(Mapping[str, np.ndarray]):
+class MessageSeries(Mapping[str, np.ndarray]):
     """Fields of messages over a run, by ``message.field``; E steps.
 
     A field of one number has the shape (E,), others (E, length). NaN stands where nothing was
@@ -48,12 +48,14 @@ class Flown(Mapping[str, np.ndarray]):
         """Number of fields."""
         return len(self.arrays)
 
-    def until(self, steps: int) -> Flown:
+    def until(self, steps: int) -> MessageSeries:
         """The first steps."""
-        return Flown(self.time_s[:steps], {name: x[:steps] for name, x in self.arrays.items()})
+        return MessageSeries(
+            self.time_s[:steps], {name: x[:steps] for name, x in self.arrays.items()}
+        )
 
 
-class Spoken(NamedTuple):
+class OperatorEvent(NamedTuple):
     """A message that the operator sent through the bench."""
 
     step: int  # the first whose parts received it
@@ -61,11 +63,11 @@ class Spoken(NamedTuple):
     values: Values
 
 
-class Ran(NamedTuple):
+class RunResult(NamedTuple):
     """Result of a run."""
 
-    flown: Flown
-    kit: Any  # of the rig
+    series: MessageSeries
+    config: Any  # of the rig
     steps: int  # that were done
     seconds: float  # of the wall clock, from the first tick to the last answer
     latencies: Latencies
@@ -76,10 +78,10 @@ class Ran(NamedTuple):
     deaths: int
     failure: str  # empty: the run came to its end
     stopped: bool  # by an observer
-    said: tuple[Spoken, ...] = ()  # by the operator
+    operator_events: tuple[OperatorEvent, ...] = ()  # by the operator
 
 
-class Judged(NamedTuple):
+class RunFigures(NamedTuple):
     """Evaluation of a run by its rig.
 
     Attributes:
@@ -97,7 +99,7 @@ class Judged(NamedTuple):
     lines: Sequence[str] = ()
 
 
-class Told(NamedTuple):
+class Alert(NamedTuple):
     """A notice for the user; levels are those of the page."""
 
     level: Any
@@ -108,7 +110,7 @@ class Told(NamedTuple):
 class Alarms(Protocol):
     """Listens to one step after another."""
 
-    def hear(self, flown: Flown, step: int) -> list[Told]:
+    def observe(self, series: MessageSeries, step: int) -> list[Alert]:
         """Notices of a step."""
         ...
 
@@ -117,26 +119,28 @@ Offer = dict[str, Any]
 """A fault on the page: its ``label``, and the ``fault`` as a scenario gives it, without a time."""
 
 
-class View(NamedTuple):
+class PageView(NamedTuple):
     """Contents of the page of a rig.
 
     Attributes:
         signals: plotted signals, by the parameters of the vehicle.
-        sample: (arrays, kit, first step since the last sample, step) -> their values.
+        sample: (arrays, config, first step since the last sample, step) -> their values.
         alarms: a listener for a run.
         counts: (arrays, steps done) -> what was counted, by name.
         offered: faults that can be injected, each with its label; left out: those of every line,
             and those of sensors and actuators that need no parameter.
-        says: operator messages, by label: (arrays, kit, last step that was done) -> the
+        console_messages: operator messages, by label: (arrays, config, last step that was done) -> the
             message and its values.
     """
 
     signals: Callable[[Any], list[Signal]]
-    sample: Callable[[Flown, Any, int, int], Sequence[float]]
+    sample: Callable[[MessageSeries, Any, int, int], Sequence[float]]
     alarms: Callable[[], Alarms | None] = lambda: None
-    counts: Callable[[Flown, int], dict[str, int]] = lambda flown, done: {}
+    counts: Callable[[MessageSeries, int], dict[str, int]] = lambda series, done: {}
     offered: tuple[Offer, ...] = ()
-    says: Mapping[str, Callable[[Flown, Any, int], tuple[str, Values]]] = MappingProxyType({})
+    console_messages: Mapping[str, Callable[[MessageSeries, Any, int], tuple[str, Values]]] = (
+        MappingProxyType({})
+    )
 
 
 # ------------------------------------------------------------------- defaults, of any messages
@@ -161,7 +165,7 @@ def axes_of(f: Field) -> list[str]:
     return list(_AXES) if f.length == len(_AXES) else [str(k) for k in range(f.length)]
 
 
-def view_of(messages: Sequence[Message]) -> View:
+def view_of(messages: Sequence[Message]) -> PageView:
     """A page that draws every number."""
     fields = drawn(messages)
     names = [f"{m.name}.{f.name}" for m, f in fields]
@@ -174,14 +178,14 @@ def view_of(messages: Sequence[Message]) -> View:
             for axis in axes_of(f)
         ]
 
-    def sample(flown: Flown, kit: Any, since: int, step: int) -> Sequence[float]:
-        every = [np.ravel(latest(flown[name], since, step)) for name in names]
+    def sample(series: MessageSeries, config: Any, since: int, step: int) -> Sequence[float]:
+        every = [np.ravel(latest(series[name], since, step)) for name in names]
         return np.concatenate(every).tolist()
 
-    return View(signals, sample)
+    return PageView(signals, sample)
 
 
-def offers_of(table: Table) -> tuple[Offer, ...]:
+def offers_of(table: FaultTable) -> tuple[Offer, ...]:
     """Faults for the page of a rig that offers none: of its lines, then of what it can itself."""
     line = [
         {"label": f"{part}: {words}", "fault": {"kind": kind, "link": part, **how} | at}
@@ -191,7 +195,7 @@ def offers_of(table: Table) -> tuple[Offer, ...]:
     ]
     own = [
         {"label": f"{one.link}: {kind}", "fault": {"kind": kind}}
-        for kind, one in table.said.items()
+        for kind, one in table.device_faults.items()
         if not one.needs
     ]
     return (*line, *own)
@@ -218,11 +222,11 @@ def figures_of(metrics: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def arrays_of(messages: Sequence[Message], flown: Flown) -> dict[str, Any]:
+def arrays_of(messages: Sequence[Message], series: MessageSeries) -> dict[str, Any]:
     """Every number as an array of the solution, with its unit."""
     out: dict[str, Any] = {}
     for m, f in drawn(messages):
-        values = flown[f"{m.name}.{f.name}"].reshape(1, len(flown.time_s), f.length)
+        values = series[f"{m.name}.{f.name}"].reshape(1, len(series.time_s), f.length)
         about = {"unit": f.unit, "long_name": f"{m.name}: {f.name}", "comment": f.text}
         out |= array("value", values, f"{m.name}_{f.name}", axes=axes_of(f), frame=m.name, **about)
     return out

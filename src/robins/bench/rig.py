@@ -31,9 +31,9 @@ from robins.errors import RobinsError, hint, moved
 if TYPE_CHECKING:
     import numpy as np
 
-    from robins.bench.broker.faults import LinkFault, Said, Table
-    from robins.bench.broker.says import Desk, Saying
-    from robins.bench.evaluation import Judged, Ran, View
+    from robins.bench.broker.console import Console, OperatorMessage
+    from robins.bench.broker.faults import DeviceFault, FaultTable, LinkFault
+    from robins.bench.evaluation import PageView, RunFigures, RunResult
     from robins.bench.recording.topics import Topic
 
 
@@ -67,7 +67,7 @@ def later(where: str) -> Any:
 
 
 @runtime_checkable
-class Kit(Protocol):
+class RunConfig(Protocol):
     """Input of the parts of a run, pickled so that processes can have a copy."""
 
     @property
@@ -89,7 +89,7 @@ class Timing(NamedTuple):
     counted_from: int  # first step that counts in figures of merit
 
 
-class Aboard(NamedTuple):
+class ExportSources(NamedTuple):
     """Sources of a program that replaces the exported part.
 
     Attributes:
@@ -104,7 +104,7 @@ class Aboard(NamedTuple):
 
 
 GivenT = TypeVar("GivenT")  # parameters of what flies
-KitT = TypeVar("KitT", bound=Kit)
+KitT = TypeVar("KitT", bound=RunConfig)
 _NEEDED = ("name", "wire", "sends", "takes", "parameters")
 
 
@@ -120,8 +120,8 @@ class Rig(Generic[GivenT, KitT]):
         sends: messages by part, each of one part alone.
         takes: messages by part.
         parameters: the class of what flies, or its place, "package.module:Name".
-        code: module whose functions, named as the parts, make them of a kit; left out: that of the
-            class.
+        code: module whose functions, named as the parts, make them of a config; left out: that of
+            the class.
         build: by part, another function that makes it, or its place, "package.module:name".
         console: messages that no part sends: the operator sends them through the bench, and parts
             take them, if they do, with a lag of one.
@@ -147,7 +147,7 @@ class Rig(Generic[GivenT, KitT]):
     kept: tuple[str, ...] = ()
     example: str = ""
     exported: str = ""
-    aboard: Callable[[Flight], Aboard] | None = None
+    aboard: Callable[[LoadedRun], ExportSources] | None = None
     address: str = ""
 
     def __init__(self, **changed: Any):
@@ -209,7 +209,7 @@ class Rig(Generic[GivenT, KitT]):
     # ------------------------------------------------------------------------ of a run: defaults
 
     def prepare(self, setup: Any, given: GivenT) -> KitT:
-        """Kit of a run: plain numbers, the same for the same setup and parameters."""
+        """Config of a run: plain numbers, the same for the same setup and parameters."""
         raise NotImplementedError
 
     def timing(self, given: Any) -> Timing:
@@ -229,26 +229,26 @@ class Rig(Generic[GivenT, KitT]):
         """
         return ""
 
-    def inside(self, kit: KitT, steps: int) -> Mapping[str, np.ndarray] | None:
+    def inside(self, config: KitT, steps: int) -> Mapping[str, np.ndarray] | None:
         """First steps of the same run inside one program, named as `Flown` names them.
 
         That of a rig with a console takes the messages sent, too. None: it cannot be compared.
         """
         return None
 
-    def judge(self, flight: Flight, ran: Ran) -> Judged:
+    def judge(self, flight: LoadedRun, result: RunResult) -> RunFigures:
         """Figures of merit of a run; by default none, and all numbers as arrays."""
-        from robins.bench.evaluation import Judged, arrays_of
+        from robins.bench.evaluation import RunFigures, arrays_of
 
-        return Judged(arrays=arrays_of(self.noted, ran.flown))
+        return RunFigures(arrays=arrays_of(self.noted, result.series))
 
-    def view(self) -> View:
+    def view(self) -> PageView:
         """Contents of its page; by default all numbers of its messages."""
         from robins.bench.evaluation import view_of
 
         return view_of(self.noted)
 
-    def topics(self, kit: KitT) -> Sequence[Topic]:
+    def topics(self, config: KitT) -> Sequence[Topic]:
         """Rows for viewers and ROS 2 of its messages, in the record; others are JSON."""
         return ()
 
@@ -272,7 +272,7 @@ class Rig(Generic[GivenT, KitT]):
         """Parameters of a run besides those of all rigs, each with type and default."""
         return {}
 
-    def said(self) -> tuple[Mapping[str, Said], Mapping[str, Any]]:
+    def device_faults(self) -> tuple[Mapping[str, DeviceFault], Mapping[str, Any]]:
         """Faults of its sensors and actuators, by kind, and their parameters."""
         return {}, {}
 
@@ -288,14 +288,14 @@ class Rig(Generic[GivenT, KitT]):
         """Messages that are noted for figures and page."""
         return [m for m in self.wire.data if m.name in self.kept or not self.kept]
 
-    def part(self, name: str, kit: KitT) -> Part:
+    def part(self, name: str, config: KitT) -> Part:
         """Part of a run.
 
         Raises:
             RigError: no function makes it.
         """
         make = self.build.get(name, f"{self.code or type(self).__module__}:{name}")
-        return (named(make) if isinstance(make, str) else make)(kit)
+        return (named(make) if isinstance(make, str) else make)(config)
 
     @cached_property
     def given(self) -> type[GivenT]:
@@ -304,35 +304,35 @@ class Rig(Generic[GivenT, KitT]):
         return cast("type[GivenT]", made if isinstance(made, type) else made())
 
     @cached_property
-    def table(self) -> Table:
+    def table(self) -> FaultTable:
         """Faults that it can have."""
-        from robins.bench.broker.faults import Table
+        from robins.bench.broker.faults import FaultTable
 
-        return Table(self.wire, self.sends, self.takes, self.said()[0])
+        return FaultTable(self.wire, self.sends, self.takes, self.device_faults()[0])
 
     @cached_property
     def fault(self) -> type[LinkFault]:
         """The parameters of a fault."""
         from robins.bench.broker.faults import faults_of
 
-        return faults_of(self.table, **self.said()[1])
+        return faults_of(self.table, **self.device_faults()[1])
 
     @cached_property
-    def desk(self) -> Desk:
+    def operator_console(self) -> Console:
         """Operator messages that it takes."""
-        from robins.bench.broker.says import Desk
+        from robins.bench.broker.console import Console
 
-        return Desk(self.wire, self.console, self.refuses)
+        return Console(self.wire, self.console, self.refuses)
 
     @cached_property
-    def saying(self) -> type[Saying]:
+    def operator_message(self) -> type[OperatorMessage]:
         """Parameters of an operator message."""
-        from robins.bench.broker.says import sayings_of
+        from robins.bench.broker.console import operator_messages_of
 
-        return sayings_of(self.desk)
+        return operator_messages_of(self.operator_console)
 
     @cached_property
-    def shown(self) -> View:
+    def shown(self) -> PageView:
         """Contents of its page, with the faults that it offers."""
         from robins.bench.evaluation import offers_of
 
@@ -340,7 +340,7 @@ class Rig(Generic[GivenT, KitT]):
         return view if view.offered else view._replace(offered=offers_of(self.table))
 
 
-class Flight(NamedTuple):
+class LoadedRun(NamedTuple):
     """A run that has been read."""
 
     name: str

@@ -65,7 +65,7 @@ def _folder() -> Iterator[int]:
         os.close(folder)
 
 
-class Status:
+class BenchStatus:
     """Report of this bench to `robins bench status`; a context that removes it at the end.
 
     Attributes:
@@ -77,7 +77,7 @@ class Status:
         self._name = f"{os.getpid()}.json"
         self._told = 0.0
 
-    def __enter__(self) -> Status:
+    def __enter__(self) -> BenchStatus:
         try:
             with _folder():
                 pass
@@ -94,10 +94,10 @@ class Status:
         """True if the next report is due."""
         return time.monotonic() - self._told >= EACH_S
 
-    def tell(self, said: Mapping[str, Any]) -> None:
+    def tell(self, state: Mapping[str, Any]) -> None:
         """Report the state; neither a full disk nor a folder of another user stops a run."""
         self._told = time.monotonic()
-        content = json.dumps({**said, "pid": os.getpid(), "at": time.time()})
+        content = json.dumps({**state, "pid": os.getpid(), "at": time.time()})
         new = f"{self._name}.{secrets.token_hex(4)}.new"
         with contextlib.suppress(OSError, RobinsError), _folder() as folder:
             way = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -127,7 +127,7 @@ def running() -> list[Report]:
             except (ValueError, KeyError, TypeError, OverflowError, RecursionError, OSError):
                 with contextlib.suppress(OSError):  # gone, or was killed before it could tidy up
                     os.unlink(name, dir_fd=folder)
-    return sorted(found, key=lambda said: said["pid"])
+    return sorted(found, key=lambda state: state["pid"])
 
 
 def _read(folder: int, name: str) -> Report:
@@ -138,10 +138,10 @@ def _read(folder: int, name: str) -> Report:
     """
     way = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     with open(os.open(name, way, dir_fd=folder), encoding="utf-8") as file:
-        said = json.loads(file.read(_LARGEST))
-    said["pid"] = int(name.partition(".")[0])
-    said["silent_s"] = round(max(time.time() - said["at"], 0.0), 1)
-    return said
+        state = json.loads(file.read(_LARGEST))
+    state["pid"] = int(name.partition(".")[0])
+    state["silent_s"] = round(max(time.time() - state["at"], 0.0), 1)
+    return state
 
 
 def table(benches: list[Report]) -> str:

@@ -13,7 +13,7 @@ from jaxtyping import Array, PyTree
 
 from robins.campaign.machine import with_stack
 from robins.campaign.many_runs import ManyRuns
-from robins.campaign.monte_carlo import contender, reported_rows, whole_case
+from robins.campaign.monte_carlo import complete_case, contender, reported_rows
 from robins.errors import require
 from robins.filters import Belief
 from robins.filters.analysis.bound import bound_along, linearised, used_sensors
@@ -28,7 +28,7 @@ from robins.filters.analysis.observability import (
 from robins.filters.model import Data
 from robins.manifold import State, dim, is_element
 from robins.program.interpreter import interpreted_rounds
-from robins.program.stages import Staged
+from robins.program.stages import StagedFunction
 from robins.results import array, variable
 from robins.systems.study import Case, Contender, Problem, StateBlock
 from robins.systems.tables import block_array
@@ -85,11 +85,11 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
     if not shown:
         raise ValueError(f"no sensor of filter '{name}' is left that measures: it has {names}")
     rows = np.eye(len(D)) if first["rows"] is None else first["rows"]
-    left = _left(rows, L[-1], D)
+    left = _share_left(rows, L[-1], D)
     data = _sigmas(problem, sigma, prior, left, [names[i] for i in shown], shown)
     data |= _information(*_states(problem.blocks, rows, first["mean"]), L, D)
-    told = {"filter": name, "runs": runs, "without": ", ".join(without)}
-    return xr.Dataset(data, attrs=told)
+    labels = {"filter": name, "runs": runs, "without": ", ".join(without)}
+    return xr.Dataset(data, attrs=labels)
 
 
 def _of_all(bounded: ManyRuns, runs: int) -> tuple[dict[str, Data], np.ndarray, np.ndarray]:
@@ -118,19 +118,19 @@ def bound_sigma(problem: Problem, name: str, world: PyTree, machine: str = "vm")
     c = contender(problem, name)
 
     def variances(world: Data) -> Array:
-        it = whole_case(c.filter, c.model, c.case(world))
+        it = complete_case(c.filter, c.model, c.case(world))
         line = linearised(c.model, _start(it), it.truth, it.y, it.u, it.aux)
         rows, _ = reported_rows(c.reported, it)
         return _reported(rows, bound_along(line, _start(it).factor).factor)
 
     if machine == "jax":
         return np.sqrt(np.asarray(jax.jit(variances)(world)))
-    staged = Staged(variances, jax.eval_shape(lambda: world), engine=interpreted_rounds)
+    staged = StagedFunction(variances, jax.eval_shape(lambda: world), engine=interpreted_rounds)
     one = jax.tree_util.tree_map(lambda x: x[None], world)
     return np.sqrt(with_stack(lambda: staged(one)[0]))
 
 
-def _left(rows: np.ndarray, L: np.ndarray, D: np.ndarray) -> np.ndarray:
+def _share_left(rows: np.ndarray, L: np.ndarray, D: np.ndarray) -> np.ndarray:
     """(r,) share of the prior that is left of the reported start; NaN if known."""
     begun = np.linalg.norm(rows * D, axis=1)
     known = begun == 0.0
@@ -162,7 +162,7 @@ def _bounded(c: Contender, subsets: Array, world: Data) -> dict[str, Data]:
         Gramian with the first subset, and D (n,) its units; spoke (S,) true for sensors that ever
         measured anything; rows (r, n) the reported combinations of the start, or None.
     """
-    it = whole_case(c.filter, c.model, c.case(world))
+    it = complete_case(c.filter, c.model, c.case(world))
     start = jax.tree_util.tree_map(jnp.asarray, _start(it))
     line = linearised(c.model, start, it.truth, it.y, it.u, it.aux)
     rows, _ = reported_rows(c.reported, it)
@@ -241,15 +241,15 @@ def _named(mean: State) -> list[str]:
 def _information(names: list[str], sign: np.ndarray, L: np.ndarray, D: np.ndarray):
     """Bits by state and time, and the directions of which least is known, in words."""
     (open_,) = np.nonzero(D > 0.0)  # what is known from the start has no information to gain
-    told = [names[i] for i in open_]
+    labels = [names[i] for i in open_]
     values, vectors = spectrum(L[-1][np.ix_(open_, open_)])
     rank = int(np.sum(values >= NOTHING))
     hidden = unobservable(values, vectors)
     rest = vectors[:, hidden.shape[1] :]
     most = min(max(_FEWEST, int(np.sum(values < FEW))), _MOST)
     shown = (sign[open_, None] * np.concatenate([hidden, rest], axis=1))[:, :most]
-    words = [f"{i + 1}: {worded(v, told)}" for i, v in enumerate(shown.T)]
-    data: dict[str, Any] = {"state": ("state", told), "direction": ("direction", words)}
+    words = [f"{i + 1}: {worded(v, labels)}" for i, v in enumerate(shown.T)]
+    data: dict[str, Any] = {"state": ("state", labels), "direction": ("direction", words)}
     data |= array("information", bits(L[:, open_]).T)
     data |= array("gramian", values[: len(words)], nothing=NOTHING)
     return data | array("gramian_rank", rank)

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from robins.campaign.monte_carlo import blocks_of, contender, one_record
-from robins.campaign.plan import Plan, Shard
-from robins.campaign.shards import Damaged, digest, unpack
+from robins.campaign.plan import CampaignPlan, Shard
+from robins.campaign.shards import DamagedShardError, digest, unpack
 from robins.campaign.statistics import Statistics
 from robins.campaign.store import Store
 from robins.systems.study import Problem
 
 
-class State(NamedTuple):
+class CampaignState(NamedTuple):
     """Progress of a campaign.
 
     Attributes:
@@ -39,14 +39,14 @@ class State(NamedTuple):
         return None if self.lacking else digest(self.found)
 
 
-def blank(problem: Problem | None) -> Statistics:
+def blank_statistics(problem: Problem | None) -> Statistics:
     """Statistics of no runs; without a problem they can be joined, and give no figures."""
     if problem is None:
         return Statistics(())
     return Statistics.of(problem)
 
 
-def gather(store: Store, plan: Plan, problem: Problem | None = None) -> State:
+def gather(store: Store, plan: CampaignPlan, problem: Problem | None = None) -> CampaignState:
     """Read all shards, check and join them.
 
     Args:
@@ -55,12 +55,12 @@ def gather(store: Store, plan: Plan, problem: Problem | None = None) -> State:
         problem: whose figures are wanted; without it sums and counts only.
     """
     there = store.names("shards")
-    found = {name: blank(problem) for name in plan.filters}
+    found = {name: blank_statistics(problem) for name in plan.filters}
     examples = {name: problem and example_of(problem, name) for name in plan.filters}
     damaged, lacking = [], 0
     for shards in plan.shards.values():
         for shard in shards:
-            of_chunk = blank(problem)
+            of_chunk = blank_statistics(problem)
             content = None
             if PurePosixPath(shard.name).name in there:
                 content = store.get(shard.name)
@@ -69,12 +69,12 @@ def gather(store: Store, plan: Plan, problem: Problem | None = None) -> State:
                 continue
             try:
                 unpack(content, of_chunk, examples[shard.filter])
-            except Damaged:
+            except DamagedShardError:
                 damaged.append(shard)
                 lacking += 1
                 continue
             found[shard.filter].merge(of_chunk)
-    return State(found, {name: s.runs for name, s in found.items()}, damaged, lacking)
+    return CampaignState(found, {name: s.runs for name, s in found.items()}, damaged, lacking)
 
 
 def example_of(problem: Problem, name: str) -> PyTree:

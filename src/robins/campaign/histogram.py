@@ -21,13 +21,13 @@ _BINS = len(EDGES) + 1
 _TOLD = np.concatenate([[0.0], np.sqrt(EDGES[:-1] * EDGES[1:]), [np.inf]])
 
 
-def counted(values: np.ndarray) -> np.ndarray:
+def histogram_of(values: np.ndarray) -> np.ndarray:
     """The table of (runs, places) numbers, none negative or NaN."""
     keys = np.arange(values.shape[1]) * _BINS + np.searchsorted(EDGES, values, side="right")
     return np.stack(np.unique(keys, return_counts=True)).astype(np.int32)
 
 
-def joined(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def merged_histograms(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The table of what two tables count."""
     keys, places = np.unique(np.concatenate([a[0], b[0]]), return_inverse=True)
     counts = np.zeros(len(keys), np.int32)

@@ -2,7 +2,7 @@
 
 All have the same random numbers and, to rounding, the same results; JAX is the reference. The two
 kinds of programs have the same bits. The interpreter (`robins.program.interpreter`) begins at once
-and gives way to compiled lanes where a campaign is long enough (`robins.campaign.handover`). JAX
+and gives way to compiled lanes where a campaign is long enough (`robins.campaign.compilation`). JAX
 computes what has no place in a program, and where there is no interpreter.
 """
 
@@ -24,15 +24,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from robins.campaign.handover import HandOver
+from robins.campaign.compilation import CompilationTrigger
 from robins.campaign.memory import (
     CHUNK_BYTES,
     LEAST,
     MEMORY,
-    at_once,
+    concurrent_chunks,
     filled,
-    give_back,
-    said,
+    memory_note,
+    release_memory,
     width_of,
 )
 from robins.campaign.monte_carlo import (
@@ -40,11 +40,11 @@ from robins.campaign.monte_carlo import (
     blocks_of,
     bytes_of_batch,
     contender,
-    cut,
-    joined,
+    first_runs,
     one_record,
-    parted,
     record,
+    rejoined_record,
+    split_record,
     traced,
     worlds,
 )
@@ -54,7 +54,7 @@ from robins.manifold import State
 from robins.program import CPP, BuildError, compiler
 from robins.program.interpreter import interpreted_rounds, interpreter_of_many
 from robins.program.lanes import compiled_rounds
-from robins.program.stages import Staged
+from robins.program.stages import StagedFunction
 from robins.systems.study import Problem
 
 MACHINES = ("vm", "c", "jax")
@@ -69,12 +69,12 @@ Taken = Callable[[str, Any], Any]  # of a filter's name and its record of a chun
 Simulated = tuple[Any, int, Callable[[str], Any]]
 
 
-def whole(name: str, record: PyTree) -> PyTree:
+def whole_record(name: str, record: PyTree) -> PyTree:
     """All of a record."""
     return record
 
 
-class ByJax:
+class JaxMachine:
     """Chunks as batches of JAX, one after the other."""
 
     name = "jax"
@@ -91,10 +91,10 @@ class ByJax:
         width = filled(runs)
         each = -(-bytes_of_batch(self.problem, self._batch, width) // width)
         width = min(width, width_of(each, MEMORY))
-        self.notes = [*self._why, *said(each, width)]
+        self.notes = [*self._why, *memory_note(each, width)]
         return width
 
-    def chunks(self, runs: int, chunk: int = 0, taken: Taken = whole) -> Iterator[Simulated]:
+    def chunks(self, runs: int, chunk: int = 0, taken: Taken = whole_record) -> Iterator[Simulated]:
         """Simulate a chunk; its filters run when their results are requested.
 
         Args:
@@ -140,7 +140,12 @@ class ByJax:
         return taken(name, record(self.problem, name, held[0], count))
 
     def compute(
-        self, chunk: Chunk, width: int, names: Sequence[str], taken: Taken = whole, left: int = 0
+        self,
+        chunk: Chunk,
+        width: int,
+        names: Sequence[str],
+        taken: Taken = whole_record,
+        left: int = 0,
     ) -> dict[str, PyTree]:
         """Compute a chunk, filled up to a width, and keep what is `taken` of each filter.
 
@@ -159,7 +164,7 @@ class ByJax:
         return self.compute(chunk, width, names)
 
 
-class InLanes:
+class LaneMachine:
     """Chunks as programs in lanes, one on each core.
 
     Attributes:
@@ -170,19 +175,19 @@ class InLanes:
     def __init__(self, problem: Problem, name: str = "vm"):
         self.problem, self.name = problem, name
         self._engine = interpreted_rounds if name == "vm" else compiled_rounds
-        self._simulate = Staged(problem.simulate, NUMBER, engine=self._engine)
+        self._simulate = StagedFunction(problem.simulate, NUMBER, engine=self._engine)
         self._world = jax.eval_shape(problem.simulate, NUMBER)
         self._filters = {name: self._staged(name, named=True) for name in problem.contenders}
         stages = (self._simulate, *self._filters.values())
         self.bytes_of_run = max(one.bytes_of_run for one in stages)
-        self._hand_over = HandOver(stages) if name == "vm" else None
+        self._hand_over = CompilationTrigger(stages) if name == "vm" else None
 
-    def _staged(self, name: str, named: bool = False) -> Staged:
+    def _staged(self, name: str, named: bool = False) -> StagedFunction:
         """The record of a filter; named: in two parts, of which the second is that of one run."""
         problem = self.problem
         one = partial(one_record, blocks_of(problem), contender(problem, name), over=one_by_one)
-        return Staged(
-            (lambda world: parted(one(world))) if named else one,
+        return StagedFunction(
+            (lambda world: split_record(one(world))) if named else one,
             self._world,
             named=named,
             engine=self._engine,
@@ -196,13 +201,13 @@ class InLanes:
             f"{name}: a part stays with JAX, as {why}"
             for name, staged in of.items()
             for why in staged.refused
-        ] + said(self.bytes_of_run, LEAST)
+        ] + memory_note(self.bytes_of_run, LEAST)
 
     def width(self, runs: int) -> int:
         """Runs of a chunk in a campaign of so many, by the memory that they need."""
         return min(width_of(self.bytes_of_run, CHUNK_BYTES), -(-runs // LEAST) * LEAST)
 
-    def chunks(self, runs: int, chunk: int = 0, taken: Taken = whole) -> Iterator[Simulated]:
+    def chunks(self, runs: int, chunk: int = 0, taken: Taken = whole_record) -> Iterator[Simulated]:
         """Simulate chunks and run their filters, on all cores, ahead of the requests.
 
         Args:
@@ -212,7 +217,7 @@ class InLanes:
                 What figures show of one run has a leading axis of one there.
         """
         width = chunk or self.width(runs)
-        workers = at_once(self.bytes_of_run, width, available_cores())
+        workers = concurrent_chunks(self.bytes_of_run, width, available_cores())
         begins, ahead_by = range(width, runs, width), workers + 1
         with threads(workers) as pool:
             # The first chunk compiles: each filter on a core of its own.
@@ -230,14 +235,19 @@ class InLanes:
             for k, begin in enumerate(begins):
                 found = ahead.popleft().result()
                 if monotonic() - returned > BETWEEN_S:
-                    give_back()
+                    release_memory()
                     returned = monotonic()
                 for later in begins[k + ahead_by : k + ahead_by + 1]:
                     ahead.append(pool.submit(self._chunk, later, width, runs, taken))
                 yield None, min(width, runs - begin), found.__getitem__
 
     def compute(
-        self, chunk: Chunk, width: int, names: Sequence[str], taken: Taken = whole, left: int = 0
+        self,
+        chunk: Chunk,
+        width: int,
+        names: Sequence[str],
+        taken: Taken = whole_record,
+        left: int = 0,
     ) -> dict[str, PyTree]:
         """Compute a chunk, filled up to a width, and keep what is `taken` of each filter.
 
@@ -262,7 +272,7 @@ class InLanes:
 
         def computed() -> dict[str, PyTree]:
             world = self._worlds(chunk.begin, width, chunk.runs)
-            return {name: cut(self._staged(name)(world), chunk.runs) for name in names}
+            return {name: first_runs(self._staged(name)(world), chunk.runs) for name in names}
 
         return with_stack(computed)
 
@@ -272,7 +282,7 @@ class InLanes:
 
     def _of(self, name: str, world: PyTree, count: int, taken: Taken) -> PyTree:
         """Run a filter, and keep what is `taken` of its record without the runs that fill up."""
-        return taken(name, joined(*cut(self._filters[name](world), count)))
+        return taken(name, rejoined_record(*first_runs(self._filters[name](world), count)))
 
     def _chunk(self, begin: int, width: int, runs: int, taken: Taken) -> dict[str, PyTree]:
         begun, count = thread_time(), min(width, runs - begin)
@@ -312,7 +322,7 @@ def with_stack(function: Callable[[], PyTree]) -> PyTree:
 def first_worlds(problem: Problem, count: int) -> State:
     """The first runs of a problem, with a leading axis, by the interpreter where it can be."""
     sys.audit("robins.simulate", count)  # counted by tests
-    simulate = Staged(problem.simulate, NUMBER, engine=interpreted_rounds)
+    simulate = StagedFunction(problem.simulate, NUMBER, engine=interpreted_rounds)
     return jax.device_put(with_stack(lambda: simulate(np.arange(count))))
 
 
@@ -357,7 +367,7 @@ def check_machine(name: str) -> None:
         raise RobinsError(error.what, where, f"{error.fix}, or take --machine jax") from error
 
 
-def machine_for(problem: Problem, name: str = "") -> ByJax | InLanes:
+def machine_for(problem: Problem, name: str = "") -> JaxMachine | LaneMachine:
     """The machine of a campaign.
 
     Args:
@@ -369,11 +379,11 @@ def machine_for(problem: Problem, name: str = "") -> ByJax | InLanes:
     """
     check_machine(name)
     if name == "jax":
-        return ByJax(problem)
+        return JaxMachine(problem)
     for which, contender_ in problem.contenders.items():
         if why := contender_.on_host:
             if not name:
-                return ByJax(problem)
+                return JaxMachine(problem)
             raise RobinsError(
                 f"filter '{which}' cannot be a program: {why}",
                 f"--machine {name}",
@@ -383,5 +393,7 @@ def machine_for(problem: Problem, name: str = "") -> ByJax | InLanes:
         try:
             interpreter_of_many()
         except BuildError as error:
-            return ByJax(problem, [f"JAX computed, as the interpreter cannot be built: {error}"])
-    return InLanes(problem, name or "vm")
+            return JaxMachine(
+                problem, [f"JAX computed, as the interpreter cannot be built: {error}"]
+            )
+    return LaneMachine(problem, name or "vm")

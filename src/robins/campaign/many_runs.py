@@ -10,13 +10,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from robins.campaign.handover import HandOver
+from robins.campaign.compilation import CompilationTrigger
 from robins.campaign.machine import available_cores, threads
-from robins.campaign.memory import CHUNK_BYTES, LEAST, at_once, width_of
+from robins.campaign.memory import CHUNK_BYTES, LEAST, concurrent_chunks, width_of
 from robins.errors import require
 from robins.program.interpreter import interpreted_rounds
 from robins.program.kinds import is_key
-from robins.program.stages import Staged
+from robins.program.stages import StagedFunction
 
 Tree = Any  # a pytree of arrays
 
@@ -33,7 +33,7 @@ class ManyRuns:
         self._function = function
         self._first: list[Any] = []  # leaves of the first point
         self._differ: list[int] = []  # those that are arguments
-        self._staged: Staged | None = None
+        self._staged: StagedFunction | None = None
 
     def __call__(
         self,
@@ -61,7 +61,7 @@ class ManyRuns:
         staged = self._staged
         if staged is None:
             staged = self._staged = self._traced(points[0], numbers, arrays)
-            self._hand_over = HandOver([staged])
+            self._hand_over = CompilationTrigger([staged])
 
         def given(at: np.ndarray) -> tuple[Tree, Tree]:
             of_runs = jax.tree_util.tree_map(lambda x: x[at % runs], arrays)
@@ -88,7 +88,9 @@ class ManyRuns:
             self._staged = None
         return {k: np.stack(list(map(np.asarray, each[k]))) for k in self._differ}
 
-    def _traced(self, point: Tree, numbers: Mapping[int, np.ndarray], arrays: Tree) -> Staged:
+    def _traced(
+        self, point: Tree, numbers: Mapping[int, np.ndarray], arrays: Tree
+    ) -> StagedFunction:
         """The function as one of the numbers that differ, and of a run."""
         tree, fixed = jax.tree_util.tree_structure(point), dict(enumerate(self._first))
 
@@ -98,11 +100,11 @@ class ManyRuns:
         shapes = jax.tree_util.tree_map(
             lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (dict(numbers), arrays)
         )
-        return Staged(function, *shapes, engine=interpreted_rounds)
+        return StagedFunction(function, *shapes, engine=interpreted_rounds)
 
     def _computed(
         self,
-        staged: Staged,
+        staged: StagedFunction,
         runs: int,
         given: Callable[[np.ndarray], tuple[Tree, Tree]],
         progress: Callable[[float], None],
@@ -110,7 +112,7 @@ class ManyRuns:
         """Results of as many runs, in chunks, one on each core."""
         each = -(-runs // available_cores())
         width = min(width_of(staged.bytes_of_run, CHUNK_BYTES), -(-each // LEAST) * LEAST)
-        workers = at_once(staged.bytes_of_run, width, available_cores())
+        workers = concurrent_chunks(staged.bytes_of_run, width, available_cores())
 
         def chunk(begin: int) -> Tree:
             begun, count = thread_time(), min(width, runs - begin)

@@ -35,12 +35,12 @@ def width_of(bytes_of_run: int, most: int) -> int:
     return SOME if SOME < width < CHUNK - LEAST else width
 
 
-def at_once(bytes_of_run: int, width: int, cores: int) -> int:
+def concurrent_chunks(bytes_of_run: int, width: int, cores: int) -> int:
     """Number of chunks computed at once: one a core, as long as memory is left."""
     return max(1, min(cores, MEMORY // max(width * bytes_of_run, 1)))
 
 
-def said(bytes_of_run: int, width: int) -> list[str]:
+def memory_note(bytes_of_run: int, width: int) -> list[str]:
     """A note, where a chunk alone is more than the bound."""
     needed = width * bytes_of_run
     if needed <= MEMORY:
@@ -52,7 +52,7 @@ def said(bytes_of_run: int, width: int) -> list[str]:
     ]
 
 
-def give_back() -> None:
+def release_memory() -> None:
     """Return free memory of the C library to Linux, between two chunks.
 
     Threads of lanes allocate in arenas of their own, which otherwise grow by 60 MB a chunk of the

@@ -68,7 +68,7 @@ def reported_rows(reported: PyTree, case: Case) -> tuple[Array | None, int | Non
     return (None if reported is None else jnp.asarray(reported, float)), None
 
 
-def solved(
+def run_case(
     filter_, model, case: Case, keep: Callable[[Step], PyTree]
 ) -> tuple[PyTree, Case, Tally]:
     """Kept parts of the steps of a filter, its case with all its inputs, and the tally.
@@ -85,10 +85,10 @@ def solved(
     return done.steps, case, done.tally
 
 
-def whole_case(filter_, model, case: Case) -> Case:
+def complete_case(filter_, model, case: Case) -> Case:
     """A case with all its inputs; in closed loop it takes the filter to know them."""
     if case.loop is not None:
-        return solved(filter_, model, case, nothing)[1]
+        return run_case(filter_, model, case, nothing)[1]
     checked(model, case.y, case.u, case.aux)
     return case
 
@@ -105,7 +105,7 @@ def one_record(
     blocks: Blocks, contender: Contender, world: PyTree, over: Over = at_once
 ) -> dict[str, PyTree]:
     """One run of one filter, to what statistics need."""
-    steps, case, tally = solved(contender.filter, contender.model, contender.case(world), _kept)
+    steps, case, tally = run_case(contender.filter, contender.model, contender.case(world), _kept)
     posterior, info, moved = steps
     rows, along = reported_rows(contender.reported, case)
     lost = jnp.cumsum(~moved) > 0
@@ -224,7 +224,7 @@ def record(problem: Problem, name: str, worlds: PyTree, count: int) -> dict[str,
     Raises:
         ValueError: there is no such contender.
     """
-    return cut(_records(*_given(problem, name), worlds), count)
+    return first_runs(_records(*_given(problem, name), worlds), count)
 
 
 def blocks_of(problem: Problem) -> Blocks:
@@ -235,7 +235,7 @@ def blocks_of(problem: Problem) -> Blocks:
 _NEEDED = ("innovation", "sigma", "nis", "dof")  # of each run's updates, by its statistics
 
 
-def parted(record: dict[str, PyTree]) -> tuple[dict[str, PyTree], dict[str, PyTree]]:
+def split_record(record: dict[str, PyTree]) -> tuple[dict[str, PyTree], dict[str, PyTree]]:
     """Split a record: the part that statistics need of each run, and that of the first run only."""
     named = {"mean": record["mean"], "updates": record["updates"]}
     needed = {
@@ -245,12 +245,12 @@ def parted(record: dict[str, PyTree]) -> tuple[dict[str, PyTree], dict[str, PyTr
     return record | {"mean": None, "updates": needed}, named
 
 
-def joined(needed: dict[str, PyTree], named: dict[str, PyTree]) -> dict[str, PyTree]:
-    """The record of `parted`; the leading axis of what is shown of one run is one."""
+def rejoined_record(needed: dict[str, PyTree], named: dict[str, PyTree]) -> dict[str, PyTree]:
+    """The record of `split_record`; the leading axis of what is shown of one run is one."""
     updates = {name: u._replace(**needed["updates"][name]) for name, u in named["updates"].items()}
     return needed | {"mean": named["mean"], "updates": updates}
 
 
-def cut(records: PyTree, count: int) -> PyTree:
+def first_runs(records: PyTree, count: int) -> PyTree:
     """First runs of records with a leading axis of runs, as NumPy."""
     return jax.tree_util.tree_map(lambda x: np.asarray(x)[:count], records)

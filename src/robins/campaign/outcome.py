@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 
 from robins.campaign.bound import bound_sigma
 from robins.campaign.histogram import WORST
-from robins.campaign.machine import ByJax, InLanes, machine_for
+from robins.campaign.machine import JaxMachine, LaneMachine, machine_for
 from robins.campaign.statistics import PERCENTS, Statistics, thinned
 from robins.filters import Code, Tally, doubts
 from robins.results import (
@@ -21,8 +21,8 @@ from robins.results import (
     Progress,
     Variables,
     array,
-    keeping,
-    silent,
+    ignore_progress,
+    keep_on_error,
     variable,
 )
 from robins.systems.judgement import RUNS, Metrics, Verdicts
@@ -35,8 +35,8 @@ def simulate(
     problem: Problem,
     runs: int,
     chunk: int = 0,
-    progress: Progress = silent,
-    machine: str | ByJax | InLanes = "",
+    progress: Progress = ignore_progress,
+    machine: str | JaxMachine | LaneMachine = "",
 ) -> Outcome:
     """Run every filter of a problem over the same runs and compare them.
 
@@ -84,7 +84,7 @@ def simulate(
         done += count
         if done < runs:
             stage("simulation", 0)
-    with keeping({name: vars(s) for name, s in found.items()}):
+    with keep_on_error({name: vars(s) for name, s in found.items()}):
         outcome = outcome_of(problem, found, bound)
     return replace(outcome, machine=by.name, notes=[*outcome.notes, *by.notes])
 
@@ -115,19 +115,19 @@ def _finds(problem: Problem, name: str, s: Statistics) -> list[str]:
     """Sentences on the instruments that a filter finds wrong, with the time."""
     if s.runs == 1:
         return sentences(name, problem.epoch_s, s.first_run.get("wrong", {}))
-    said, suspects = [], s.suspects
+    remarks, suspects = [], s.suspects
     for suspect in suspects:
         first = s.first_wrong(suspect)
         if count := int(np.sum(first >= 0)):
             since = np.median(problem.epoch_s[first[first >= 0]])
-            said.append(
+            remarks.append(
                 f"{name} finds {words(suspect)} wrong in {count} of {s.runs} runs, "
                 f"first at {since:.1f} s in the median."
             )
-    if suspects and not said:
+    if suspects and not remarks:
         listed = ", ".join(map(words, suspects))
         return [f"{name} finds none of these wrong in any of {s.runs} runs: {listed}."]
-    return said
+    return remarks
 
 
 def _scores(problem: Problem, s: Statistics) -> dict[str, float]:

@@ -48,7 +48,7 @@ class Chunk(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Plan:
+class CampaignPlan:
     """A campaign, as written in `campaign.json`.
 
     Attributes:
@@ -80,8 +80,8 @@ class Plan:
 
     def shard(self, chunk: Chunk, name: str) -> Shard:
         """The shard of a filter, whose name is a hash of all that its content depends on."""
-        said = scenario.mapping_of(self.text)
-        of = {k: v for k, v in said.items() if k not in _WANTED}
+        tables = scenario.mapping_of(self.text)
+        of = {k: v for k, v in tables.items() if k not in _WANTED}
         key = [of, self.seed, self.machine, self.width, self.code, name, chunk.begin, chunk.runs]
         return Shard(f"shards/{_hash(key)}.npz", name, chunk.number)
 
@@ -106,7 +106,7 @@ class Plan:
         begin = run // self.width * self.width
         return Chunk(run // self.width, begin, min(self.width, self.runs - begin))
 
-    def with_more(self, runs: int, filters: tuple[str, ...]) -> Plan:
+    def with_more(self, runs: int, filters: tuple[str, ...]) -> CampaignPlan:
         """The plan of as many runs and of these filters too."""
         both = tuple(dict.fromkeys((*self.filters, *filters)))
         return replace(self, runs=max(runs, self.runs), filters=both)
@@ -116,13 +116,13 @@ def _hash(data: Any) -> str:
     return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()[:40]
 
 
-def write(store: Store, plan: Plan) -> None:
+def write(store: Store, plan: CampaignPlan) -> None:
     """Put a plan in the place of that which is there."""
     data = {"schema": SCHEMA} | asdict(plan)
-    store.put(NAME, f"{json.dumps(data, indent=2)}\n".encode(), anew=True)
+    store.put(NAME, f"{json.dumps(data, indent=2)}\n".encode(), overwrite=True)
 
 
-def read(store: Store) -> Plan | None:
+def read(store: Store) -> CampaignPlan | None:
     """The plan of a campaign; None where there is none.
 
     Raises:
@@ -134,7 +134,7 @@ def read(store: Store) -> Plan | None:
     try:
         data = json.loads(content)
         schema = data.pop("schema")
-        plan = Plan(**data | {"filters": tuple(data["filters"])})
+        plan = CampaignPlan(**data | {"filters": tuple(data["filters"])})
         _check(plan)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise RobinsError(
@@ -151,7 +151,7 @@ def read(store: Store) -> Plan | None:
     return plan
 
 
-def _check(plan: Plan) -> None:
+def _check(plan: CampaignPlan) -> None:
     """Refuse a plan that cannot be cut into chunks.
 
     Raises:
@@ -165,7 +165,7 @@ def _check(plan: Plan) -> None:
         raise ValueError(f"{plan.runs} runs in chunks of {plan.width} of {plan.filters}")
 
 
-def needed(store: Store) -> Plan:
+def require_plan(store: Store) -> CampaignPlan:
     """The plan of a campaign that is there.
 
     Raises:
@@ -210,7 +210,7 @@ def code_of(asked: str, text: str) -> str:
     return sha.hexdigest()[:16]
 
 
-def check_code(store: Store, plan: Plan) -> None:
+def check_code(store: Store, plan: CampaignPlan) -> None:
     """Refuse to go on with other code: half of the runs would be of one version, half of another.
 
     Raises:

@@ -15,14 +15,14 @@ from pathlib import PurePosixPath
 from typing import NamedTuple
 
 from robins.campaign.plan import Chunk, Shard
-from robins.campaign.shards import Damaged, unpack
+from robins.campaign.shards import DamagedShardError, unpack
 from robins.campaign.statistics import Statistics
 from robins.campaign.store import Store
 
 NAMED, DIVERGED = "histories", "diverged"  # groups of objects
 
 
-class History(NamedTuple):
+class RunHistories(NamedTuple):
     """The histories of one run of a filter."""
 
     run: int
@@ -39,7 +39,9 @@ def by_stem(shards: Mapping[Chunk, list[Shard]]) -> dict[str, Shard]:
     return {shard.stem: shard for some in shards.values() for shard in some}
 
 
-def histories(store: Store, group: str, shards: Mapping[str, Shard]) -> dict[str, list[History]]:
+def histories(
+    store: Store, group: str, shards: Mapping[str, Shard]
+) -> dict[str, list[RunHistories]]:
     """Histories that a group holds, by filter, in the order of the runs.
 
     Args:
@@ -47,12 +49,12 @@ def histories(store: Store, group: str, shards: Mapping[str, Shard]) -> dict[str
         group: `NAMED` or `DIVERGED`.
         shards: `by_stem`; histories of others are of no run of this campaign.
     """
-    found: dict[str, list[History]] = {}
+    found: dict[str, list[RunHistories]] = {}
     for name in store.names(group):
         stem, _, run = PurePosixPath(name).stem.partition("-")
         if stem in shards and run.isdecimal():
             of = found.setdefault(shards[stem].filter, [])
-            of.append(History(int(run), f"{group}/{name}"))
+            of.append(RunHistories(int(run), f"{group}/{name}"))
     return {name: sorted(of) for name, of in found.items()}
 
 
@@ -84,6 +86,6 @@ def damaged(store: Store, shards: Mapping[str, Shard]) -> dict[str, Shard]:
             for one in of:
                 try:
                     unpack(store.get(one.name) or b"", Statistics(()), None)
-                except Damaged:
+                except DamagedShardError:
                     found[one.name] = shards[PurePosixPath(one.name).stem.partition("-")[0]]
     return found

@@ -47,7 +47,7 @@ Path = tuple[str | int, ...]  # names of fields and numbers of items, from the p
 # -------------------------------------------------------------------------- numbers that vary
 
 
-class Between(NamedTuple):
+class ParameterRange(NamedTuple):
     """The numbers of the parameters that one key stands for, such as three axes, and their ends."""
 
     paths: tuple[Path, ...]
@@ -76,7 +76,7 @@ def one_at(share: Data, low: float, high: float, by_logarithm: bool) -> Data:
     return low * (high / low) ** share if by_logarithm else low + (high - low) * share
 
 
-def between(low: Any, high: Any) -> Between:
+def between(low: Any, high: Any) -> ParameterRange:
     """Differences between two sets of parameters.
 
     Raises:
@@ -85,7 +85,7 @@ def between(low: Any, high: Any) -> Between:
     found = list(_differing(low, high, ()))
     if not found:
         raise ValueError("its two ends are the same")
-    return Between(*(tuple(one) for one in zip(*found, strict=True)))
+    return ParameterRange(*(tuple(one) for one in zip(*found, strict=True)))
 
 
 def _differing(low: Any, high: Any, path: Path) -> Iterator[tuple[Path, float, float]]:
@@ -102,7 +102,7 @@ def _differing(low: Any, high: Any, path: Path) -> Iterator[tuple[Path, float, f
         raise ValueError("is no quantity that can take any value between its ends")
 
 
-def placed(given: Any, numbers: Mapping[Path, Any]) -> Any:
+def with_numbers(given: Any, numbers: Mapping[Path, Any]) -> Any:
     """Parameters with other numbers, which may be traced and are not checked."""
     if () in numbers:
         return numbers[()]
@@ -110,16 +110,18 @@ def placed(given: Any, numbers: Mapping[Path, Any]) -> Any:
     for (head, *rest), value in numbers.items():
         inner.setdefault(head, {})[tuple(rest)] = value
     if isinstance(given, tuple):
-        return tuple(placed(x, inner[k]) if k in inner else x for k, x in enumerate(given))
+        return tuple(with_numbers(x, inner[k]) if k in inner else x for k, x in enumerate(given))
     return given.model_copy(
-        update={str(name): placed(getattr(given, str(name)), rest) for name, rest in inner.items()}
+        update={
+            str(name): with_numbers(getattr(given, str(name)), rest) for name, rest in inner.items()
+        }
     )
 
 
 # ----------------------------------------------------------------------------- points and runs
 
 
-class Budget(NamedTuple):
+class SensitivityRuns(NamedTuple):
     """A filter in worlds whose numbers vary between their ends."""
 
     study: Study
@@ -128,7 +130,7 @@ class Budget(NamedTuple):
     view: View
     contender: Contender
     seed: int
-    ranges: tuple[Between, ...]
+    ranges: tuple[ParameterRange, ...]
 
     def run(self, shares: Array, index: Array) -> tuple[Array, Array]:
         """One run at one point; pure.
@@ -145,7 +147,9 @@ class Budget(NamedTuple):
         numbers: dict[Path, Any] = {}
         for k, one in enumerate(self.ranges):
             numbers |= one.at(shares[k])
-        world = self.study.simulate(placed(self.given, numbers), self.course, self.seed, index)
+        world = self.study.simulate(
+            with_numbers(self.given, numbers), self.course, self.seed, index
+        )
         blocks = tuple((b.name, b.where.start, b.where.stop) for b in self.view.blocks)
         record = one_record(blocks, self.contender, world, over=one_by_one)
         error, sigma = record["error"], record["sigma"]
@@ -173,7 +177,7 @@ def follows(believed: np.ndarray) -> list[bool]:
     return [not np.allclose(one, believed[0], rtol=1e-9, atol=1e-12) for one in believed[2:]]
 
 
-def depends(before: Any, course: Any, after: Any) -> bool:
+def course_differs(before: Any, course: Any, after: Any) -> bool:
     """True if a course differs from another, by all that can be compared of it.
 
     Args:
@@ -203,10 +207,10 @@ def _alike(a: Data, b: Data) -> bool:
     return type(a) is type(b) and bool(a == b)
 
 
-def untraceable(budget: Budget) -> list[int]:
+def untraceable(budget: SensitivityRuns) -> list[int]:
     """Numbers of the parameters whose worlds JAX cannot trace, each varied alone."""
 
-    def fails(one: Between) -> bool:
+    def fails(one: ParameterRange) -> bool:
         alone = budget._replace(ranges=(one,))
         try:
             jax.eval_shape(alone.run, jax.ShapeDtypeStruct((1,), float), jnp.asarray(0))
@@ -218,7 +222,7 @@ def untraceable(budget: Budget) -> list[int]:
 
 
 def simulate_points(
-    budget: Budget,
+    budget: SensitivityRuns,
     shares: np.ndarray,
     runs: int,
     progress: Callable[[float], None] = lambda share: None,
@@ -232,7 +236,8 @@ def simulate_points(
         progress: called with the share done.
 
     Returns:
-        (points, runs, blocks) and (points, runs), as of `Budget.run`; parts that JAX computed.
+        (points, runs, blocks) and (points, runs), as of `SensitivityRuns.run`; parts that JAX
+        computed.
 
     Raises:
         jax.errors.JAXTypeError: a world cannot be traced; see `untraceable`.

@@ -23,7 +23,7 @@ _ABOUT = "about"
 _COUNTS = ("runs", "diverged", "n")
 
 
-class Damaged(RobinsError):
+class DamagedShardError(RobinsError):
     """A shard whose content differs from what was written."""
 
 
@@ -39,13 +39,13 @@ def pack(about: Mapping[str, Any], statistics: Statistics) -> bytes:
         f"example {k:04}": np.asarray(x)
         for k, x in enumerate(jax.tree_util.tree_leaves(statistics.example))
     }
-    told = {
+    header = {
         **about,
         **{name: int(getattr(statistics, name)) for name in _COUNTS},
     }
-    told["sha256"] = _seal(told, arrays)
+    header["sha256"] = _seal(header, arrays)
     file = io.BytesIO()
-    np.savez(file, **{_ABOUT: np.array(json.dumps(told, sort_keys=True))}, **arrays)
+    np.savez(file, **{_ABOUT: np.array(json.dumps(header, sort_keys=True))}, **arrays)
     return file.getvalue()
 
 
@@ -68,17 +68,17 @@ def unpack(content: bytes, into: Statistics, example: PyTree = None) -> dict[str
         What it is of.
 
     Raises:
-        Damaged: the content is cut or changed.
+        DamagedShardError: the content is cut or changed.
     """
-    arrays = arrays_of(content, Damaged)
-    with decoding(Damaged):
-        told = json.loads(str(arrays.pop(_ABOUT, "{}")))
-    if not isinstance(told, dict) or told.pop("sha256", None) != _seal(told, arrays):
-        raise Damaged("its checksum does not fit")
+    arrays = arrays_of(content, DamagedShardError)
+    with decoding(DamagedShardError):
+        header = json.loads(str(arrays.pop(_ABOUT, "{}")))
+    if not isinstance(header, dict) or header.pop("sha256", None) != _seal(header, arrays):
+        raise DamagedShardError("its checksum does not fit")
     for name in _COUNTS:
-        if not isinstance(told.get(name), int):
-            raise Damaged(f"it does not state {name!r}")
-        setattr(into, name, told[name])
+        if not isinstance(header.get(name), int):
+            raise DamagedShardError(f"it does not state {name!r}")
+        setattr(into, name, header[name])
     leaves = []
     for name in sorted(arrays):
         kind, _, what = name.partition(" ")
@@ -93,9 +93,9 @@ def unpack(content: bytes, into: Statistics, example: PyTree = None) -> dict[str
     if leaves and example is not None:
         tree = jax.tree_util.tree_structure(example)
         if tree.num_leaves != len(leaves):
-            raise Damaged(f"its record has {len(leaves)} arrays, not {tree.num_leaves}")
+            raise DamagedShardError(f"its record has {len(leaves)} arrays, not {tree.num_leaves}")
         into.example = jax.tree_util.tree_unflatten(tree, leaves)
-    return told
+    return header
 
 
 def digest(found: Mapping[str, Statistics]) -> str:

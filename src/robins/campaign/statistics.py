@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 from scipy.special import stdtrit
 
-from robins.campaign.histogram import counted, joined, percentiles
+from robins.campaign.histogram import histogram_of, merged_histograms, percentiles
 from robins.filters import Tally
 from robins.filters.analysis.consistency import Verdict, grand_mean_nis
 from robins.filters.chi_square import chi2_band
@@ -152,7 +152,7 @@ class Statistics:
         self.each.setdefault(name, []).append(np.array(values))
 
     def _count(self, name: str, table: np.ndarray) -> None:
-        self.bins[name] = joined(self.bins[name], table) if name in self.bins else table
+        self.bins[name] = merged_histograms(self.bins[name], table) if name in self.bins else table
 
     def _all(self, name: str) -> np.ndarray:
         return np.concatenate(self.each[name])
@@ -173,7 +173,7 @@ class Statistics:
             of = some[:, :, block.where]
             i, j = np.tril_indices(of.shape[2], -1)
             self._sum(f"product of {block.name}", of[:, :, i] * of[:, :, j])
-            self._count(block.name, counted(np.linalg.norm(of, axis=2)))
+            self._count(block.name, histogram_of(np.linalg.norm(of, axis=2)))
 
     def _lengths(self, error: np.ndarray) -> None:
         for norm in self.norms:

@@ -32,13 +32,13 @@ class Store(Protocol):
 
     where: str
 
-    def put(self, name: str, content: bytes, *, anew: bool = False) -> bool:
+    def put(self, name: str, content: bytes, *, overwrite: bool = False) -> bool:
         """Put an object in place whole, or leave the one that is there; True if it was put.
 
         Args:
             name: of the object.
             content: all of it.
-            anew: take the place of what is there.
+            overwrite: take the place of what is there.
 
         Raises:
             RobinsError: the disk is full, or it cannot be written.
@@ -62,17 +62,17 @@ class Store(Protocol):
         ...
 
 
-class Folder:
+class FolderStore:
     """Objects as files of a folder: written under another name, synced, linked into place."""
 
     def __init__(self, path: str | os.PathLike[str]):
         self.path = Path(path)
         self.where = str(path)
 
-    def put(self, name: str, content: bytes, *, anew: bool = False) -> bool:
+    def put(self, name: str, content: bytes, *, overwrite: bool = False) -> bool:
         """Put an object; see `Store`."""
         target = self.path / name
-        if not anew and target.exists():
+        if not overwrite and target.exists():
             return False
         partial = self.path / _PARTIAL / f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex}"
         try:
@@ -83,7 +83,7 @@ class Folder:
                     file.write(content)
                     file.flush()
                     os.fsync(file.fileno())
-                placed = _replace(partial, target) if anew else _link(partial, target)
+                placed = _replace(partial, target) if overwrite else _link(partial, target)
                 _sync(target.parent)
             finally:
                 partial.unlink(missing_ok=True)
@@ -161,7 +161,7 @@ def _sync(folder: Path) -> None:
         os.close(descriptor)
 
 
-class Objects:
+class ObjectStore:
     """Objects of a store of the S3 kind, Azure's or Google's, by `obstore` (extra ``objects``)."""
 
     def __init__(self, url: str):
@@ -176,9 +176,9 @@ class Objects:
         with decoding(lambda why: RobinsError(f"cannot be opened: {why}", url, fix)):
             self._store = obstore.store.from_url(url)
 
-    def put(self, name: str, content: bytes, *, anew: bool = False) -> bool:
+    def put(self, name: str, content: bytes, *, overwrite: bool = False) -> bool:
         """Put an object; see `Store`."""
-        mode = "overwrite" if anew else "create"
+        mode = "overwrite" if overwrite else "create"
         try:
             self._obstore.put(self._store, name, content, mode=mode)
         except self._obstore.exceptions.AlreadyExistsError:
@@ -228,10 +228,10 @@ class Objects:
         return failure
 
 
-def open_store(where: str | os.PathLike[str]) -> Folder | Objects:
+def open_store(where: str | os.PathLike[str]) -> FolderStore | ObjectStore:
     """A folder, or for an address such as ``s3://bucket/campaign`` object storage.
 
     Raises:
         RobinsError: the storage cannot be opened, or the package for it is missing.
     """
-    return Objects(str(where)) if "://" in str(where) else Folder(where)
+    return ObjectStore(str(where)) if "://" in str(where) else FolderStore(where)

@@ -23,7 +23,7 @@ from scipy.special import ndtri, stdtrit
 
 from robins.campaign.many_runs import ManyRuns
 from robins.errors import RobinsError
-from robins.results import Progress, silent
+from robins.results import Progress, ignore_progress
 
 FARTHEST = math.log(1000.0)  # of a factor, either way
 TOO_WIDE = math.log(3.0)  # of a 95 % interval, either way: the data do not determine it
@@ -100,7 +100,7 @@ class Tuned(NamedTuple):
         return self.gain_low > 0.0
 
 
-class TooLittle(RobinsError, ValueError):
+class UndeterminedError(RobinsError, ValueError):
     """The data do not determine a parameter."""
 
     bad_input = True
@@ -111,7 +111,7 @@ def choose(
     names: Sequence[str],
     chosen_on: Data,
     judged_on: Data,
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> Tuned:
     """Find x on some data, and judge it on other data.
 
@@ -126,29 +126,31 @@ def choose(
         progress: called with the share done and what is being done.
 
     Raises:
-        TooLittle: there are too few parts, a parameter changes nothing, runs away, or its interval
-            of 95 % is wider than a factor of 3 either way.
+        UndeterminedError: there are too few parts, a parameter changes nothing, runs away, or its
+            interval of 95 % is wider than a factor of 3 either way.
     """
-    slopes = Slopes(objective, len(names), chosen_on, progress)
+    slopes = ObjectiveGradient(objective, len(names), chosen_on, progress)
     x0 = np.zeros(len(names))
     first, jacobian = slopes.at(x0)
     if len(first) < FEWEST_PARTS:
-        raise TooLittle(
+        raise UndeterminedError(
             f"{len(first)} runs or segments of a log are too few to tell chance from a difference; "
             f"{FEWEST_PARTS} are the least"
         )
     if not np.isfinite(slopes.total(first)):
-        raise TooLittle("the filter is lost as it is written: begin from other values")
+        raise UndeterminedError("the filter is lost as it is written: begin from other values")
     idle = [
         n for n, column in zip(names, np.moveaxis(jacobian, -1, 0), strict=True) if not column.any()
     ]
     if idle:
-        raise TooLittle(f"{' and '.join(idle)} changes nothing that the filter says: leave it out")
+        raise UndeterminedError(
+            f"{' and '.join(idle)} changes nothing that the filter says: leave it out"
+        )
     x = _least(slopes, len(names))
     for name, one in zip(names, x, strict=True):
         if abs(one) > 0.98 * FARTHEST:
             way = "large" if one > 0.0 else "small"
-            raise TooLittle(
+            raise UndeterminedError(
                 f"{name} would become {way} without end: the data do not say what it is"
             )
     sigma = _sigma(slopes, x, names)
@@ -160,7 +162,7 @@ def choose(
     )
 
 
-class Slopes:
+class ObjectiveGradient:
     """An objective and its gradient, on the data that x is chosen on.
 
     By central differences: all ends are computed at once, and the same noise makes the objective
@@ -168,7 +170,9 @@ class Slopes:
     INS/GNSS) was 20 times as long to compute and 5 times to compile as the run.
     """
 
-    def __init__(self, objective: Objective, p: int, data: Data, progress: Progress = silent):
+    def __init__(
+        self, objective: Objective, p: int, data: Data, progress: Progress = ignore_progress
+    ):
         self._objective, self._p, self._data, self._progress = objective, p, data, progress
         self._measured: dict[Hashable, ManyRuns] = {}  # by structure
         self.evaluations = 0
@@ -249,7 +253,7 @@ def _by_mean(total: Callable[[np.ndarray], float], mean: np.ndarray) -> np.ndarr
     return np.array([(a - b) / (2.0 * s) for (a, b), s in zip(ends, steps, strict=True)])
 
 
-def _least(slopes: Slopes, p: int) -> np.ndarray:
+def _least(slopes: ObjectiveGradient, p: int) -> np.ndarray:
     """The x at which the objective is least."""
     edge = [(-FARTHEST, FARTHEST)] * p
     if slopes.gradient:
@@ -278,13 +282,13 @@ def _least(slopes: Slopes, p: int) -> np.ndarray:
     return found.x
 
 
-def _sigma(slopes: Slopes, x: np.ndarray, names: Sequence[str]) -> np.ndarray:
+def _sigma(slopes: ObjectiveGradient, x: np.ndarray, names: Sequence[str]) -> np.ndarray:
     """(p,) standard deviations of x: the spread of the parts' gradients through the curvature.
 
     The estimate of Huber (1967), cov(x) = H^-1 cov(g) H^-1, which holds for a wrong model too.
 
     Raises:
-        TooLittle: a parameter is not known within `TOO_WIDE`.
+        UndeterminedError: a parameter is not known within `TOO_WIDE`.
     """
     step = _CURVED if slopes.gradient else 2.0 * _COARSE
     _, each = slopes.gradients(x)
@@ -306,7 +310,7 @@ def _sigma(slopes: Slopes, x: np.ndarray, names: Sequence[str]) -> np.ndarray:
         if z * s > TOO_WIDE
     ]
     if wide:
-        raise TooLittle(
+        raise UndeterminedError(
             f"the data say too little: {'; '.join(wide)}, at 95 %. Give more runs or a longer log, "
             "or tune fewer parameters: some act alike"
         )

@@ -19,10 +19,10 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from robins.campaign.gather import blank
-from robins.campaign.machine import ByJax, InLanes
-from robins.campaign.memory import give_back
-from robins.campaign.plan import Chunk, Plan, Shard
+from robins.campaign.gather import blank_statistics
+from robins.campaign.machine import JaxMachine, LaneMachine
+from robins.campaign.memory import release_memory
+from robins.campaign.plan import CampaignPlan, Chunk, Shard
 from robins.campaign.retention import DIVERGED, NAMED, by_stem, histories, name_of, trim
 from robins.campaign.shards import pack
 from robins.campaign.statistics import Statistics
@@ -34,7 +34,7 @@ LEAST_S = 5.0  # before this worker has computed one
 POLL_S = 0.2
 
 
-class Missing(NamedTuple):
+class MissingShards(NamedTuple):
     """A chunk, and its shards that are not in the store yet."""
 
     chunk: Chunk
@@ -46,11 +46,11 @@ class Missing(NamedTuple):
         return f"claims/{self.shards[0].stem}"
 
 
-def missing(store: Store, shards: Mapping[Chunk, list[Shard]]) -> list[Missing]:
+def missing(store: Store, shards: Mapping[Chunk, list[Shard]]) -> list[MissingShards]:
     """All that is not there yet, in the order of the runs."""
     there = store.names("shards")
     lack = (
-        Missing(chunk, [s for s in some if PurePosixPath(s.name).name not in there])
+        MissingShards(chunk, [s for s in some if PurePosixPath(s.name).name not in there])
         for chunk, some in shards.items()
     )
     return [one for one in lack if one.shards]
@@ -59,10 +59,10 @@ def missing(store: Store, shards: Mapping[Chunk, list[Shard]]) -> list[Missing]:
 class Worker:
     """Computes shards of one campaign."""
 
-    def __init__(self, store: Store, plan: Plan, problem: Problem):
+    def __init__(self, store: Store, plan: CampaignPlan, problem: Problem):
         self.store, self.plan, self.problem = store, plan, problem
         by_jax = plan.machine == "jax"
-        self.machine = ByJax(problem) if by_jax else InLanes(problem, plan.machine)
+        self.machine = JaxMachine(problem) if by_jax else LaneMachine(problem, plan.machine)
         self._shards = plan.shards
         self._stems = by_stem(self._shards)
         self._seen: dict[str, float] = {}  # when a claim was first seen
@@ -80,11 +80,11 @@ class Worker:
                 continue
             began = monotonic()
             self.compute(taken)
-            give_back()
+            release_memory()
             self._took = monotonic() - began
             self.store.drop(taken.claim)
 
-    def compute(self, one: Missing) -> None:
+    def compute(self, one: MissingShards) -> None:
         """Compute shards of a chunk and put them, after the histories that are kept of its runs."""
         names = [s.filter for s in one.shards]
         found = self.found(one.chunk, names)
@@ -97,7 +97,7 @@ class Worker:
         """The statistics of filters over a chunk."""
 
         def taken(name: str, record: dict[str, PyTree]) -> Statistics:
-            of_chunk = blank(self.problem)
+            of_chunk = blank_statistics(self.problem)
             of_chunk.add(record)
             if chunk.number:
                 of_chunk.example = None  # figures show the first run of all
@@ -118,7 +118,7 @@ class Worker:
         }
 
     def _alone(self, record: dict[str, PyTree], index: int) -> Statistics:
-        one = blank(self.problem)
+        one = blank_statistics(self.problem)
         one.add(jax.tree_util.tree_map(lambda x: x[index : index + 1], record))
         return one
 
@@ -144,7 +144,7 @@ class Worker:
         if lost and most is not None:
             trim(self.store, self._stems, shard.filter, most)
 
-    def _next(self, lack: list[Missing]) -> Missing | None:
+    def _next(self, lack: list[MissingShards]) -> MissingShards | None:
         """Chunk that is not claimed; else one claimed for long; else none for now."""
         claimed = self.store.names("claims")
         who = {"host": socket.gethostname(), "process": os.getpid()}

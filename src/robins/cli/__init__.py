@@ -5,7 +5,10 @@ when it runs, so that help and usage errors come at once.
 """
 
 from robins.cli.commands import app
-from robins.cli.frame import Status
+from robins.cli.frame import ExitStatus
 from robins.cli.running import main
+from robins.errors import moved
 
-__all__ = ["Status", "app", "main"]
+__all__ = ["ExitStatus", "app", "main"]
+
+__getattr__ = moved(__name__)

@@ -9,7 +9,7 @@ import click
 from click import option
 
 from robins.cli import cache
-from robins.cli.frame import Status, only_json
+from robins.cli.frame import ExitStatus, only_json
 from robins.cli.options import (
     DEBUG,
     LOGS,
@@ -21,8 +21,8 @@ from robins.cli.options import (
     folder_name,
     publishes,
 )
+from robins.cli.printing import carry_out, print_data
 from robins.cli.progress import Progress
-from robins.cli.tell import carry_out, say
 
 
 @click.group(
@@ -107,7 +107,7 @@ def up(scenario: str, out: Path | None, filter_: str | None, **options: Any) -> 
         opened=lambda url: click.echo(f"Page:   {url}", err=True),
         **options,
     )
-    return Status.FAILED if outcome.failure else Status.DONE
+    return ExitStatus.FAILED if outcome.failure else ExitStatus.DONE
 
 
 @bench.command(short_help="Show the benches that run on this machine.")
@@ -117,7 +117,7 @@ def status(as_json: bool) -> None:
     from robins.bench.status import running, table
 
     found = running()
-    say({"benches": found}, table(found), as_json)
+    print_data({"benches": found}, table(found), as_json)
 
 
 @bench.command(
@@ -148,9 +148,9 @@ def replay(record: Path, as_json: bool, **options: Any) -> int:
         found = bench_replay(record, progress=progress, **options)
     for damage in found.damages:
         click.echo(damage, err=as_json)
-    say(found.data, found.text, as_json)
+    print_data(found.data, found.text, as_json)
     asked = options["filter_"] is not None or options["diff"] is not None
-    return Status.DONE if (found.same or asked) and found.whole else Status.FAILED
+    return ExitStatus.DONE if (found.same or asked) and found.whole else ExitStatus.FAILED
 
 
 @bench.command(short_help="List the serial ports of this machine.")
@@ -160,7 +160,7 @@ def ports(as_json: bool) -> None:
     from robins.bench.ports.port import list_ports, table
 
     found = list_ports()
-    say({"ports": [port._asdict() for port in found]}, table(found), as_json)
+    print_data({"ports": [port._asdict() for port in found]}, table(found), as_json)
 
 
 @bench.command(

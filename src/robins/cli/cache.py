@@ -73,9 +73,11 @@ def _tried(version: str, folder: Path | None) -> bool | None:
         if memory and (known := memory.read_text("utf-8")) in ("taken", "refused"):
             return known == "taken"
     try:
-        told = {"XLA_FLAGS": _XLA_FLAGS, "JAX_PLATFORMS": "cpu"}
+        settings = {"XLA_FLAGS": _XLA_FLAGS, "JAX_PLATFORMS": "cpu"}
         trial = [sys.executable, "-P", "-c", _TRIAL]
-        done = subprocess.run(trial, env=os.environ | told, capture_output=True, timeout=_TRIAL_S)
+        done = subprocess.run(
+            trial, env=os.environ | settings, capture_output=True, timeout=_TRIAL_S
+        )
     except (OSError, subprocess.TimeoutExpired):
         return None
     if done.returncode and _UNKNOWN not in done.stderr:
@@ -113,10 +115,12 @@ def _prune(folder: Path) -> None:
 
 def _machine() -> str:
     """A digest of the processor: machines that share a home must not share its instructions."""
-    told = [platform.machine(), platform.processor()]
+    settings = [platform.machine(), platform.processor()]
     try:
         lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
-        told += [line for line in lines if line.startswith(("model name", "flags", "Features"))][:2]
+        settings += [
+            line for line in lines if line.startswith(("model name", "flags", "Features"))
+        ][:2]
     except OSError:
         pass
-    return hashlib.sha256("\n".join(told).encode()).hexdigest()[:12]
+    return hashlib.sha256("\n".join(settings).encode()).hexdigest()[:12]

@@ -12,10 +12,10 @@ import click
 from click import option
 
 from robins.cli import cache
-from robins.cli.frame import Status, command_line, only_json
+from robins.cli.frame import ExitStatus, command_line, only_json
 from robins.cli.options import MACHINE, OUT, TRUST, answers, choices, examples
+from robins.cli.printing import carry_out, print_and_write, print_data
 from robins.cli.progress import Progress
-from robins.cli.tell import carry_out, deliver, say
 
 
 @click.group(
@@ -54,7 +54,7 @@ def _held(_context: click.Context, _given: click.Parameter, held: bool) -> None:
     def wait() -> None:
         while os.read(0, 1024):
             pass
-        os._exit(Status.INTERRUPTED)
+        os._exit(ExitStatus.INTERRUPTED)
 
     threading.Thread(target=wait, daemon=True).start()
 
@@ -87,7 +87,7 @@ def run(scenario: str, out: str, workers: int | None, as_json: bool, **options: 
         with only_json(as_json):
             bench.plan_campaign(out, scenario, **options)
             found = bench.campaign_status(out)
-        say(found._asdict(), _progress_text(out, found), as_json)
+        print_data(found._asdict(), _progress_text(out, found), as_json)
         return
     with only_json(as_json), Progress() as progress:
         outcome = bench.campaign_run(out, scenario, workers=workers, progress=progress, **options)
@@ -103,7 +103,7 @@ def _deliver(bench: Any, where: str, outcome: Any, as_json: bool, to: Path | Non
     def write() -> Any:
         return bench.publish(outcome, to, command=command, progress=writing, patience_s=patience_s)
 
-    deliver(outcome, write, writing, as_json)
+    print_and_write(outcome, write, writing, as_json)
 
 
 @campaign.command(
@@ -125,7 +125,7 @@ def work(where: str, as_json: bool) -> None:
         for done, total in bench.campaign_work(where):
             progress(done / total, f"{done} of {total} shards")
     data = {"done": done, "shards": total}
-    say(
+    print_data(
         data,
         f"{done} of {total} shards are there.\nNext:   robins campaign report {where}",
         as_json,
@@ -146,9 +146,9 @@ def status(where: str, as_json: bool) -> None:
         found = _workbench().status(where)
     if isinstance(found, dict):
         points = {name: one._asdict() for name, one in found.items()}
-        say({"points": points}, _points_text(where, found), as_json)
+        print_data({"points": points}, _points_text(where, found), as_json)
     else:
-        say(found._asdict(), _progress_text(where, found), as_json)
+        print_data(found._asdict(), _progress_text(where, found), as_json)
 
 
 def _points_text(where: str, found: dict[str, Any]) -> str:
@@ -165,12 +165,12 @@ def _points_text(where: str, found: dict[str, Any]) -> str:
 def _progress_text(where: str, found: Any) -> str:
     lines = [f"{found.scenario}, seed {found.seed}, by {found.machine}: {found.wanted} runs wanted"]
     for name in found.filters:
-        told = "".join(
+        shards_text = "".join(
             f"   {what}: {', '.join(map(str, runs[:10]))}{' ...' if len(runs) > 10 else ''}"
             for what, runs in (("diverged", found.diverged[name]), ("kept", found.kept[name]))
             if runs
         )
-        lines.append(f"  {name:<20} {found.done[name]:>8} done{told}")
+        lines.append(f"  {name:<20} {found.done[name]:>8} done{shards_text}")
     lines.append(
         f"shards: {found.shards}, {found.missing} missing, {len(found.damaged)} damaged"
         + "".join(f"\n  damaged: {name}" for name in found.damaged)
@@ -203,8 +203,8 @@ def verify(where: str, share: float, as_json: bool) -> int:
         + "".join(f"\n  damaged: {name}" for name in found.damaged)
         + "".join(f"\n  different: {name}" for name in found.different)
     )
-    say(found._asdict(), text, as_json)
-    return Status.FAILED if found.damaged or found.different else Status.DONE
+    print_data(found._asdict(), text, as_json)
+    return ExitStatus.FAILED if found.damaged or found.different else ExitStatus.DONE
 
 
 @campaign.command(

@@ -18,7 +18,7 @@ from robins.cli.export import write
 from robins.cli.listing import listing
 from robins.cli.made import Made
 from robins.cli.options import COLUMNS, LOGS, RESULTS, folder_name
-from robins.cli.tell import carry_out, say
+from robins.cli.printing import carry_out, print_data
 from robins.workbench import InputError
 
 _EXAMPLES = """
@@ -108,7 +108,7 @@ def _simulated_or_aligned(
 
 def _guessed(path: Path, as_json: bool) -> None:
     text = importlib.import_module("robins.workbench").guess(path)
-    say({"toml": text}, text.rstrip("\n"), as_json)
+    print_data({"toml": text}, text.rstrip("\n"), as_json)
     words = shlex.join(["robins", "doctor", str(path), "--columns", "columns.toml"])
     click.echo(f"Next:   save it as columns.toml, check what is GUESSED, then {words}", err=True)
 
@@ -116,12 +116,12 @@ def _guessed(path: Path, as_json: bool) -> None:
 def _compared(first: Path, second: Path, as_json: bool) -> None:
     comparison = importlib.import_module("robins.workbench.compare")
     found = comparison.compare(first, second)
-    say(found._asdict(), "\n".join(comparison.lines(found)), as_json)
+    print_data(found._asdict(), "\n".join(comparison.lines(found)), as_json)
 
 
 def _verified(where: Path, as_json: bool) -> None:
     found = importlib.import_module("robins.workbench.compare").verify(where)
-    say(found, f"{where}: whole, {found['files']} files of {found['scenario']}", as_json)
+    print_data(found, f"{where}: whole, {found['files']} files of {found['scenario']}", as_json)
 
 
 _WRITE = option(

@@ -8,8 +8,8 @@ from typing import Any
 
 import click
 
-from robins.cli.frame import Status, only_json
-from robins.cli.tell import say
+from robins.cli.frame import ExitStatus, only_json
+from robins.cli.printing import print_data
 
 _COLOURS = {"error": "red", "warning": "yellow", "note": "cyan"}
 _KINDS = {
@@ -30,7 +30,7 @@ def warn(findings: Sequence[Any]) -> None:
 
 def judge(
     paths: Sequence[Path], columns: Sequence[Path | str], as_json: bool, write: Path | None = None
-) -> Status:
+) -> ExitStatus:
     """Print what there is and the findings; bad input if a run on this log would be wrong.
 
     What the log shows of its unit is written to a file where one is named.
@@ -40,11 +40,11 @@ def judge(
         from robins.workbench.doctor import unit_file
 
         found = examine(paths, columns)
-    say(found.data if as_json else None, _text(found, paths, columns), as_json)
+    print_data(found.data if as_json else None, _text(found, paths, columns), as_json)
     if write is not None:  # after the findings, which explain why nothing may be found
         with only_json(as_json):
             write.write_text(unit_file(paths, columns))
-    return Status.BAD_INPUT if found.counts["error"] else Status.DONE
+    return ExitStatus.BAD_INPUT if found.counts["error"] else ExitStatus.DONE
 
 
 def _text(found: Any, log: Sequence[Path], columns: Sequence[Path | str]) -> str:
@@ -58,8 +58,8 @@ def _text(found: Any, log: Sequence[Path], columns: Sequence[Path | str]) -> str
     for finding in found.findings:
         severity = click.style(f"{finding.severity}:", fg=_COLOURS[finding.severity], bold=True)
         lines.append(f"{severity} {finding.sentence}")
-    told = [f"{n} {kind}{'' if n == 1 else 's'}" for kind, n in found.counts.items()]
-    lines.append(f"{', '.join(told)}.")
+    counts = [f"{n} {kind}{'' if n == 1 else 's'}" for kind, n in found.counts.items()]
+    lines.append(f"{', '.join(counts)}.")
     if found.counts["error"]:
         return "\n".join(
             [*lines, "Next:   mend the errors; a run on this log would be wrong or meaningless"]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from robins.cli import cache
-from robins.cli.tell import say
+from robins.cli.printing import print_data
 
 
 def write(name: str, to: Path, *, as_json: bool, **options: Any) -> None:
@@ -33,12 +33,12 @@ def write(name: str, to: Path, *, as_json: bool, **options: Any) -> None:
     )
     if made.program:
         # what it believes is in the code, so that it flies with what it was exported with
-        told = "".join(f" --set {shlex.quote(one)}" for one in options["settings"])
-        told += f" --seed {options['seed']}" if options["seed"] else ""
+        options_text = "".join(f" --set {shlex.quote(one)}" for one in options["settings"])
+        options_text += f" --seed {options['seed']}" if options["seed"] else ""
         node = f"{made.program.name.removesuffix('_board')}={made.program}"
-        flown = f"robins bench up {name} --filter {made.filter} --node {node}{told}"
+        flown = f"robins bench up {name} --filter {made.filter} --node {node}{options_text}"
         text += f"\n        {flown}   flies with it"
     cost = made.cost and made.cost.as_data()
     data = {**made._asdict(), "folder": str(to), "scenario": name, "cost": cost}
     data["program"] = made.program and str(made.program)
-    say(data, text, as_json)
+    print_data(data, text, as_json)

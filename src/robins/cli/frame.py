@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import click
 
 
-class Status(enum.IntEnum):
+class ExitStatus(enum.IntEnum):
     """Exit status of every command."""
 
     DONE = 0

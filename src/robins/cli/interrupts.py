@@ -39,7 +39,7 @@ def _interrupt(_number: int, frame: FrameType | None) -> None:
 
 
 @contextlib.contextmanager
-def heeded() -> Iterator[None]:
+def interruptible() -> Iterator[None]:
     """Context in which SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt where it is received.
 
     SIGTERM and SIGHUP too, so that a command that is killed, or whose terminal is closed, unwinds
@@ -61,12 +61,12 @@ def heeded() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def asked() -> bool:
+def interrupt_requested() -> bool:
     """True if an interrupt was requested."""
     return _asked
 
 
-def obey() -> None:
+def raise_if_interrupted() -> None:
     """Raise KeyboardInterrupt if one was requested and swallowed by other code on its way."""
     if _asked:
         raise KeyboardInterrupt

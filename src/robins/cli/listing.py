@@ -9,7 +9,7 @@ import click
 
 from robins.cli import cache
 from robins.cli.frame import only_json
-from robins.cli.tell import say
+from robins.cli.printing import print_data
 
 
 def listing(system: str | None, as_json: bool) -> None:
@@ -19,21 +19,21 @@ def listing(system: str | None, as_json: bool) -> None:
     name, sections = system, workbench.overview()
     if name is None and not as_json:
         first = next(scenario for _, titles in sections.values() for scenario in titles)
-        click.echo("\n\n".join(_section(name, *told) for name, told in sections.items()))
+        click.echo("\n\n".join(_section(name, *inventory) for name, inventory in sections.items()))
         click.echo("\nNext:   robins list SYSTEM   lists its filters and claims")
         click.echo(f"        robins run {first}")
         return
     cache.enable()
     with only_json(as_json):
-        told = workbench.inventory(name)
+        inventory = workbench.inventory(name)
     if name is None:
-        return say(told, "", as_json)
-    if "rigs" in told:
-        rig = name if name in told["rigs"] else next(iter(told["rigs"]))
+        return print_data(inventory, "", as_json)
+    if "rigs" in inventory:
+        rig = name if name in inventory["rigs"] else next(iter(inventory["rigs"]))
         words = f"{_section('bench', *sections['bench'])}\n\nNext:   robins bench up {rig}"
-        return say(told, words, as_json)
-    section = sections.get(name, (told["summary"], {}))
-    return say(told, _details(told, *section), as_json)
+        return print_data(inventory, words, as_json)
+    section = sections.get(name, (inventory["summary"], {}))
+    return print_data(inventory, _details(inventory, *section), as_json)
 
 
 def _section(name: str, summary: str, titles: Mapping[str, str]) -> str:

@@ -33,7 +33,7 @@ from robins.cli.options import (
     publishes,
     result_name,
 )
-from robins.cli.tell import carry_out
+from robins.cli.printing import carry_out
 from robins.workbench import options
 
 Decorator = Callable[[Callable], Callable]

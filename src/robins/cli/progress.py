@@ -37,7 +37,7 @@ class Progress:
         Raises:
             KeyboardInterrupt: it was requested, and got lost.
         """
-        interrupts.obey()
+        interrupts.raise_if_interrupted()
         with self._lock:
             self._share, self._what = min(max(share, 0.0), 1.0), what
             if self._bar is not None:

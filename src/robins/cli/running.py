@@ -15,7 +15,7 @@ import click
 
 from robins.cli import interrupts
 from robins.cli.commands import app
-from robins.cli.frame import Status
+from robins.cli.frame import ExitStatus
 from robins.errors import RobinsError
 
 _OF_A_PATH = {  # what is wrong with a path that was given, not with the disk
@@ -75,8 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line; the arguments of the process by default.
 
     Returns:
-        The exit status, see `Status`. Errors are reported in a few lines on standard error, with
-        the traceback only if ``--debug`` is among the arguments.
+        The exit status, see `ExitStatus`. Errors are reported in a few lines on standard error,
+        with the traceback only if ``--debug`` is among the arguments.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     with contextlib.ExitStack() as stack:
@@ -84,44 +84,46 @@ def main(arguments: Sequence[str] | None = None) -> int:
             nowhere = stack.enter_context(open(os.devnull, "w", encoding="utf-8"))
             stack.enter_context(contextlib.redirect_stderr(nowhere))
         if sys.stdout is None:
-            _tell("cannot write to standard output: it is closed")
-            return Status.FAILED
+            _print_error("cannot write to standard output: it is closed")
+            return ExitStatus.FAILED
         output = _Output(sys.stdout, "--json" in given)
-        stack.enter_context(interrupts.heeded())
+        stack.enter_context(interrupts.interruptible())
         stack.enter_context(contextlib.redirect_stdout(output))
         try:
             status = app.main(given, prog_name="robins", standalone_mode=False, obj=given)
             output.flush()
-            return status if isinstance(status, int) else Status.DONE
+            return status if isinstance(status, int) else ExitStatus.DONE
         except (click.Abort, KeyboardInterrupt) as stop:
             for note in getattr(stop.__cause__ or stop, "__notes__", ()):  # click wraps Ctrl-C
-                _tell(note)
+                _print_error(note)
             return _interrupted(for_good=arguments is None)
         except Exception as error:
-            if interrupts.asked():  # and turned into this on its way, as by a terminal that is gone
+            if (
+                interrupts.interrupt_requested()
+            ):  # and turned into this on its way, as by a terminal that is gone
                 return _interrupted(for_good=arguments is None)
             if output.failure is not None:
                 output.abandon()
                 if output.failure.errno != errno.EPIPE:  # a reader may go when it has seen enough
                     why = output.failure.strerror or output.failure
-                    _tell(f"cannot write to standard output: {why}")
-                return Status.FAILED
+                    _print_error(f"cannot write to standard output: {why}")
+                return ExitStatus.FAILED
             if "--debug" in given and not isinstance(error, click.ClickException):
                 traceback.print_exception(error)
-            return _told(error)
+            return _report_error(error)
 
 
-def _interrupted(for_good: bool) -> Status:
-    _tell(
+def _interrupted(for_good: bool) -> ExitStatus:
+    _print_error(
         "interrupted. No half result was written and an earlier one is as it was; the same "
         "command starts again."
     )
     if for_good:
-        _leave(Status.INTERRUPTED)
-    return Status.INTERRUPTED
+        _leave(ExitStatus.INTERRUPTED)
+    return ExitStatus.INTERRUPTED
 
 
-def _leave(status: Status) -> NoReturn:
+def _leave(status: ExitStatus) -> NoReturn:
     """End the process here and now.
 
     A compilation goes on in threads of its own when the interpreter takes the rest away, and that
@@ -133,38 +135,38 @@ def _leave(status: Status) -> NoReturn:
     os._exit(status)
 
 
-def _told(error: Exception) -> Status:
+def _report_error(error: Exception) -> ExitStatus:
     """Report an error in a few lines, and return its exit status."""
     if isinstance(error, click.UsageError):
-        _tell(error.format_message())
+        _print_error(error.format_message())
         command = error.ctx.command_path if error.ctx else "robins"
-        _tell(f"`{command} --help` lists what can be given.")
-        return Status.BAD_INPUT
+        _print_error(f"`{command} --help` lists what can be given.")
+        return ExitStatus.BAD_INPUT
     if isinstance(error, click.ClickException):
-        _tell(error.format_message())
-        return Status(error.exit_code)
+        _print_error(error.format_message())
+        return ExitStatus(error.exit_code)
     if isinstance(error, RobinsError):
-        _tell(str(error))
-        return Status.BAD_INPUT if error.bad_input else Status.FAILED
+        _print_error(str(error))
+        return ExitStatus.BAD_INPUT if error.bad_input else ExitStatus.FAILED
     if isinstance(error, ModuleNotFoundError) and error.name in _OF_THE_BENCH:
-        _tell(
+        _print_error(
             f"the bench needs the extra 'bench': pip install 'robins[bench]' ({error.name} is "
             "missing)"
         )
-        return Status.BAD_INPUT
+        return ExitStatus.BAD_INPUT
     if isinstance(error, MemoryError):
-        _tell("out of memory; ask for fewer runs or filters at a time.")
-        return Status.FAILED
+        _print_error("out of memory; ask for fewer runs or filters at a time.")
+        return ExitStatus.FAILED
     if isinstance(error, OSError) and error.filename is not None:
-        _tell(f"{os.fsdecode(error.filename)}: {error.strerror}; choose another path.")
-        return Status.BAD_INPUT if error.errno in _OF_A_PATH else Status.FAILED
+        _print_error(f"{os.fsdecode(error.filename)}: {error.strerror}; choose another path.")
+        return ExitStatus.BAD_INPUT if error.errno in _OF_A_PATH else ExitStatus.FAILED
     first = (str(error).strip().splitlines() or [""])[0]
-    _tell(f"failed: {type(error).__name__}: {first}")
-    _tell("this may be a fault of robins; run it again with --debug to see where.")
-    return Status.FAILED
+    _print_error(f"failed: {type(error).__name__}: {first}")
+    _print_error("this may be a fault of robins; run it again with --debug to see where.")
+    return ExitStatus.FAILED
 
 
-def _tell(text: str) -> None:
+def _print_error(text: str) -> None:
     with contextlib.suppress(OSError, ValueError):
         for line in text.splitlines():
             print(f"robins: {line}", file=sys.stderr)

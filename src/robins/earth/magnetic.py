@@ -241,8 +241,8 @@ def field_along(
     _refuse_outside("lat_rad", lat, -half_pi, half_pi, where)
     _refuse_outside("lon_rad", lon, -np.inf, np.inf, "every value must be finite")
     _refuse_outside("alt_m", alt, LOWEST_M, HIGHEST_M, f"{model.name} holds between these heights")
-    mend = f"that is the life of {model.name}; take the model of the date with wmm_for"
-    _refuse_outside("decimal_year", when, *model.life, mend)
+    remedy = f"that is the life of {model.name}; take the model of the date with wmm_for"
+    _refuse_outside("decimal_year", when, *model.life, remedy)
     if time_s is None:
         return np.asarray(_field_n(model, lat, lon, alt, when - model.epoch))
     time = np.asarray(time_s, float)

@@ -10,14 +10,14 @@ The C of one program is `robins.program.c`, the header of the wire `robins.bench
 """
 
 from robins.export.folder import Request, files_of, with_adjustable, write_folder
-from robins.export.library import Entry, Library
+from robins.export.library import EntryPoint, Library
 from robins.export.runs import board_runs, by_jax, entry_functions, reset_function
-from robins.export.single_precision import Cost
+from robins.export.single_precision import PrecisionCost
 
 __all__ = [
-    "Cost",
-    "Entry",
+    "EntryPoint",
     "Library",
+    "PrecisionCost",
     "Request",
     "board_runs",
     "by_jax",

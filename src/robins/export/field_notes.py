@@ -52,9 +52,9 @@ def components(axes: list[Axis | None]) -> list[str]:
     lines = [
         "factor is lower triangular, covariance P = factor factor' of the error, whose rows are"
     ]
-    for first, last, (name, told, _), names in _pieces(axes):
+    for first, last, (name, unit_text, _), names in _pieces(axes):
         rows = f"{first}" if first == last else f"{first} to {last}"
-        lines.append(f"  {rows}: {name} {told}: {', '.join(names)}")
+        lines.append(f"  {rows}: {name} {unit_text}: {', '.join(names)}")
     if len(lines) == 1:
         lines = [lines[0].replace(", whose rows are", "")]
     elif None in axes:
@@ -81,7 +81,7 @@ def field_notes(
     mean = state.belief.mean
     for root in _roots(state):
         for name, first, last, own in tangent_fields(mean, root):
-            if text := _said(own, _told(axes[first:last], first)):
+            if text := _joined_note(own, _components_text(axes[first:last], first)):
                 notes["state", name] = text
                 if root == MEAN:
                     notes["reset_belief", name] = text
@@ -90,7 +90,7 @@ def field_notes(
         if sensor is not None:
             name = symbol(entry)
             for field, first, last, own in tangent_fields(arguments[0], ""):
-                notes[f"{name}_reading", field] = _said(own, _read(sensor, first, last))
+                notes[f"{name}_reading", field] = _joined_note(own, _read(sensor, first, last))
             notes[f"{name}_result", "innovation"] = _read(sensor, 0, len(sensor.axes))
             deviation = f"{sensor.units}: its standard deviation; NaN where not used"
             notes[f"{name}_result", "sigma"] = deviation
@@ -117,12 +117,12 @@ def _read(sensor: SensorAxes, first: int, last: int) -> str:
     return f"{', '.join(units)}, {sensor.frame}: {', '.join(axes)}"
 
 
-def _said(own: str | None, told: str) -> str:
+def _joined_note(own: str | None, unit_text: str) -> str:
     """The note of a field: in its own words, or those of its error."""
     if own is None:
-        return told
+        return unit_text
     text, _, error = own.partition("; error: ")
-    return f"{text}; error: {told}" if error and told else text
+    return f"{text}; error: {unit_text}" if error and unit_text else text
 
 
 Place = tuple[str, int, int, str | None]
@@ -166,11 +166,11 @@ def _inner(leaf: State) -> Iterator[tuple[KeyPath, str | None]]:
             yield path, None if additive else own.get(getattr(path[-1], "name", ""), "")
 
 
-def _told(axes: list[Axis | None], at: int) -> str:
+def _components_text(axes: list[Axis | None], at: int) -> str:
     """The components of a field of the mean, counted from its own 0."""
     pieces = list(_pieces(axes))
     texts = []
-    for first, last, (name, told, _), names in pieces:
+    for first, last, (name, unit_text, _), names in pieces:
         where = "" if len(pieces) == 1 and last - first + 1 == len(axes) else f"{first} to {last}: "
-        texts.append(f"{where}{name} {told}: {', '.join(names)}")
+        texts.append(f"{where}{name} {unit_text}: {', '.join(names)}")
     return "; ".join(texts)

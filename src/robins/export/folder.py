@@ -17,8 +17,8 @@ import numpy as np
 from robins import __version__
 from robins.campaign.monte_carlo import reported_rows
 from robins.export.field_notes import components, field_notes, mean_fields, tangent_axes
-from robins.export.harness import Key, Recorded, check_c, makefile, recorded_h
-from robins.export.library import Entry, Library, symbol
+from robins.export.harness import Key, RecordedSteps, check_c, makefile, recorded_h
+from robins.export.library import EntryPoint, Library, symbol
 from robins.export.page import page
 from robins.export.runs import (
     BoardRun,
@@ -29,7 +29,7 @@ from robins.export.runs import (
     entry_functions,
     reset_function,
 )
-from robins.export.single_precision import Cost, cost, differences, in_floats
+from robins.export.single_precision import PrecisionCost, cost, differences, in_floats
 from robins.filters import FilterState
 from robins.filters.composite.adjustable import adjustable
 from robins.filters.model import Data
@@ -75,7 +75,7 @@ def with_adjustable(request: Request, numbers: Sequence[str]) -> Request:
 
 def files_of(
     request: Request, unroll: int | None, precision: Precision
-) -> tuple[dict[str, str], Library, Cost | None]:
+) -> tuple[dict[str, str], Library, PrecisionCost | None]:
     """Texts of an exported folder by name, their library, and what single precision costs.
 
     Args:
@@ -101,7 +101,7 @@ def files_of(
 
 def _library(
     request: Request, unroll: int | None, precision: Precision
-) -> tuple[Library, str, Recorded, Cost | None]:
+) -> tuple[Library, str, RecordedSteps, PrecisionCost | None]:
     """The filter as a library, its C, some steps of it by JAX, and what single precision costs."""
     problem, name, label = request[:3]
     contender = problem.contenders[name]
@@ -139,13 +139,15 @@ def _library(
     return library, c, record._replace(ruined="" if found.bearable else found.verdict), found
 
 
-def _entry(name: str, program: Program) -> Entry:
+def _entry(name: str, program: Program) -> EntryPoint:
     """An entry point with its words."""
     if name == "predict":
-        return Entry(name, program, ("input",), "Moves on by one step.")
+        return EntryPoint(name, program, ("input",), "Moves on by one step.")
     if name == RESET:
-        return Entry(name, program, ("belief",), "Starts again from a belief, all else as by init.")
-    return Entry(name, program, ("reading", "about"), f"Uses a reading of {name[7:]}.")
+        return EntryPoint(
+            name, program, ("belief",), "Starts again from a belief, all else as by init."
+        )
+    return EntryPoint(name, program, ("reading", "about"), f"Uses a reading of {name[7:]}.")
 
 
 def _any_start(runs: Sequence[BoardRun]) -> Any:
@@ -159,7 +161,7 @@ def _any_start(runs: Sequence[BoardRun]) -> Any:
     return jax.tree_util.tree_map(either, *(run.start for run in runs))
 
 
-def _record(run: BoardRun, functions: Mapping[str, Any], anew: Any) -> Recorded:
+def _record(run: BoardRun, functions: Mapping[str, Any], anew: Any) -> RecordedSteps:
     """The steps by JAX, and then a new start from what was believed after the first."""
     made = by_jax(functions, run, dict)
     states = list(made.values())[-1][0]
@@ -168,7 +170,7 @@ def _record(run: BoardRun, functions: Mapping[str, Any], anew: Any) -> Recorded:
     made[RESET] = jax.tree_util.tree_map(lambda x: np.asarray(x)[None], once)
     sizes = _sizes(made)
     tolerances = {key: NIS for key in sizes if key[1] == "nis"}
-    return Recorded(run.given, made, tolerances, 0, sizes, {RESET: (first.belief,)})
+    return RecordedSteps(run.given, made, tolerances, 0, sizes, {RESET: (first.belief,)})
 
 
 def _sizes(made: Calls) -> dict[Key, float]:
@@ -178,17 +180,17 @@ def _sizes(made: Calls) -> dict[Key, float]:
     NIS.
     """
     sizes: dict[Key, float] = {}
-    for entry, (state, told) in made.items():
+    for entry, (state, answer) in made.items():
         factor, mean = state.belief.factor, state.belief.mean
         sigma = np.sqrt(np.sum(np.square(factor), axis=-1))
         for name, first, end, own in mean_fields(jax.tree_util.tree_map(lambda a: a[0], mean)):
             if not own:
                 key = "state", name
                 sizes[key] = max(sizes.get(key, 0.0), _largest(sigma[:, first:end]))
-        if hasattr(told, "innovation"):
+        if hasattr(answer, "innovation"):
             struct = f"{symbol(entry)}_result"
-            sizes[struct, "innovation"] = _largest(told.sigma)
-            sizes[struct, "nis"] = _largest(told.dof)
+            sizes[struct, "innovation"] = _largest(answer.sigma)
+            sizes[struct, "nis"] = _largest(answer.dof)
     return sizes
 
 
@@ -196,7 +198,7 @@ def _largest(numbers: np.ndarray) -> float:
     return float(np.max(numbers, initial=0.0, where=np.isfinite(numbers)))
 
 
-def _compared(library: Library, record: Recorded, singles: Calls) -> Recorded:
+def _compared(library: Library, record: RecordedSteps, singles: Calls) -> RecordedSteps:
     """Record with the tolerances of floats: their differences times a margin."""
     parts: dict[Key, float] = {}
     off = 0

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from robins.export.library import C_TYPES, CODE, Entry, Field, Library, fields_of, number
+from robins.export.library import C_TYPES, CODE, EntryPoint, Library, StructField, fields_of, number
 from robins.program.precision import DOUBLE, SINGLE, Precision
 from robins.program.wrap import wrapped
 
@@ -125,7 +125,7 @@ COUNTED = ("    wrong += off;", "}", "")
 Key = tuple[str, str]  # struct ("state", "predict_result") and field, as in the notes of a library
 
 
-class Recorded(NamedTuple):
+class RecordedSteps(NamedTuple):
     """Steps of a filter.
 
     Attributes:
@@ -158,7 +158,7 @@ def makefile(library: Library) -> str:
     return MAKEFILE.format(name=library.name)
 
 
-def recorded_h(library: Library, record: Recorded) -> str:
+def recorded_h(library: Library, record: RecordedSteps) -> str:
     """The record as C."""
     steps = len(jax.tree_util.tree_leaves(record.given)[0])
     lines = [
@@ -182,7 +182,9 @@ def recorded_h(library: Library, record: Recorded) -> str:
     return "\n".join([*lines, ""])
 
 
-def _given(library: Library, record: Recorded) -> Iterator[tuple[str, Field, np.ndarray]]:
+def _given(
+    library: Library, record: RecordedSteps
+) -> Iterator[tuple[str, StructField, np.ndarray]]:
     """Table, field and numbers of all arguments; leading axis of calls."""
     once = jax.tree_util.tree_map(lambda x: np.asarray(x)[None], dict(record.ends))
     given = {**record.given, **once}
@@ -194,7 +196,9 @@ def _given(library: Library, record: Recorded) -> Iterator[tuple[str, Field, np.
                 yield f"{struct}_{f.name}", f, leaf
 
 
-def _made(library: Library, record: Recorded) -> Iterator[tuple[str, Key, Field, np.ndarray]]:
+def _made(
+    library: Library, record: RecordedSteps
+) -> Iterator[tuple[str, Key, StructField, np.ndarray]]:
     """Table, key, field and numbers of all outputs; leading axis of calls."""
     start = jax.tree_util.tree_map(lambda x: np.asarray(x)[None], library.start)
     for f, leaf in _filled(library.state, start):
@@ -208,13 +212,15 @@ def _made(library: Library, record: Recorded) -> Iterator[tuple[str, Key, Field,
             yield f"{struct}_{f.name}", (struct, f.name), f, leaf
 
 
-def _filled(fields: Sequence[Field], tree: PyTree) -> Iterator[tuple[Field, np.ndarray]]:
+def _filled(
+    fields: Sequence[StructField], tree: PyTree
+) -> Iterator[tuple[StructField, np.ndarray]]:
     """Fields and their numbers; empty arrays have no field."""
     leaves = [np.asarray(x) for x in jax.tree_util.tree_leaves(tree)]
     return zip(fields, [x for x in leaves if x[0].size], strict=True)
 
 
-def _table(name: str, f: Field, leaf: np.ndarray, precision: Precision) -> list[str]:
+def _table(name: str, f: StructField, leaf: np.ndarray, precision: Precision) -> list[str]:
     kind = precision.kind if f.is_real else C_TYPES[f.leaf.kind]
     rows = [
         "    {" + ", ".join(number(x, f.is_real, precision) for x in row.ravel().tolist()) + "}"
@@ -224,7 +230,7 @@ def _table(name: str, f: Field, leaf: np.ndarray, precision: Precision) -> list[
     return [head, ",\n".join(rows), "};"]
 
 
-def check_c(library: Library, record: Recorded) -> str:
+def check_c(library: Library, record: RecordedSteps) -> str:
     """The test."""
     name = library.name
     lines = BEGIN.format(name=name, **BITS[library.precision]).split("\n")
@@ -240,7 +246,7 @@ def check_c(library: Library, record: Recorded) -> str:
     return "\n".join([*(part for line in lines for part in wrapped(line)), END])
 
 
-def _called(library: Library, entry: Entry) -> list[str]:
+def _called(library: Library, entry: EntryPoint) -> list[str]:
     """A function that calls an entry point on a row of what is given, and compares all it makes."""
     name, e, given = library.name, entry.symbol, []
     lines = [f"static void call_{e}({name}_state *state, int t)", "{"]
@@ -253,15 +259,15 @@ def _called(library: Library, entry: Entry) -> list[str]:
                 table = f"{struct}_{f.name}[t]"
                 lines.append(f"    memcpy(&{argument}.{f.name}, {table}, sizeof {table});")
     lines += [f"    {name}_{e}_result result;", "    memset(&result, 0x5a, sizeof result);"]
-    told = ", ".join(["state", *(f"&{a}" for a in given), "&result"])
-    lines.append(f"    const int code = {name}_{e}({told});")
+    arguments = ", ".join(["state", *(f"&{a}" for a in given), "&result"])
+    lines.append(f"    const int code = {name}_{e}({arguments});")
     lines.append(f'    int off = differ("{e}/code", code != {e}_result_{CODE}[t][0]);')
     lines += _compared(e, library.result(entry), "result")
     lines += _compared(e, library.state, "state")
     return [*lines, *COUNTED]
 
 
-def _compared(entry: str, fields: Sequence[Field], struct: str) -> list[str]:
+def _compared(entry: str, fields: Sequence[StructField], struct: str) -> list[str]:
     """The fields of a struct against a row of the record."""
     lines = []
     for f in fields:

@@ -38,7 +38,7 @@ C_TYPES = {"flag": "int", "whole": "int64_t", "word": "uint32_t", "word64": "uin
 CODE = "code"  # of a result: what the entry point returns
 
 
-class Entry(NamedTuple):
+class EntryPoint(NamedTuple):
     """One entry point, ``(state, *args) -> (state, result)``.
 
     Attributes:
@@ -59,7 +59,7 @@ class Entry(NamedTuple):
         return symbol(self.name)
 
 
-class Field(NamedTuple):
+class StructField(NamedTuple):
     """An array in a struct, and where it lies in the arrays of a program."""
 
     name: str
@@ -81,7 +81,7 @@ class Field(NamedTuple):
         return f"&{struct}->{self.name}" + "[0]" * len(self.leaf.shape)
 
 
-def fields_of(leaves: Sequence[Leaf], which: int) -> list[Field]:
+def fields_of(leaves: Sequence[Leaf], which: int) -> list[StructField]:
     """The fields of one of the arguments or results; empty arrays have none."""
     counted, found, taken = {True: 0, False: 0}, [], set()
     for leaf in leaves:
@@ -94,7 +94,7 @@ def fields_of(leaves: Sequence[Leaf], which: int) -> list[Field]:
             while name in taken:
                 name, k = f"{base}_{k}", k + 1
             taken.add(name)
-            found.append(Field(name, leaf, counted[real]))
+            found.append(StructField(name, leaf, counted[real]))
         counted[real] += size
     return found
 
@@ -130,18 +130,18 @@ class Library(NamedTuple):
     """
 
     name: str
-    entries: Sequence[Entry]
+    entries: Sequence[EntryPoint]
     start: Any
     about: Sequence[str] = ()
     notes: dict[tuple[str, str], str] = {}  # noqa: RUF012 a default that is never changed
     precision: Precision = DOUBLE
 
     @property
-    def state(self) -> list[Field]:
+    def state(self) -> list[StructField]:
         """Fields of the state."""
         return fields_of(self.entries[0].program.inputs, 0)
 
-    def structs(self) -> Iterator[tuple[str, list[Field], str]]:
+    def structs(self) -> Iterator[tuple[str, list[StructField], str]]:
         """Name, fields and a sentence of each struct of the header."""
         yield "state", self.state, "All that is carried from one call to the next."
         for entry in self.entries:
@@ -150,17 +150,17 @@ class Library(NamedTuple):
                     yield self.argument(entry, name), fields, f"What {entry.name} takes."
             yield f"{entry.symbol}_result", self.result(entry), f"What {entry.name} tells."
 
-    def argument(self, entry: Entry, name: str) -> str:
+    def argument(self, entry: EntryPoint, name: str) -> str:
         """The name of the struct of an argument."""
         return f"{entry.symbol}_{name}"
 
-    def result(self, entry: Entry) -> list[Field]:
+    def result(self, entry: EntryPoint) -> list[StructField]:
         """Fields of the result of an entry point."""
         return fields_of(entry.program.results, 1)
 
     # ------------------------------------------------------------------------------ the header
 
-    def signature(self, entry: Entry) -> str:
+    def signature(self, entry: EntryPoint) -> str:
         """The declaration of an entry point."""
         given = [
             f"const {self.name}_{self.argument(entry, name)} *{name}"
@@ -235,7 +235,7 @@ class Library(NamedTuple):
             copies.append(f"    memcpy({f.first('state')}, {at}, sizeof {at});")
         return [*lines, *copies, "}", ""]
 
-    def _entry(self, entry: Entry) -> list[str]:
+    def _entry(self, entry: EntryPoint) -> list[str]:
         program, lines = entry.program, [self.signature(entry), "{"]
         # The program writes its results last, so that they may lie where the arguments do.
         sizes = zip(lengths(program.inputs), lengths(program.results), strict=True)
@@ -278,7 +278,7 @@ def _text(lines: Sequence[str]) -> str:
 
 
 def _copied(
-    fields: Sequence[Field], struct: str, reals: str, others: str, inwards: bool
+    fields: Sequence[StructField], struct: str, reals: str, others: str, inwards: bool
 ) -> list[str]:
     """Lines of C that copy between a struct and the arrays of a program."""
     lines = []

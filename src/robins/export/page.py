@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from robins import __version__
 from robins.export.library import Library
-from robins.export.single_precision import Cost
+from robins.export.single_precision import PrecisionCost
 from robins.filters import SENTENCES, Code
 
 
 def page(
-    library: Library, name: str, label: str, found: Cost | None, margin: float, least: float
+    library: Library,
+    name: str,
+    label: str,
+    found: PrecisionCost | None,
+    margin: float,
+    least: float,
 ) -> str:
     """README of an exported folder, in Markdown.
 
@@ -54,7 +59,7 @@ change it by `{n}_init` and the calls only.
 {_costs(found, margin, least)}"""
 
 
-def _costs(found: Cost | None, margin: float, least: float) -> str:
+def _costs(found: PrecisionCost | None, margin: float, least: float) -> str:
     """The part of the page on single precision."""
     if found is None:
         return ""

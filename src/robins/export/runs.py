@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from robins.campaign.machine import first_worlds
-from robins.campaign.monte_carlo import whole_case
+from robins.campaign.monte_carlo import complete_case
 from robins.filters import Belief, Code, Filter, Model, StepInfo
 from robins.filters.kalman import WRONG
 from robins.filters.trees import select
@@ -20,13 +20,13 @@ from robins.manifold import State
 from robins.systems.study import Case, Problem
 
 
-class Told(NamedTuple):
+class PredictionResult(NamedTuple):
     """Result of a prediction on a board."""
 
     code: Array
 
 
-class Used(NamedTuple):
+class UpdateResult(NamedTuple):
     """Result of an update on a board."""
 
     code: Array
@@ -74,7 +74,7 @@ def board_runs(problem: Problem, name: str, count: int) -> list[BoardRun]:
     batch = first_worlds(problem, count)
     for k in range(count):
         world = jax.tree_util.tree_map(lambda a, k=k: a[k], batch)
-        case = whole_case(contender.filter, model, contender.case(world))
+        case = complete_case(contender.filter, model, contender.case(world))
         start = case.start
         state = contender.filter.init(start, model.dims) if isinstance(start, Belief) else start
         state = jax.tree_util.tree_map(lambda x: jnp.asarray(x, jnp.asarray(x).dtype), state)
@@ -97,23 +97,25 @@ def entry_functions(filter_: Filter, model: Model, names: Mapping[str, Any]) -> 
 
     def predict(state: Any, u: Any):
         state, prediction = filter_.predict(state, model.motion, u)
-        return state, Told(prediction.code)
+        return state, PredictionResult(prediction.code)
 
     def update(name: str) -> Any:
         sensor = model.sensor(name)
 
         def use(state: Any, y: Any, aux: Any):
             state, info = filter_.update(state, sensor, y, aux)
-            return state, _told(info)
+            return state, _update_result(info)
 
         return use
 
     return {n: predict if n == "predict" else update(n.removeprefix("update_")) for n in names}
 
 
-def _told(info: StepInfo) -> Used:
+def _update_result(info: StepInfo) -> UpdateResult:
     wrong = info.notes.get(WRONG, ())
-    return Used(info.code, info.nis, info.dof, info.innovation, info.sigma, info.used, wrong)
+    return UpdateResult(
+        info.code, info.nis, info.dof, info.innovation, info.sigma, info.used, wrong
+    )
 
 
 def reset_function(filter_: Filter, start: Any) -> Any:
@@ -129,7 +131,7 @@ def reset_function(filter_: Filter, start: Any) -> Any:
         whole = jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree_util.tree_leaves(given)])
         taken = jnp.all(whole)
         code = jnp.where(taken, int(Code.DONE), int(Code.NOT_FINITE))
-        return select(taken, filter_.reset(start, given), state), Told(code)
+        return select(taken, filter_.reset(start, given), state), PredictionResult(code)
 
     return begin_anew
 
@@ -140,7 +142,7 @@ Kept = TypeVar("Kept")
 
 def ends(calls: Calls) -> tuple[State, Array]:
     """The state after a step, and the codes (entry points,)."""
-    return list(calls.values())[-1][0], jnp.stack([told.code for _, told in calls.values()], -1)
+    return list(calls.values())[-1][0], jnp.stack([result.code for _, result in calls.values()], -1)
 
 
 def by_jax(functions: Mapping[str, Any], run: BoardRun, kept: Callable[[Calls], Kept]) -> Kept:

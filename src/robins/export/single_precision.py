@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 from robins import units
 from robins.campaign.monte_carlo import Blocks, blocks_of, reported_rows
-from robins.export.library import Field, Library
+from robins.export.library import Library, StructField
 from robins.export.runs import BoardRun, Calls, Kept
 from robins.filters import Belief
 from robins.filters.analysis.consistency import normalised_sq
@@ -64,7 +64,7 @@ class BlockCost(NamedTuple):
         return float(found) if np.isfinite(self.rms_single) else math.inf
 
 
-class Cost(NamedTuple):
+class PrecisionCost(NamedTuple):
     """Cost of single precision.
 
     Attributes:
@@ -212,7 +212,7 @@ Made = tuple[Any, np.ndarray | Array]  # states and codes of a run
 
 
 def differences(
-    fields: Sequence[Field], doubles: Any, singles: Any, least: Mapping[str, float] = NONE
+    fields: Sequence[StructField], doubles: Any, singles: Any, least: Mapping[str, float] = NONE
 ) -> dict[str, float]:
     """Largest difference over its size, of each field of reals in the states or results of a run.
 
@@ -238,7 +238,7 @@ def cost(
     runs: Sequence[BoardRun],
     doubles: Sequence[Made],
     singles: Sequence[Made],
-) -> Cost:
+) -> PrecisionCost:
     """Cost of single precision in some runs."""
     fields: dict[str, float] = {}
     for (wide, _), (narrow, _) in zip(doubles, singles, strict=True):
@@ -260,10 +260,10 @@ def cost(
             rms = units.convert(np.sqrt(np.mean(error**2)), block.units, block.display_unit)
             figures.append((float(rms), float(np.mean(nees))))
         (rms, nees), (rms_single, nees_single) = figures
-        told = block.name, block.display_unit, rms, rms_single, nees, nees_single
-        blocks.append(BlockCost(*told))
+        block_figures = block.name, block.display_unit, rms, rms_single, nees, nees_single
+        blocks.append(BlockCost(*block_figures))
     codes = [np.array([c for _, c in made]) for made in (doubles, singles)]
-    return Cost(
+    return PrecisionCost(
         runs=len(runs),
         steps=codes[0].shape[1],
         fields=fields,

@@ -16,11 +16,11 @@ from robins.filters.analysis import (
     worst_case_gain,
 )
 from robins.filters.belief import SENTENCES, Belief, Code, StepInfo
-from robins.filters.closed_loop import Closed, Loop, Reading, run_closed
+from robins.filters.closed_loop import ClosedLoopRun, Loop, Reading, run_closed
 from robins.filters.composite import (
     Channel,
-    Family,
-    Late,
+    DelayedMeasurement,
+    ModeFamily,
     adaptive,
     at_master,
     channel,
@@ -67,14 +67,14 @@ __all__ = [
     "Belief",
     "Bound",
     "Channel",
-    "Closed",
+    "ClosedLoopRun",
     "Code",
-    "Family",
+    "DelayedMeasurement",
     "Filter",
     "FilterState",
-    "Late",
     "Linearisation",
     "Loop",
+    "ModeFamily",
     "Model",
     "Motion",
     "Normalised",

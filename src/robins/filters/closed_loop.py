@@ -71,7 +71,9 @@ def _without(filter_: Filter, sensor: Sensor, state: FilterState, y: Data, aux: 
 
 
 @partial(jax.jit, static_argnames=("keep",))
-def _scan(filter_: Filter, model: Model, state: FilterState, loop: Loop, keep: Keep) -> Closed:
+def _scan(
+    filter_: Filter, model: Model, state: FilterState, loop: Loop, keep: Keep
+) -> ClosedLoopRun:
     def body(carry: _Carry, given: tuple[Data, Data]) -> tuple[_Carry, tuple[Data, Reading]]:
         state, world, tally = carry
         row, due = given
@@ -94,7 +96,7 @@ def _scan(filter_: Filter, model: Model, state: FilterState, loop: Loop, keep: K
     (state, world, tally), (steps, readings) = jax.lax.scan(
         body, (state, loop.world, Tally.blank(tuple(model.dims))), (loop.rows, dict(loop.due))
     )
-    return Closed(steps, readings, state, world, tally)
+    return ClosedLoopRun(steps, readings, state, world, tally)
 
 
 def _update(filter_: Filter, sensor: Sensor, state: FilterState, y: Data, aux: Data) -> Updated:
@@ -111,7 +113,7 @@ def _apart(step: Callable[..., T], *args: Data) -> T:
     return barrier(step(*shape.unflatten(barrier(leaves))))
 
 
-class Closed(NamedTuple):
+class ClosedLoopRun(NamedTuple):
     """A run in closed loop; steps and readings have a leading axis of T steps."""
 
     steps: Data  # result of `keep` for each `robins.filters.Step`
@@ -128,7 +130,7 @@ def run_closed(
     loop: Loop,
     keep: Keep = everything,
     time_s: ArrayLike | None = None,
-) -> Closed:
+) -> ClosedLoopRun:
     """Run a filter in a loop: for each step the world reacts to the belief, then the filter
     predicts with the reading's input and updates with each sensor.
 

@@ -336,8 +336,10 @@ def _as_way(given: Any) -> Linearisation:
 
 def _as_rules(given: Any) -> tuple[Rule, ...]:
     if isinstance(given, Rule) or not isinstance(given, Sequence):
-        told = f"the rule {given.name}" if isinstance(given, Rule) else _named(given)
-        raise TypeError(f"rules must be a sequence of rules, as in rules=[gate()], got {told}")
+        given_name = f"the rule {given.name}" if isinstance(given, Rule) else _named(given)
+        raise TypeError(
+            f"rules must be a sequence of rules, as in rules=[gate()], got {given_name}"
+        )
     for i, one in enumerate(given):
         if not isinstance(one, Rule):
             raise TypeError(

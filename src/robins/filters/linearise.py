@@ -183,7 +183,7 @@ def taylor() -> Linearisation:
     return Taylor()
 
 
-class Weights(NamedTuple):
+class SigmaWeights(NamedTuple):
     """Weights of 2n + 1 symmetric sigma points, centre first (Wan & van der Merwe 2000)."""
 
     mean: Array  # (2n+1,)
@@ -191,7 +191,7 @@ class Weights(NamedTuple):
     reach: float  # c: points lie at m +- c s_i
 
 
-def sigma_weights(n: int, alpha: Number, beta: Number, kappa: Number) -> Weights:
+def sigma_weights(n: int, alpha: Number, beta: Number, kappa: Number) -> SigmaWeights:
     """Weights of the sigma points of n dimensions.
 
     Raises:
@@ -213,7 +213,7 @@ def sigma_weights(n: int, alpha: Number, beta: Number, kappa: Number) -> Weights
     ring = jnp.full(2 * n, 1.0 / (2.0 * c_sq))
     mean = jnp.concatenate([jnp.array([wm0]), ring])
     cov = jnp.concatenate([jnp.array([wm0 + 1.0 - alpha**2 + beta]), ring])
-    return Weights(mean, cov, math.sqrt(c_sq))
+    return SigmaWeights(mean, cov, math.sqrt(c_sq))
 
 
 def sigma_points(belief: Belief, reach: Number) -> State:

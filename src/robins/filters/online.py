@@ -17,7 +17,7 @@ from robins.filters.model import Data, Model
 from robins.filters.observation import as_measurement, as_real
 from robins.filters.run import Step, everything
 from robins.filters.tally import Tally, doubts
-from robins.filters.values import Numbers, settled
+from robins.filters.values import Numbers, without_weak_types
 from robins.manifold import State
 
 T = TypeVar("T")
@@ -63,7 +63,9 @@ class OnlineFilter:
                 raises it for an operation that C lacks, with the line of the model or the rule.
         """
         self.filter, self.model = filter_, model
-        state = settled(filter_.init(start, model.dims) if isinstance(start, Belief) else start)
+        state = without_weak_types(
+            filter_.init(start, model.dims) if isinstance(start, Belief) else start
+        )
         self._machine = on(machine, self.filter, self.model, state)
         self._reports = filter_.reports
         self._start = self._copied(self.state)

@@ -17,7 +17,7 @@ from robins.filters.kalman import Again, Filter, FilterState, Prediction
 from robins.filters.model import Data, Model
 from robins.filters.observation import as_measurement
 from robins.filters.tally import Tally, warn_not_taken
-from robins.filters.values import is_known, settled, split_numbers
+from robins.filters.values import is_known, split_numbers, without_weak_types
 from robins.manifold import State
 
 
@@ -167,7 +167,7 @@ def _interpreted(
     from robins.program.scanned import scan
 
     numbers, joined, key = split_numbers((filter_, model))
-    carry = numbers, _begun(settled(state), rows)
+    carry = numbers, _begun(without_weak_types(state), rows)
     (_, found), steps = scan(partial(_round, joined, keep), (key, keep), carry, rows)
     return Solution(steps, *found)
 

@@ -13,7 +13,7 @@ import numpy as np
 from robins.filters.belief import FAILURES, SENTENCES, Code, StepInfo
 from robins.filters.chi_square import chi2_band
 from robins.filters.values import Numbers
-from robins.filters.whiteness import looked, suspicions
+from robins.filters.whiteness import innovation_sums, suspicions
 from robins.manifold import State
 
 REFUSED_SHARE = 1.0 / 3.0  # of refused measurements that is reported: a sound gate refuses few
@@ -38,7 +38,9 @@ class Tally(NamedTuple):
     updates: dict[str, Numbers]  # (codes,) number of updates by `Code`, by sensor
     nis: dict[str, Numbers]  # () sum of the normalised innovations squared, by sensor
     dof: dict[str, Numbers]  # () sum of their degrees of freedom, by sensor
-    looks: Mapping[str, np.ndarray] = {}  # `whiteness.looked` by sensor, where steps were kept
+    looks: Mapping[
+        str, np.ndarray
+    ] = {}  # `whiteness.innovation_sums` by sensor, where steps were kept
 
     @classmethod
     def blank(cls, sensors: Collection[str]) -> Tally:
@@ -72,7 +74,7 @@ class Tally(NamedTuple):
         looks = {}
         for name, one in info.items():
             i = jax.tree_util.tree_map(np.asarray, one)  # NumPy compiles no programs
-            looks[name] = looked(i.innovation, i.sigma, i.nis, i.dof, given.get(name))
+            looks[name] = innovation_sums(i.innovation, i.sigma, i.nis, i.dof, given.get(name))
         return self._replace(looks=looks)
 
     def counts(self, sensor: str | None = None) -> dict[Code, int]:

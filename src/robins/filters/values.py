@@ -175,7 +175,7 @@ def split_numbers(tree: T) -> tuple[np.ndarray, Callable[[Numbers], T], Hashable
     return np.concatenate(given), joined, (content(structure.unflatten(fixed)), masks)
 
 
-def settled(state: T) -> T:
+def without_weak_types(state: T) -> T:
     """State without weak types, which would compile everything again after the first step."""
     if not any(getattr(x, "weak_type", False) for x in jax.tree_util.tree_leaves(state)):
         return state

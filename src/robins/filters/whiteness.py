@@ -35,11 +35,11 @@ LATE_NIS = 2.0  # least mean NIS per degree of freedom in the last quarter that 
 REPEATS = 10  # equal readings in a row of a stuck sensor
 COARSE = 0.1  # resolution over sigma of the innovation above which readings may repeat
 
-# Columns of `looked`: the sums of several pieces of one log may be added.
+# Columns of `innovation_sums`: the sums of several pieces of one log may be added.
 _COUNT, _PRODUCT, _SQUARE, _SEEN, _ABOVE, _LATE, _LATE_ABOVE, _FAR, _NIS, _DOF, _REPEATS = range(11)
 
 
-def looked(
+def innovation_sums(
     innovation: ArrayLike,
     sigma: ArrayLike,
     nis: ArrayLike,
@@ -149,8 +149,8 @@ def suspicions(looks: Mapping[str, ArrayLike], assumed: Collection[str] = ()) ->
     """Sentences on sequences that a consistent filter would not show.
 
     Args:
-        looks: sums of `looked` by sensor; with leading axes each run is judged by itself, and a
-            sentence counts the runs for which it holds.
+        looks: sums of `innovation_sums` by sensor; with leading axes each run is judged by itself,
+            and a sentence counts the runs for which it holds.
         assumed: sensors with correlated errors by design, so that only the size of the innovations
             and repeated readings count: their noise is a cautious guess, or the gain is held or
             leaves states out (`constant_gain`, `consider`).

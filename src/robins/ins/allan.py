@@ -78,7 +78,7 @@ class Allan(NamedTuple):
     stretches: tuple[int, ...] = ()  # samples of each part between gaps; () without a gap
 
 
-class Coefficients(NamedTuple):
+class NoiseCoefficients(NamedTuple):
     """Coefficients of the noise terms, each (A,), in SI units of the sensor."""
 
     Q: np.ndarray  # quantisation [rad | m/s]
@@ -91,9 +91,9 @@ class Coefficients(NamedTuple):
 class AllanFit(NamedTuple):
     """Noise terms read off an Allan curve. Terms not requested are zero with zero interval."""
 
-    value: Coefficients
-    lower: Coefficients  # interval of the given confidence; 0 where a term is not resolved
-    upper: Coefficients
+    value: NoiseCoefficients
+    lower: NoiseCoefficients  # interval of the given confidence; 0 where a term is not resolved
+    upper: NoiseCoefficients
     chi2: np.ndarray  # (A,) weighted squared residual; far above dof: the terms do not explain it
     dof: np.ndarray  # (A,) degrees of freedom of it
     terms: str
@@ -221,13 +221,14 @@ def fit(allan: Allan, terms: str = "NBK", confidence: float = 0.95) -> AllanFit:
     squares, sigmas = (np.stack([c[k] for c in columns], axis=-1) for k in (0, 1))  # (5, A)
     reach = ndtri((1.0 + confidence) / 2.0) * sigmas
     value, lower, upper = (
-        Coefficients(*np.sqrt(np.maximum(squares + side * reach, 0.0))) for side in (0.0, -1.0, 1.0)
+        NoiseCoefficients(*np.sqrt(np.maximum(squares + side * reach, 0.0)))
+        for side in (0.0, -1.0, 1.0)
     )
     chi2, dof, first = (np.array([c[k] for c in columns]) for k in (2, 3, 4))
     return AllanFit(value, lower, upper, chi2, dof, terms, confidence, allan.tau_s[keep][first])
 
 
-def term_curves(coefficients: Coefficients, tau_s: np.ndarray) -> np.ndarray:
+def term_curves(coefficients: NoiseCoefficients, tau_s: np.ndarray) -> np.ndarray:
     """Allan deviation (5, T, A) of each term Q, N, B, K, R; the whole is the root of their squares.
 
     Args:
@@ -237,7 +238,7 @@ def term_curves(coefficients: Coefficients, tau_s: np.ndarray) -> np.ndarray:
     return np.sqrt(mean_variances(tau_s).T)[:, :, None] * np.stack(coefficients)[:, None, :]
 
 
-class Interval(NamedTuple):
+class CoefficientInterval(NamedTuple):
     """A coefficient of each axis (A,) in a unit of the field, and the bounds of its interval."""
 
     unit: str
@@ -246,7 +247,9 @@ class Interval(NamedTuple):
     upper: np.ndarray
 
 
-def in_field_units(fitted: AllanFit, sensor: Literal["gyro", "accel"]) -> dict[str, Interval]:
+def in_field_units(
+    fitted: AllanFit, sensor: Literal["gyro", "accel"]
+) -> dict[str, CoefficientInterval]:
     """The terms of a fit as data sheets state them.
 
     White noise is stated twice, as random walk and as density: the density here is that of the
@@ -258,7 +261,9 @@ def in_field_units(fitted: AllanFit, sensor: Literal["gyro", "accel"]) -> dict[s
         if term in fitted.terms:
             per_hour, factor = ("/h", 3600.0) if term == "R" else ("", 1.0)
             values = (getattr(c, term) for c in (fitted.value, fitted.lower, fitted.upper))
-            out[name] = Interval(unit + per_hour, *(from_si(v, unit) * factor for v in values))
+            out[name] = CoefficientInterval(
+                unit + per_hour, *(from_si(v, unit) * factor for v in values)
+            )
     return out
 
 

@@ -75,8 +75,8 @@ def to_enu_rfu(table: Table) -> Table:
 
 
 def _to(table: Table, nav: NavFrame, body: BodyFrame) -> Table:
-    said = {side: to for side, to in (("nav", nav), ("body", body)) if hasattr(table, side)}
-    turns = {side for side, to in said.items() if getattr(table, side) != to}
+    targets = {side: to for side, to in (("nav", nav), ("body", body)) if hasattr(table, side)}
+    turns = {side for side, to in targets.items() if getattr(table, side) != to}
     if not turns:
         return table
     new: dict[str, Any] = {
@@ -87,7 +87,7 @@ def _to(table: Table, nav: NavFrame, body: BodyFrame) -> Table:
     }
     if isinstance(table, Trajectory | AttitudeTable):
         new["q_nb"] = _turned(table.q_nb, "nav" in turns, "body" in turns)
-    return replace(table, **said, **new)
+    return replace(table, **targets, **new)
 
 
 def _turned(q, turn_nav: bool, turn_body: bool):

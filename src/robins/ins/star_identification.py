@@ -171,7 +171,7 @@ def identify(
         return nothing._replace(refusal=f"{len(there)} stars are seen; a pyramid has four")
     image = _Image(b[there], sigma[there], None if light is None else light[there])
     density = _CROWDED * len(index.unit_i) / (4.0 * np.pi)  # stars per steradian
-    tried = asked = 0
+    tried = tests_made = 0
     best = 1.0
     for corners in _triangles(len(there)):
         if tried == _MOST_TRIANGLES:
@@ -180,7 +180,7 @@ def identify(
             continue
         tried += 1
         for stars in _candidates(index, image, corners, magnitude_tolerance):
-            asked += 1
+            tests_made += 1
             found = _confirmed(index, image, corners, stars, magnitude_tolerance)
             if found is None:
                 continue
@@ -188,7 +188,7 @@ def identify(
             others = len(there) - 3
             p = -np.expm1(-density * np.pi * np.mean(tolerance**2))
             agreed = int(np.sum(star >= 0)) - 3
-            chance = float(asked * bdtrc(agreed - 1, others, p)) if agreed > 0 else 1.0
+            chance = float(tests_made * bdtrc(agreed - 1, others, p)) if agreed > 0 else 1.0
             best = min(best, chance)
             if chance < most_chance:
                 return _named(index, len(b), there, star, rotation, chance, tried)

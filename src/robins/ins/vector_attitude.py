@@ -238,7 +238,7 @@ def attitude_from_vectors(
     return VectorAttitude(*(np.asarray(x) for x in answer))
 
 
-class _Seen(NamedTuple):
+class _Solution(NamedTuple):
     b: Any  # (..., n, 3), zero where there is no star
     r: Any  # (..., n, 3), as well
     weight: Any  # (..., n)
@@ -246,7 +246,7 @@ class _Seen(NamedTuple):
     solved: Any  # (...)
 
 
-def _seen(vectors_b, vectors_i, weight, least_separation_rad) -> _Seen:
+def _seen(vectors_b, vectors_i, weight, least_separation_rad) -> _Solution:
     there = weight > 0.0
     b, r = (jnp.where(there[..., None], jnp.asarray(v, float), 0.0) for v in (vectors_b, vectors_i))
     w = jnp.where(there, weight, 0.0)
@@ -258,10 +258,10 @@ def _seen(vectors_b, vectors_i, weight, least_separation_rad) -> _Seen:
     share = w / jnp.where(total > 0.0, total, 1.0)[..., None]
     profile = jnp.einsum("...n,...ni,...nj->...ij", share, b, r)
     some = jnp.broadcast_to(jnp.diag(jnp.array([0.5, 0.3, 0.2])), profile.shape)
-    return _Seen(b, r, w, jnp.where(solved[..., None, None], profile, some), solved)
+    return _Solution(b, r, w, jnp.where(solved[..., None, None], profile, some), solved)
 
 
-def _answer(seen: _Seen, q, covariance=None) -> VectorAttitude:
+def _answer(seen: _Solution, q, covariance=None) -> VectorAttitude:
     q = jnp.where(q[..., :1] < 0.0, -q, q)
     if covariance is None:
         outer = jnp.einsum("...n,...ni,...nj->...ij", seen.weight, seen.b, seen.b)

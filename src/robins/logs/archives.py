@@ -26,8 +26,8 @@ from robins.foreign import (
     columns_of_parquet,
 )
 from robins.logs.findings import LogError
-from robins.logs.opening import beginning, whole
-from robins.logs.text import Columns, Head, Layout, peek
+from robins.logs.opening import read_beginning, read_whole
+from robins.logs.text import Columns, Head, TextLayout, peek
 
 _LARGEST = 1 << 30  # bytes of a file
 _TEXT = "S40"  # of time stamps, as `robins.logs.text` has them
@@ -56,19 +56,19 @@ def names_in(path: str, changed_ns: int) -> frozenset[str]:
     Raises:
         LogError: as `arrays_in`.
     """
-    if kind_of_archive(beginning(path)) == "npz":
-        data, _ = whole(path, _LARGEST)
+    if kind_of_archive(read_beginning(path)) == "npz":
+        data, _ = read_whole(path, _LARGEST)
         members = archive_of(data, partial(_damaged, path, len(data))).namelist()
         return frozenset(name.removesuffix(".npy") for name in members)
     return frozenset(arrays_in(path))
 
 
 def _damaged(path: str, size: int, why: str) -> LogError:
-    mend = (
+    remedy = (
         "fetch it again, or save it as plain numbers; nothing of it was used, for no number in it "
         "can be trusted"
     )
-    return LogError(path, f"is cut short or damaged after {size} bytes: {why}", mend)
+    return LogError(path, f"is cut short or damaged after {size} bytes: {why}", remedy)
 
 
 def arrays_in(
@@ -84,7 +84,7 @@ def arrays_in(
         LogError: it is cut or damaged, or a package to read it is not installed. Nothing is read
             from a damaged one.
     """
-    data, _ = whole(path, _LARGEST)
+    data, _ = read_whole(path, _LARGEST)
     damaged = partial(_damaged, os.fspath(path), len(data))
     kind = kind_of_archive(data[:256])
     if kind == "npz":
@@ -102,7 +102,7 @@ def head_of(path: str | os.PathLike[str]) -> Head:
     Raises:
         LogError: as `arrays_in` and `robins.logs.text.peek`; an archive holds no columns.
     """
-    start = beginning(path)
+    start = read_beginning(path)
     if not kind_of_archive(start):
         return peek(path)
     columns = dict(_columns(arrays_in(path)))
@@ -124,7 +124,7 @@ def _columns(arrays: dict[str, np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
             yield f"{name}[:,{k}]", rows[:, k]
 
 
-def rows_of(head: Head, layout: Layout) -> Columns:
+def rows_of(head: Head, layout: TextLayout) -> Columns:
     """Columns of an archive as those of a text file, numbered from 1.
 
     Raises:
@@ -138,8 +138,8 @@ def rows_of(head: Head, layout: Layout) -> Columns:
     sizes = {head.names[k]: len(head.arrays[k]) for k in wanted}
     if len(set(sizes.values())) != 1:
         listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
-        mend = "declare columns of one sensor, which have one length"
-        raise LogError(head.file, f"the columns differ in length: {listed}", mend)
+        remedy = "declare columns of one sensor, which have one length"
+        raise LogError(head.file, f"the columns differ in length: {listed}", remedy)
     if dates := [head.names[k] for k in numbers if head.arrays[k].dtype.kind == "M"]:
         raise LogError(head.file, f"{dates[0]} holds dates, not numbers", "declare it as the time")
     rows = next(iter(sizes.values()))

@@ -13,9 +13,9 @@ import numpy as np
 from robins.dataset import AttitudeTable, ImuTable
 from robins.logs.checks_motion import words_of
 from robins.logs.findings import Finding
-from robins.logs.motion import Steps, signed_permutations, steps_of
+from robins.logs.motion import TurnSteps, signed_permutations, steps_of
 from robins.logs.ordering import increasing
-from robins.logs.quiet import Signal, error, signal_of, warning, windows_of
+from robins.logs.quiet import ImuSignal, error, signal_of, warning, windows_of
 from robins.logs.tables import TOLERANCE
 from robins.rotation import to_dcm
 
@@ -53,7 +53,7 @@ def check_attitude(imu: ImuTable, attitude: AttitudeTable) -> Iterator[Finding]:
 
 
 def _turning(
-    attitude: AttitudeTable, steps: Steps, time_s: np.ndarray, q: np.ndarray
+    attitude: AttitudeTable, steps: TurnSteps, time_s: np.ndarray, q: np.ndarray
 ) -> Iterator[Finding]:
     as_is = _left_over(steps, time_s, q)[0]
     if as_is < _WRONG:
@@ -84,7 +84,7 @@ def _turning(
 
 
 def _left_over(
-    steps: Steps, time_s: np.ndarray, q: np.ndarray, maps: np.ndarray | None = None
+    steps: TurnSteps, time_s: np.ndarray, q: np.ndarray, maps: np.ndarray | None = None
 ) -> np.ndarray:
     """(h,) share of the turning that the gyros leave over, seen along other axes."""
     S = np.eye(3)[None] if maps is None else maps
@@ -96,7 +96,7 @@ def _left_over(
 
 
 def _upright(
-    attitude: AttitudeTable, signal: Signal, time_s: np.ndarray, q: np.ndarray
+    attitude: AttitudeTable, signal: ImuSignal, time_s: np.ndarray, q: np.ndarray
 ) -> Iterator[Finding]:
     """Judge by the specific force at rest whether these attitudes are upright."""
     windows = windows_of(signal)

@@ -11,7 +11,7 @@ import numpy as np
 
 from robins.dataset import GnssTable
 from robins.logs.findings import Finding
-from robins.logs.gnss_motion import Steps, Track, lateness, steps_of, track_of
+from robins.logs.gnss_motion import FixTrack, PositionSteps, steps_of, track_of, velocity_delay
 from robins.logs.limits import ALT_LIMIT_M, LAT_LIMIT, LON_LIMIT, SPEED_LIMIT
 from robins.logs.quiet import error, finding, median_of, note, warning
 from robins.logs.tables import place_of
@@ -188,7 +188,7 @@ def check_velocity(gnss: GnssTable) -> Iterator[Finding]:
     steps = steps_of(track) if track else None
     if track is None or steps is None:
         return
-    late = lateness(track)
+    late = velocity_delay(track)
     if late is not None:
         steps = steps_of(track, late) or steps
     # Between fixes far apart the vehicle turns, so its velocities there tell its way but roughly.
@@ -240,7 +240,7 @@ def _wrong_axes(gnss: GnssTable, change: str) -> Finding:
     )
 
 
-def _late(gnss: GnssTable, track: Track, late: float) -> Finding:
+def _late(gnss: GnssTable, track: FixTrack, late: float) -> Finding:
     epoch = float(np.median(np.diff(track.time_s)))
     half = abs(late - epoch / 2) < 0.2 * epoch
     cause = (
@@ -280,7 +280,7 @@ def _horizontal(p: np.ndarray, v: np.ndarray) -> tuple[str | None, float]:
     return best[0], best[1]
 
 
-def _vertical_reversed(steps: Steps, track: Track) -> bool:
+def _vertical_reversed(steps: PositionSteps, track: FixTrack) -> bool:
     p, v = (x[:, 2] - x[:, 2].mean() for x in steps)
     if np.std(p) < max(3.0 * track.sigma_m, 0.05) or np.std(v) == 0.0:
         return False

@@ -23,7 +23,7 @@ from robins.ins.plausible import (
 )
 from robins.logs.findings import Finding, Value
 from robins.logs.quiet import (
-    Signal,
+    ImuSignal,
     Windows,
     error,
     finding,
@@ -61,7 +61,7 @@ def check_imu(imu: ImuTable, in_vehicle: bool = True) -> Iterator[Finding]:
         yield from _rates(imu, signal, windows)
 
 
-def _gravity(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Finding]:
+def _gravity(imu: ImuTable, signal: ImuSignal, windows: Windows) -> Iterator[Finding]:
     size = np.linalg.norm(windows.accel[windows.calm], axis=-1)
     measured = float(np.median(size))
     row = int(signal.rows[windows.first[np.flatnonzero(windows.calm)[0]]])
@@ -147,8 +147,8 @@ def _g_word(unit: str) -> str:
 
 def _unit_causes(measured: float) -> list[tuple[str, str]]:
     return [
-        ("gravity_unit", f"The unit is probably {unit}: {mend}")
-        for value, (unit, mend) in FORCE_UNITS.items()
+        ("gravity_unit", f"The unit is probably {unit}: {remedy}")
+        for value, (unit, remedy) in FORCE_UNITS.items()
         if is_near(measured, value)
     ]
 
@@ -191,7 +191,7 @@ def _up(imu: ImuTable, windows: Windows) -> Iterator[Finding]:
         )
 
 
-def _rates(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Finding]:
+def _rates(imu: ImuTable, signal: ImuSignal, windows: Windows) -> Iterator[Finding]:
     """Rates that no vehicle has, and the Earth's rate in another unit.
 
     The unit has a name only where the Earth's rate tells it: of all others that make a bias or a

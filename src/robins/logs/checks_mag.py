@@ -112,9 +112,9 @@ def _dead(mag: MagTable, axes: list[str], field: np.ndarray) -> Finding:
 
 def _unit(mag: MagTable, size: float) -> Iterator[Finding]:
     shown = f"the magnetic field is {size * 1e6:.4g} uT strong where the Earth's is 20 to 70"
-    for shift, (severity, cause, mend) in _SHIFTS.items():
+    for shift, (severity, cause, remedy) in _SHIFTS.items():
         if EARTH_FIELD_T[0] <= size / 10.0**shift <= EARTH_FIELD_T[1]:
-            yield finding(severity, mag, "field_unit", size)(f"{shown}. {cause}: {mend}.")
+            yield finding(severity, mag, "field_unit", size)(f"{shown}. {cause}: {remedy}.")
             return
     # Iron in the casing of a cheap sensor is often stronger than the Earth's field.
     if not EARTH_FIELD_T[0] / 2 <= size <= 10 * EARTH_FIELD_T[1]:

@@ -20,8 +20,8 @@ from robins.logs.checks_motion import SCALES, words_of
 from robins.logs.findings import Finding
 from robins.logs.motion import signed_permutations
 from robins.logs.pair_motion import (
-    Shared,
-    Turning,
+    SharedMotion,
+    TurningFit,
     fit_turning,
     fit_velocity,
     forces_of,
@@ -104,7 +104,7 @@ def _missing(master: Trajectory) -> Iterator[Finding]:
 
 
 def _turning(
-    imu: ImuTable, master: Trajectory, shared: Shared | None, delay_s: float
+    imu: ImuTable, master: Trajectory, shared: SharedMotion | None, delay_s: float
 ) -> Iterator[Finding]:
     of_master = np.zeros((1, 3)) if shared is None else turned(shared.q, shared)
     of_master = of_master - of_master.mean(axis=0)
@@ -121,10 +121,10 @@ def _turning(
         f"the gyros do not turn as the attitudes of {name_of(master)} do ({unfitted:.0%} of the "
         "turning is left over"
     )
-    told = [_other_attitudes(imu, master, shared, as_is)]
+    causes = [_other_attitudes(imu, master, shared, as_is)]
     if as_is.share > _BETTER:
-        told.append(_other_gyros(imu, shared, as_is, shown))
-    found = min((t for t in told if t is not None), key=lambda t: float(t.value), default=None)
+        causes.append(_other_gyros(imu, shared, as_is, shown))
+    found = min((t for t in causes if t is not None), key=lambda t: float(t.value), default=None)
     if found is not None:
         yield found
     elif as_is.share > _WELL:
@@ -142,16 +142,16 @@ def _left(of_master: np.ndarray, of_gyros: np.ndarray) -> float:
 
 
 def _other_attitudes(
-    imu: ImuTable, master: Trajectory, shared: Shared, as_is: Turning
+    imu: ImuTable, master: Trajectory, shared: SharedMotion, as_is: TurningFit
 ) -> Finding | None:
     """Another convention of the attitudes, if one of them explains the turning."""
     angles = shared.q.as_euler("ZYX")
     tried = {
         f"with {name} reversed": (
             Rotation.from_euler("ZYX", angles * signs),
-            f"{name.capitalize()} is probably {mend}",
+            f"{name.capitalize()} is probably {remedy}",
         )
-        for name, (signs, mend) in _CONVENTIONS.items()
+        for name, (signs, remedy) in _CONVENTIONS.items()
     }
     tried["the other way round"] = (
         shared.q.inv(),
@@ -168,7 +168,9 @@ def _other_attitudes(
     )
 
 
-def _other_gyros(imu: ImuTable, shared: Shared, as_is: Turning, shown: str) -> Finding | None:
+def _other_gyros(
+    imu: ImuTable, shared: SharedMotion, as_is: TurningFit, shown: str
+) -> Finding | None:
     """Another unit or other axes of the gyros, if one of them explains the turning."""
     maps = signed_permutations()
     scales = np.array([*SCALES, *(1.0 / s for s in SCALES)])
@@ -183,15 +185,15 @@ def _other_gyros(imu: ImuTable, shared: Shared, as_is: Turning, shown: str) -> F
     else:
         code = "gyro_unit"
         scale = float(tried[k][0, 0])
-        unit, mend = SCALES.get(scale, ("of the attitudes in another unit", "check both files"))
-        cause = f"They are probably {unit}: {mend}"
+        unit, remedy = SCALES.get(scale, ("of the attitudes in another unit", "check both files"))
+        cause = f"They are probably {unit}: {remedy}"
     return error(imu, code, float(left[k]))(f"{shown}, with other gyros {left[k]:.0%}). {cause}.")
 
 
-def _late(imu: ImuTable, master: Trajectory, fit: Turning, delay_s: float) -> Finding:
+def _late(imu: ImuTable, master: Trajectory, fit: TurningFit, delay_s: float) -> Finding:
     total_s = fit.late_s + delay_s
-    said = f"the stated delay of {delay_s:g} s makes them" if delay_s else "their stamps"
-    mend = (
+    stamps_text = f"the stated delay of {delay_s:g} s makes them" if delay_s else "their stamps"
+    remedy = (
         f'State that: master.delay = "{total_s:.3f} s"'
         if total_s >= 0.0
         else f"Add {-total_s:.3f} s to their stamps, and state no delay"
@@ -200,12 +202,12 @@ def _late(imu: ImuTable, master: Trajectory, fit: Turning, delay_s: float) -> Fi
         "error" if abs(fit.late_s) > _TOO_LATE_S else "warning", master, "master_late", fit.late_s
     )(
         f"its attitudes are {1e3 * abs(fit.late_s):.0f} ms (one sigma {1e3 * fit.sigma_s:.1f} ms) "
-        f"{'older' if fit.late_s > 0 else 'younger'} than {said}, judged by the gyros of "
-        f"{name_of(imu)}. {mend}."
+        f"{'older' if fit.late_s > 0 else 'younger'} than {stamps_text}, judged by the gyros of "
+        f"{name_of(imu)}. {remedy}."
     )
 
 
-def _velocity_sign(imu: ImuTable, master: Trajectory, shared: Shared) -> Iterator[Finding]:
+def _velocity_sign(imu: ImuTable, master: Trajectory, shared: SharedMotion) -> Iterator[Finding]:
     """Velocities whose change the accelerometers feel only with the sign of one turned."""
     as_is = fit_velocity(shared.v_n, shared)
     if as_is is None:
@@ -220,7 +222,7 @@ def _velocity_sign(imu: ImuTable, master: Trajectory, shared: Shared) -> Iterato
             )
 
 
-def _force(imu: ImuTable, master: Trajectory, shared: Shared | None) -> Iterator[Finding]:
+def _force(imu: ImuTable, master: Trajectory, shared: SharedMotion | None) -> Iterator[Finding]:
     """Accelerometers against what the master's velocities and attitudes ask for."""
     forces = None if shared is None else forces_of(shared)
     if forces is None:
@@ -237,10 +239,10 @@ def _force(imu: ImuTable, master: Trajectory, shared: Shared | None) -> Iterator
     units = [(G / value, "gravity_unit", *words) for value, words in FORCE_UNITS.items()]
     step_s = usual_step_s(imu.time_ns)
     if imu.kind == "increment":  # before cm/s^2, which look the same at 100 Hz
-        mend = (step_s, "rates_as_increments", "rates", "name a format of rates")
+        remedy = (step_s, "rates_as_increments", "rates", "name a format of rates")
     else:
-        mend = (1.0 / step_s, "increments_as_rates", "increments", "name a format of those")
-    units.insert(0, mend)
+        remedy = (1.0 / step_s, "increments_as_rates", "increments", "name a format of those")
+    units.insert(0, remedy)
     tried = np.concatenate([maps, [factor * np.eye(3) for factor, *_ in units]])
     left = np.array([_left(wanted, measured @ m.T) for m in tried])
     k = int(np.argmax(left < np.min(left) + 1e-3))
@@ -253,8 +255,8 @@ def _force(imu: ImuTable, master: Trajectory, shared: Shared | None) -> Iterator
             ),
         )
     elif k >= len(maps):
-        _, code, unit, mend = units[k - len(maps)]
-        cause = f"They are probably {unit}: {mend}"
+        _, code, unit, remedy = units[k - len(maps)]
+        cause = f"They are probably {unit}: {remedy}"
     elif np.array_equal(maps[k], -np.eye(3)):
         code, cause = "accel_reversed", "They have the opposite sign: turn all three"
     else:

@@ -17,10 +17,16 @@ import numpy as np
 from robins.dataset import GnssTable, ImuTable
 from robins.logs.findings import Finding
 from robins.logs.gnss_motion import lowest, track_of
-from robins.logs.motion import GRAVITY, at_the_spot, power_of, signed_permutations, squares_by_map
+from robins.logs.motion import (
+    GRAVITY,
+    power_of,
+    signed_permutations,
+    squares_by_map,
+    stationary_integrals,
+)
 from robins.logs.motion_fit import FORCE, LEVER, OFFSET, RATE, SCALE
 from robins.logs.motion_models import SCALES as STARTS
-from robins.logs.motion_models import Verdict, judge
+from robins.logs.motion_models import ModelChoice, judge
 from robins.logs.quiet import (
     error,
     finding,
@@ -105,7 +111,7 @@ def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
         yield from _forward(imu, gnss, found)
 
 
-def estimates(verdict: Verdict) -> dict[str, tuple[float, float]]:
+def estimates(verdict: ModelChoice) -> dict[str, tuple[float, float]]:
     """Value and sigma of what was estimated, by name.
 
     "gyros" and "gyro x" are factors that the gyros are to be multiplied by, "accel x" likewise,
@@ -149,14 +155,14 @@ def estimates(verdict: Verdict) -> dict[str, tuple[float, float]]:
     return {name: (float(value), float(s)) for name, (value, s) in out.items()}
 
 
-def explained(verdict: Verdict) -> bool:
+def explained(verdict: ModelChoice) -> bool:
     """Judge whether little is left but noise, so that the causes can be believed."""
     views = verdict.views
     noise = views.noise**2 / float(np.mean(power_of(views)))
     return verdict.fit.left(views) < max(_WELL, _CHI * noise)
 
 
-def in_body(verdict: Verdict) -> np.ndarray:
+def in_body(verdict: ModelChoice) -> np.ndarray:
     """(k, 3) velocities faster than 0.5 m/s, along the axes of the IMU [m/s]."""
     views, one = verdict.views, verdict.fit
     seen = np.zeros(len(views.v), bool)
@@ -166,7 +172,7 @@ def in_body(verdict: Verdict) -> np.ndarray:
     return v_b[seen & (np.linalg.norm(views.v, axis=-1) > 0.5)]
 
 
-def travel(verdict: Verdict) -> tuple[float, float] | None:
+def travel(verdict: ModelChoice) -> tuple[float, float] | None:
     """Direction of travel from x to y [deg] and its sigma; None where there is none."""
     v_b = in_body(verdict)
     if len(v_b) <= 20:
@@ -189,7 +195,7 @@ def _nearest(M: np.ndarray) -> np.ndarray:
 
 
 def _unclear(
-    imu: ImuTable, gnss: GnssTable, verdict: Verdict, left: float, found: dict
+    imu: ImuTable, gnss: GnssTable, verdict: ModelChoice, left: float, found: dict
 ) -> Iterator[Finding]:
     """A motion that is explained by two causes alike, or by none."""
     if verdict.nothing.left(verdict.views) < _GOOD:
@@ -230,7 +236,7 @@ def _all(share: float) -> str:
 
 
 def _gyros(
-    imu: ImuTable, verdict: Verdict, found: dict, step_s: float, share: str
+    imu: ImuTable, verdict: ModelChoice, found: dict, step_s: float, share: str
 ) -> list[Finding]:
     """Findings about the matrix of the gyros."""
     P, state = _nearest(verdict.fit.state.M_g), verdict.fit.state
@@ -318,7 +324,7 @@ def _forces(imu: ImuTable, found: dict, share: str) -> list[Finding]:
 
 
 def _clock(
-    imu: ImuTable, gnss: GnssTable, verdict: Verdict, found: dict, share: str
+    imu: ImuTable, gnss: GnssTable, verdict: ModelChoice, found: dict, share: str
 ) -> Iterator[Finding]:
     """Findings about the clocks: steps, rate, offset."""
     state, views = verdict.fit.state, verdict.views
@@ -346,7 +352,7 @@ def _clock(
         yield _offset(imu, gnss, offset, s, share)
 
 
-def small_offset(verdict: Verdict) -> float | None:
+def small_offset(verdict: ModelChoice) -> float | None:
     """Seconds to be added to the stamps of fixes where that is certain and small; else None."""
     offset, sigma = estimates(verdict)["offset"]
     sound = "clock" in verdict.free and not verdict.rival and explained(verdict)
@@ -448,7 +454,7 @@ def check_turning(imu: ImuTable) -> Iterator[Finding]:
     size = usual_force(windows_of(signal))
     if not size > 0.0:
         return
-    views = at_the_spot(signal._replace(accel=signal.accel * (GRAVITY / size)), imu.kind)
+    views = stationary_integrals(signal._replace(accel=signal.accel * (GRAVITY / size)), imu.kind)
     if views is None:
         return
     scales = np.array([*STARTS, 0.0])  # the last: as if it had not turned at all

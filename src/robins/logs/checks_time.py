@@ -122,7 +122,7 @@ def _shared(table: Table, size: float, step_s: float) -> Finding:
         if again.mean() > 0.01
         else f"samples are stamped in bursts of {size:g}, one burst every {many_s:.4g} s"
     )
-    mend = (
+    remedy = (
         "A batch lasts so long that nothing can be timed in it; log the time with all its digits"
         if many_s > _LONGEST_BATCH_S
         else f"`clean` spreads each batch evenly, {step_s * 1e3:.4g} ms apart; all may be early or "
@@ -134,7 +134,7 @@ def _shared(table: Table, size: float, step_s: float) -> Finding:
         "stamps_shared",
         size,
         int(np.argmax(again)) + 1 if again.any() else None,
-    )(f"{how}. A buffer was read at once and stamped on arrival, or stamps were rounded. {mend}.")
+    )(f"{how}. A buffer was read at once and stamped on arrival, or stamps were rounded. {remedy}.")
 
 
 def _duplicates(table: Table) -> Iterator[Finding]:
@@ -250,7 +250,7 @@ def _jitter(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
         return
     scatter = float(step.std()) / usual
     rounded = resolution_ns(stamps) * 1e-9
-    if scatter > 0.1 and rounded > 0.5 * usual and _strays(stamps) < 1.5 * rounded:
+    if scatter > 0.1 and rounded > 0.5 * usual and _stamp_scatter(stamps) < 1.5 * rounded:
         yield note(table, "stamps_rounded", rounded)(
             f"stamps are whole multiples of {rounded:.4g} s, for samples {step.mean():.4g} s apart "
             f"({1 / step.mean():.4g} Hz). Their digits were lost in writing; log them all, or a "
@@ -266,7 +266,7 @@ def _jitter(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
         )
 
 
-def _strays(stamps: np.ndarray) -> float:
+def _stamp_scatter(stamps: np.ndarray) -> float:
     """Range of the stamps about a constant rate [s], in the median of parts of the table.
 
     Rounding leaves that of the last digit; where rows are missing here and there it is more.

@@ -88,10 +88,10 @@ def clean_imu(imu: ImuTable) -> tuple[ImuTable, dict[str, int], list[tuple[int, 
     counts |= spread_counts("imu", read, imu)
     if np.count_nonzero(keep) < 2:
         reasons = {k.removeprefix("imu_"): n for k, n in counts.items() if n and k != "imu_spread"}
-        told = ", ".join(f"{n} {reason}" for reason, n in reasons.items()) or "none"
+        counted = ", ".join(f"{n} {reason}" for reason, n in reasons.items()) or "none"
         raise LogError(
             imu.source or "ImuTable",
-            f"fewer than two of {len(imu)} samples can be used (refused: {told})",
+            f"fewer than two of {len(imu)} samples can be used (refused: {counted})",
             "the doctor tells what is wrong with them",
         )
     return rows_where(imu, keep), counts, _gaps(imu, keep)

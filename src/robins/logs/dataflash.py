@@ -24,18 +24,18 @@ from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.logs.findings import (
     Finding,
     LogError,
-    above_geoid,
-    breaks_off,
     damaged,
-    left_out,
-    telling,
-    undated,
+    finding_reporter,
+    report_cut_end,
+    report_geoid_heights,
+    report_left_out,
+    report_undated,
 )
 from robins.logs.fix_kinds import MAVLINK, fixes, over_ground
 from robins.logs.merging import gps_clock
-from robins.logs.opening import Bytes, mapped
+from robins.logs.opening import Bytes, map_file
 from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS
-from robins.logs.ulog import Topic, column, stamps, triad
+from robins.logs.ulog import UlogTopic, column, stamps, triad
 from robins.units import to_si
 
 _MARK, _FMT = b"\xa3\x95", 0x80
@@ -62,7 +62,7 @@ def read_dataflash(path: str | os.PathLike[str], findings: list[Finding] | None 
         LogError: a definition is damaged, or there are no inertial samples.
     """
     file = str(path)
-    topics = _topics(file, mapped(path, findings), findings)
+    topics = _topics(file, map_file(path, findings), findings)
     imu, mag, gps, gpa = (_instance(file, topics, name, findings) for name in _WANTED)
     if imu is None:
         held = ", ".join(sorted(topics)) or "nothing that robins reads"
@@ -89,7 +89,7 @@ def read_dataflash(path: str | os.PathLike[str], findings: list[Finding] | None 
     )
 
 
-def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[str, Topic]:
+def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[str, UlogTopic]:
     """The wanted messages; bytes that belong to none are counted.
 
     Raises:
@@ -116,7 +116,7 @@ def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[str,
                 at = data.find(_MARK, at + 1)
             at = end if at < 0 else at
             if at == end and end - begin < 256 and data[begin : begin + 2] == _MARK:
-                breaks_off(findings, file, begin)
+                report_cut_end(findings, file, begin)
             elif _NO_FILL.search(data, begin, at):
                 stray += at - begin
             continue
@@ -132,13 +132,15 @@ def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[str,
         elif kind in found:
             found[kind].append(data[at + 3 : at + size])
         at += size
-    left_out(findings, file, stray, "bytes belong to no message")
-    topics: dict[str, Topic] = {}
+    report_left_out(findings, file, stray, "bytes belong to no message")
+    topics: dict[str, UlogTopic] = {}
     for number, (name, layout, factors) in kinds.items():
         if found[number]:
             rows = np.frombuffer(b"".join(found[number]), layout)
             fields = zip(layout.names or (), factors, strict=True)
-            topics[name] = Topic(name, {n: rows[n] * f if f != 1 else rows[n] for n, f in fields})
+            topics[name] = UlogTopic(
+                name, {n: rows[n] * f if f != 1 else rows[n] for n, f in fields}
+            )
     return topics
 
 
@@ -162,8 +164,8 @@ def _definition(file: str, data: Bytes, at: int) -> tuple[int, int, str, np.dtyp
 
 
 def _instance(
-    file: str, topics: dict[str, Topic], name: str, findings: list[Finding] | None
-) -> Topic | None:
+    file: str, topics: dict[str, UlogTopic], name: str, findings: list[Finding] | None
+) -> UlogTopic | None:
     """The rows of the lowest instance; of GPS the lowest that had fixes, of GPA the same one."""
     topic, gps = topics.get(name), topics.get("GPS")
     if topic is None or "I" not in topic.fields:
@@ -174,23 +176,23 @@ def _instance(
         receivers, fixed = column(file, gps, "I"), column(file, gps, "Status") >= _FIX
         number = receivers[fixed if fixed.any() else slice(None)].min()
     if len(numbers) > 1 and name != "GPA":
-        telling(findings, "note", "several_instances", file, value=len(numbers))(
+        finding_reporter(findings, "note", "several_instances", file, value=len(numbers))(
             f"{name} was logged of {len(numbers)} sensors; number {number:g} is read and "
             "the others are left alone."
         )
     mine = of == number
     fields = {key: values[mine] for key, values in topic.fields.items()}
-    return Topic(name, fields) if mine.any() else None
+    return UlogTopic(name, fields) if mine.any() else None
 
 
 def _fixes(
-    file: str, gps: Topic, gpa: Topic | None, findings: list[Finding] | None
+    file: str, gps: UlogTopic, gpa: UlogTopic | None, findings: list[Finding] | None
 ) -> tuple[GnssTable, np.ndarray]:
     """Fixes that have a GPS time, and when each was logged."""
     week, ms = column(file, gps, "GWk"), column(file, gps, "GMS")
     dated = (week > 0) & (week < _LAST_WEEK) & (ms < WEEK_NS // 1_000_000)
-    undated(findings, file, int((~dated).sum()), "messages GPS")
-    gps = Topic(gps.name, {name: values[dated] for name, values in gps.fields.items()})
+    report_undated(findings, file, int((~dated).sum()), "messages GPS")
+    gps = UlogTopic(gps.name, {name: values[dated] for name, values in gps.fields.items()})
     arrived, status = stamps(file, gps), column(file, gps, "Status")
     time_ns = week[dated].astype(np.int64) * WEEK_NS + ms[dated].astype(np.int64) * 1_000_000
 
@@ -206,7 +208,7 @@ def _fixes(
     # the autopilot counts the geoid's height with the other sign
     separation = beside("Und")
     if np.isnan(separation).any():
-        above_geoid(findings, file, "A newer version of ArduPilot logs the geoid.")
+        report_geoid_heights(findings, file, "A newer version of ArduPilot logs the geoid.")
         separation = np.zeros_like(separation)
     down = np.where(beside("VV") == 0.0, np.nan, column(file, gps, "VZ"))
     table = fixes(

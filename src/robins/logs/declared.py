@@ -32,7 +32,7 @@ from robins.foreign import decoding
 from robins.logs.archives import head_of
 from robins.logs.findings import LogError, refused
 from robins.logs.quantities import QUANTITIES
-from robins.logs.registry import called, fitting
+from robins.logs.registry import format_named, matching_formats
 from robins.logs.text import Head
 from robins.logs.text_format import Column, TextFormat, columns_of, header_of, one_of
 from robins.units import KINDS, UnitError, parse
@@ -75,8 +75,8 @@ def format_of(text: str, file: str) -> TextFormat:
         content = tomllib.loads(text)
     _checked(file, "", content, _KEYS)
     if not content.get("columns"):
-        mend = 'state them, such as time = { name = "t", unit = "ms" }'
-        raise refused(file, "columns")("states no columns", mend)
+        remedy = 'state them, such as time = { name = "t", unit = "ms" }'
+        raise refused(file, "columns")("states no columns", remedy)
     columns = tuple(_column(file, *item) for item in content.pop("columns").items())
     if content.get("skip", 0) < 0:
         at = refused(file, field="skip", value=content["skip"])
@@ -96,25 +96,25 @@ def format_of(text: str, file: str) -> TextFormat:
 def _column(file: str, quantity: str, stated: Any) -> Column:
     key = f"columns.{quantity}"
     if not isinstance(stated, dict):
-        mend = 'write it like { name = "t", unit = "ms" }'
-        raise refused(file, field=key, value=stated)("is not a table of name and unit", mend)
+        remedy = 'write it like { name = "t", unit = "ms" }'
+        raise refused(file, field=key, value=stated)("is not a table of name and unit", remedy)
     _checked(file, f"{key}.", stated, _COLUMN)
     ways = [way for way in ("name", "place", "value") if way in stated]
     if len(ways) != 1:
-        mend = "state the name in the header, or the place from 1 where there is none"
+        remedy = "state the name in the header, or the place from 1 where there is none"
         both = f"both {' and '.join(ways)}" if ways else "neither name nor place"
-        raise refused(file, key)(f"has {both}", mend)
+        raise refused(file, key)(f"has {both}", remedy)
     if not 1 <= (place := stated.get("place", 1)) <= _WIDEST:
         wrong = "is less than 1" if place < 1 else f"is beyond {_WIDEST}"
         raise refused(file, key, "place", place)(wrong, "count from 1")
     kind = QUANTITIES.get(quantity, "ratio")
     if kind != "ratio" and "unit" not in stated:
-        mend = f"state one of {', '.join(KINDS[kind])}"
-        raise refused(file, key)("has no unit", mend)
+        remedy = f"state one of {', '.join(KINDS[kind])}"
+        raise refused(file, key)("has no unit", remedy)
     where = next(iter(stated.get("where", {}).items()), ("", ""))
     if len(stated.get("where", {"": ""})) != 1 or not isinstance(where[1], str):
-        mend = 'write it like { sensor = "GYR" }'
-        raise refused(file, key, "where", stated["where"])("is not one column and its text", mend)
+        remedy = 'write it like { sensor = "GYR" }'
+        raise refused(file, key, "where", stated["where"])("is not one column and its text", remedy)
     count, symbol = 1.0, stated.get("unit")
     if symbol is not None and (many := _MANY.fullmatch(symbol)):
         count, symbol = float(many[1]), many[2]
@@ -167,13 +167,13 @@ def formats_of(files: Paths, columns: Paths) -> dict[str, str | TextFormat]:
         if not fits and heads:
             columns_of(row, heads[0].file, header_of(row, heads[0]))
         if not fits:
-            mend = "check separator, skip and places"
-            raise LogError(row.source, "its columns fit none of the files", mend)
+            remedy = "check separator, skip and places"
+            raise LogError(row.source, "its columns fit none of the files", remedy)
     for name in names:
-        called(name, "--format")
+        format_named(name, "--format")
         plain = (os.fspath(file) for file in files if not os.path.isdir(file))
         open_ones = [file for file in plain if file not in out]
-        meant = [f for f in open_ones if len(open_ones) == 1 or len(fitting(f)[1]) != 1]
+        meant = [f for f in open_ones if len(open_ones) == 1 or len(matching_formats(f)[1]) != 1]
         if not meant:
             raise LogError(f"--format {name}", "all files are recognised", "omit the name")
         out |= dict.fromkeys(meant, name)

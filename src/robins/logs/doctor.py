@@ -29,7 +29,7 @@ from robins.logs.limits import check_limits
 from robins.logs.tables import KINDS, Table, checked, kind_of, tables_of
 
 
-class Code(NamedTuple):
+class FindingCode(NamedTuple):
     """Meaning of one finding."""
 
     name: str
@@ -44,7 +44,7 @@ class Check:
     topic: str  # heading in the documents
     find: Callable[..., Iterable[Finding]]
     needs: str  # what it is given, in this order; where one of these is missing it is not asked
-    codes: tuple[Code, ...]
+    codes: tuple[FindingCode, ...]
     silenced_by: str = ""  # codes; beside these it would blame the wrong thing
     unless: str = ""  # it is not asked where one of these is there, for that tells more ...
     but_after: str = ""  # ... but where it could tell nothing, by this code
@@ -52,13 +52,13 @@ class Check:
     overrules: str = ""  # codes found before that it judges better ...
     undecided: str = ""  # ... unless by this code it could not
 
-    def is_asked(self, things: Mapping[str, Any], found: set[str]) -> bool:
+    def applies(self, things: Mapping[str, Any], found: set[str]) -> bool:
         """True if the check runs on these things and after these codes."""
         there = things.keys() >= set(self.needs.split())
         kept_out = set(self.unless.split()) & things.keys() and self.but_after not in found
         return there and not kept_out and not set(self.silenced_by.split()) & found
 
-    def ask(self, things: Mapping[str, Any]) -> list[Finding]:
+    def run(self, things: Mapping[str, Any]) -> list[Finding]:
         """Findings of the check."""
         return list(self.find(*(things[need] for need in self.needs.split())))
 
@@ -75,31 +75,39 @@ def _check(topic: str, find: Callable[..., Iterable[Finding]], needs: str, **whe
 
 # What readers leave out or doubt while they read.
 OF_READERS = (
-    Code("ends_early", "warning", "the recording or the copy was interrupted"),
-    Code("begins_midway", "warning", "the recording began in the middle of a line"),
-    Code("no_place", "note", "the path is in local metres; it was put at latitude 0, longitude 0"),
-    Code("no_velocity", "note", "RTKLIB did not solve for velocities"),
-    Code("height_above_geoid", "warning", "heights are above the geoid, not the ellipsoid"),
-    Code("dt_disagrees", "warning", "the column dt is not the time that has passed"),
-    Code("several_instances", "note", "a recording holds several sensors of one kind"),
-    Code("angle_range", "warning", "single angles that cannot be; they are taken as missing"),
-    Code("quaternion_length", "warning", "single quaternions of another length; likewise"),
-    Code("other_kinds", "note", "a file holds lines of kinds that are not read"),
-    Code("damaged_frames", "warning", "messages without a right checksum, or bytes of none"),
-    Code("undated", "note", "fixes from before the receiver knew the date"),
-    Code("sigma_assumed", "note", "a receiver states no sigmas; those of its kind of fix are used"),
-    Code("sensors_merged", "note", "gyros and accelerometers were recorded apart"),
-    Code("clock_aligned", "note", "samples are put on GPS time by the arrival of the fixes"),
-    Code("velocity_taken", "note", "velocities of fixes come from a topic of their own"),
-    Code("lines_left_out", "warning", "lines that fail their checksum, or of an idle receiver"),
-    Code("fixes_of_truth", "note", "fixes and path are one solution, of the same receiver"),
+    FindingCode("ends_early", "warning", "the recording or the copy was interrupted"),
+    FindingCode("begins_midway", "warning", "the recording began in the middle of a line"),
+    FindingCode(
+        "no_place", "note", "the path is in local metres; it was put at latitude 0, longitude 0"
+    ),
+    FindingCode("no_velocity", "note", "RTKLIB did not solve for velocities"),
+    FindingCode("height_above_geoid", "warning", "heights are above the geoid, not the ellipsoid"),
+    FindingCode("dt_disagrees", "warning", "the column dt is not the time that has passed"),
+    FindingCode("several_instances", "note", "a recording holds several sensors of one kind"),
+    FindingCode(
+        "angle_range", "warning", "single angles that cannot be; they are taken as missing"
+    ),
+    FindingCode("quaternion_length", "warning", "single quaternions of another length; likewise"),
+    FindingCode("other_kinds", "note", "a file holds lines of kinds that are not read"),
+    FindingCode("damaged_frames", "warning", "messages without a right checksum, or bytes of none"),
+    FindingCode("undated", "note", "fixes from before the receiver knew the date"),
+    FindingCode(
+        "sigma_assumed", "note", "a receiver states no sigmas; those of its kind of fix are used"
+    ),
+    FindingCode("sensors_merged", "note", "gyros and accelerometers were recorded apart"),
+    FindingCode("clock_aligned", "note", "samples are put on GPS time by the arrival of the fixes"),
+    FindingCode("velocity_taken", "note", "velocities of fixes come from a topic of their own"),
+    FindingCode(
+        "lines_left_out", "warning", "lines that fail their checksum, or of an idle receiver"
+    ),
+    FindingCode("fixes_of_truth", "note", "fixes and path are one solution, of the same receiver"),
 )
 
 _OF_VELOCITY = (
-    Code("velocity_unit", "error", "velocities that fit the positions in another unit"),
-    Code("velocity_axes", "error", "velocities that fit with axes exchanged or reversed"),
-    Code("velocity_disagrees", "warning", "velocities that fit the positions in no way"),
-    Code("velocity_late", "warning", "velocities that fit only with a delay"),
+    FindingCode("velocity_unit", "error", "velocities that fit the positions in another unit"),
+    FindingCode("velocity_axes", "error", "velocities that fit with axes exchanged or reversed"),
+    FindingCode("velocity_disagrees", "warning", "velocities that fit the positions in no way"),
+    FindingCode("velocity_late", "warning", "velocities that fit only with a delay"),
 )
 
 _NO_PLACE = "position_unit no_fix_as_zero"
@@ -107,72 +115,92 @@ _NO_PLACE = "position_unit no_fix_as_zero"
 # Asked about each table by itself; only findings on that table silence.
 ALONE = (
     _check("In time", check_time, "stamps unit_known")(
-        Code("too_short", "error", "fewer than two samples; nothing can be run on that"),
-        Code("time_stands", "error", "a time column that is constant, or another one"),
-        Code("time_unit", "error", "the rate tells that time is in ms, us or ns"),
-        Code("time_slow", "warning", "inertial samples too far apart to navigate by"),
-        Code("stamps_shared", "error or warning", "stamps of batches; `clean` spreads the samples"),
-        Code("time_duplicate", "warning", "samples that repeat a time; `clean` refuses them"),
-        Code("clock_set_back", "error", "a counter ran over, a time zone, a restart"),
-        Code("time_backward", "warning", "samples that step back; `clean` refuses them"),
-        Code("time_jump", "warning", "a gap, or a clock set by a leap second, a time zone"),
-        Code("gap_short", "warning or note", "samples are missing, for less than a second"),
-        Code("gap_long", "warning or note", "samples are missing, for a second or more"),
-        Code("stamps_rounded", "note", "digits of stamps were lost"),
-        Code("time_jitter", "warning or note", "stamps taken on arrival, not by the sensor"),
+        FindingCode("too_short", "error", "fewer than two samples; nothing can be run on that"),
+        FindingCode("time_stands", "error", "a time column that is constant, or another one"),
+        FindingCode("time_unit", "error", "the rate tells that time is in ms, us or ns"),
+        FindingCode("time_slow", "warning", "inertial samples too far apart to navigate by"),
+        FindingCode(
+            "stamps_shared", "error or warning", "stamps of batches; `clean` spreads the samples"
+        ),
+        FindingCode(
+            "time_duplicate", "warning", "samples that repeat a time; `clean` refuses them"
+        ),
+        FindingCode("clock_set_back", "error", "a counter ran over, a time zone, a restart"),
+        FindingCode("time_backward", "warning", "samples that step back; `clean` refuses them"),
+        FindingCode("time_jump", "warning", "a gap, or a clock set by a leap second, a time zone"),
+        FindingCode("gap_short", "warning or note", "samples are missing, for less than a second"),
+        FindingCode("gap_long", "warning or note", "samples are missing, for a second or more"),
+        FindingCode("stamps_rounded", "note", "digits of stamps were lost"),
+        FindingCode("time_jitter", "warning or note", "stamps taken on arrival, not by the sensor"),
     ),
     _check("In the numbers of any table", check_limits, "table")(
-        Code("absurd", "warning", "single numbers no vehicle has: a bit or a digit was lost"),
+        FindingCode(
+            "absurd", "warning", "single numbers no vehicle has: a bit or a digit was lost"
+        ),
     ),
     _check("In the inertial samples", check_columns, "imu")(
-        Code("column_missing", "error", "a column without a number"),
-        Code("not_finite", "warning", "single samples without a number"),
-        Code("axis_stuck", "error", "a value that never changes"),
-        Code("axis_stuck_for_a_while", "warning", "a value that hung for a while"),
-        Code("saturated", "warning", "the range was too small"),
-        Code("coarse", "warning", "the bits or the decimals were too few"),
+        FindingCode("column_missing", "error", "a column without a number"),
+        FindingCode("not_finite", "warning", "single samples without a number"),
+        FindingCode("axis_stuck", "error", "a value that never changes"),
+        FindingCode("axis_stuck_for_a_while", "warning", "a value that hung for a while"),
+        FindingCode("saturated", "warning", "the range was too small"),
+        FindingCode("coarse", "warning", "the bits or the decimals were too few"),
     ),
     _check("In the inertial samples", check_imu, "imu in_vehicle")(
-        Code("no_samples", "error", "fewer than ten samples have all six numbers"),
-        Code("gravity_bias", "note", "the unit is right, the accelerometers are a little off"),
-        Code("rates_as_increments", "error", "gravity tells that rates are read as increments"),
-        Code("increments_as_rates", "error", "gravity tells that increments are read as rates"),
-        Code("gravity_unit", "error", "gravity tells that the unit is g, mg, cm/s^2, ft/s^2"),
-        Code("gravity_missing", "error", "gravity was taken off"),
-        Code("gravity_unknown", "error", "gravity is not there, and no usual unit makes it"),
-        Code("gravity_not_seen", "warning", "the same, in a log without a second at rest"),
-        Code("sensor_axes", "note", "gravity is not along z: attitude will be the sensor's"),
-        Code("z_axis_reversed", "error", "gravity points the wrong way"),
-        Code("not_level", "warning", "gravity points along another axis"),
-        Code("gyro_unit", "error or warning", "too fast, or the Earth's rate in deg/h, deg/s"),
+        FindingCode("no_samples", "error", "fewer than ten samples have all six numbers"),
+        FindingCode(
+            "gravity_bias", "note", "the unit is right, the accelerometers are a little off"
+        ),
+        FindingCode(
+            "rates_as_increments", "error", "gravity tells that rates are read as increments"
+        ),
+        FindingCode(
+            "increments_as_rates", "error", "gravity tells that increments are read as rates"
+        ),
+        FindingCode(
+            "gravity_unit", "error", "gravity tells that the unit is g, mg, cm/s^2, ft/s^2"
+        ),
+        FindingCode("gravity_missing", "error", "gravity was taken off"),
+        FindingCode("gravity_unknown", "error", "gravity is not there, and no usual unit makes it"),
+        FindingCode("gravity_not_seen", "warning", "the same, in a log without a second at rest"),
+        FindingCode("sensor_axes", "note", "gravity is not along z: attitude will be the sensor's"),
+        FindingCode("z_axis_reversed", "error", "gravity points the wrong way"),
+        FindingCode("not_level", "warning", "gravity points along another axis"),
+        FindingCode(
+            "gyro_unit", "error or warning", "too fast, or the Earth's rate in deg/h, deg/s"
+        ),
     ),
     _check("In the GNSS fixes", check_gnss, "gnss")(
-        Code("gnss_missing", "error, warning or note", "components; the others are used"),
-        Code("position_unit", "error", "degrees for radians, longitude for latitude"),
-        Code("no_fix_as_zero", "error", '"no fix" was written as latitude 0, longitude 0'),
-        Code("position_in_radians", "warning", "radians were read as degrees"),
-        Code("height", "error or warning", "nobody drives, sails or flies by air there"),
-        Code("sigma_not_positive", "warning", "zero, which means unknown, not exact"),
-        Code("sigma_missing", "note", "there is none in any fix; a replay assumes the usual ones"),
-        Code("sigma_absurd", "warning", "they are in another unit, or variances"),
-        Code("float_sigma", "warning", "float solutions claim to be as good as fixed ones"),
-        Code("position_resolution", "note", "too few decimals for so good a fix"),
+        FindingCode("gnss_missing", "error, warning or note", "components; the others are used"),
+        FindingCode("position_unit", "error", "degrees for radians, longitude for latitude"),
+        FindingCode("no_fix_as_zero", "error", '"no fix" was written as latitude 0, longitude 0'),
+        FindingCode("position_in_radians", "warning", "radians were read as degrees"),
+        FindingCode("height", "error or warning", "nobody drives, sails or flies by air there"),
+        FindingCode("sigma_not_positive", "warning", "zero, which means unknown, not exact"),
+        FindingCode(
+            "sigma_missing", "note", "there is none in any fix; a replay assumes the usual ones"
+        ),
+        FindingCode("sigma_absurd", "warning", "they are in another unit, or variances"),
+        FindingCode("float_sigma", "warning", "float solutions claim to be as good as fixed ones"),
+        FindingCode("position_resolution", "note", "too few decimals for so good a fix"),
     ),
     _check("In the GNSS fixes", check_velocity, "gnss", silenced_by=_NO_PLACE)(
         *_OF_VELOCITY,
-        Code("velocity_sign", "error", "a vertical velocity of the other sign"),
+        FindingCode("velocity_sign", "error", "a vertical velocity of the other sign"),
     ),
     _check("In the magnetic field", check_mag, "mag")(
-        Code("field_missing", "warning", "samples without a number"),
-        Code("field_zero", "error or warning", "0 0 0 where there was no measurement"),
-        Code("field_stuck", "error", "an axis that never changes"),
-        Code("field_unit", "error or warning", "the Earth's field of 20 to 70 uT tells it"),
-        Code("field_stuck_for_a_while", "warning", "the sensor hung"),
-        Code("field_repeated", "note", "more rows than the sensor took measurements"),
-        Code("field_saturated", "warning", "a magnet drove it to its stop"),
-        Code("field_offset", "warning", "hard iron: run `robins calibrate`"),
-        Code("field_varies", "warning", "hard or soft iron, or steel and magnets around"),
-        Code("field_disturbed", "note", "single stretches of another field than the Earth's"),
+        FindingCode("field_missing", "warning", "samples without a number"),
+        FindingCode("field_zero", "error or warning", "0 0 0 where there was no measurement"),
+        FindingCode("field_stuck", "error", "an axis that never changes"),
+        FindingCode("field_unit", "error or warning", "the Earth's field of 20 to 70 uT tells it"),
+        FindingCode("field_stuck_for_a_while", "warning", "the sensor hung"),
+        FindingCode("field_repeated", "note", "more rows than the sensor took measurements"),
+        FindingCode("field_saturated", "warning", "a magnet drove it to its stop"),
+        FindingCode("field_offset", "warning", "hard iron: run `robins calibrate`"),
+        FindingCode("field_varies", "warning", "hard or soft iron, or steel and magnets around"),
+        FindingCode(
+            "field_disturbed", "note", "single stretches of another field than the Earth's"
+        ),
     ),
 )
 
@@ -187,9 +215,11 @@ _GYROS_WRONG = "gyro_unit gyro_scale gyro_axes gyro_reversed left_handed"
 # Asked about all tables of a log together.
 TOGETHER = (
     _check("In time", check_span, "imu others")(
-        Code("no_overlap", "error", "the files share no time; names the offset that would fit"),
-        Code("leap_seconds", "note", "one file may be in UTC, one in GPS time"),
-        Code("little_overlap", "warning", "the files share little of their time"),
+        FindingCode(
+            "no_overlap", "error", "the files share no time; names the offset that would fit"
+        ),
+        FindingCode("leap_seconds", "note", "one file may be in UTC, one in GPS time"),
+        FindingCode("little_overlap", "warning", "the files share little of their time"),
     ),
     # An IMU alone is judged at rest or nearly so; a master tells more, in any motion.
     _check(
@@ -200,22 +230,22 @@ TOGETHER = (
         "z_axis_reversed not_level rates_as_increments increments_as_rates",
         undecided="force_not_checked",
     )(
-        Code("master_missing", "error or warning", "position, velocity or attitude"),
+        FindingCode("master_missing", "error or warning", "position, velocity or attitude"),
         *_OF_VELOCITY,
-        Code("velocity_sign", "error", "it changes against positions or specific forces"),
-        Code("turning_not_checked", "note", "the vehicle hardly turns"),
-        Code("attitude_sign", "error", "heading, pitch or roll reversed, or all inverted"),
-        Code("gyro_axes", "error", "the gyros turn as the attitudes with other axes"),
-        Code("gyro_unit", "error", "the gyros turn as the attitudes in another unit"),
-        Code("turning_disagrees", "error", "gyros and attitudes show two turnings"),
-        Code("master_late", "error or warning", "attitudes older or younger than stated"),
-        Code("force_not_checked", "note", "too few seconds of both"),
-        Code("gravity_unit", "error", "accelerometers fit the velocities in another unit"),
-        Code("rates_as_increments", "error", "likewise"),
-        Code("increments_as_rates", "error", "likewise"),
-        Code("accel_reversed", "error", "they fit with the opposite sign"),
-        Code("accel_axes", "error", "they fit with axes exchanged or reversed"),
-        Code("force_disagrees", "error", "they feel something else than the velocities ask"),
+        FindingCode("velocity_sign", "error", "it changes against positions or specific forces"),
+        FindingCode("turning_not_checked", "note", "the vehicle hardly turns"),
+        FindingCode("attitude_sign", "error", "heading, pitch or roll reversed, or all inverted"),
+        FindingCode("gyro_axes", "error", "the gyros turn as the attitudes with other axes"),
+        FindingCode("gyro_unit", "error", "the gyros turn as the attitudes in another unit"),
+        FindingCode("turning_disagrees", "error", "gyros and attitudes show two turnings"),
+        FindingCode("master_late", "error or warning", "attitudes older or younger than stated"),
+        FindingCode("force_not_checked", "note", "too few seconds of both"),
+        FindingCode("gravity_unit", "error", "accelerometers fit the velocities in another unit"),
+        FindingCode("rates_as_increments", "error", "likewise"),
+        FindingCode("increments_as_rates", "error", "likewise"),
+        FindingCode("accel_reversed", "error", "they fit with the opposite sign"),
+        FindingCode("accel_axes", "error", "they fit with axes exchanged or reversed"),
+        FindingCode("force_disagrees", "error", "they feel something else than the velocities ask"),
     ),
     _check(
         "In IMU and GNSS together",
@@ -227,22 +257,26 @@ TOGETHER = (
         overrules="leap_seconds",
         undecided="motion_not_checked",
     )(
-        Code("motion_not_checked", "note", "too little motion to compare them"),
-        Code("motion_disagrees", "warning", "they do not describe one motion in any way"),
-        Code("time_offset", "error or warning", "they fit only if one file is shifted"),
-        Code("leap_seconds", "error", "likewise, by the 18 s between UTC and GPS time"),
-        Code("time_jump", "error", "they fit only if one file is shifted from there on"),
-        Code("clock_rate", "error", "the clocks of the two drift apart"),
-        Code("gyro_unit", "error", "turns fit those of the velocities in another unit or scale"),
-        Code("gyro_scale", "error", "they fit with another scale about one axis"),
-        Code("force_scale", "warning", "likewise specific forces along an axis"),
-        Code("left_handed", "error", "axes or signs of both triads"),
-        Code("accel_reversed", "error", "the accelerometers have the opposite sign"),
-        Code("accel_axes", "error", "axes or signs of the accelerometers"),
-        Code("gyro_reversed", "error", "the gyros have the opposite sense"),
-        Code("gyro_axes", "error", "axes or signs of the gyros"),
-        Code("lever_arm", "note", "the antenna is away from the IMU"),
-        Code("forward_axis", "warning", "the vehicle does not travel along its forward axis"),
+        FindingCode("motion_not_checked", "note", "too little motion to compare them"),
+        FindingCode("motion_disagrees", "warning", "they do not describe one motion in any way"),
+        FindingCode("time_offset", "error or warning", "they fit only if one file is shifted"),
+        FindingCode("leap_seconds", "error", "likewise, by the 18 s between UTC and GPS time"),
+        FindingCode("time_jump", "error", "they fit only if one file is shifted from there on"),
+        FindingCode("clock_rate", "error", "the clocks of the two drift apart"),
+        FindingCode(
+            "gyro_unit", "error", "turns fit those of the velocities in another unit or scale"
+        ),
+        FindingCode("gyro_scale", "error", "they fit with another scale about one axis"),
+        FindingCode("force_scale", "warning", "likewise specific forces along an axis"),
+        FindingCode("left_handed", "error", "axes or signs of both triads"),
+        FindingCode("accel_reversed", "error", "the accelerometers have the opposite sign"),
+        FindingCode("accel_axes", "error", "axes or signs of the accelerometers"),
+        FindingCode("gyro_reversed", "error", "the gyros have the opposite sense"),
+        FindingCode("gyro_axes", "error", "axes or signs of the gyros"),
+        FindingCode("lever_arm", "note", "the antenna is away from the IMU"),
+        FindingCode(
+            "forward_axis", "warning", "the vehicle does not travel along its forward axis"
+        ),
     ),
     _check(
         "In an IMU that was turned about",
@@ -253,11 +287,11 @@ TOGETHER = (
         but_after="motion_not_checked",
         proves="gyro_unit",
     )(
-        Code(
+        FindingCode(
             "gyro_unit", "error", "the gyros turn gravity as it was seen in another unit or scale"
         ),
-        Code("left_handed", "error", "they do with the opposite sense, or triads reflected"),
-        Code("gyro_axes", "error", "they do with axes exchanged or reversed"),
+        FindingCode("left_handed", "error", "they do with the opposite sense, or triads reflected"),
+        FindingCode("gyro_axes", "error", "they do with axes exchanged or reversed"),
     ),
     _check(
         "In the magnetic field",
@@ -266,7 +300,7 @@ TOGETHER = (
         silenced_by=f"{_SPOILT} {_GYROS_WRONG} field_unit field_stuck",
         unless="master",
     )(
-        Code("field_axes", "error", "it turns as the gyros say only with other columns"),
+        FindingCode("field_axes", "error", "it turns as the gyros say only with other columns"),
     ),
     _check(
         "In the attitudes",
@@ -275,11 +309,11 @@ TOGETHER = (
         silenced_by=f"{_SPOILT} {_GYROS_WRONG}",
         unless="master",
     )(
-        Code("attitude_missing", "warning", "there is none"),
-        Code("attitude_order", "error", "they are scalar last, or navigation to body"),
-        Code("attitude_axes", "error", "they are of a body with other axes"),
-        Code("attitude_disagrees", "warning", "they are of another body or another time"),
-        Code("attitude_frame", "error", "they are to NED where ENU is said, or not upright"),
+        FindingCode("attitude_missing", "warning", "there is none"),
+        FindingCode("attitude_order", "error", "they are scalar last, or navigation to body"),
+        FindingCode("attitude_axes", "error", "they are of a body with other axes"),
+        FindingCode("attitude_disagrees", "warning", "they are of another body or another time"),
+        FindingCode("attitude_frame", "error", "they are to NED where ENU is said, or not upright"),
     ),
 )
 
@@ -351,8 +385,8 @@ def _asked(
 ) -> list[Finding]:
     """The findings, with those of the checks that are asked about these things."""
     for check in checks:
-        if check.is_asked(things, {f.code for f in findings}):
-            new = check.ask(things)
+        if check.applies(things, {f.code for f in findings}):
+            new = check.run(things)
             outdated = check.outdated({f.code for f in new})
             findings = [f for f in findings if f.code not in outdated] + new
     return findings

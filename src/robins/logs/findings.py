@@ -52,7 +52,7 @@ class LogWarning(UserWarning):
     """A finding of a reader that was given no list to put it in."""
 
 
-def told(
+def make_finding(
     severity: Severity, code: str, file: str, where: str = "", value: Value = "", name: str = ""
 ) -> Callable[[str], Finding]:
     """Makes a finding of its sentence, put behind name (or file) and place."""
@@ -68,7 +68,7 @@ def report(findings: list[Finding] | None, finding: Finding) -> None:
         findings.append(finding)
 
 
-def telling(
+def finding_reporter(
     findings: list[Finding] | None,
     severity: Severity,
     code: str,
@@ -76,8 +76,8 @@ def telling(
     where: str = "",
     value: Value = "",
 ) -> Callable[[str], None]:
-    """Reports the finding that `told` makes of its sentence."""
-    make = told(severity, code, file, where, value)
+    """Reports the finding that `make_finding` makes of its sentence."""
+    make = make_finding(severity, code, file, where, value)
     return lambda sentence: report(findings, make(sentence))
 
 
@@ -87,31 +87,31 @@ def damaged(file: str) -> Callable[[str], LogError]:
     return lambda why: LogError(file, f"is damaged ({why})", fix)
 
 
-def left_out(findings: list[Finding] | None, file: str, count: int, what: str) -> None:
+def report_left_out(findings: list[Finding] | None, file: str, count: int, what: str) -> None:
     """Report what was not read because it is damaged, if there is any."""
     if count:
-        make = telling(findings, "warning", "damaged_frames", file, value=count)
+        make = finding_reporter(findings, "warning", "damaged_frames", file, value=count)
         make(f"{count} {what}; they are left out.")
 
 
-def undated(findings: list[Finding] | None, file: str, count: int, what: str) -> None:
+def report_undated(findings: list[Finding] | None, file: str, count: int, what: str) -> None:
     """Report fixes from before a receiver knew the date, if there are any."""
     if count:
-        make = telling(findings, "note", "undated", file, value=count)
+        make = finding_reporter(findings, "note", "undated", file, value=count)
         make(f"{count} {what} have no date yet; they are left out.")
 
 
-def breaks_off(findings: list[Finding] | None, file: str, at: int) -> None:
+def report_cut_end(findings: list[Finding] | None, file: str, at: int) -> None:
     """Report a last message that is not whole."""
-    telling(findings, "warning", "ends_early", file, f"byte {at}", at)(
+    finding_reporter(findings, "warning", "ends_early", file, f"byte {at}", at)(
         "the last message is not whole: the recording or the copy was interrupted. All before it "
         "was read."
     )
 
 
-def above_geoid(findings: list[Finding] | None, file: str, fix: str) -> None:
+def report_geoid_heights(findings: list[Finding] | None, file: str, fix: str) -> None:
     """Report heights that are not above the ellipsoid."""
-    telling(findings, "warning", "height_above_geoid", file, value="geoid")(
+    finding_reporter(findings, "warning", "height_above_geoid", file, value="geoid")(
         "heights are above the geoid, and robins takes them as above the WGS-84 ellipsoid. "
         f"Differences of height stay right; gravity errs by 3e-6 m/s^2 per metre. {fix}"
     )

@@ -25,16 +25,16 @@ from scipy.spatial.transform import Rotation
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.gps_time import gps_of
-from robins.logs.findings import Finding, LogError, refused, telling
+from robins.logs.findings import Finding, LogError, finding_reporter, refused
 from robins.logs.fix_kinds import with_usual_sigmas
 from robins.logs.merging import interpolated
 from robins.logs.mounting import Origin
-from robins.logs.opening import RECORDING, whole
+from robins.logs.opening import RECORDING, read_whole
 from robins.logs.phone import fixes_of
 from robins.logs.read_text import read_text
 from robins.logs.rosbag import read_rosbag
 from robins.logs.tables import Table
-from robins.logs.text import Columns, Layout, peek, read_columns
+from robins.logs.text import Columns, TextLayout, peek, read_columns
 from robins.logs.text_formats import TEXT_FORMATS
 from robins.logs.timebase import dates_to_ns, stamps_to_ns
 from robins.units import to_si
@@ -79,8 +79,8 @@ def read_folder(
         why = error.strerror or str(error)
         raise LogError(str(path), f"cannot be read: {why}", "check its permissions") from error
     held = ", ".join(names[:5]) or "nothing"
-    mend = "give files, or the folder of a recording (ROS, EuRoC, KITTI, phones)"
-    raise LogError(str(path), f"is a folder with {held}", mend)
+    remedy = "give files, or the folder of a recording (ROS, EuRoC, KITTI, phones)"
+    raise LogError(str(path), f"is a folder with {held}", remedy)
 
 
 def _without(origin: Origin | None, folder: Path, read: Table | Dataset) -> Table | Dataset:
@@ -117,7 +117,7 @@ def _table(
     numbers = tuple(sorted({at for at in places if at >= 0}))
     texts = (place(clock),) if clock else ()
     comma = separator != "," and re.search(r"\d,\d", "".join(t for _, t in peek(path).data(3)[1:]))
-    layout = Layout(
+    layout = TextLayout(
         tuple(held), separator, texts, numbers, skip=line, decimal="," if comma else "."
     )
     read = read_columns(path, layout, findings)
@@ -143,7 +143,7 @@ def _euroc(folder: Path, findings: Findings, origin: Origin | None = None) -> Da
 def _oxts(folder: Path, findings: Findings) -> Dataset:
     file, clock = str(folder), folder / "timestamps.txt"
     records = sorted((folder / "data").glob("*.txt"))
-    lines = whole(clock, _LARGEST)[0].split(b"\n")
+    lines = read_whole(clock, _LARGEST)[0].split(b"\n")
     stamps = [stamp.strip()[:39] for stamp in lines if stamp.strip()]
     if len(stamps) != len(records) or not records:
         cause = f"{clock.name} has {len(stamps)} stamps for {len(records)} files in data"
@@ -155,7 +155,7 @@ def _oxts(folder: Path, findings: Findings) -> Dataset:
     place, v_n = (lat, lon, v[:, 2].copy()), np.stack([v[:, 6], v[:, 7], -v[:, 10]], axis=-1)
     q_nb = _turning(roll, pitch, np.pi / 2.0 - v[:, 5])
     sigma, sigma_v = (np.repeat(v[:, k, None], 3, axis=1) for k in (23, 24))
-    telling(findings, "note", "fixes_of_truth", file)(
+    finding_reporter(findings, "note", "fixes_of_truth", file)(
         "fixes and path are both the solution of the OXTS unit, so errors against the path are "
         "smaller than those of a receiver of its own."
     )
@@ -176,7 +176,7 @@ def _turning(roll: np.ndarray, pitch: np.ndarray, heading: np.ndarray) -> np.nda
 
 def _record(path: Path) -> np.ndarray:
     try:
-        numbers = np.array([whole(path, _LARGEST)[0].split()], np.float64)
+        numbers = np.array([read_whole(path, _LARGEST)[0].split()], np.float64)
     except ValueError as error:
         raise LogError(str(path), f"is no record: {error}", "copy it again") from error
     if numbers.shape != (1, _OXTS):

@@ -18,7 +18,7 @@ _SPEED = 0.3  # m/s; below it a receiver at rest
 _KEPT = 0.9  # share of the steps that tell how late velocities are, those that fit best
 
 
-class Track(NamedTuple):
+class FixTrack(NamedTuple):
     """The complete fixes of a table, in the order of time."""
 
     rows: np.ndarray  # (m,) index into the table
@@ -29,7 +29,7 @@ class Track(NamedTuple):
     sigma_v: float  # velocity noise, median over all axes
 
 
-def track_of(gnss: GnssTable, *, swap: bool = False) -> Track | None:
+def track_of(gnss: GnssTable, *, swap: bool = False) -> FixTrack | None:
     """Fixes with all components; None if there are fewer than ten.
 
     Args:
@@ -58,17 +58,17 @@ def track_of(gnss: GnssTable, *, swap: bool = False) -> Track | None:
     sigma_v = np.inf if gnss.sigma_v is None else float(np.median(gnss.sigma_v[rows]))
     sigma_m = float(np.median(gnss.sigma_m[rows][:, :2]))
     time_s = (gnss.time_ns[rows] - gnss.time_ns[0]) * 1e-9
-    return Track(rows, time_s, r_n, v, sigma_m, sigma_v)
+    return FixTrack(rows, time_s, r_n, v, sigma_m, sigma_v)
 
 
-class Steps(NamedTuple):
+class PositionSteps(NamedTuple):
     """Change of position over one to eight seconds, seen by positions and by velocities [m]."""
 
     of_position: np.ndarray  # (k, 3)
     of_velocity: np.ndarray  # (k, 3)
 
 
-def steps_of(track: Track, late_s: float = 0.0) -> Steps | None:
+def steps_of(track: FixTrack, late_s: float = 0.0) -> PositionSteps | None:
     """Steps of a moving receiver; None without velocities, or if it moves too little to judge.
 
     Args:
@@ -83,13 +83,13 @@ def steps_of(track: Track, late_s: float = 0.0) -> Steps | None:
     by_either |= _moves(of_position, duration, track.sigma_m)
     if np.count_nonzero(by_either) < 10:
         return None
-    either = Steps(of_position[by_either], of_velocity[by_either])
+    either = PositionSteps(of_position[by_either], of_velocity[by_either])
     # Of steps chosen by noisy positions, noise has made the ways longer.
     for base_s in _BASES_S:
         of_position, of_velocity, duration = _steps_over(track, track.v_n, base_s, late_s)
         moving = _moves(of_velocity, duration, track.sigma_m)
         if np.count_nonzero(moving) >= 10:
-            return Steps(of_position[moving], of_velocity[moving])
+            return PositionSteps(of_position[moving], of_velocity[moving])
     return either
 
 
@@ -99,7 +99,7 @@ def _moves(way: np.ndarray, duration: np.ndarray, sigma_m: float) -> np.ndarray:
 
 
 def _steps_over(
-    track: Track, v_n: np.ndarray, base_s: float, late_s: float
+    track: FixTrack, v_n: np.ndarray, base_s: float, late_s: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Change of position by positions and by velocities (k, 3) [m], and over what time (k,) [s]."""
     time_s = track.time_s
@@ -115,7 +115,7 @@ def _steps_over(
     return track.r_n[last] - track.r_n[first], np.subtract(*ends), time_s[last] - time_s[first]
 
 
-def lateness(track: Track) -> float | None:
+def velocity_delay(track: FixTrack) -> float | None:
     """Age of velocities at their stamps [s], by the positions; None if unclear.
 
     Many receivers give the mean velocity of the last epoch, half an epoch late.

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from robins.dataset import Finding, OdometryTable, PlaceTable, RangeLog, RangeTable
-from robins.logs.findings import LogError, refused, told
+from robins.logs.findings import LogError, make_finding, refused
 from robins.logs.opening import Source
 from robins.logs.timebase import stamps_to_ns
 
@@ -162,7 +162,7 @@ def read_librsf(
     if others and findings is not None:
         listed = ", ".join(f"{count} of {name!r}" for name, count in others.items())
         findings.append(
-            told("note", "other_kinds", file, value=sum(others.values()))(
+            make_finding("note", "other_kinds", file, value=sum(others.values()))(
                 f"lines of other kinds were left out: {listed}."
             )
         )

@@ -11,7 +11,7 @@ from robins.dataset import Dataset, ImuTable, Trajectory
 from robins.logs.findings import Finding, LogError
 from robins.logs.merging import are_halves, merged
 from robins.logs.mounting import Mounting, turned
-from robins.logs.registry import fitting, open_log
+from robins.logs.registry import matching_formats, open_log
 from robins.logs.tables import Table, kind_of, tables_of
 from robins.logs.text_format import TextFormat
 
@@ -136,7 +136,7 @@ def _open_as(
     """A file that holds several kinds of columns is read for the kind that is wanted."""
     format = (formats or {}).get(os.fspath(path))
     if format is None and not os.path.isdir(path):
-        names = [f.name for f in fitting(path)[1] if f.holds == (kind,)]
+        names = [f.name for f in matching_formats(path)[1] if f.holds == (kind,)]
         format = names[0] if len(names) == 1 else None
     opened = open_log(path, format, findings)
     if isinstance(opened, Dataset):
@@ -145,5 +145,5 @@ def _open_as(
 
 
 def _exchanged(path: str | os.PathLike[str], what: str, option: str) -> LogError:
-    mend = f"give {option} the right file; were master and slave exchanged?"
-    return LogError(os.fspath(path), f"holds {what}", mend)
+    remedy = f"give {option} the right file; were master and slave exchanged?"
+    return LogError(os.fspath(path), f"holds {what}", remedy)

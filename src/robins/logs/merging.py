@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from robins.dataset import ImuTable
-from robins.logs.findings import Finding, LogError, telling
+from robins.logs.findings import Finding, LogError, finding_reporter
 
 _LONG = 5.0  # typical intervals; across a longer one no specific force is interpolated
 _DRIFT, _STRAY_S = 2e-4, 1.0  # of a clock; a stamp that is further from the others is not used
@@ -44,7 +44,7 @@ def merged(gyro: ImuTable, accel: ImuTable, findings: list[Finding] | None) -> I
     if not inside.any():
         cause = "rates and specific forces were recorded apart and share no time"
         raise LogError(gyro.source, cause, "are they of one recording?")
-    telling(findings, "note", "sensors_merged", gyro.source, value=int((~inside).sum()))(
+    finding_reporter(findings, "note", "sensors_merged", gyro.source, value=int((~inside).sum()))(
         "rates and specific forces were recorded apart; the forces are interpolated to the times "
         f"of the rates, and {(~inside).sum()} samples without both are left out."
     )
@@ -103,7 +103,7 @@ def gps_clock(
     slope = float(np.polyfit(x[near], late[near], 1)[0]) if span > _TREND_S else 0.0
     slope = float(np.clip(slope, -_DRIFT, _DRIFT))
     rest = late[near] - slope * x[near]
-    telling(findings, "note", "clock_aligned", file, value=float(np.ptp(rest)))(
+    finding_reporter(findings, "note", "clock_aligned", file, value=float(np.ptp(rest)))(
         "stamps of the samples are put on GPS time by the arrival of the fixes, whose delays vary "
         f"by {np.ptp(rest):.3f} s; a constant delay of the receiver remains as a latency."
     )

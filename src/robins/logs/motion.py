@@ -21,7 +21,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from robins.dataset import GnssTable
-from robins.logs.quiet import Signal
+from robins.logs.quiet import ImuSignal
 from robins.rotation import skew
 
 GRAVITY = 9.8
@@ -51,7 +51,7 @@ def signed_permutations() -> np.ndarray:
     return np.array(out)
 
 
-class Views(NamedTuple):
+class MotionIntegrals(NamedTuple):
     """Integrals of the IMU and changes of velocity, both from one zero of time.
 
     Changes are between nodes of one stretch a second apart or more; they overlap. A node is a
@@ -78,7 +78,7 @@ class Views(NamedTuple):
 
 
 def views_of(
-    signal: Signal,
+    signal: ImuSignal,
     kind: str,
     gnss: GnssTable,
     rows: np.ndarray,
@@ -86,7 +86,7 @@ def views_of(
     r_n: np.ndarray,
     v_n: np.ndarray | None,
     noise: tuple[float, float],
-) -> Views | None:
+) -> MotionIntegrals | None:
     """Put both on one time; None if no stretch has enough motion for a judgement.
 
     Args:
@@ -124,7 +124,7 @@ def views_of(
     v_e = np.einsum("nij,nj->ni", C, v[nodes])
     v, gained = _inertial(since, v_e, g_e, node, node + stride)
     turn, push = on_grid(signal, kind)
-    return Views(
+    return MotionIntegrals(
         *(turn, push, _gaps(signal), begin[nodes], end[nodes], means),
         *(node_of, v, node, node_of[node], gained, start),
         length_s=max(float(end[k[-1]] - begin[k[0]]) for k in chosen),
@@ -222,7 +222,7 @@ def normal_gravity(lat: np.ndarray, alt: np.ndarray) -> np.ndarray:
     return on_ellipsoid - 3.086e-6 * alt
 
 
-def at_the_spot(signal: Signal, kind: str) -> Views | None:
+def stationary_integrals(signal: ImuSignal, kind: str) -> MotionIntegrals | None:
     """An IMU alone, taken to stay about where it is: then gravity must not turn.
 
     None unless it is turned about enough that the specific force points elsewhere by 10 deg or so.
@@ -246,12 +246,12 @@ def at_the_spot(signal: Signal, kind: str) -> Views | None:
     gained = np.tile([0.0, 0.0, -GRAVITY], (len(node), 1))
     fields = (node_of, np.zeros((len(when), 3)), node, node_of[node], gained, starts)
     middle = float(np.mean(starts))
-    return Views(
+    return MotionIntegrals(
         turn, push, gaps, when, when, False, *fields, float(count), middle, power="gravity"
     )
 
 
-def on_grid(signal: Signal, kind: str) -> tuple[np.ndarray, np.ndarray]:
+def on_grid(signal: ImuSignal, kind: str) -> tuple[np.ndarray, np.ndarray]:
     """Integrals of rate and specific force up to each time of the grid."""
     grid = np.arange(0.0, signal.time_s[-1], 1.0 / RATE_HZ)
     turn, push = (
@@ -261,14 +261,14 @@ def on_grid(signal: Signal, kind: str) -> tuple[np.ndarray, np.ndarray]:
     return turn, push
 
 
-def _gaps(signal: Signal) -> np.ndarray:
+def _gaps(signal: ImuSignal) -> np.ndarray:
     """(gaps, 2) begin and end of times without samples."""
     step = np.diff(signal.time_s)
     k = np.flatnonzero(step > max(_GAP_S, 3.0 * signal.step_s))
     return np.stack([signal.time_s[k], signal.time_s[k + 1]], axis=-1)
 
 
-def power_of(views: Views) -> np.ndarray:
+def power_of(views: MotionIntegrals) -> np.ndarray:
     """(stretches,) mean square of what the share left is a share of [m^2/s^2]."""
     count = np.bincount(views.of)
     squares = np.bincount(views.of, np.sum(views.gained**2, axis=1)) / count
@@ -278,7 +278,7 @@ def power_of(views: Views) -> np.ndarray:
     return squares - np.sum(mean**2, axis=0)
 
 
-def squares_by_lag(views: Views, lags_s: np.ndarray) -> np.ndarray:
+def squares_by_lag(views: MotionIntegrals, lags_s: np.ndarray) -> np.ndarray:
     """(stretches, lags) means of the squares left by tables as they are, if fixes are later.
 
     Args:
@@ -309,7 +309,7 @@ def squares_by_lag(views: Views, lags_s: np.ndarray) -> np.ndarray:
     return out
 
 
-def squares_by_map(views: Views, maps: np.ndarray, shift_s: np.ndarray) -> np.ndarray:
+def squares_by_map(views: MotionIntegrals, maps: np.ndarray, shift_s: np.ndarray) -> np.ndarray:
     """(maps, 2) means of the squares left by the best rotation and by the best reflection, summed.
 
     Args:
@@ -342,7 +342,7 @@ def squares_by_map(views: Views, maps: np.ndarray, shift_s: np.ndarray) -> np.nd
     return left
 
 
-def _compared(views: Views, s: int, v: np.ndarray) -> list[np.ndarray]:
+def _compared(views: MotionIntegrals, s: int, v: np.ndarray) -> list[np.ndarray]:
     """Means of the squares left (h,) of velocities (h, nodes, 3) by a rotation, by a reflection."""
     once = slice(None, None, views.stride)  # changes that do not overlap
     u = (v[:, views.stride :] - v[:, : -views.stride])[:, once]
@@ -421,7 +421,7 @@ def kabsch(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
     return R, total - 2.0 * (both + sign * s[:, 2]), total - 2.0 * (both - sign * s[:, 2])
 
 
-class Steps(NamedTuple):
+class TurnSteps(NamedTuple):
     """Steps of 0.2 s in which the sensor turned."""
 
     begin_s: np.ndarray  # (n,) from the zero of the signal
@@ -429,7 +429,7 @@ class Steps(NamedTuple):
     C: np.ndarray  # (n, 3, 3) sensor axes at the end to those at the beginning
 
 
-def steps_of(signal: Signal, time_s: np.ndarray) -> Steps | None:
+def steps_of(signal: ImuSignal, time_s: np.ndarray) -> TurnSteps | None:
     """The steps that turn most; None if there are too few.
 
     Args:
@@ -455,7 +455,7 @@ def steps_of(signal: Signal, time_s: np.ndarray) -> Steps | None:
     C = np.broadcast_to(np.eye(3), (len(chosen), 3, 3))
     for k in range(_PER_STEP):
         C = C @ rotations(fine[chosen, k])
-    return Steps(grid[chosen], grid[chosen + 1], C)
+    return TurnSteps(grid[chosen], grid[chosen + 1], C)
 
 
 def _recorded(grid: np.ndarray, time_s: np.ndarray) -> np.ndarray:

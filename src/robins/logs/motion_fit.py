@@ -21,7 +21,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robins.logs.motion import RATE_HZ, Views, between, composed, kabsch, power_of, rotations
+from robins.logs.motion import (
+    RATE_HZ,
+    MotionIntegrals,
+    between,
+    composed,
+    kabsch,
+    power_of,
+    rotations,
+)
 from robins.rotation import skew
 
 SCALE, GYRO_BIAS, FORCE, FORCE_BIAS = slice(0, 9), slice(9, 12), slice(12, 18), slice(18, 21)
@@ -51,7 +59,7 @@ class PairState(NamedTuple):
         return self.offset[self.part[stretch]] + self.rate * (time_s - middle_s)
 
 
-class Fit(NamedTuple):
+class MotionFit(NamedTuple):
     """A model fitted."""
 
     state: PairState
@@ -61,14 +69,14 @@ class Fit(NamedTuple):
     turned: np.ndarray  # (nodes, 3, 3) attitude C at each node
     strain: float = 0.0  # chi-square of the parameters against what they were expected to be
 
-    def left(self, views: Views) -> float:
+    def left(self, views: MotionIntegrals) -> float:
         """Share of the change of velocity that is left unexplained; infinite where no IMU was."""
         seen = np.isfinite(self.squares)
         if not seen.any():
             return np.inf
         return trimmed(self.squares[seen]) / float(np.mean(power_of(views)[views.of[seen]]))
 
-    def by_stretch(self, views: Views) -> np.ndarray:
+    def by_stretch(self, views: MotionIntegrals) -> np.ndarray:
         """(stretches,) mean of the squares left; all of the change where no IMU was."""
         power, out = power_of(views), np.empty(len(views.start_s))
         for s in range(len(out)):
@@ -82,7 +90,9 @@ def trimmed(squares: np.ndarray) -> float:
     return float(np.mean(np.sort(squares)[: max(1, round(_TRIMMED * len(squares)))]))
 
 
-def start_of(views: Views, M_g: np.ndarray | None = None, mirror: float = 1.0) -> PairState:
+def start_of(
+    views: MotionIntegrals, M_g: np.ndarray | None = None, mirror: float = 1.0
+) -> PairState:
     """PairState in which tables are what they claim to be, or the gyros need a map."""
     zero, eye = np.zeros(3), np.eye(3)
     part = np.zeros(len(views.start_s), int)
@@ -90,7 +100,7 @@ def start_of(views: Views, M_g: np.ndarray | None = None, mirror: float = 1.0) -
     return PairState(M_g, zero, mirror * eye, zero, zero, 0.0, np.zeros(1), part)
 
 
-def _sums(views: Views, state: PairState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _sums(views: MotionIntegrals, state: PairState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gained velocity and its derivatives.
 
     Returns:
@@ -178,14 +188,14 @@ def _cumulative(steps: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros_like(steps[:, :1]), np.cumsum(steps, axis=1)], axis=1)
 
 
-def _recorded(views: Views, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+def _recorded(views: MotionIntegrals, first: np.ndarray, last: np.ndarray) -> np.ndarray:
     """(stretches,) whether the IMU was recorded without a gap from first to last."""
     inside = (first > -_EDGE_S) & (last < (len(views.turn) - 1) / RATE_HZ + _EDGE_S)
     begin, end = views.gaps.T
     return inside & ~np.any((begin < last[:, None]) & (end > first[:, None]), axis=1)
 
 
-def fit(views: Views, start: PairState, prior: np.ndarray, rounds: int = 8) -> Fit:
+def fit(views: MotionIntegrals, start: PairState, prior: np.ndarray, rounds: int = 8) -> MotionFit:
     """Fit all parameters by Gauss and Newton.
 
     Args:
@@ -241,8 +251,8 @@ def _moved_by(state: PairState, start: PairState) -> np.ndarray:
 
 
 def _step(
-    views: Views, state: PairState, start: PairState, prior: np.ndarray
-) -> tuple[Fit, np.ndarray]:
+    views: MotionIntegrals, state: PairState, start: PairState, prior: np.ndarray
+) -> tuple[MotionFit, np.ndarray]:
     """Judgement of a state, and the step from it."""
     u, C, recorded = _sums(views, state)
     count, stretches = u.shape[2] - 1, len(views.start_s)
@@ -280,7 +290,7 @@ def _step(
     meat *= len(scores) / max(len(scores) - 1, 1) / variance**2
     spread = np.maximum(np.diag(inverse), np.diag(inverse @ meat @ inverse))
     strain = float(moved @ expected @ moved)
-    return Fit(state, np.sqrt(spread), R, squares, C, strain), step
+    return MotionFit(state, np.sqrt(spread), R, squares, C, strain), step
 
 
 def prior_of(parts: int = 1, *free: str) -> np.ndarray:

@@ -13,19 +13,19 @@ from typing import NamedTuple
 import numpy as np
 
 from robins.dataset import GnssTable, ImuTable
-from robins.logs.gnss_motion import Track, lateness
+from robins.logs.gnss_motion import FixTrack, velocity_delay
 from robins.logs.motion import (
     GRAVITY,
     RATE_HZ,
-    Views,
+    MotionIntegrals,
     power_of,
     signed_permutations,
     squares_by_lag,
     squares_by_map,
     views_of,
 )
-from robins.logs.motion_fit import Fit, PairState, fit, prior_of, start_of
-from robins.logs.quiet import Signal, usual_force, windows_of
+from robins.logs.motion_fit import MotionFit, PairState, fit, prior_of, start_of
+from robins.logs.quiet import ImuSignal, usual_force, windows_of
 
 SCALES = np.exp(np.arange(np.log(1e-6), np.log(1e3), 0.2))  # of gyros, where a fit may start
 _BLOCKS = {
@@ -47,21 +47,21 @@ _ROUNDS = 14
 _LEAST_SHARE = 1e-4  # left, below which nothing is gained
 
 
-class Verdict(NamedTuple):
+class ModelChoice(NamedTuple):
     """The model chosen."""
 
-    views: Views
-    nothing: Fit  # with nuisances only
-    clocked: Fit  # likewise, and the clock free
-    fit: Fit  # with the blocks that are free
+    views: MotionIntegrals
+    nothing: MotionFit  # with nuisances only
+    clocked: MotionFit  # likewise, and the clock free
+    fit: MotionFit  # with the blocks that are free
     free: tuple[str, ...]  # "clock", "gyros", "forces", in the order of what they explain
     rival: str  # a block that explains nearly as much as the first, or ""
     factor: float  # by which specific forces were multiplied before, as gravity suggested
 
 
 def judge(
-    imu: ImuTable, gnss: GnssTable, signal: Signal, track: Track, late_s: float | None = None
-) -> Verdict | None:
+    imu: ImuTable, gnss: GnssTable, signal: ImuSignal, track: FixTrack, late_s: float | None = None
+) -> ModelChoice | None:
     """Choose a model; None if there is too little motion.
 
     Args:
@@ -74,17 +74,17 @@ def judge(
     scaled, factor = _at_rest(signal, track)
     if scaled is None:
         return None
-    late = lateness(track) if late_s is None else late_s
+    late = velocity_delay(track) if late_s is None else late_s
     start_s = (int(imu.time_ns[signal.rows[0]]) - int(gnss.time_ns[0])) * 1e-9
     when = track.time_s - start_s - (late or 0.0)
     noise = track.sigma_m, track.sigma_v if np.isfinite(track.sigma_v) else 0.1
     views = views_of(scaled, imu.kind, gnss, track.rows, when, track.r_n, track.v_n, noise)
     if views is None:
         return None
-    return Verdict(views, *choose(views), factor)
+    return ModelChoice(views, *choose(views), factor)
 
 
-def _at_rest(signal: Signal, track: Track) -> tuple[Signal | None, float]:
+def _at_rest(signal: ImuSignal, track: FixTrack) -> tuple[ImuSignal | None, float]:
     """Signal without the bias of the gyros at rest, in m/s^2 by a factor if gravity needs one."""
     windows = windows_of(signal)
     size, bias = usual_force(windows), np.zeros(3)
@@ -98,7 +98,7 @@ def _at_rest(signal: Signal, track: Track) -> tuple[Signal | None, float]:
     return signal._replace(accel=signal.accel * factor, gyro=signal.gyro - bias), factor
 
 
-def _stood(track: Track) -> bool:
+def _stood(track: FixTrack) -> bool:
     """Judge by the fixes whether the vehicle stood for three seconds."""
     step = np.diff(track.time_s)
     moved = np.diff(track.r_n, axis=0) / step[:, None]
@@ -107,8 +107,8 @@ def _stood(track: Track) -> bool:
     return float(np.sum(step[slow])) > 3.0
 
 
-def choose(views: Views) -> tuple[Fit, Fit, Fit, tuple[str, ...], str]:
-    """Fits of `Verdict`, the blocks that are free, and a rival of the first."""
+def choose(views: MotionIntegrals) -> tuple[MotionFit, MotionFit, MotionFit, tuple[str, ...], str]:
+    """Fits of `ModelChoice`, the blocks that are free, and a rival of the first."""
     nothing = fit(views, start_of(views), prior_of())
     best, clocked, free, rival = nothing, nothing, (), ""
     for _ in range(2):
@@ -132,7 +132,7 @@ def choose(views: Views) -> tuple[Fit, Fit, Fit, tuple[str, ...], str]:
     return nothing, clocked, best, free, rival
 
 
-def _freed(views: Views, block: str, best: Fit, free: tuple[str, ...]) -> Fit:
+def _freed(views: MotionIntegrals, block: str, best: MotionFit, free: tuple[str, ...]) -> MotionFit:
     """A model with one more block, from the most promising start."""
     trials = []
     for start in _starts(views, block, best, free):
@@ -151,7 +151,7 @@ def _freed(views: Views, block: str, best: Fit, free: tuple[str, ...]) -> Fit:
     return fits[int(np.argmax(gains))]
 
 
-def _gain(views: Views, before: Fit, after: Fit) -> float:
+def _gain(views: MotionIntegrals, before: MotionFit, after: MotionFit) -> float:
     """Log-likelihood gained, of which a third counts; each stretch has a variance of its own."""
     least = _LEAST_SHARE * float(np.median(power_of(views)))
     one, other = (np.log(f.by_stretch(views) + least) for f in (before, after))
@@ -159,7 +159,9 @@ def _gain(views: Views, before: Fit, after: Fit) -> float:
     return 0.5 * (float(np.bincount(views.of) @ (one - other)) / np.sqrt(views.stride) + strain)
 
 
-def _starts(views: Views, block: str, best: Fit, free: tuple[str, ...]) -> list[PairState]:
+def _starts(
+    views: MotionIntegrals, block: str, best: MotionFit, free: tuple[str, ...]
+) -> list[PairState]:
     """States from which a model with one more free block is fitted."""
     state = _known(views, best.state, free)
     out, power = [state], power_of(views)
@@ -178,7 +180,7 @@ def _starts(views: Views, block: str, best: Fit, free: tuple[str, ...]) -> list[
     return out
 
 
-def _known(views: Views, state: PairState, free: tuple[str, ...]) -> PairState:
+def _known(views: MotionIntegrals, state: PairState, free: tuple[str, ...]) -> PairState:
     """State of the free blocks; nuisances start again from the claims of the tables."""
     out = start_of(views, mirror=float(np.sign(np.linalg.det(state.M_a))))
     if "clock" in free:
@@ -188,7 +190,7 @@ def _known(views: Views, state: PairState, free: tuple[str, ...]) -> PairState:
     return out._replace(M_a=state.M_a) if "forces" in free else out
 
 
-def _clocks(views: Views) -> list[PairState]:
+def _clocks(views: MotionIntegrals) -> list[PairState]:
     """Offset and rate, and offsets of parts, that explain most."""
     last = (len(views.turn) - 1) / RATE_HZ
     far = min(max(last, float(views.end_s[-1])), _FAR_S)
@@ -207,7 +209,9 @@ def _clocks(views: Views) -> list[PairState]:
     return [_line(views, start, lags, cost), *(_steps(start, lags, cost, s) for s in _SWITCH)]
 
 
-def _line(views: Views, start: PairState, lags: np.ndarray, cost: np.ndarray) -> PairState:
+def _line(
+    views: MotionIntegrals, start: PairState, lags: np.ndarray, cost: np.ndarray
+) -> PairState:
     """The best offset and rate."""
     near = np.abs(lags) <= _NEAR_S
     lags, cost = lags[near], cost[:, near]
@@ -247,7 +251,7 @@ def _steps(start: PairState, lags: np.ndarray, cost: np.ndarray, switch: float) 
     return start._replace(offset=offset, part=part)
 
 
-def _maps(views: Views, state: PairState, axes: np.ndarray) -> list[PairState]:
+def _maps(views: MotionIntegrals, state: PairState, axes: np.ndarray) -> list[PairState]:
     """Maps of the gyros that explain most: one of some orders and signs of axes, and a factor."""
     shift = state.shift(np.arange(len(views.start_s)), views.start_s, views.middle_s)
     scale, out = 1.0, []

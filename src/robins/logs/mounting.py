@@ -179,8 +179,8 @@ def turned(opened: T, mounting: Mounting | None) -> T:
         return opened
     if isinstance(opened, Dataset):
         on_board = {k: turned(getattr(opened, k), mounting) for k in ("imu", "mag", "attitude")}
-        told = {"lever_arm_b_m": _lever_arm(opened, mounting), "mounted": True}
-        return dataclasses.replace(opened, **on_board, **told)
+        extra = {"lever_arm_b_m": _lever_arm(opened, mounting), "mounted": True}
+        return dataclasses.replace(opened, **on_board, **extra)
     if isinstance(opened, ImuTable | MagTable | AttitudeTable):
         return mounting.turn(opened)
     return opened
@@ -192,8 +192,8 @@ def _lever_arm(dataset: Dataset, mounting: Mounting) -> tuple[float, float, floa
         return dataset.lever_arm_b_m
     if dataset.gnss is None:
         cause = "has no GNSS fixes, but is given a lever arm to their antenna"
-        mend = "give the log of the receiver too, or omit the lever arm"
-        raise LogError(dataset.name, cause, mend)
+        remedy = "give the log of the receiver too, or omit the lever arm"
+        raise LogError(dataset.name, cause, remedy)
     if not np.all(np.isfinite(arm)):
         raise LogError(dataset.name, f"is given a lever arm of {arm} m", "give finite numbers")
     return arm

@@ -24,9 +24,16 @@ import numpy as np
 
 from robins.dataset import GnssTable
 from robins.gps_time import gps_of
-from robins.logs.findings import Finding, LogError, above_geoid, breaks_off, left_out, telling
+from robins.logs.findings import (
+    Finding,
+    LogError,
+    finding_reporter,
+    report_cut_end,
+    report_geoid_heights,
+    report_left_out,
+)
 from robins.logs.fix_kinds import fixes, over_ground
-from robins.logs.opening import Bytes, mapped
+from robins.logs.opening import Bytes, map_file
 from robins.logs.text import Head
 from robins.units import to_si
 
@@ -56,7 +63,7 @@ def read_nmea(path: str | os.PathLike[str], findings: list[Finding] | None = Non
     Raises:
         LogError: there is no sentence GGA or RMC with a right checksum.
     """
-    return fixes_of(str(path), mapped(path, findings), findings)[0]
+    return fixes_of(str(path), map_file(path, findings), findings)[0]
 
 
 def fixes_of(
@@ -82,7 +89,9 @@ def fixes_of(
     course = np.where(np.isnan(course) & (speed < _SLOW), 0.0, course)
     nothing, height = np.full(len(kept), np.nan), column("height")
     if (np.isnan(height) & np.isfinite(column("altitude"))).any():
-        above_geoid(findings, file, "Set the receiver to state the separation of the geoid in GGA.")
+        report_geoid_heights(
+            findings, file, "Set the receiver to state the separation of the geoid in GGA."
+        )
         height = column("altitude")
     table = fixes(
         file,
@@ -103,13 +112,13 @@ def _report_unread(
 ) -> None:
     """Report places that are in RMC only, and qualities of GGA that count as no fix."""
     if count := sum("lat2" in epoch and "lat1" not in epoch for epoch in epochs):
-        telling(findings, "note", "other_kinds", file, value=count)(
+        finding_reporter(findings, "note", "other_kinds", file, value=count)(
             f"{count} of {len(epochs)} epochs have RMC and no GGA; they are left out. Switch on "
             "GGA at the rate of RMC, or switch off GGA to read the places of RMC."
         )
     for quality, what in _NO_FIX.items():
         if count := sum(epoch.get("quality") == quality for epoch in epochs):
-            telling(findings, "note", "other_kinds", file, value=count)(
+            finding_reporter(findings, "note", "other_kinds", file, value=count)(
                 f"{count} sentences GGA have the quality {quality} ({what}); they count as no fix."
             )
 
@@ -122,7 +131,7 @@ def _epochs(file: str, data: Bytes, findings: list[Finding] | None) -> list[dict
     for one in _in_order(data):
         talker, kind, body, given = one.groups()
         if given is None and one.end() == len(data):
-            breaks_off(findings, file, one.start())
+            report_cut_end(findings, file, one.start())
             continue
         try:
             if given is None or int(given, 16) != reduce(xor, talker + kind + b"," + body):
@@ -140,9 +149,9 @@ def _epochs(file: str, data: Bytes, findings: list[Finding] | None) -> list[dict
                 left.add(talker)
             better = talker == b"GN" and len(talkers) > 1
             epoch |= found if better else {k: x for k, x in found.items() if k not in epoch}
-    left_out(findings, file, wrong, "sentences lack a right checksum or a field")
+    report_left_out(findings, file, wrong, "sentences lack a right checksum or a field")
     if len(left) and len(talkers) > 1:
-        telling(findings, "note", "several_instances", file, value=len(talkers))(
+        finding_reporter(findings, "note", "several_instances", file, value=len(talkers))(
             f"several talkers ({', '.join(sorted(t.decode() for t in talkers))}) state the same; "
             "GN is read where it is among them, else the first."
         )
@@ -224,7 +233,7 @@ def _days(file: str, epochs: list[dict[str, float]], findings: list[Finding] | N
         midnights[k] = midnights[k - 1] + back
     stated = [int(e["day"]) - n for e, n in zip(epochs, midnights, strict=True) if "day" in e]
     if epochs and not stated:
-        telling(findings, "note", "undated", file, value=len(epochs))(
+        finding_reporter(findings, "note", "undated", file, value=len(epochs))(
             "no sentence states the date (RMC, ZDA); stamps count from the midnight before the "
             "first."
         )

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from robins.foreign import FREE, decoding, within
-from robins.logs.findings import Finding, LogError, telling
+from robins.logs.findings import Finding, LogError, finding_reporter
 
 Bytes: TypeAlias = bytes | mmap.mmap
 _BLOCK, _ABOUT, _LARGEST = 1 << 20, 1 << 22, 1 << 30
@@ -213,7 +213,7 @@ class Source:
         )
 
 
-def beginning(path: str | os.PathLike[str], size: int = 256) -> bytes:
+def read_beginning(path: str | os.PathLike[str], size: int = 256) -> bytes:
     """The first bytes of a file, decompressed.
 
     Raises:
@@ -227,7 +227,7 @@ def beginning(path: str | os.PathLike[str], size: int = 256) -> bytes:
     return start[:size]
 
 
-def mapped(path: str | os.PathLike[str], findings: list[Finding] | None) -> Bytes:
+def map_file(path: str | os.PathLike[str], findings: list[Finding] | None) -> Bytes:
     """All bytes of a file; a compressed stream that ended early is reported.
 
     A plain file is mapped, so that it may be larger than memory; a compressed one is unpacked.
@@ -235,12 +235,12 @@ def mapped(path: str | os.PathLike[str], findings: list[Finding] | None) -> Byte
     Raises:
         LogError: as `Source`; or more than 1 GiB would have to be unpacked.
     """
-    beginning(path, 1)  # the error, if it cannot be read
+    read_beginning(path, 1)  # the error, if it cannot be read
     with Path(path).open("rb") as file:
         if file.read(6).startswith((_XZ, _GZIP)):
-            data, cut = whole(path, _LARGEST)
+            data, cut = read_whole(path, _LARGEST)
             if cut:
-                telling(findings, "warning", "ends_early", str(path), value=len(data))(
+                finding_reporter(findings, "warning", "ends_early", str(path), value=len(data))(
                     "its compressed stream has no end: the copy was interrupted. All before it was "
                     "read."
                 )
@@ -248,7 +248,7 @@ def mapped(path: str | os.PathLike[str], findings: list[Finding] | None) -> Byte
         return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if file.tell() else b""
 
 
-def whole(path: str | os.PathLike[str], limit: int) -> tuple[bytes, bool]:
+def read_whole(path: str | os.PathLike[str], limit: int) -> tuple[bytes, bool]:
     """All bytes of a file, decompressed, and whether a compressed stream ended early.
 
     Raises:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from robins.dataset import ImuTable, Trajectory
 from robins.logs.motion import at
 from robins.logs.ordering import increasing
-from robins.logs.quiet import Signal, signal_of
+from robins.logs.quiet import ImuSignal, signal_of
 from robins.rotation import skew
 
 GRAVITY = 9.80665  # m/s^2
@@ -26,7 +26,7 @@ _HALF_S = 0.05  # over which the gyros give a rate, to either side
 LAGS_S = np.arange(-10, 11) * 0.1
 
 
-class Shared(NamedTuple):
+class SharedMotion(NamedTuple):
     """Records of the master about half a second apart, and the IMU's integrals; w windows."""
 
     time_s: np.ndarray  # (w + 1,) of the records, from the first sample on
@@ -43,7 +43,7 @@ class Shared(NamedTuple):
         return np.diff(self.time_s)[self.inside]
 
 
-def shared_motion(imu: ImuTable, master: Trajectory) -> Shared | None:
+def shared_motion(imu: ImuTable, master: Trajectory) -> SharedMotion | None:
     """Both on the clock of the IMU; None if there are fewer than ten windows."""
     signal = signal_of(imu)
     known = np.flatnonzero(np.isfinite(master.q_nb).all(axis=1))
@@ -59,10 +59,10 @@ def shared_motion(imu: ImuTable, master: Trajectory) -> Shared | None:
         return None
     q = Rotation.from_quat(master.q_nb[known], scalar_first=True)
     angle, pushed = (_integral(imu, signal, a) for a in (signal.gyro, signal.accel))
-    return Shared(time_s, inside, q, master.v_n[known], signal.time_s, angle, pushed)
+    return SharedMotion(time_s, inside, q, master.v_n[known], signal.time_s, angle, pushed)
 
 
-def _integral(imu: ImuTable, signal: Signal, values: np.ndarray) -> np.ndarray:
+def _integral(imu: ImuTable, signal: ImuSignal, values: np.ndarray) -> np.ndarray:
     """(n, 3) integral of rates up to each sample, from the first; those of increments are means."""
     steps = np.diff(signal.time_s, prepend=signal.time_s[0])[:, None]
     before = np.concatenate([values[:1], values[:-1]])
@@ -71,17 +71,17 @@ def _integral(imu: ImuTable, signal: Signal, values: np.ndarray) -> np.ndarray:
     )
 
 
-def turned_by_gyros(shared: Shared, lag_s: float = 0.0) -> np.ndarray:
+def turned_by_gyros(shared: SharedMotion, lag_s: float = 0.0) -> np.ndarray:
     """(k, 3) rad: by how much the IMU turned in each window, that much earlier than its stamps."""
     return np.diff(at(shared.time_s - lag_s, shared.sample_s, shared.angle), axis=0)[shared.inside]
 
 
-def turned(q: Rotation, shared: Shared) -> np.ndarray:
+def turned(q: Rotation, shared: SharedMotion) -> np.ndarray:
     """(k, 3) rad: by how much attitudes at the records turn in each window."""
     return (q[:-1].inv() * q[1:]).as_rotvec()[shared.inside]
 
 
-class Turning(NamedTuple):
+class TurningFit(NamedTuple):
     """Turning of attitudes against the gyros."""
 
     share: float  # of the turning that is left over
@@ -89,7 +89,9 @@ class Turning(NamedTuple):
     sigma_s: float
 
 
-def fit_turning(q: Rotation, shared: Shared, gyro_map: np.ndarray | None = None) -> Turning:
+def fit_turning(
+    q: Rotation, shared: SharedMotion, gyro_map: np.ndarray | None = None
+) -> TurningFit:
     """Fit bias, mounting error and delay by Gauss and Newton, from the best of the coarse delays.
 
     Args:
@@ -108,18 +110,18 @@ def fit_turning(q: Rotation, shared: Shared, gyro_map: np.ndarray | None = None)
     bias = shared.length_s[:, None, None] * np.eye(3)
     step_s = 0.02
     spread = np.sum((of_master - of_master.mean(axis=0)) ** 2)
-    fit = Turning(np.inf, late_s, np.inf)
+    fit = TurningFit(np.inf, late_s, np.inf)
     for _ in range(4):
         early, here, late = (by_gyros(fit.late_s + k * step_s) for k in (-1, 0, 1))
         slope = (late - early) / (2.0 * step_s)
         design = np.concatenate([bias, skew(here), slope[:, :, None]], axis=-1).reshape(-1, 7)
         left, found, sigma = _least_squares((of_master - here).ravel(), design)
         late_s = np.clip(fit.late_s + np.clip(found[6], -0.1, 0.1), LAGS_S[0], LAGS_S[-1])
-        fit = Turning(float(left @ left / spread), float(late_s), float(sigma[6]))
+        fit = TurningFit(float(left @ left / spread), float(late_s), float(sigma[6]))
     return fit
 
 
-def _pushes(v_n: np.ndarray, shared: Shared) -> tuple[np.ndarray, ...] | None:
+def _pushes(v_n: np.ndarray, shared: SharedMotion) -> tuple[np.ndarray, ...] | None:
     """Windows with velocities at both ends; None if there are fewer than ten.
 
     Returns:
@@ -139,7 +141,7 @@ def _pushes(v_n: np.ndarray, shared: Shared) -> tuple[np.ndarray, ...] | None:
     return at_, length_s[at_], q.as_matrix()[at_], gained[at_], pushed[at_]
 
 
-def forces_of(shared: Shared) -> tuple[np.ndarray, np.ndarray] | None:
+def forces_of(shared: SharedMotion) -> tuple[np.ndarray, np.ndarray] | None:
     """Mean specific force (k, 3) along the body in each window: by the master, by the IMU."""
     p = _pushes(shared.v_n, shared)
     if p is None:
@@ -149,7 +151,7 @@ def forces_of(shared: Shared) -> tuple[np.ndarray, np.ndarray] | None:
     return np.einsum("kji,kj->ki", C, f_n), pushed / length_s[:, None]
 
 
-def fit_velocity(v_n: np.ndarray, shared: Shared) -> np.ndarray | None:
+def fit_velocity(v_n: np.ndarray, shared: SharedMotion) -> np.ndarray | None:
     """Fit bias, mounting error and lever arm; the squares (3,) left over along north, east, down.
 
     Args:

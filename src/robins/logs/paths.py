@@ -22,16 +22,16 @@ import numpy as np
 
 from robins import rotation
 from robins.dataset import Trajectory
-from robins.logs.findings import Finding, LogError, refused, telling
+from robins.logs.findings import Finding, LogError, finding_reporter, refused
 from robins.logs.mounting import LocalPath, from_local
-from robins.logs.opening import whole
+from robins.logs.opening import read_whole
 from robins.logs.read_text import NOWHERE
-from robins.logs.text import Head, Layout, read_columns
+from robins.logs.text import Head, TextLayout, read_columns
 from robins.logs.timebase import WEEK_NS, stamps_to_ns, unrolled, week_to_ns
 
 Findings = list[Finding] | None
 _LARGEST = 1 << 30  # bytes of a file
-_KITTI = Layout(tuple(f"{row}{k}" for row in "123" for k in range(1, 5)), None, texts=())
+_KITTI = TextLayout(tuple(f"{row}{k}" for row in "123" for k in range(1, 5)), None, texts=())
 _TO_ENU = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # x right, y down, z ahead
 _CAMERA = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # of forward, right, down
 _SBET = np.dtype("<f8")
@@ -63,7 +63,7 @@ def read_kitti(path: str | os.PathLike[str], findings: Findings = None) -> Traje
     times = next((one for one in beside if one.exists()), None)
     if times is None:
         raise LogError(str(path), "has no times beside it", f"put times.txt into {file.parent}")
-    clock = read_columns(times, Layout(("time",), None), findings)
+    clock = read_columns(times, TextLayout(("time",), None), findings)
     if len(clock.rows) != len(poses.rows):
         cause = f"has {len(poses.rows)} poses, and {times} {len(clock.rows)} times"
         raise LogError(str(path), cause, "give the times of this sequence")
@@ -74,7 +74,7 @@ def read_kitti(path: str | os.PathLike[str], findings: Findings = None) -> Traje
     except ValueError as error:
         raise LogError(str(path), f"holds no rotation: {error}", "copy it again") from error
     r_l = matrix[:, :, 3] @ _TO_ENU.T
-    telling(findings, "note", "no_place", str(path), value="0 0 0")(
+    finding_reporter(findings, "note", "no_place", str(path), value="0 0 0")(
         "positions are metres from the first camera, whose axes are taken as east, down, north; "
         "they are put at latitude 0, longitude 0, height 0."
     )
@@ -100,11 +100,11 @@ def read_sbet(path: str | os.PathLike[str], findings: Findings = None) -> Trajec
     Raises:
         LogError: it cannot be read, or holds no whole record of finite numbers.
     """
-    data, _ = whole(path, _LARGEST)
+    data, _ = read_whole(path, _LARGEST)
     file, count = str(path), len(data) // _RECORD
     if rest := len(data) % _RECORD:
         sentence = f"ends early: the last {rest} bytes are no whole record and are left out."
-        telling(findings, "warning", "ends_early", file, value=rest)(sentence)
+        finding_reporter(findings, "warning", "ends_early", file, value=rest)(sentence)
     v = np.frombuffer(data, _SBET, 17 * count).reshape(count, 17)
     bad = ~(np.abs(v[:, 0]) < 1e8)
     if bad.any() or not count:
@@ -133,7 +133,7 @@ def read_inspva(path: str | os.PathLike[str], findings: Findings = None) -> Traj
     """
     file, rows, numbers, clocks = str(path), list[int](), list[list[float]](), list[list[bytes]]()
     damaged = idle = 0
-    data = whole(path, _LARGEST)[0].removeprefix(b"\xef\xbb\xbf")
+    data = read_whole(path, _LARGEST)[0].removeprefix(b"\xef\xbb\xbf")
     for k, raw in enumerate(data.split(b"\n"), start=1):
         if not raw.startswith(tuple(one.encode() for one in _INSPVA)):
             continue
@@ -153,7 +153,7 @@ def read_inspva(path: str | os.PathLike[str], findings: Findings = None) -> Traj
         clocks.append(fields[:2])
     for count, what in ((damaged, "are cut or fail their checksum"), (idle, "are not aligned")):
         if count:
-            telling(findings, "warning", "lines_left_out", file, value=count)(
+            finding_reporter(findings, "warning", "lines_left_out", file, value=count)(
                 f"{count} INSPVA lines {what} and are left out."
             )
     if not rows:

@@ -24,7 +24,7 @@ import numpy as np
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.logs.findings import Finding, LogError, refused
 from robins.logs.fix_kinds import over_ground
-from robins.logs.text import Head, Layout, peek, read_columns
+from robins.logs.text import Head, TextLayout, peek, read_columns
 from robins.logs.timebase import dates_to_ns
 from robins.units import to_si
 
@@ -70,7 +70,7 @@ def read_phone(path: str | os.PathLike[str], findings: list[Finding] | None = No
         )
     if names[0] != "time":
         raise refused(file, f"line {line}")("the first column is not the time", "put it first")
-    columns = read_columns(path, Layout(tuple(names), ",", skip=line, all_named=True), findings)
+    columns = read_columns(path, TextLayout(tuple(names), ",", skip=line, all_named=True), findings)
     place = {name: k - 1 for k, name in enumerate(names)}
 
     def stack(*wanted: str) -> np.ndarray:

@@ -9,14 +9,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 
-class Group(NamedTuple):
+class QuantityGroup(NamedTuple):
     """Quantities that are given together or not at all."""
 
     kinds: dict[str, str]  # quantity -> kind of its unit in `robins.units`
     text: str
 
 
-class Makeup(NamedTuple):
+class TableRecipe(NamedTuple):
     """The groups of a table."""
 
     text: str
@@ -30,37 +30,45 @@ def _parts(stem: str, ends: str, kind: str) -> dict[str, str]:
 
 _XYZ, _NED = "x y z", "north east down"
 
-GROUPS: dict[str, Group] = {
-    "time": Group({"time": "time"}, "time of the row"),
-    "time_of_week": Group({"time_of_week": "time"}, "second of the GPS week, goes on at its end"),
-    "week": Group({"week": "ratio"}, "GPS week; time counts from the beginning of the first"),
-    "gyro": Group(_parts("gyro", _XYZ, "angle rate"), "turn rate"),
-    "accel": Group(_parts("accel", _XYZ, "specific force"), "specific force"),
-    "dtheta": Group(_parts("dtheta", _XYZ, "angle"), "turn since the row before"),
-    "dv": Group(_parts("dv", _XYZ, "speed"), "specific force summed up since the row before"),
-    "dt": Group(
+GROUPS: dict[str, QuantityGroup] = {
+    "time": QuantityGroup({"time": "time"}, "time of the row"),
+    "time_of_week": QuantityGroup(
+        {"time_of_week": "time"}, "second of the GPS week, goes on at its end"
+    ),
+    "week": QuantityGroup(
+        {"week": "ratio"}, "GPS week; time counts from the beginning of the first"
+    ),
+    "gyro": QuantityGroup(_parts("gyro", _XYZ, "angle rate"), "turn rate"),
+    "accel": QuantityGroup(_parts("accel", _XYZ, "specific force"), "specific force"),
+    "dtheta": QuantityGroup(_parts("dtheta", _XYZ, "angle"), "turn since the row before"),
+    "dv": QuantityGroup(
+        _parts("dv", _XYZ, "speed"), "specific force summed up since the row before"
+    ),
+    "dt": QuantityGroup(
         {"dt": "time"}, "time over which dtheta and dv are, compared with that of the rows"
     ),
-    "mag": Group(_parts("mag", _XYZ, "magnetic field"), "magnetic field"),
-    "place": Group(
+    "mag": QuantityGroup(_parts("mag", _XYZ, "magnetic field"), "magnetic field"),
+    "place": QuantityGroup(
         {"lat": "angle", "lon": "angle", "height": "length"}, "place, above the WGS-84 ellipsoid"
     ),
-    "local": Group(dict.fromkeys(("east", "north", "up"), "length"), "place, from an origin"),
-    "velocity": Group(_parts("v", _NED, "speed"), "velocity"),
-    "sigma": Group(_parts("sigma", _NED, "length"), "sigma of the place"),
-    "sigma_v": Group(_parts("sigma_v", _NED, "speed"), "sigma of the velocity"),
-    "quality": Group({"quality": "ratio"}, "1 fixed, 2 float, 5 single, as RTKLIB counts"),
-    "euler": Group(dict.fromkeys(("roll", "pitch", "heading"), "angle"), "of the vehicle"),
-    "quaternion": Group(_parts("q", "w x y z", "ratio"), "turns body into navigation axes"),
-    "omega": Group(_parts("omega", _XYZ, "angle rate"), "turn rate against inertial space"),
+    "local": QuantityGroup(
+        dict.fromkeys(("east", "north", "up"), "length"), "place, from an origin"
+    ),
+    "velocity": QuantityGroup(_parts("v", _NED, "speed"), "velocity"),
+    "sigma": QuantityGroup(_parts("sigma", _NED, "length"), "sigma of the place"),
+    "sigma_v": QuantityGroup(_parts("sigma_v", _NED, "speed"), "sigma of the velocity"),
+    "quality": QuantityGroup({"quality": "ratio"}, "1 fixed, 2 float, 5 single, as RTKLIB counts"),
+    "euler": QuantityGroup(dict.fromkeys(("roll", "pitch", "heading"), "angle"), "of the vehicle"),
+    "quaternion": QuantityGroup(_parts("q", "w x y z", "ratio"), "turns body into navigation axes"),
+    "omega": QuantityGroup(_parts("omega", _XYZ, "angle rate"), "turn rate against inertial space"),
 }
 """Every group by its name."""
 
-TABLES: dict[str, Makeup] = {
-    "imu": Makeup("inertial samples", (("gyro", "accel"), ("dtheta", "dv")), ("dt",)),
-    "mag": Makeup("magnetic field", (("mag",),)),
-    "gnss": Makeup("fixes", (("place",),), ("sigma", "velocity", "sigma_v", "quality")),
-    "trajectory": Makeup(
+TABLES: dict[str, TableRecipe] = {
+    "imu": TableRecipe("inertial samples", (("gyro", "accel"), ("dtheta", "dv")), ("dt",)),
+    "mag": TableRecipe("magnetic field", (("mag",),)),
+    "gnss": TableRecipe("fixes", (("place",),), ("sigma", "velocity", "sigma_v", "quality")),
+    "trajectory": TableRecipe(
         "path",
         (
             ("place", "velocity", "euler"),
@@ -69,7 +77,7 @@ TABLES: dict[str, Makeup] = {
         ),
         ("velocity", "omega"),
     ),
-    "attitude": Makeup("attitude", (("quaternion",), ("euler",))),
+    "attitude": TableRecipe("attitude", (("quaternion",), ("euler",))),
 }
 """Every table by its kind."""
 

@@ -12,7 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from robins.dataset import AttitudeTable, ImuTable, MagTable
 from robins.ins.increments import own_intervals
-from robins.logs.findings import SEVERITIES, Finding, Severity, Value, told
+from robins.logs.findings import SEVERITIES, Finding, Severity, Value, make_finding
 from robins.logs.ordering import increasing
 from robins.logs.tables import Table
 
@@ -46,9 +46,9 @@ def place(table: Table, row: int) -> str:
 def finding(
     severity: Severity, table: Table, code: str, value: Value, row: int | None = None
 ) -> Callable[[str], Finding]:
-    """As `told`, about a table or a row of it."""
+    """As `make_finding`, about a table or a row of it."""
     where = "" if row is None else place(table, row)
-    return told(severity, code, table.source, where, value, name_of(table))
+    return make_finding(severity, code, table.source, where, value, name_of(table))
 
 
 error, warning, note = (partial(finding, severity) for severity in SEVERITIES)
@@ -77,7 +77,7 @@ def longest_run(same: np.ndarray) -> tuple[int, int]:
     return int(starts[k]), int(lengths[k])
 
 
-class Signal(NamedTuple):
+class ImuSignal(NamedTuple):
     """An IMU table as rates, good rows only, in the order of time."""
 
     rows: np.ndarray  # (n,) index into the table
@@ -87,7 +87,7 @@ class Signal(NamedTuple):
     step_s: float  # mean step, gaps left out
 
 
-def signal_of(imu: ImuTable) -> Signal | None:
+def signal_of(imu: ImuTable) -> ImuSignal | None:
     """The usable samples of a table; None if there are fewer than ten."""
     # Wide enough for deg/h and milli-g, so that a wrong unit is seen, and squares do not overflow.
     good = (np.abs(np.hstack([imu.gyro, imu.accel])) < _NONSENSE).all(axis=1)
@@ -101,7 +101,7 @@ def signal_of(imu: ImuTable) -> Signal | None:
     per = np.ones((len(rows), 1))
     if imu.kind == "increment":
         per[:, 0] = own_intervals(steps, imu.gyro[rows], imu.accel[rows])
-    return Signal(rows, time_s, imu.gyro[rows] / per, imu.accel[rows] / per, step_s)
+    return ImuSignal(rows, time_s, imu.gyro[rows] / per, imu.accel[rows] / per, step_s)
 
 
 class Windows(NamedTuple):
@@ -129,7 +129,7 @@ def _long_enough(low: np.ndarray, change: np.ndarray, least: int) -> np.ndarray:
     return np.convolve(row, np.ones(least)) > 0
 
 
-def windows_of(signal: Signal) -> Windows:
+def windows_of(signal: ImuSignal) -> Windows:
     """Cut a signal into windows of one second, or of ten samples if that is longer."""
     n = min(max(round(_WINDOW_S / signal.step_s), 10), len(signal.rows))
     count = len(signal.rows) // n

@@ -24,18 +24,18 @@ from robins.dataset import (
 )
 from robins.ins.frames import swap, swap_q
 from robins.logs.archives import head_of, rows_of
-from robins.logs.findings import Finding, LogError, refused, telling
+from robins.logs.findings import Finding, LogError, finding_reporter, refused
 from robins.logs.merging import interpolated
 from robins.logs.mounting import LocalPath, Origin, from_local
 from robins.logs.quantities import CLOCKS, DATES, QUANTITIES, TABLES, parts, words_of
 from robins.logs.tables import Table, kind_of, unit_quaternions
-from robins.logs.text import COMMENTS, Columns, Head, Layout, read_columns
+from robins.logs.text import COMMENTS, Columns, Head, TextLayout, read_columns
 from robins.logs.text_format import (
     PAIRS,
     Axes,
     Column,
-    Found,
-    Header,
+    ColumnHeader,
+    FoundColumn,
     TextFormat,
     columns_of,
     header_of,
@@ -59,11 +59,11 @@ _NUMBER = r"([-+]?\d+\.?\d*(?:[eE][-+]?\d+)?)"
 _ORIGIN = re.compile(rf"\borigin: {_NUMBER} deg,? {_NUMBER} deg,? {_NUMBER} m\b")
 
 
-class Read(NamedTuple):
+class TextContents(NamedTuple):
     """Contents of the columns of a file."""
 
     file: str
-    columns: dict[str, Found]
+    columns: dict[str, FoundColumn]
     values: dict[str, np.ndarray]  # by quantity, SI
     time_ns: np.ndarray
     rows: np.ndarray
@@ -85,7 +85,7 @@ class Read(NamedTuple):
         """Source of the numbers, for a table."""
         return {"source": self.file, "rows": self.rows}
 
-    def of(self, rows: np.ndarray) -> Read:
+    def of(self, rows: np.ndarray) -> TextContents:
         """Some of the rows."""
         values = {q: v[rows] for q, v in self.values.items()}
         return self._replace(values=values, time_ns=self.time_ns[rows], rows=self.rows[rows])
@@ -118,7 +118,7 @@ def read_text(
     texts = {q: f for q, f in columns.items() if q in _TEXTS}
     numbers = {q: f for q, f in columns.items() if q not in _TEXTS}
     marks = _marks(file, header, columns)
-    layout = Layout(
+    layout = TextLayout(
         tuple(header.names),
         format.delimiter,
         texts=tuple(sorted({*(f.place for f in texts.values()), *marks.values()})),
@@ -130,7 +130,7 @@ def read_text(
     table = rows_of(head, layout) if head.names else read_columns(path, layout, findings)
     stamps = {q: table.texts[:, layout.texts.index(f.place)] for q, f in texts.items()}
     nav, body = _frames(format, head)
-    read = Read(
+    read = TextContents(
         file,
         numbers,
         {q: _column(f, table, layout, marks) for q, f in numbers.items()}
@@ -151,7 +151,7 @@ def read_text(
     return _tables(format, read, origin, known=any(f.sure for f in texts.values()))
 
 
-def _marks(file: str, header: Header, columns: dict[str, Found]) -> dict[str, int]:
+def _marks(file: str, header: ColumnHeader, columns: dict[str, FoundColumn]) -> dict[str, int]:
     """Places of the columns whose text tells which rows hold a quantity.
 
     Raises:
@@ -165,7 +165,9 @@ def _marks(file: str, header: Header, columns: dict[str, Found]) -> dict[str, in
     return {name: header.names.index(name) for name in names}
 
 
-def _column(found: Found, table: Columns, layout: Layout, marks: dict[str, int]) -> np.ndarray:
+def _column(
+    found: FoundColumn, table: Columns, layout: TextLayout, marks: dict[str, int]
+) -> np.ndarray:
     """Numbers of a column in SI units; NaN in rows of other sensors."""
     values = _si(found.column, found.unit, table.values[:, layout.number(found.place)])
     name, text = found.column.where
@@ -184,7 +186,7 @@ def _si(column: Column, symbol: str, values: np.ndarray) -> np.ndarray:
 
 def _times(
     file: str,
-    texts: dict[str, Found],
+    texts: dict[str, FoundColumn],
     stamps: dict[str, np.ndarray],
     rows: np.ndarray,
     rate_hz: float,
@@ -220,14 +222,14 @@ def _frames(format: TextFormat, head: Head) -> tuple[NavFrame, BodyFrame]:
     """
     nav: NavFrame = "ENU" if format.nav == "ENU" else "NED"
     body: BodyFrame = "RFU" if format.body == "RFU" else "FRD"
-    for number, text in _comments(head) if format.says_frames else ():
-        said = re.search(r"\bframes?:\s*(.+)", text)
-        if said is None:
+    for number, text in _comments(head) if format.states_frames else ():
+        matched = re.search(r"\bframes?:\s*(.+)", text)
+        if matched is None:
             continue
-        words = set(re.findall(r"[A-Z]{3}", said[1]))
+        words = set(re.findall(r"[A-Z]{3}", matched[1]))
         fitting = [pair for pair in PAIRS if words and words <= set(pair)]
         if len(fitting) != 1:
-            raise refused(head.file, f"line {number}", "frames", said[1].strip())(
+            raise refused(head.file, f"line {number}", "frames", matched[1].strip())(
                 "is neither NED FRD nor ENU RFU",
                 "convert the columns to one of the two and say which",
             )
@@ -236,8 +238,8 @@ def _frames(format: TextFormat, head: Head) -> tuple[NavFrame, BodyFrame]:
 
 
 def _origin(head: Head) -> Origin | None:
-    said = (_ORIGIN.search(text) for _, text in _comments(head))
-    return next((Origin(*map(float, found.groups())) for found in said if found), None)
+    matched = (_ORIGIN.search(text) for _, text in _comments(head))
+    return next((Origin(*map(float, found.groups())) for found in matched if found), None)
 
 
 def _comments(head: Head) -> list[tuple[int, str]]:
@@ -247,7 +249,9 @@ def _comments(head: Head) -> list[tuple[int, str]]:
     return [(k, text) for k, text in lines if text.lstrip().startswith(COMMENTS)]
 
 
-def _tables(format: TextFormat, read: Read, origin: Origin | None, known: bool) -> Table | Dataset:
+def _tables(
+    format: TextFormat, read: TextContents, origin: Origin | None, known: bool
+) -> Table | Dataset:
     made = []
     for kind in format.kinds:
         own = {q for need in TABLES[kind].needs for q in parts(need)} & set(read.values)
@@ -269,7 +273,7 @@ def _tables(format: TextFormat, read: Read, origin: Origin | None, known: bool) 
     )
 
 
-def _imu(read: Read) -> ImuTable:
+def _imu(read: TextContents) -> ImuTable:
     if read.has("dt"):
         _compare_dt(read)
     rate = read.has("gyro")
@@ -288,11 +292,11 @@ def _imu(read: Read) -> ImuTable:
     )
 
 
-def _mag(read: Read) -> MagTable:
+def _mag(read: TextContents) -> MagTable:
     return MagTable(read.time_ns, read.stack("mag"), read.body, **read.origin)
 
 
-def _gnss(read: Read) -> GnssTable:
+def _gnss(read: TextContents) -> GnssTable:
     quality = read.values.get("quality")
     if quality is not None:
         quality = np.where(np.abs(quality) < 100.0, quality, 0.0).astype(np.int64)
@@ -308,19 +312,19 @@ def _gnss(read: Read) -> GnssTable:
     )
 
 
-def _attitude(read: Read) -> AttitudeTable:
+def _attitude(read: TextContents) -> AttitudeTable:
     q_nb = _quaternions(read)
     return AttitudeTable(read.time_ns, q_nb, read.nav, read.body, **read.origin)
 
 
-def _path(read: Read, origin: Origin | None) -> Trajectory:
+def _path(read: TextContents, origin: Origin | None) -> Trajectory:
     for quantity in _LIMIT_DEG:
         _within_limits(read, quantity)
     q_nb, v_n = _quaternions(read), read.stack("velocity")
     omega = read.stack("omega") if read.has("omega") else None
     if read.has("local"):
         if origin is None:
-            telling(read.findings, "note", "no_place", read.file, value="0 0 0")(
+            finding_reporter(read.findings, "note", "no_place", read.file, value="0 0 0")(
                 "positions are local metres; they are put at latitude 0, longitude 0, height "
                 "0, x to the east. Gravity and Earth rate there are not those of the "
                 "recording; give an origin if that matters."
@@ -343,7 +347,7 @@ def _path(read: Read, origin: Origin | None) -> Trajectory:
 _MAKERS = {"imu": _imu, "mag": _mag, "gnss": _gnss, "attitude": _attitude}
 
 
-def _quaternions(read: Read) -> np.ndarray:
+def _quaternions(read: TextContents) -> np.ndarray:
     """As recorded, or from roll, pitch and heading, the same in both pairs of frames."""
     if read.has("quaternion"):
         names = [read.columns[q].name for q in parts("quaternion")]
@@ -355,7 +359,7 @@ def _quaternions(read: Read) -> np.ndarray:
     return np.asarray(swap_q(q)) if read.nav == "ENU" else q
 
 
-def _within_limits(read: Read, quantity: str) -> None:
+def _within_limits(read: TextContents, quantity: str) -> None:
     """Take out angles that cannot be; refuse the column if they are many.
 
     Raises:
@@ -379,20 +383,19 @@ def _within_limits(read: Read, quantity: str) -> None:
             "name the column with the unit it is in",
         )
     values[beyond] = np.nan
-    telling(read.findings, "warning", "angle_range", read.file, f"line {read.rows[k]}", shown)(
-        f"{found.name} is {shown:g}, beyond {allowed} ({count}). What cannot be is taken as "
-        "missing."
-    )
+    finding_reporter(
+        read.findings, "warning", "angle_range", read.file, f"line {read.rows[k]}", shown
+    )(f"{found.name} is {shown:g}, beyond {allowed} ({count}). What cannot be is taken as missing.")
 
 
-def _compare_dt(read: Read) -> None:
+def _compare_dt(read: TextContents) -> None:
     """An increment is taken to be over the time since the row before: say where dt disagrees."""
     dt, elapsed = read.values["dt"], np.diff(read.time_ns) * 1e-9
     off = np.flatnonzero(np.abs(dt[1:] - elapsed) > 0.01 * np.abs(dt[1:]))
     if len(off):
         first = int(off[0]) + 1
         where, shown = f"line {read.rows[first]}", float(dt[first])
-        telling(read.findings, "warning", "dt_disagrees", read.file, where, shown)(
+        finding_reporter(read.findings, "warning", "dt_disagrees", read.file, where, shown)(
             f"dt is {shown:g} s but the time has grown by {elapsed[first - 1]:g} s ({len(off)} "
             "such rows). Increments are taken over the time since the row before; rows are "
             "missing, or dt belongs to the next row."

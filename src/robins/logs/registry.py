@@ -31,7 +31,7 @@ from robins.logs.archives import head_of, kind_of_archive
 from robins.logs.findings import Finding, LogError, refused
 from robins.logs.folders import read_folder
 from robins.logs.mounting import Origin
-from robins.logs.opening import beginning
+from robins.logs.opening import read_beginning
 from robins.logs.quantities import words_of
 from robins.logs.read_text import read_text
 from robins.logs.tables import KINDS, Table, kind_in_text, tables_of
@@ -203,13 +203,13 @@ def _of_names(path: str | os.PathLike[str]) -> Callable[..., Table | Dataset]:
     return partial(read_text, rows[0])
 
 
-def fitting(path: str | os.PathLike[str]) -> tuple[Head, list[Format]]:
+def matching_formats(path: str | os.PathLike[str]) -> tuple[Head, list[Format]]:
     """Beginning of a file, and the formats that it fits.
 
     Raises:
         LogError: the file is empty, cannot be opened, or is neither text nor of a known kind.
     """
-    head = Head(os.fspath(path), [], beginning(path))
+    head = Head(os.fspath(path), [], read_beginning(path))
     if found := [f for f in FORMATS if f.binary and f.recognise(head)]:
         return head, found
     head = peek(path)
@@ -222,12 +222,12 @@ def recognise(path: str | os.PathLike[str]) -> Format:
     Raises:
         LogError: no format fits, or several do; the sentence lists the candidates.
     """
-    head, found = fitting(path)
+    head, found = matching_formats(path)
     if len(found) == 1:
         return found[0]
     shown = (head.data(1) or [(1, head.lines[0])])[0]
     commas = any(re.search(r"\d,\d+(;|\s)\s*[-+\d]", text) for _, text in head.data(2))
-    mend = (
+    remedy = (
         "write numbers with a decimal point, not a comma"
         if commas
         else "give --format, or --columns (`robins guess` writes them); these are known"
@@ -237,7 +237,7 @@ def recognise(path: str | os.PathLike[str]) -> Format:
     listed = "".join(f"\n  {f.name:{width}}  {f.about}" for f in candidates)
     raise refused(head.file, f"line {shown[0]}")(
         f"{'several formats fit' if found else 'no known format fits'} ({shown[1][:60]!r})",
-        f"{mend}:{listed}",
+        f"{remedy}:{listed}",
     )
 
 
@@ -270,7 +270,7 @@ def open_log(
     elif os.path.isdir(path) and format is None:
         return read_folder(path, findings, origin)
     else:
-        known = recognise(path) if format is None else called(format, path)
+        known = recognise(path) if format is None else format_named(format, path)
     if os.path.isdir(path) and known.read is not rosbag.read_rosbag:
         cause = f"is a folder, and {known.name} is a format of files"
         raise LogError(str(path), cause, "omit the format, or give a file")
@@ -314,7 +314,7 @@ def write_log(
         row = format
     else:
         written = [f for f in FORMATS if f.text or f.write]
-        named = called(format or _usual(path, table), path, written)
+        named = format_named(format or _usual(path, table), path, written)
         if named.write is not None:
             if week is not None or origin is not None:
                 cause = f"{named.name} has neither a GPS week nor local metres"
@@ -331,7 +331,7 @@ def _usual(path: str | os.PathLike[str], table: Table | Dataset) -> str:
         return "ros-mcap"
     kinds = tuple(map(kind_in_text, tables_of(table)))
     for name in ("named-imu", "named-path"):
-        if kinds == called(name, path).holds:
+        if kinds == format_named(name, path).holds:
             return name
     raise LogError(
         str(path),
@@ -340,7 +340,9 @@ def _usual(path: str | os.PathLike[str], table: Table | Dataset) -> str:
     )
 
 
-def called(name: str, path: str | os.PathLike[str], among: Sequence[Format] = FORMATS) -> Format:
+def format_named(
+    name: str, path: str | os.PathLike[str], among: Sequence[Format] = FORMATS
+) -> Format:
     """Format of this name; the path is for the message.
 
     Raises:

@@ -19,8 +19,8 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, cast
 
 from robins.foreign import decoding, largest, unpacked, within
-from robins.logs.findings import Finding, LogError, breaks_off, damaged, telling
-from robins.logs.opening import UNZSTD, Bytes, mapped
+from robins.logs.findings import Finding, LogError, damaged, finding_reporter, report_cut_end
+from robins.logs.opening import UNZSTD, Bytes, map_file
 
 if TYPE_CHECKING:
     from mcap.records import McapRecord
@@ -50,7 +50,7 @@ def raw_messages(
     Raises:
         LogError: a package is not installed; the file is damaged or of no kind that ROS records.
     """
-    data = mapped(path, findings)
+    data = map_file(path, findings)
     read = {MCAP: _from_mcap, SQLITE: _from_db3, BAG: _from_bag}
     for magic, found in read.items():
         if data[: len(magic)] == magic:
@@ -104,7 +104,7 @@ def _from_mcap(
             if kind in wanted:
                 yield kind, topic, _plain(one.data, refuse), False
     if not closed:
-        breaks_off(findings, file, len(data))
+        report_cut_end(findings, file, len(data))
 
 
 def _sound(data: Bytes) -> tuple[int, bool]:
@@ -174,7 +174,7 @@ def _from_db3(
     file, refuse = str(path), damaged(str(path))
     waiting = path.with_name(path.name + "-wal")
     if waiting.exists() and waiting.stat().st_size:
-        telling(findings, "warning", "ends_early", file, value=waiting.stat().st_size)(
+        finding_reporter(findings, "warning", "ends_early", file, value=waiting.stat().st_size)(
             f"its last messages are still in {waiting.name}, for the recorder was not closed; they "
             f"are not read. Close it: sqlite3 {path.name} 'PRAGMA wal_checkpoint'."
         )

@@ -27,7 +27,7 @@ import numpy as np
 from robins import ros
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.gps_time import GPS_EPOCH_S, gps_of
-from robins.logs.findings import Finding, LogError, damaged, telling
+from robins.logs.findings import Finding, LogError, damaged, finding_reporter
 from robins.logs.fix_kinds import with_usual_sigmas
 from robins.logs.merging import are_halves, merged
 from robins.logs.opening import parts_of
@@ -46,7 +46,7 @@ _STATUS, _PLACE, _VARIANCE, _KIND = 0, slice(2, 5), [5, 9, 13], 14
 _TWIST_VARIANCE = [6, 13, 20]
 
 
-class _Found(NamedTuple):
+class _TopicMessages(NamedTuple):
     """The messages of a topic."""
 
     topic: str
@@ -55,7 +55,7 @@ class _Found(NamedTuple):
     values: np.ndarray  # (n, numbers of a message)
 
 
-Topics: TypeAlias = dict[tuple[str, str], _Found]
+Topics: TypeAlias = dict[tuple[str, str], _TopicMessages]
 """Messages by type and topic."""
 
 
@@ -123,18 +123,20 @@ def _topics(
         time_ns = np.array(stamps.pop(key), np.int64)
         dated = time_ns >= GPS_EPOCH_S * 1_000_000_000
         rows = np.array(values.pop(key)).reshape(len(time_ns), -1)
-        found[key] = _Found(key[1], frame_id, np.where(dated, gps_of(time_ns), time_ns), rows)
+        found[key] = _TopicMessages(
+            key[1], frame_id, np.where(dated, gps_of(time_ns), time_ns), rows
+        )
     return found, kinds
 
 
 def _first(
     file: str, topics: Topics, name: str, findings: list[Finding] | None, beside: str = ""
-) -> _Found | None:
+) -> _TopicMessages | None:
     """The first topic of a type, and a note of the others but that `beside` it."""
     found = [one for (of, _), one in topics.items() if of == name]
     left = [one.topic for one in found[1:] if one.topic != beside]
     if left:
-        telling(findings, "note", "several_instances", file, value=len(found))(
+        finding_reporter(findings, "note", "several_instances", file, value=len(found))(
             f"{name} was recorded on {len(found)} topics; the first, {found[0].topic}, is read and "
             f"the others are left alone: {', '.join(left)}."
         )
@@ -144,7 +146,7 @@ def _first(
 def _inertial(file: str, topics: Topics, findings: list[Finding] | None) -> ImuTable | None:
     """Samples of the first topic, with those of another where it has one half of them only."""
 
-    def known(one: _Found, place: slice, at: int) -> np.ndarray:
+    def known(one: _TopicMessages, place: slice, at: int) -> np.ndarray:
         """A quantity, forward-right-down; NaN where its covariance states that it is not known."""
         return np.where(one.values[:, at : at + 1] == -1.0, np.nan, one.values[:, place] * _FLU)
 
@@ -162,7 +164,9 @@ def _inertial(file: str, topics: Topics, findings: list[Finding] | None) -> ImuT
     return merged(first, other[1], findings) if other else first
 
 
-def _fixes(file: str, gnss: _Found, topics: Topics, findings: list[Finding] | None) -> GnssTable:
+def _fixes(
+    file: str, gnss: _TopicMessages, topics: Topics, findings: list[Finding] | None
+) -> GnssTable:
     status = gnss.values[:, _STATUS]
     lost = status < 0
     variance = gnss.values[:, _VARIANCE][:, _NED]
@@ -186,7 +190,7 @@ def _fixes(file: str, gnss: _Found, topics: Topics, findings: list[Finding] | No
 
 
 def _velocities(
-    file: str, gnss: _Found, topics: Topics, findings: list[Finding] | None
+    file: str, gnss: _TopicMessages, topics: Topics, findings: list[Finding] | None
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Velocities of the fixes and their sigmas, where the receiver's driver wrote them."""
     for (name, topic), one in topics.items():
@@ -204,7 +208,7 @@ def _velocities(
             variance = one.values[row][:, _TWIST_VARIANCE][:, _NED]
             with np.errstate(invalid="ignore"):
                 sigma_v = np.where(same & (variance > 0.0), np.sqrt(variance), np.nan)
-        telling(findings, "note", "velocity_taken", file, value=topic)(
+        finding_reporter(findings, "note", "velocity_taken", file, value=topic)(
             f"velocities of {int(same.sum())} of {len(same)} fixes are those of {topic}, taken as "
             f"east, north, up: it has the frame_id and the stamps of {gnss.topic}."
         )

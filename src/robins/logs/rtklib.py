@@ -13,8 +13,8 @@ import re
 import numpy as np
 
 from robins.dataset import GnssTable
-from robins.logs.findings import Finding, LogError, refused, telling
-from robins.logs.text import Head, Layout, peek, read_columns
+from robins.logs.findings import Finding, LogError, finding_reporter, refused
+from robins.logs.text import Head, TextLayout, peek, read_columns
 from robins.logs.timebase import calendar_to_ns, stamps_to_ns, week_to_ns, weeks_of
 
 # What RTKLIB writes, with velocities or without; used where the header was stripped.
@@ -62,7 +62,7 @@ def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = N
     width = len(data[0][1].split("," if comma else None)) - texts
     names = names or (_WITH_VELOCITY if width >= len(_WITH_VELOCITY) else _POSITION)
     time_names = ("date", "time")[-texts:] if calendar else ("week", "time of week")
-    layout = Layout((*time_names, *names), "," if comma else None, tuple(range(texts)))
+    layout = TextLayout((*time_names, *names), "," if comma else None, tuple(range(texts)))
     columns = read_columns(path, layout, findings)
     if missing := [n for n in _NEEDED if n not in names]:
         raise refused(file, "header")(
@@ -81,13 +81,13 @@ def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = N
         v_n, sigma_v = vectors("vn", "ve", "vu", -1.0), vectors("sdvn", "sdve", "sdvu", 1.0)
         if not (v_n.any() or sigma_v.any()):
             v_n = sigma_v = None
-            telling(findings, "note", "no_velocity", file, value=0.0)(
+            finding_reporter(findings, "note", "no_velocity", file, value=0.0)(
                 "all velocities and their sigmas are zero, so RTKLIB did not solve for them; "
                 "they are left out. Heading will be found from the positions alone; set "
                 "out-outvel = on."
             )
     if any("/geodetic" in line for line in head.lines if line.startswith("%")):
-        telling(findings, "warning", "height_above_geoid", file, "header", "geodetic")(
+        finding_reporter(findings, "warning", "height_above_geoid", file, "header", "geodetic")(
             "heights are above the geoid, and robins takes them as above the WGS-84 "
             "ellipsoid. Differences of height stay right; gravity errs by 3e-6 m/s^2 per "
             "metre. Set out-height = ellipsoidal in RTKLIB."
@@ -112,10 +112,10 @@ def _header(head: Head) -> tuple[list[str], bool]:
     for number, line in enumerate(head.lines, start=1):
         if line.startswith("%"):
             fields = line[1:].replace(",", " ").split()
-            for mark, (what, mend) in _UNSUPPORTED.items():
+            for mark, (what, remedy) in _UNSUPPORTED.items():
                 if any(mark in field for field in fields) and "ns" in fields:
                     raise refused(head.file, f"line {number}")(
-                        what, f"set {mend} in RTKLIB and solve again"
+                        what, f"set {remedy} in RTKLIB and solve again"
                     )
             if fields[:1] in (["GPST"], ["UTC"]):
                 names = [field.split("(")[0] for field in fields[1:]]

@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
-from robins.logs.findings import Finding, LogError, refused, telling
+from robins.logs.findings import Finding, LogError, finding_reporter, refused
 from robins.logs.timebase import LIMIT_NS
 
 Table = ImuTable | GnssTable | Trajectory | MagTable | AttitudeTable
@@ -80,8 +80,8 @@ def checked(table: AnyTable) -> AnyTable:
         )
     if isinstance(table, GnssTable) and (table.v_n is None) != (table.sigma_v is None):
         lacking = "sigma_v" if table.sigma_v is None else "v_n"
-        mend = f"give {lacking} as well"
-        raise LogError(_name(table), "velocities and their sigmas belong together", mend)
+        remedy = f"give {lacking} as well"
+        raise LogError(_name(table), "velocities and their sigmas belong together", remedy)
     out = {"time_ns": _stamps(table)}
     n = len(out["time_ns"])
     for field, components in _FLOATS[type(table)].items():
@@ -125,11 +125,11 @@ def _stamps(table: Table) -> np.ndarray:
     return time_ns
 
 
-def _integers(table: Table, field: str, mend: str) -> np.ndarray:
+def _integers(table: Table, field: str, remedy: str) -> np.ndarray:
     array = np.asarray(getattr(table, field))
     if array.dtype.kind not in "iu" or array.ndim != 1:
         cause = f"is {array.dtype} of shape {array.shape}, not a row of integers"
-        raise refused(_name(table), field=field)(cause, mend)
+        raise refused(_name(table), field=field)(cause, remedy)
     return np.ascontiguousarray(array, np.int64)
 
 
@@ -173,7 +173,7 @@ def unit_quaternions(
         raise refused(file, where, f"length of {name}", float(length[k]))(
             f"is not of unit length, as in {count}", "are the columns scalar first: w, x, y, z?"
         )
-    telling(findings, "warning", "quaternion_length", file, where, float(length[k]))(
+    finding_reporter(findings, "warning", "quaternion_length", file, where, float(length[k]))(
         f"the quaternion {name} has length {length[k]:g}, not 1 ({count}). Such attitudes are "
         "taken as missing."
     )

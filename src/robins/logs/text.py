@@ -34,7 +34,7 @@ _NUMBER = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|in
 COMMENTS = ("#", "%")
 
 
-class Layout(NamedTuple):
+class TextLayout(NamedTuple):
     """Layout of the lines of a file.
 
     Columns at the places `texts`, at least one, are kept as text (time stamps are read from their
@@ -112,7 +112,7 @@ def peek(path: str | os.PathLike[str]) -> Head:
 
 
 def read_columns(
-    path: str | os.PathLike[str], layout: Layout, findings: list[Finding] | None = None
+    path: str | os.PathLike[str], layout: TextLayout, findings: list[Finding] | None = None
 ) -> Columns:
     """Read all lines of a file.
 
@@ -126,7 +126,7 @@ def read_columns(
     """
     file = str(path)
     width, cut_first = _width(peek(path), layout)
-    reader = _Reader(file, layout, width)
+    reader = _BlockReader(file, layout, width)
     source = Source(path)
     parts, line, ends_early = [], 1, ""
     for block, whole in _blocks_of_lines(file, source):
@@ -191,7 +191,7 @@ def _split(data: bytes, line: int) -> tuple[bytes, bytes]:
     return data[:at], data[at:]
 
 
-def _width(head: Head, layout: Layout) -> tuple[int, tuple[int, str] | None]:
+def _width(head: Head, layout: TextLayout) -> tuple[int, tuple[int, str] | None]:
     """Fields a line, and the first line if it is shorter than the second."""
     data = [d for d in head.data(layout.skip + 3) if d[0] > layout.skip]
     if not data:
@@ -213,10 +213,10 @@ def _fields(line: bytes, delimiter: str | None) -> list[bytes]:
     return line.split(delimiter.encode() if delimiter else None)
 
 
-class _Reader:
+class _BlockReader:
     """Turns blocks of whole lines into arrays."""
 
-    def __init__(self, file: str, layout: Layout, width: int):
+    def __init__(self, file: str, layout: TextLayout, width: int):
         self.file, self.layout, self.width = file, layout, width
         numbers = range(width) if layout.numbers is None else layout.numbers
         self.kinds = [

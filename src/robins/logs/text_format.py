@@ -146,7 +146,7 @@ class TextFormat:
     skip: int = 0  # lines before the header, or before the rows where there is none
     body: str = "FRD"  # ways of the axes x, y, z; other than FRD and RFU are turned to FRD
     nav: str = "NED"  # or ENU, to which attitudes turn
-    says_frames: bool = False  # a comment "frames: ENU RFU" says so, and is written
+    states_frames: bool = False  # a comment "frames: ENU RFU" says so, and is written
     commented: bool = False  # the header is written as a comment
     choice: bool = False  # a file has one whole set of these columns, or more
     whole: bool = False  # its readers know no missing components
@@ -228,7 +228,7 @@ class TextFormat:
         return [row for row in numbers if not any(map(math.isnan, row))]
 
 
-class Found(NamedTuple):
+class FoundColumn(NamedTuple):
     """A column in a file."""
 
     column: Column
@@ -242,22 +242,22 @@ class Found(NamedTuple):
         return "{unit" in self.column.name
 
 
-class Header(NamedTuple):
+class ColumnHeader(NamedTuple):
     """The line that names the columns, or what stands for it."""
 
     line: int  # its number, or that of the last line before the rows
     names: list[str]  # of the columns
-    found: list[Found]
+    found: list[FoundColumn]
     all_named: bool = False  # a comment need not name every column
 
 
-def header_by_name(format: TextFormat, head: Head) -> Header:
+def header_by_name(format: TextFormat, head: Head) -> ColumnHeader:
     """The line that names most columns: the first that is no comment, or one near the beginning.
 
     What a program writes above its header, such as the device and its settings, is passed over.
     """
     if head.names:
-        return Header(0, list(head.names), _found(format, list(head.names)), all_named=True)
+        return ColumnHeader(0, list(head.names), _found(format, list(head.names)), all_named=True)
     data = [(k, text) for k, text in head.data(format.skip + _ABOVE) if k > format.skip]
     first = data[0][0] if data else len(head.lines)
     named = {first, *(k for k, text in data if _LETTER.search(text))}
@@ -270,32 +270,32 @@ def header_by_name(format: TextFormat, head: Head) -> Header:
     return max(candidates, key=lambda header: len(header.found))
 
 
-def header_of(format: TextFormat, head: Head) -> Header:
+def header_of(format: TextFormat, head: Head) -> ColumnHeader:
     """The columns of a format in a file; those of a header that is a comment may do without it."""
     if format.named:
         header = header_by_name(format, head)
         if header.found or not format.commented:
             return header
     places = [
-        Found(column, (column.place or k) - 1, column.names[0], column.unit)
+        FoundColumn(column, (column.place or k) - 1, column.names[0], column.unit)
         for k, column in enumerate(format.columns, start=1)
         if column.value is None
     ]
     names = [f"column {k}" for k in range(1, 2 + max(f.place for f in places))]
     for f in places:
         names[f.place] = f.name
-    return Header(format.skip, names, places)
+    return ColumnHeader(format.skip, names, places)
 
 
-def _header(format: TextFormat, line: int, text: str, all_named: bool) -> Header:
+def _header(format: TextFormat, line: int, text: str, all_named: bool) -> ColumnHeader:
     stripped = (
         text.strip().lstrip("".join(COMMENTS)) if text.lstrip().startswith(COMMENTS) else text
     )
     names = [name.strip().strip('"') for name in stripped.split(format.delimiter)]
-    return Header(line, names, _found(format, names), all_named)
+    return ColumnHeader(line, names, _found(format, names), all_named)
 
 
-def _found(format: TextFormat, names: list[str]) -> list[Found]:
+def _found(format: TextFormat, names: list[str]) -> list[FoundColumn]:
     found = []
     for place, name in enumerate(names):
         plain = name.replace("µ", "u").replace("μ", "u")
@@ -304,7 +304,7 @@ def _found(format: TextFormat, names: list[str]) -> list[Found]:
             if symbol is None and place == 0 and ANY in column.name.split(" | "):
                 symbol = column.unit
             if symbol is not None:
-                found.append(Found(column, place, name, symbol))
+                found.append(FoundColumn(column, place, name, symbol))
     return found
 
 
@@ -331,14 +331,14 @@ def whole_sets(
     return used, lacking
 
 
-def columns_of(format: TextFormat, file: str, header: Header) -> dict[str, Found]:
+def columns_of(format: TextFormat, file: str, header: ColumnHeader) -> dict[str, FoundColumn]:
     """Quantity -> the column that holds it.
 
     Raises:
         LogError: columns are missing, two hold the same, or a unit is none.
     """
     at = partial(refused, file, f"line {header.line}")
-    out: dict[str, Found] = {}
+    out: dict[str, FoundColumn] = {}
     for f in header.found:
         if (other := out.get(f.column.holds)) is not None:
             raise at()(f"{other.name} and {f.name} are the same thing", "keep one")
@@ -352,12 +352,12 @@ def columns_of(format: TextFormat, file: str, header: Header) -> dict[str, Found
             for c in format.columns
             if c.holds in lacking
         )
-        mend = "name the columns so, with their units"
+        remedy = "name the columns so, with their units"
         if format.source:
             between = next((s for s in ";\t|," if s in header.names[0]), "")
-            mend = f"state separator = {between!r}" if between else "state the names that it has"
-            mend += f" in {format.source}"
-        raise at()(f"the header lacks {wanted}; it has {', '.join(header.names)}", mend)
+            remedy = f"state separator = {between!r}" if between else "state the names that it has"
+            remedy += f" in {format.source}"
+        raise at()(f"the header lacks {wanted}; it has {', '.join(header.names)}", remedy)
     out = {q: f for q, f in out.items() if q in used}
     for quantity, f in out.items():
         try:
@@ -385,16 +385,16 @@ def _check_column(column: Column, source: str) -> None:
         except UnitError as error:
             raise at(where, "unit", symbol)(str(error), "state one of these") from error
         if clock and plain not in CLOCKS:
-            mend = f"record it in one of {', '.join(CLOCKS)}"
-            raise at(where, "unit", symbol)("is no unit of time stamps", mend)
+            remedy = f"record it in one of {', '.join(CLOCKS)}"
+            raise at(where, "unit", symbol)("is no unit of time stamps", remedy)
     numbers = (column.offset, 0.0 if column.value is None else column.value)
     if not all(map(math.isfinite, numbers)):
         raise at(where)("has an offset or value that is not finite", "give a number")
     if column.value is not None and (clock or quantity == "week"):
         raise at(where, "value", column.value)("is not for time", "state rate, such as 100 Hz")
     if not (math.isfinite(column.scale) and column.scale):
-        mend = "give a number other than 0, such as -1"
-        raise at(where, "scale", column.scale)("cannot scale anything", mend)
+        remedy = "give a number other than 0, such as -1"
+        raise at(where, "scale", column.scale)("cannot scale anything", remedy)
     if quantity == "week" and (column.scale, column.offset) != (1.0, 0.0):
         raise at(where)("is scaled or offset", "state weeks since 1980 as they are")
     if clock and column.scale < 0.0:
@@ -415,29 +415,29 @@ def _check(format: TextFormat) -> None:
         between = f"is not between {RATES_HZ[0]:g} and {RATES_HZ[1]:g} Hz"
         raise at("", "rate", format.rate_hz)(between, "give rows a second, such as 100 Hz")
     if len({"time", "time_of_week"} & format.quantities) != (0 if format.rate_hz else 1):
-        mend = "state one column as time, or a rate of the rows"
-        raise at("columns")("there is no time, or there are two", mend)
+        remedy = "state one column as time, or a rate of the rows"
+        raise at("columns")("there is no time, or there are two", remedy)
     if "week" in format.quantities and "time" in format.quantities:
         raise at("columns.week")("needs the second of that week", "state time_of_week")
     kinds = format.kinds
     if not kinds or (len(kinds) > 1 and "imu" not in kinds):
         what = f"make {' and '.join(kinds)} alone" if kinds else "make no table"
-        mend = f"state all columns of a table: {'; '.join(map(_needs, TABLES))}"
-        raise at("columns")(f"{what}, where several need an IMU" if kinds else what, mend)
+        remedy = f"state all columns of a table: {'; '.join(map(_needs, TABLES))}"
+        raise at("columns")(f"{what}, where several need an IMU" if kinds else what, remedy)
     used, lacking = whole_sets(kinds, set(QUANTITIES), format.quantities)
     if lacking:
-        told = ", ".join(q for q in QUANTITIES if q in lacking)
-        mend = f"state the columns that hold them: {'; '.join(map(_needs, kinds))}"
-        raise at("columns")(f"without {told} a table is not whole", mend)
+        listed = ", ".join(q for q in QUANTITIES if q in lacking)
+        remedy = f"state the columns that hold them: {'; '.join(map(_needs, kinds))}"
+        raise at("columns")(f"without {listed} a table is not whole", remedy)
     if not format.choice and (idle := format.quantities - used):
-        told = ", ".join(q for q in QUANTITIES if q in idle)
-        raise at("columns")(f"{told} have no use in {' and '.join(kinds)}", "leave them out")
+        listed = ", ".join(q for q in QUANTITIES if q in idle)
+        raise at("columns")(f"{listed} have no use in {' and '.join(kinds)}", "leave them out")
     if format.decimal not in (".", ",") or format.decimal == format.separator:
-        mend = 'give "," with another separator, such as ";"'
-        raise at("", "decimal", format.decimal)("cannot be the sign of decimals", mend)
+        remedy = 'give "," with another separator, such as ";"'
+        raise at("", "decimal", format.decimal)("cannot be the sign of decimals", remedy)
     if len(format.separator) != 1 or format.separator.isalnum() or format.separator in '+-."#%':
-        mend = 'give one character, such as "," ";" "\\t" or " "'
-        raise at("", "separator", format.separator)("cannot separate numbers", mend)
+        remedy = 'give one character, such as "," ";" "\\t" or " "'
+        raise at("", "separator", format.separator)("cannot separate numbers", remedy)
     try:
         Axes.of(format.body)
     except ValueError as error:
@@ -446,8 +446,8 @@ def _check(format: TextFormat) -> None:
         raise at("", "nav", format.nav)("is neither NED nor ENU", "choose one")
     turned = groups_of(format.quantities) & {"euler", "quaternion"}
     if turned and not format.local and (format.nav, format.body) not in PAIRS:
-        mend = "use NED with FRD or ENU with RFU where there are attitudes"
-        raise at("", "body", format.body)(f"does not go with nav {format.nav}", mend)
+        remedy = "use NED with FRD or ENU with RFU where there are attitudes"
+        raise at("", "body", format.body)(f"does not go with nav {format.nav}", remedy)
 
 
 def one_of(name: str, allowed: Iterable[str]) -> str:

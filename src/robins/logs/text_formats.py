@@ -237,7 +237,7 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
     _format(
         "named-imu",
         "anyone: CSV with units in its header; rates, or increments since the line before",
-        says_frames=True,
+        states_frames=True,
         choice=True,
     )(
         _NAMED,
@@ -249,7 +249,7 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
     _format(
         "named-path",
         "anyone: CSV with units in its header; with angles or quaternions, maybe turn rates",
-        says_frames=True,
+        states_frames=True,
         choice=True,
     )(
         _NAMED,

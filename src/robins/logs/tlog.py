@@ -23,12 +23,19 @@ import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.gps_time import dated, gps_of
-from robins.logs.findings import Finding, LogError, above_geoid, breaks_off, left_out, telling
+from robins.logs.findings import (
+    Finding,
+    LogError,
+    finding_reporter,
+    report_cut_end,
+    report_geoid_heights,
+    report_left_out,
+)
 from robins.logs.fix_kinds import MAVLINK, fixes, over_ground
 from robins.logs.merging import gps_clock
-from robins.logs.opening import Bytes, mapped
+from robins.logs.opening import Bytes, map_file
 from robins.logs.text import Head
-from robins.logs.ulog import Topic, column, stamps, triad
+from robins.logs.ulog import UlogTopic, column, stamps, triad
 from robins.units import to_si
 
 _STAMP = struct.Struct(">Q")  # microseconds of UTC at which the ground station received it
@@ -59,7 +66,7 @@ def read_tlog(path: str | os.PathLike[str], findings: list[Finding] | None = Non
         LogError: pymavlink is not installed, or there are no inertial samples.
     """
     file = str(path)
-    topics = _topics(file, mapped(path, findings), findings)
+    topics = _topics(file, map_file(path, findings), findings)
     number = next((k for k in _INERTIAL if k in topics), None)
     if number is None:
         cause = f"has no messages {', '.join(_INERTIAL.values())}"
@@ -98,17 +105,17 @@ def _frames(
             stray += at
             continue
         if at + size > end:
-            breaks_off(findings, file, at)
+            report_cut_end(findings, file, at)
             break
         frame = data[at + 8 : at + size]
         number = frame[5] if first == _ONE else int.from_bytes(frame[7:10], "little")
         if number == _GPS or number in _INERTIAL:
             yield at, number, frame
         at += size
-    left_out(findings, file, stray, "bytes belong to no message")
+    report_left_out(findings, file, stray, "bytes belong to no message")
 
 
-def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[int, Topic]:
+def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[int, UlogTopic]:
     """Messages of the first vehicle with inertial samples, by their number.
 
     Raises:
@@ -132,18 +139,18 @@ def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[int,
         unit = one.id if number == 105 else 0  # of several on one vehicle
         sender = senders.setdefault((one.get_srcSystem(), one.get_srcComponent(), unit), {})
         sender.setdefault(number, []).append([at, stamp, *(getattr(one, x) for x in names)])
-    left_out(findings, file, wrong, "messages have a wrong checksum")
+    report_left_out(findings, file, wrong, "messages have a wrong checksum")
     if len(senders) > 1:
-        telling(findings, "note", "several_instances", file, value=len(senders))(
+        finding_reporter(findings, "note", "several_instances", file, value=len(senders))(
             f"{len(senders)} vehicles, components or units sent samples; the first is read."
         )
     first = next((s for s in senders.values() if s.keys() - {_GPS}), {})
-    topics: dict[int, Topic] = {}
+    topics: dict[int, UlogTopic] = {}
     for number, rows in first.items():
         names = ("at", "timestamp", *(_FIX if number == _GPS else _SENSORS))
         fields = {name: np.array([row[k] for row in rows]) for k, name in enumerate(names)}
         fields["timestamp"] = fields["timestamp"].astype(np.uint64)
-        topics[number] = Topic(_INERTIAL.get(number, "GPS_RAW_INT"), fields)
+        topics[number] = UlogTopic(_INERTIAL.get(number, "GPS_RAW_INT"), fields)
     return topics
 
 
@@ -151,18 +158,18 @@ def _dated(time_ns: np.ndarray) -> bool:
     return dated(int(time_ns[-1]))
 
 
-def _stamps(file: str, topic: Topic) -> np.ndarray:
+def _stamps(file: str, topic: UlogTopic) -> np.ndarray:
     """GPS time where the vehicle knows UTC, else time since power-up [ns]."""
     time_ns = stamps(file, topic)
     return gps_of(time_ns) if _dated(time_ns) else time_ns
 
 
-def _fixes(file: str, gps: Topic, findings: list[Finding] | None) -> GnssTable:
+def _fixes(file: str, gps: UlogTopic, findings: list[Finding] | None) -> GnssTable:
     fix, lat, lon, msl, ellipsoid, h_acc, v_acc, vel_acc, vel, cog = (
         column(file, gps, name) for name in _FIX
     )
     if not ellipsoid.any():  # MAVLink 1 does not have it
-        above_geoid(findings, file, "Set the telemetry to MAVLink 2.")
+        report_geoid_heights(findings, file, "Set the telemetry to MAVLink 2.")
         ellipsoid = msl
     speed, course = (np.where(x < 65535.0, x * 1e-2, np.nan) for x in (vel, cog))
     return fixes(

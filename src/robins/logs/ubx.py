@@ -22,11 +22,18 @@ import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable
 from robins.gps_time import gps_of
-from robins.logs.findings import Finding, LogError, breaks_off, left_out, telling, undated
+from robins.logs.findings import (
+    Finding,
+    LogError,
+    finding_reporter,
+    report_cut_end,
+    report_left_out,
+    report_undated,
+)
 from robins.logs.fix_kinds import fixes
 from robins.logs.merging import gps_clock, merged
 from robins.logs.nmea import fixes_of
-from robins.logs.opening import Bytes, beginning, foreign, mapped
+from robins.logs.opening import Bytes, foreign, map_file, read_beginning
 from robins.logs.tables import Table
 from robins.logs.text import Head
 from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS
@@ -62,7 +69,7 @@ def is_ubx(head: Head) -> bool:
         return True
     if foreign(head.start) and not head.start.startswith(_RTCM):
         return False
-    start = beginning(head.file, _FAR)
+    start = read_beginning(head.file, _FAR)
     places = (at.start() for at in re.finditer(re.escape(_SYNC), start))
     return any(start[at + 2 : at + 3] != b"\0" and _end(start, at) for at in places)
 
@@ -83,10 +90,10 @@ def read_ubx(
         LogError: the file holds neither.
     """
     file = str(path)
-    data = mapped(path, findings)
+    data = map_file(path, findings)
     frames = _frames(file, data, findings)
     if frames[_RAW]:
-        telling(findings, "note", "other_kinds", file, value=len(frames[_RAW]))(
+        finding_reporter(findings, "note", "other_kinds", file, value=len(frames[_RAW]))(
             f"{len(frames[_RAW])} messages ESF-RAW are left out; switch on ESF-MEAS for samples."
         )
     measured = [place for place in frames[_MEAS] if place[1] >= _TAG.size]
@@ -127,9 +134,9 @@ def _frames(file: str, data: Bytes, findings: list[Finding] | None) -> Frames:
         else:
             wrong += 1
         at = data.find(_SYNC, at + 2)
-    left_out(findings, file, wrong, "messages have a wrong length or checksum")
+    report_left_out(findings, file, wrong, "messages have a wrong length or checksum")
     if open_at >= 0:
-        breaks_off(findings, file, open_at)
+        report_cut_end(findings, file, open_at)
     return found
 
 
@@ -162,7 +169,7 @@ def _fixes(
     pvt, at = _rows(data, frames[_PVT], _NAV_PVT)
     dated = ((pvt["valid"] & _DATED) == _DATED) & (pvt["tow"] < WEEK_NS // 1_000_000)
     dated &= (pvt["year"] >= 1980) & (pvt["year"] < 2100) & (pvt["month"] - 1 < 12)
-    undated(findings, file, int((~dated).sum()), "messages NAV-PVT")
+    report_undated(findings, file, int((~dated).sum()), "messages NAV-PVT")
     pvt, at = pvt[dated], at[dated]
     day = [f"{y:04d}-{m:02d}" for y, m in zip(pvt["year"], pvt["month"], strict=True)]
     days = np.array(day, "datetime64[M]").astype("datetime64[D]").astype(np.int64) + pvt["day"] - 1

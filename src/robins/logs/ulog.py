@@ -25,9 +25,9 @@ import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.foreign import decoding
-from robins.logs.findings import Finding, LogError, damaged, refused, report, telling
+from robins.logs.findings import Finding, LogError, damaged, finding_reporter, refused, report
 from robins.logs.fix_kinds import PX4
-from robins.logs.opening import whole
+from robins.logs.opening import read_whole
 from robins.logs.timebase import LIMIT_NS
 from robins.units import to_si
 
@@ -49,7 +49,7 @@ _EARLY = (
 )
 
 
-class Topic(NamedTuple):
+class UlogTopic(NamedTuple):
     """Fields logged of one topic."""
 
     name: str
@@ -67,7 +67,7 @@ def read_ulog(path: str | os.PathLike[str], findings: list[Finding] | None = Non
         LogError: pyulog is not installed; the log is damaged, or holds no inertial samples.
     """
     file = str(path)
-    data, cut = whole(path, _LARGEST)
+    data, cut = read_whole(path, _LARGEST)
     if not data.startswith(MAGIC):
         raise refused(file, "byte 0")("is no ULog", "leave the format to be recognised")
     sound = _sound(data)
@@ -157,32 +157,34 @@ def _decode(file: str, data: bytes) -> Any:
             "is a PX4 ULog, and the package that reads it is not installed",
             "install it with: pip install 'robins[logs]'",
         ) from error
-    told = io.StringIO()
+    printed = io.StringIO()
     # it prints what it doubts
-    with decoding(damaged(file)), contextlib.redirect_stdout(told):
+    with decoding(damaged(file)), contextlib.redirect_stdout(printed):
         log = ULog(io.BytesIO(data), [*_IMU, *_MAG, *_GNSS], disable_str_exceptions=False)
     if log.file_corruption:
-        raise damaged(file)(" ".join(told.getvalue().split()) or "messages contradict each other")
+        raise damaged(file)(
+            " ".join(printed.getvalue().split()) or "messages contradict each other"
+        )
     return log
 
 
 def _first(
     file: str, log: Any, topics: tuple[str, ...], findings: list[Finding] | None
-) -> Topic | None:
+) -> UlogTopic | None:
     """The first instance of the first of these topics that was logged."""
     for name in topics:
         found = sorted((d for d in log.data_list if d.name == name), key=lambda d: d.multi_id)
         if len(found) > 1:
-            telling(findings, "note", "several_instances", file, value=len(found))(
+            finding_reporter(findings, "note", "several_instances", file, value=len(found))(
                 f"{name} was logged of {len(found)} sensors; the first, number "
                 f"{found[0].multi_id}, is read and the others are left alone."
             )
         if found:
-            return Topic(name, dict(found[0].data))
+            return UlogTopic(name, dict(found[0].data))
     return None
 
 
-def column(file: str, topic: Topic, name: str) -> np.ndarray:
+def column(file: str, topic: UlogTopic, name: str) -> np.ndarray:
     """Numbers of a field.
 
     Raises:
@@ -200,12 +202,12 @@ def column(file: str, topic: Topic, name: str) -> np.ndarray:
     )
 
 
-def triad(file: str, topic: Topic, pattern: str, parts: str) -> np.ndarray:
+def triad(file: str, topic: UlogTopic, pattern: str, parts: str) -> np.ndarray:
     """Three fields, (n, 3)."""
     return np.stack([column(file, topic, pattern.format(part)) for part in parts], axis=-1)
 
 
-def stamps(file: str, topic: Topic) -> np.ndarray:
+def stamps(file: str, topic: UlogTopic) -> np.ndarray:
     """When it was measured, or else logged [ns]."""
     sample = topic.fields.get("timestamp_sample")
     stamps = topic.fields.get("timestamp") if sample is None or not np.all(sample) else sample
@@ -216,13 +218,13 @@ def stamps(file: str, topic: Topic) -> np.ndarray:
     return stamps.astype(np.int64) * 1000
 
 
-def _field(file: str, topic: Topic) -> MagTable:
+def _field(file: str, topic: UlogTopic) -> MagTable:
     pattern, parts = ("{}", "xyz") if topic.name == "sensor_mag" else ("magnetometer_ga[{}]", "012")
     field_t = to_si(triad(file, topic, pattern, parts), "G")
     return MagTable(stamps(file, topic), field_t, source=file)
 
 
-def _fixes(file: str, topic: Topic) -> GnssTable:
+def _fixes(file: str, topic: UlogTopic) -> GnssTable:
     """Older versions log integers of 1e-7 deg and mm, newer ones degrees and metres."""
 
     def either(new: str, old: str, scale: float) -> np.ndarray:

@@ -15,9 +15,9 @@ import numpy as np
 from robins import rotation
 from robins.dataset import GnssTable, ImuTable
 from robins.logs.checks_motion import in_body, small_offset
-from robins.logs.gnss_motion import lateness, track_of
-from robins.logs.motion_models import Verdict, judge
-from robins.logs.quiet import Signal, signal_of, windows_of
+from robins.logs.gnss_motion import track_of, velocity_delay
+from robins.logs.motion_models import ModelChoice, judge
+from robins.logs.quiet import ImuSignal, signal_of, windows_of
 
 _STRAIGHT = 0.85  # mean of the directions of travel, below which there is no forward
 _LEAST = 20  # directions of travel
@@ -26,7 +26,7 @@ _RESTS = 5  # pairs of seconds at rest, for the noise
 _LATE_S = 0.03
 
 
-class Found(NamedTuple):
+class UnitProperties(NamedTuple):
     """Properties found in a log; None where it does not show them."""
 
     orientation_deg: tuple[float, float, float] | None = None  # roll, pitch, yaw of the mounting
@@ -37,7 +37,7 @@ class Found(NamedTuple):
     left: tuple[float, float] | None = None  # unexplained share of the motion, before and with it
 
 
-def find_unit(imu: ImuTable, gnss: GnssTable | None) -> Found:
+def find_unit(imu: ImuTable, gnss: GnssTable | None) -> UnitProperties:
     """Mounting, latency, velocity window and noise, as far as a log tells them.
 
     Args:
@@ -46,14 +46,14 @@ def find_unit(imu: ImuTable, gnss: GnssTable | None) -> Found:
     """
     signal, track = signal_of(imu), None if gnss is None else track_of(gnss)
     if signal is None:
-        return Found()
+        return UnitProperties()
     if gnss is None or track is None or track.v_n is None:
-        return Found(**_noise(imu, None, None))
+        return UnitProperties(**_noise(imu, None, None))
     epoch = float(np.median(np.diff(track.time_s)))
     verdict = judge(imu, gnss, signal, track)
     if verdict is None:
-        return Found(**_noise(imu, gnss, None))
-    late, lag = lateness(track), small_offset(verdict)
+        return UnitProperties(**_noise(imu, gnss, None))
+    late, lag = velocity_delay(track), small_offset(verdict)
     window = 2.0 * late if late is not None and late > _LATE_S else None
     if window is not None and abs(window - epoch) < 0.4 * epoch:
         window = epoch
@@ -66,7 +66,7 @@ def find_unit(imu: ImuTable, gnss: GnssTable | None) -> Found:
         plain = verdict if late is None else judge(imu, gnss, signal, track, late_s=0.0)
         if plain is not None:
             left = plain.nothing.left(plain.views), verdict.fit.left(verdict.views)
-    return Found(
+    return UnitProperties(
         orientation_deg=orientation,
         latency_s=None if lag is None else -lag,
         velocity_window_s=window,
@@ -76,7 +76,7 @@ def find_unit(imu: ImuTable, gnss: GnssTable | None) -> Found:
 
 
 def _orientation(
-    signal: Signal, verdict: Verdict
+    signal: ImuSignal, verdict: ModelChoice
 ) -> tuple[tuple[float, float, float] | None, np.ndarray | None]:
     """Roll, pitch, yaw [deg] of the vehicle seen from the sensor, and C_bs."""
     v_b = in_body(verdict)
@@ -126,7 +126,7 @@ def _noise(imu: ImuTable, gnss: GnssTable | None, C_bs: np.ndarray | None) -> di
     return out
 
 
-def toml_of(found: Found, log: str) -> str:
+def toml_of(found: UnitProperties, log: str) -> str:
     """A configuration of `robins replay` with what was found; the rest is the default.
 
     Args:

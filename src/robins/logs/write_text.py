@@ -59,7 +59,7 @@ def write_text(
     if format.whole:
         _refuse_missing(format, path, time_ns, columns, values)
     comments = []
-    if format.says_frames:
+    if format.states_frames:
         said = (getattr(tables[0], which, "") for which in ("nav", "body"))
         comments.append(f"# frames: {' '.join(filter(None, said))}")
     if origin is not None and format.local:
@@ -75,14 +75,14 @@ def _check(format: TextFormat, path: str | os.PathLike[str], table: Table) -> No
         cause = f"{format.name} holds {held}, not {words_of(kind)}"
         raise LogError(str(path), cause, "choose another format")
     if isinstance(table, ImuTable):
-        wanted, other, mend = {
+        wanted, other, remedy = {
             "rate": ("gyro_x", "increment", "integrate them first"),
             "increment": ("dtheta_x", "rate", "divide them by their dt first"),
         }[table.kind]
         if wanted not in format.quantities:
             cause = f"{format.name} wants {other}s, these are {table.kind}s"
-            raise LogError(str(path), cause, mend)
-    if format.says_frames:
+            raise LogError(str(path), cause, remedy)
+    if format.states_frames:
         if isinstance(table, Trajectory) and (table.nav, table.body) not in PAIRS:
             cause = f"frames {table.nav} and {table.body} do not belong together"
             raise LogError(str(path), cause, "convert the table first")

@@ -1,9 +1,9 @@
 """Equations on arrays of all runs: NumPy moves large ones, programs compute numbers.
 
 Between the loops of a function lie a few numbers of each run, which are a program of one round
-(`Written`), and long histories that are cut, joined and gathered (`moved`) or computed entry by
-entry. Programs are interpreted: nothing is compiled. What has no place in a program stays with JAX
-(`by_jax`).
+(`ArrayProgram`), and long histories that are cut, joined and gathered (`moving_step`) or computed
+entry by entry. Programs are interpreted: nothing is compiled. What has no place in a program stays
+with JAX (`by_jax`).
 
 Arrays are those of NumPy, with a leading axis of runs where they depend on the run; a key of random
 numbers is a whole number (`robins.program.kinds.numbers_of`).
@@ -20,12 +20,12 @@ import jax
 import numpy as np
 from jax.extend import core as jex
 
-from robins.program.kept import kept_rounds
+from robins.program.kept import cached_rounds
 from robins.program.kinds import array_of, kind_of, numbers_of
-from robins.program.lanes import Given, Rounds
+from robins.program.lanes import CompiledRounds, Given
 from robins.program.liveness import (
     Equation,
-    Touched,
+    StageMemory,
     Variable,
     bytes_of,
     bytes_of_jaxpr,
@@ -37,7 +37,7 @@ from robins.program.loops import ENTRYWISE, number_of
 from robins.program.nodes import Graph
 from robins.program.primitives.indexing import filling, gathered, scattered
 from robins.program.refusal import BuildError, ProgramError
-from robins.program.walk import RULES, Leaf, Program, Walk
+from robins.program.walk import RULES, JaxprWriter, Leaf, Program
 
 Values = dict[Variable, np.ndarray]
 
@@ -76,7 +76,7 @@ def made_by(equations: Sequence[Equation], wanted: Callable[[Variable], bool]) -
     return [v for e in equations for v in e.outvars if wanted(v)]
 
 
-class Written:
+class ArrayProgram:
     """Equations as a program of one round, for all runs; or for all entries of arrays.
 
     Attributes:
@@ -122,8 +122,8 @@ class Written:
                 return by_jax(self._equations, self.makes, self._batched)
             jaxpr = jaxpr_of(self._equations, self.takes, self.makes)
             parts = [jaxpr, self._entries, [known.get(v) for v in self.takes]]
-            program, engine, _ = kept_rounds(parts, lambda: self._program(known))
-            self._rounds = Rounds(program, 1, 0, len(program.inputs), engine=engine)
+            program, engine, _ = cached_rounds(parts, lambda: self._program(known))
+            self._rounds = CompiledRounds(program, 1, 0, len(program.inputs), engine=engine)
         except (ProgramError, BuildError) as error:
             self.refused = error
             return by_jax(self._equations, self.makes, self._batched)
@@ -131,7 +131,7 @@ class Written:
 
     def _program(self, known: Values) -> Program:
         """Write the program; known: indices and flags, which are the same in all calls."""
-        walk = Walk(Graph(), UNROLL)
+        walk = JaxprWriter(Graph(), UNROLL)
         shape = (lambda v: ()) if self._entries else (lambda v: v.aval.shape)
         nodes = [
             walk.constants(known[v]) if v in known else walk.taken(shape(v), v.aval.dtype)
@@ -182,7 +182,7 @@ def by_jax(
     return compute
 
 
-def moved(e: Equation, batched: Collection[Variable]) -> Compute:
+def moving_step(e: Equation, batched: Collection[Variable]) -> Compute:
     """An equation that moves or counts the entries of arrays, at places that all runs share."""
     name = e.primitive.name
     index = e.invars[1] if name in INDEXED else None
@@ -225,11 +225,11 @@ def _places(e: Equation, known: list[np.ndarray], data: list[Variable]) -> list[
         begin += size_of(v)
     if name in INDEXED:
         return [INDEXED[name](e, *known, *places)]
-    made = RULES[name](Walk(Graph()), e, *places)
+    made = RULES[name](JaxprWriter(Graph()), e, *places)
     return list(made) if isinstance(made, (list, tuple)) else [made]
 
 
-class Arrays:
+class ArraySteps:
     """Equations outside of loops, in an order of computation.
 
     Attributes:
@@ -246,23 +246,23 @@ class Arrays:
         self._most = 0
 
     @property
-    def touched(self) -> Touched:
+    def touched(self) -> StageMemory:
         """Variables in and out, and the bytes needed in between."""
         outside = sum(map(bytes_of, {*self.takes, *self.makes}))
-        return Touched(self.takes, self.makes, max(self._most - outside, 0))
+        return StageMemory(self.takes, self.makes, max(self._most - outside, 0))
 
     @property
     def refused(self) -> list[ProgramError | BuildError]:
         """Reasons why parts stay with JAX, once it was called."""
-        every = (step for _, _, step in self._steps if isinstance(step, Written))
+        every = (step for _, _, step in self._steps if isinstance(step, ArrayProgram))
         return [step.refused for step in every if step.refused is not None]
 
     def connect(self, batched: Collection[Variable], wanted: Callable[[Variable], bool]) -> None:
         """Find the variables in and out, and cut the equations into steps."""
         self.takes, self.makes = taken_by(self.equations), made_by(self.equations, wanted)
         self._most = bytes_of_jaxpr(jaxpr_of(self.equations, self.takes, self.makes))
-        self._steps = parted(self.equations, self.makes, batched)
-        touched = [Touched(takes, makes) for takes, makes, _ in self._steps]
+        self._steps = steps_of(self.equations, self.makes, batched)
+        touched = [StageMemory(takes, makes) for takes, makes, _ in self._steps]
         self._dropped = last_uses(touched, {*self.takes, *self.makes})
 
     def __call__(self, runs: int, values: Values) -> Values:
@@ -275,7 +275,7 @@ class Arrays:
         return {v: here[v] for v in self.makes}
 
 
-def parted(
+def steps_of(
     equations: Sequence[Equation], makes: list[Variable], batched: Collection[Variable]
 ) -> list[Step]:
     """Equations as steps: what is small at each level together, then what is large."""
@@ -291,13 +291,13 @@ def parted(
     groups = [
         group
         for k in sorted({*small, *large})
-        for group in ([small[k]] if k in small else []) + together(large.get(k, []))
+        for group in ([small[k]] if k in small else []) + grouped(large.get(k, []))
     ]
     needed = {*makes, *(v for group in groups for v in taken_by(group))}
     return [_step(group, made_by(group, needed.__contains__), batched) for group in groups]
 
 
-def together(equations: Sequence[Equation]) -> list[list[Equation]]:
+def grouped(equations: Sequence[Equation]) -> list[list[Equation]]:
     """Large equations: those that follow each other and go entry by entry are one group."""
     groups: list[list[Equation]] = []
     kinds: list[tuple[int, ...] | None] = []
@@ -311,7 +311,7 @@ def together(equations: Sequence[Equation]) -> list[list[Equation]]:
     return groups
 
 
-def is_moved(e: Equation, batched: Collection[Variable]) -> bool:
+def moves_entries(e: Equation, batched: Collection[Variable]) -> bool:
     """True for an equation that moves entries, to places that all runs share."""
     name = e.primitive.name
     if name in INDEXED:
@@ -322,7 +322,7 @@ def is_moved(e: Equation, batched: Collection[Variable]) -> bool:
 def is_large(e: Equation, batched: Collection[Variable]) -> bool:
     """True for an equation that is a step of its own: of large arrays, or none for a program."""
     name = e.primitive.name
-    if is_moved(e, batched) or name in ENTRYWISE:
+    if moves_entries(e, batched) or name in ENTRYWISE:
         return max(map(size_of, [*e.invars, *e.outvars])) > LARGE
     return name not in RULES or nodes_of(e) > MOST
 
@@ -356,10 +356,10 @@ def _each(value: Any) -> Sequence[Any]:
 def _step(equations: list[Equation], makes: list[Variable], batched: Collection[Variable]) -> Step:
     e = equations[0]
     large = is_large(e, batched)
-    if large and is_moved(e, batched):
-        return variables(e.invars), list(e.outvars), moved(e, batched)
+    if large and moves_entries(e, batched):
+        return variables(e.invars), list(e.outvars), moving_step(e, batched)
     entries = e.outvars[0].aval.shape if large and e.primitive.name in ENTRYWISE else ()
-    one = Written(equations, makes, batched, entries)
+    one = ArrayProgram(equations, makes, batched, entries)
     return one.takes, one.makes, one
 
 

@@ -13,8 +13,8 @@ from importlib.resources import files
 
 import numpy as np
 
-from robins.program.layout import IN_PLACE, Array, Layout, operands
-from robins.program.nodes import Loop, Node
+from robins.program.layout import IN_PLACE, Array, MemoryLayout, operands
+from robins.program.nodes import GraphLoop, Node
 from robins.program.operations import OPERATIONS
 from robins.program.precision import DOUBLE, Precision
 from robins.program.walk import Program
@@ -80,7 +80,7 @@ class _Writer:
         self.inner: dict[int, list[Node]] = defaultdict(list)
         for node in live:
             self.inner[self.graph.scope[node]].append(node)
-        self.layout = Layout(self.graph, live, self.roots)
+        self.layout = MemoryLayout(self.graph, live, self.roots)
         picks = [self.graph.args[n] for n in live if self.graph.op[n] == "pick"]
         # arrays that are picked from by any number
         self.addressed = {array for array, index in picks if not self.graph.is_round(index)}
@@ -176,7 +176,7 @@ class _Writer:
             case "item":
                 return f"b{graph.args[node][0]}[{graph.value[node]}]"
             case "after":
-                loop: Loop = graph.value[graph.args[node][0]]
+                loop: GraphLoop = graph.value[graph.args[node][0]]
                 k, row = graph.value[node]
                 if row is None:
                     return f"l{loop.scope}_{k}"
@@ -257,7 +257,7 @@ class _Writer:
         self.lines += [f"{pad}    {routine}({arguments});", f"{pad}}}"]
         self.names[node] = f"b{node}"
 
-    def _loop(self, loop: Loop, node: Node, depth: int) -> None:
+    def _loop(self, loop: GraphLoop, node: Node, depth: int) -> None:
         graph, pad, s = self.graph, "    " * depth, loop.scope
         self.names[node] = ""
         for k, n in enumerate(loop.begin):

@@ -55,7 +55,7 @@ def template_of(call: Call) -> Template | None:
     return steps, shaped
 
 
-def written(template: Template, graph: Graph, given: Sequence[Node]) -> list[Nodes]:
+def write_template(template: Template, graph: Graph, given: Sequence[Node]) -> list[Nodes]:
     """Results of a call with other arguments, written into a graph."""
     steps, outputs = template
     nodes = list(given)
@@ -100,7 +100,7 @@ def results_of(
     if found is not None and len(found) == 3:
         found = calls[key] = template_of(found)
     if found is not None:
-        return written(found, graph, given)
+        return write_template(found, graph, given)
     met, outputs = len(graph.met), write()
     if not is_known:
         made = [n for n in given if graph.op[n] not in SEEN_THROUGH]
@@ -109,7 +109,7 @@ def results_of(
     return outputs
 
 
-def forget(calls: Calls, graphs: Sequence[Graph]) -> None:
+def drop_templates(calls: Calls, graphs: Sequence[Graph]) -> None:
     """Drop the calls that hold other graphs than these."""
     for key, found in list(calls.items()):
         if found is not None and len(found) == 3 and all(found[0] is not g for g in graphs):

@@ -16,7 +16,7 @@ from jax.core import Tracer
 from robins.program.nodes import Graph
 from robins.program.primitives.control import size_of
 from robins.program.refusal import ProgramError
-from robins.program.walk import Walk
+from robins.program.walk import JaxprWriter
 
 Data = Any  # a pytree of arrays of numbers
 T = TypeVar("T")
@@ -39,7 +39,7 @@ def evaluated(function: Callable[..., T], *args: Data) -> T:
         return function(*args)
     try:
         jaxpr, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
-        walk = Walk(Graph())
+        walk = JaxprWriter(Graph())
         if size_of(jaxpr.jaxpr) > MOST:
             return function(*args)
         found = walk.closed(jaxpr, *[walk.constants(np.asarray(a)) for a in given])

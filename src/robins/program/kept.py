@@ -45,7 +45,7 @@ _BEGAN_S = time.time()  # about when the code of this process was read
 DAMAGED = OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error
 
 
-def kept(
+def cached_program(
     parts: Iterable[Any], write: Callable[[], Program], interpreter: Interpreter
 ) -> tuple[Program, Tape, int]:
     """A program, its tape, and how many nodes it has; from the cache or made.
@@ -75,17 +75,17 @@ def kept(
     return program, tape, nodes
 
 
-def kept_rounds(
+def cached_rounds(
     parts: Iterable[Any], write: Callable[[], Program]
 ) -> tuple[Program, RoundsEngine, int]:
-    """A program as `kept`, its rounds by the interpreter of many runs, and its number of nodes.
+    """Program as of `cached_program`, its rounds by the interpreter of many runs, node count.
 
     Raises:
         ProgramError: it cannot be made.
         BuildError: there is no interpreter.
     """
     interpreter = interpreter_of_many()
-    program, tape, nodes = kept(parts, write, interpreter)
+    program, tape, nodes = cached_program(parts, write, interpreter)
     return program, lambda _: interpreter.rounds(tape), nodes
 
 
@@ -122,7 +122,7 @@ def _read(path: Path) -> tuple[Program, Tape, int]:
     return program, tape, about["nodes"]
 
 
-def kept_by_name(
+def cached_by_name(
     what: str, key: Hashable, write: Callable[[], Program], interpreter: Interpreter
 ) -> tuple[Program, Tape]:
     """A program and its tape; from the cache if the key has a text (`names.by_name`), else made.
@@ -141,7 +141,7 @@ def kept_by_name(
     except LookupError:
         program = write()
         return program, interpreter.tape(program)
-    program, tape, _ = kept([what, text], write, interpreter)
+    program, tape, _ = cached_program([what, text], write, interpreter)
     return program, tape
 
 

@@ -62,7 +62,7 @@ def compiled_rounds(program: Program) -> tuple[Scan, int]:
     return library.robins_scan, library.robins_lanes()
 
 
-class Rounds:
+class CompiledRounds:
     """A program with rounds around it, called with arrays of all runs.
 
     Attributes:

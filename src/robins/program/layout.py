@@ -10,7 +10,7 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Sequence
 from itertools import accumulate, pairwise
 
-from robins.program.nodes import Graph, Loop, Node
+from robins.program.nodes import Graph, GraphLoop, Node
 
 # The prefix of its name and the rest ("b" and a block; "" and a name), or "input" and a kind; then
 # the scopes of loops whose rounds move the place of a number, each with the step of one round.
@@ -34,7 +34,7 @@ def operands(graph: Graph, block: Node) -> list[tuple[Node, ...]]:
     return [args[a:b] for a, b in pairwise(accumulate([0, *counts]))]
 
 
-class Layout:
+class MemoryLayout:
     """Arrays of the live nodes of a graph.
 
     Attributes:
@@ -62,7 +62,7 @@ class Layout:
                 self._lay_out(graph.value[node], kept[graph.value[node].scope])
         self._whole = {key: self._column[entry][0] for key, entry in whole.items()}
 
-    def _lay_out(self, loop: Loop, kept: set[int]) -> None:
+    def _lay_out(self, loop: GraphLoop, kept: set[int]) -> None:
         arrays = self.rows[loop.scope] = []
         for part, (begin, end) in enumerate(pairwise(accumulate([0, *loop.sizes]))):
             if entries := [k for k in range(begin, end) if k in kept]:

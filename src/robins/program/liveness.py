@@ -33,7 +33,7 @@ from robins.program.primitives.control import called
 KEY_BYTES = 8
 
 
-class Touched(NamedTuple):
+class StageMemory(NamedTuple):
     """Inputs and outputs of a stage, and the bytes that it needs for itself in addition."""
 
     takes: Sequence[Variable]
@@ -41,7 +41,7 @@ class Touched(NamedTuple):
     within: int = 0
 
 
-def last_uses(stages: Sequence[Touched], kept: Collection[Variable]) -> list[list[Variable]]:
+def last_uses(stages: Sequence[StageMemory], kept: Collection[Variable]) -> list[list[Variable]]:
     """Variables that nothing needs once a stage is done, by stage.
 
     Args:
@@ -59,7 +59,7 @@ def last_uses(stages: Sequence[Touched], kept: Collection[Variable]) -> list[lis
 
 
 def most_bytes(
-    stages: Sequence[Touched], given: Iterable[Variable], kept: Collection[Variable]
+    stages: Sequence[StageMemory], given: Iterable[Variable], kept: Collection[Variable]
 ) -> int:
     """The most bytes that all values take at once, if each is dropped after its last use.
 
@@ -83,13 +83,13 @@ def bytes_of_jaxpr(jaxpr: jex.Jaxpr) -> int:
     Rather too much: XLA makes one of several equations, and what they hand on is never in memory.
     """
 
-    def touched(e: Equation) -> Touched:
+    def touched(e: Equation) -> StageMemory:
         inner = called(e)
         if inner is None:
-            return Touched(e.invars, e.outvars)
+            return StageMemory(e.invars, e.outvars)
         there = {*variables(e.invars), *e.outvars}
         within = bytes_of_jaxpr(inner.jaxpr) - sum(map(bytes_of, there))
-        return Touched(e.invars, e.outvars, max(within, 0))
+        return StageMemory(e.invars, e.outvars, max(within, 0))
 
     given = [*jaxpr.invars, *jaxpr.constvars]
     return most_bytes([touched(e) for e in jaxpr.eqns], given, jaxpr.outvars)

@@ -36,7 +36,7 @@ from robins.program.liveness import Equation, Variable, jaxpr_of, variables
 from robins.program.nodes import Graph
 from robins.program.primitives.control import size_of
 from robins.program.primitives.random import bits_of, numbered
-from robins.program.walk import Leaf, Nodes, Program, Walk
+from robins.program.walk import JaxprWriter, Leaf, Nodes, Program
 
 ROUNDS = 200  # of a loop of rows that is worth it; a scan is from SHORTEST on
 SHORTEST = 30
@@ -66,7 +66,7 @@ Named = dict[Variable, Nodes]
 Along = tuple[int, bool]  # length of an axis, and whether equations go along it backwards
 
 
-def along(e: Equation) -> Along | None:
+def axis_of(e: Equation) -> Along | None:
     """The axis along which an equation goes, if it does and can be part of a loop."""
     name, p = e.primitive.name, e.params
     if name == "scan":
@@ -148,7 +148,7 @@ def makes_rows(e: Equation) -> list[Variable]:
     return e.outvars[e.params["num_carry"] :] if e.primitive.name == "scan" else e.outvars
 
 
-class Body:
+class LoopBody:
     """The body of a loop over some equations, ready to be made a program.
 
     Attributes:
@@ -216,7 +216,7 @@ class Body:
             ProgramError: an equation has no place in a program.
         """
         graph = Graph()
-        walk = Walk(graph, unroll, calls)
+        walk = JaxprWriter(graph, unroll, calls)
 
         def taken(shape: tuple[int, ...], dtype: Any) -> Nodes:
             return walk.taken(shape, dtype, zero=zeros.get(len(walk.inputs)))
@@ -247,7 +247,7 @@ class Body:
 
     def _scanned(
         self,
-        walk: Walk,
+        walk: JaxprWriter,
         e: Equation,
         now: list[Nodes],
         whole: dict[Variable, Nodes],
@@ -266,7 +266,7 @@ class Body:
 
     def _row(
         self,
-        walk: Walk,
+        walk: JaxprWriter,
         e: Equation,
         whole: dict[Variable, Nodes],
         rows: dict[Variable, Nodes],

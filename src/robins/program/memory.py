@@ -21,7 +21,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from robins.program.interpreter import interpreted_step, interpreter_of_one
-from robins.program.kept import kept_by_name, second_result
+from robins.program.kept import cached_by_name, second_result
 from robins.program.kinds import kind_of
 from robins.program.names import Tree
 from robins.program.native import Engine, Step
@@ -39,7 +39,7 @@ _FLOAT = np.dtype(float)
 _PYTHON = {float: _FLOAT, int: np.dtype(np.int64), bool: np.dtype(bool)}
 
 
-class Slot(NamedTuple):
+class MemorySlot(NamedTuple):
     """Place of an array in the memory of the reals, or in that of all else."""
 
     is_real: bool
@@ -54,7 +54,9 @@ class Slot(NamedTuple):
         return pool[self.first : self.last].reshape(self.shape)
 
 
-def slots(leaves: list[Leaf], counted: tuple[int, int] = (0, 0)) -> tuple[list[Slot], int, int]:
+def slots(
+    leaves: list[Leaf], counted: tuple[int, int] = (0, 0)
+) -> tuple[list[MemorySlot], int, int]:
     """The slots of arrays one after the other, and how many reals and others there are then.
 
     Args:
@@ -66,7 +68,7 @@ def slots(leaves: list[Leaf], counted: tuple[int, int] = (0, 0)) -> tuple[list[S
     for leaf in leaves:
         size, real = int(np.prod(leaf.shape)), leaf.kind == "real"
         at = reals if real else others
-        found.append(Slot(real, at, at + size, leaf.shape, np.dtype(leaf.dtype)))
+        found.append(MemorySlot(real, at, at + size, leaf.shape, np.dtype(leaf.dtype)))
         reals, others = (reals + size, others) if real else (reals, others + size)
     return found, reals, others
 
@@ -74,19 +76,21 @@ def slots(leaves: list[Leaf], counted: tuple[int, int] = (0, 0)) -> tuple[list[S
 class Reader:
     """Puts arrays together from where they lie in memory."""
 
-    def __init__(self, told: list[Slot], tree: Tree):
+    def __init__(self, result_slots: list[MemorySlot], tree: Tree):
         """Take slots, and the structure whose leaves they are."""
         self._tree = tree
-        self._blank = [None] * len(told)
+        self._blank = [None] * len(result_slots)
         self._arrays = [
             (k, slice(s.first, s.last), s.shape if len(s.shape) > 1 else None)
-            for k, s in enumerate(told)
+            for k, s in enumerate(result_slots)
             if s.is_real and s.shape
         ]
-        self._numbers = [(k, s.first) for k, s in enumerate(told) if s.is_real and not s.shape]
+        self._numbers = [
+            (k, s.first) for k, s in enumerate(result_slots) if s.is_real and not s.shape
+        ]
         self._others = [
             (k, slice(s.first, s.last) if s.shape else s.first, s.shape, s.dtype)
-            for k, s in enumerate(told)
+            for k, s in enumerate(result_slots)
             if not s.is_real
         ]
 
@@ -263,7 +267,7 @@ class NativeState:
         count, (program, result, step) = len(self._slots), made
         begin = self._reals, self._others
         given, *after = slots(program.inputs[count:], begin)
-        told, *end = slots(program.results[count:])
+        result_slots, *end = slots(program.results[count:])
         wanted = [max(a, b + e) for a, b, e in zip(after, begin, end, strict=True)]
         if wanted[0] > len(self._x) or wanted[1] > len(self._k):
             self._calls.clear()  # they point to the memory that was
@@ -279,7 +283,7 @@ class NativeState:
             (x, k, x, k),
             begin,
             (begin[0] + end[0], begin[1] + end[1]),
-            Reader(told, result),
+            Reader(result_slots, result),
         )
 
     def _made(self, key: Hashable, function: Function, args: tuple) -> Made:
@@ -294,7 +298,7 @@ class NativeState:
         write = partial(self._traced, function, args)
         if self._lasting and engine is interpreted_step:
             interpreter = interpreter_of_one()
-            program, tape = kept_by_name("step", (key, unroll), write, interpreter)
+            program, tape = cached_by_name("step", (key, unroll), write, interpreter)
             step = interpreter.steps(tape)
         else:
             program = write()

@@ -54,10 +54,10 @@ def compiler(language: Language = C) -> tuple[str, ...]:
     Raises:
         BuildError: there is none.
     """
-    if told := shlex.split(os.environ.get(language.variable, "")):
-        if shutil.which(told[0]) is None:
-            raise BuildError(f"there is no program '{told[0]}'", language.variable, NO_COMPILER)
-        return tuple(told)
+    if words := shlex.split(os.environ.get(language.variable, "")):
+        if shutil.which(words[0]) is None:
+            raise BuildError(f"there is no program '{words[0]}'", language.variable, NO_COMPILER)
+        return tuple(words)
     for name in language.names:
         if (found := shutil.which(name)) is not None:
             return (found,)
@@ -130,8 +130,8 @@ def build_once(text: str, flags: tuple[str, ...], language: Language) -> Path:
     return _compiled(library, compiler(language), text, flags, language)
 
 
-def _named(*told: str) -> Path:
-    name = hashlib.sha256("\0".join(told).encode()).hexdigest()[:24]
+def _named(*words: str) -> Path:
+    name = hashlib.sha256("\0".join(words).encode()).hexdigest()[:24]
     return cache_folder() / f"{name}.so"
 
 
@@ -148,8 +148,8 @@ def _compiled(
         line = [*command, *flags, *SHARED, str(source), "-o", str(made), "-lm"]
         done = subprocess.run(line, capture_output=True, text=True)
         if done.returncode:
-            said = "\n".join(done.stderr.strip().splitlines()[:5])
-            raise BuildError(f"the compiler does not accept a program: {said}", command[0])
+            output = "\n".join(done.stderr.strip().splitlines()[:5])
+            raise BuildError(f"the compiler does not accept a program: {output}", command[0])
         made.replace(library)  # of two processes that build the same, either's will do
     return library
 

@@ -5,7 +5,7 @@ order of nodes is an order of computation. Two equal nodes are one node. In addi
 operations there are
 
 - *blocks*: a routine on arrays, such as a QR; its arguments are gathered, its results are leaves;
-- *loops*: `Loop`; what depends on the leaves of a loop is computed inside it, all else before.
+- *loops*: `GraphLoop`; what depends on the leaves of a loop is computed inside it, all else before.
 
 Zeros are structural: a product with a known zero is zero, whatever the other factor is. A step
 looks at its inputs before it trusts a product, so an infinity is not lost by that.
@@ -30,7 +30,7 @@ _DOUBLE = struct.Struct("<d")
 
 
 @dataclass
-class Loop:
+class GraphLoop:
     """A loop: leaves that each round begins with, and what it leaves for the next.
 
     Attributes:
@@ -226,7 +226,7 @@ class Graph:
 
     # -------------------------------------------------------------------------------- loops
 
-    def open(self, begin: Sequence[Node], count: int | None) -> Loop:
+    def open(self, begin: Sequence[Node], count: int | None) -> GraphLoop:
         """A loop; what is made of its leaves from here on is computed inside it."""
         scope = len(self.within)
         self.within.append(max((self.scope[n] for n in begin), default=0))
@@ -234,9 +234,9 @@ class Graph:
             self.add("leaf", (), self.kind[n], (scope, k), scope=scope) for k, n in enumerate(begin)
         ]
         index = self.add("leaf", (), "whole", (scope, -1), scope=scope)
-        return Loop(scope, list(begin), leaves, index, count)
+        return GraphLoop(scope, list(begin), leaves, index, count)
 
-    def close(self, loop: Loop) -> tuple[list[Node], list[list[Node]]]:
+    def close(self, loop: GraphLoop) -> tuple[list[Node], list[list[Node]]]:
         """The leaves after the last round, and of each kept node its values in all rounds."""
         outside = [n for n in self._needed_by(loop) if self.scope[n] < loop.scope]
         args = list(dict.fromkeys([*loop.begin, *outside]))
@@ -255,7 +255,7 @@ class Graph:
         kept = [[of_round(k, n, i) for i in rounds] for k, n in enumerate(loop.kept)]
         return after, kept
 
-    def _needed_by(self, loop: Loop) -> list[Node]:
+    def _needed_by(self, loop: GraphLoop) -> list[Node]:
         """All nodes inside a loop that its roots need, and the nodes outside that these use."""
         seen: set[Node] = set()
         ahead = loop.roots

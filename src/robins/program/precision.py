@@ -53,12 +53,12 @@ class Precision(NamedTuple):
         return _WRITTEN.sub(self._in_single, double)
 
     def _in_single(self, found: re.Match[str]) -> str:
-        told = found[0]
-        if told.startswith("/*"):
-            return told
-        if told.startswith("FROM_C"):
-            return f"{told[:-1]}{self.suffix})"
-        return _OTHER.get(told) or self.number(told)
+        literal = found[0]
+        if literal.startswith("/*"):
+            return literal
+        if literal.startswith("FROM_C"):
+            return f"{literal[:-1]}{self.suffix})"
+        return _OTHER.get(literal) or self.number(literal)
 
 
 DOUBLE = Precision("double", "", np.float64, "sine.h")

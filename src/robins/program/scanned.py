@@ -13,9 +13,9 @@ import numpy as np
 
 from robins.errors import require
 from robins.program.interpreter import interpreter_of_one
-from robins.program.kept import kept_by_name, second_result
+from robins.program.kept import cached_by_name, second_result
 from robins.program.kinds import is_key
-from robins.program.lanes import KINDS, Rounds
+from robins.program.lanes import KINDS, CompiledRounds
 from robins.program.memory import LIVE_UNROLL, form
 from robins.program.names import Tree
 from robins.program.refusal import BuildError, ProgramError
@@ -61,13 +61,13 @@ def scan(body: Body, content: Hashable, carry: Data, rows: Data) -> tuple[Data, 
     if made is None:
         one = jax.tree_util.tree_unflatten(tree, first)
         write = partial(_written, body, one, count)
-        program, tape = kept_by_name("scan", key, write, interpreter)
+        program, tape = cached_by_name("scan", key, write, interpreter)
         made = _known[key] = program, tape, second_result(program, body, *one)
         if len(_known) > _MOST:
             _known.popitem(last=False)
     _known.move_to_end(key)
     program, tape, keeps = made
-    rounds = Rounds(program, length, count, 0, engine=lambda _: interpreter.rounds(tape))
+    rounds = CompiledRounds(program, length, count, 0, engine=lambda _: interpreter.rounds(tape))
     found = [a[0] for a in rounds(1, [(a, False) for a in arrays])]
     begun, _ = tree.children()
     return begun.unflatten(found[:count]), keeps.unflatten(found[count:])
@@ -109,7 +109,7 @@ def _by_jax(function: Body, bound: tuple, carry: Data, rows: Data) -> tuple[Data
     return jax.lax.scan(partial(function, *bound), carry, rows)
 
 
-def on_each(function: Callable[[Data], Data], rows: Data) -> Data:
+def mapped_rows(function: Callable[[Data], Data], rows: Data) -> Data:
     """Return ``jax.vmap(function)(rows)`` with numbers of NumPy, by `named_scan`."""
     return named_scan(partial(_alone, function), (), rows)[1]
 

@@ -45,7 +45,7 @@ from jaxtyping import PyTree
 from robins.program.arrays import (
     LARGE,
     UNROLL,
-    Arrays,
+    ArraySteps,
     Values,
     by_jax,
     jaxpr_of,
@@ -54,15 +54,22 @@ from robins.program.arrays import (
     taken_by,
 )
 from robins.program.interpreter import interpreted_rounds
-from robins.program.kept import kept_rounds
+from robins.program.kept import cached_rounds
 from robins.program.kinds import array_of, is_key, numbers_of
-from robins.program.lanes import Given, Rounds, RoundsEngine, compiled_rounds, zero_in_all
-from robins.program.liveness import Equation, Touched, Variable, last_uses, most_bytes, variables
+from robins.program.lanes import CompiledRounds, Given, RoundsEngine, compiled_rounds, zero_in_all
+from robins.program.liveness import (
+    Equation,
+    StageMemory,
+    Variable,
+    last_uses,
+    most_bytes,
+    variables,
+)
 from robins.program.loops import (
     SHORTEST,
     Along,
-    Body,
-    along,
+    LoopBody,
+    axis_of,
     makes_rows,
     number_of,
     operations,
@@ -84,7 +91,7 @@ CUMULATED = {
 }
 
 
-def flattened(function: Callable[..., PyTree], *shapes: PyTree) -> tuple[jex.ClosedJaxpr, Tree]:
+def as_jaxpr(function: Callable[..., PyTree], *shapes: PyTree) -> tuple[jex.ClosedJaxpr, Tree]:
     """A function of these shapes as one jaxpr, and the structure of its results.
 
     All calls are written out, and sums along the first axis are scans; variables occur once.
@@ -105,7 +112,7 @@ def flattened(function: Callable[..., PyTree], *shapes: PyTree) -> tuple[jex.Clo
 
         for e in jaxpr.eqns:
             given = list(map(read, e.invars))
-            inner = called(e) or cumulated(e) or written_out(e)
+            inner = called(e) or cumulative_scan(e) or unrolled_scan(e)
             if inner is not None:
                 found = write(inner, given)
             else:
@@ -120,7 +127,7 @@ def flattened(function: Callable[..., PyTree], *shapes: PyTree) -> tuple[jex.Clo
     return jex.ClosedJaxpr(jaxpr, list(known.values())), jax.tree_util.tree_structure(results)
 
 
-def cumulated(e: Equation) -> jex.ClosedJaxpr | None:
+def cumulative_scan(e: Equation) -> jex.ClosedJaxpr | None:
     """A sum, product or extreme along the first axis as the closed jaxpr of a scan."""
     name, p = e.primitive.name, e.params
     if name not in CUMULATED or p["axis"] != 0:
@@ -139,7 +146,7 @@ def cumulated(e: Equation) -> jex.ClosedJaxpr | None:
     return jax.make_jaxpr(scanned)(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
 
 
-def written_out(e: Equation) -> jex.ClosedJaxpr | None:
+def unrolled_scan(e: Equation) -> jex.ClosedJaxpr | None:
     """A short scan over large arrays as a closed jaxpr without it: its rounds one after another."""
     p = e.params
     if e.primitive.name != "scan" or p["length"] >= SHORTEST:
@@ -168,7 +175,7 @@ def _extreme(dtype: np.dtype, sign: int) -> float | int:
     return np.iinfo(dtype).max if sign > 0 else np.iinfo(dtype).min
 
 
-class Loop:
+class AxisLoop:
     """Equations along one axis: rounds of a program, or JAX if they have no place in one.
 
     Attributes:
@@ -183,7 +190,7 @@ class Loop:
         self._engine = engine if is_worth else interpreted_rounds
         self.equations: list[Equation] = []
         self.refused: ProgramError | BuildError | None = None
-        self.rounds: Rounds | None = None
+        self.rounds: CompiledRounds | None = None
         self.nodes = 0
         self._lock = threading.Lock()
 
@@ -196,10 +203,10 @@ class Loop:
     ) -> None:
         """Find what goes in and out; of some variables that are made the first run is enough."""
         self._batched, self._wanted, self._unroll = batched, wanted, unroll
-        self.body = body = Body(self.equations, self.axis, wanted)
+        self.body = body = LoopBody(self.equations, self.axis, wanted)
         made = [*body.after, *body.made]
         self._named = {k for k, v in enumerate(made, 1) if v in named}
-        self.touched = Touched([*body.begin, *body.stays, *body.rows], made)
+        self.touched = StageMemory([*body.begin, *body.stays, *body.rows], made)
 
     def __call__(self, runs: int, values: Values) -> Values:
         """Compute the variables that it makes from those that are there."""
@@ -246,12 +253,12 @@ class Loop:
         try:
             if self._engine is interpreted_rounds:
                 parts = [body.jaxpr, self.axis, self._unroll, body.known(known), zeros]
-                program, engine, self.nodes = kept_rounds(parts, self._write)
+                program, engine, self.nodes = cached_rounds(parts, self._write)
             else:
                 program, engine = self._write(), self._engine
             stays = len(body.stays) - len(known)
             axis = self.axis
-            self.rounds = Rounds(program, axis[0], len(begin), stays, axis[1], engine)
+            self.rounds = CompiledRounds(program, axis[0], len(begin), stays, axis[1], engine)
         except (ProgramError, BuildError) as error:
             self.refused = error
             takes, makes = taken_by(self.equations), made_by(self.equations, self._wanted)
@@ -259,9 +266,11 @@ class Loop:
             self._by_jax = by_jax(self.equations, makes, [v in self._batched for v in takes])
 
 
-def cut(
+def split_stages(
     equations: Sequence[Equation], takes: Sequence[Variable], engine: RoundsEngine
-) -> tuple[Arrays, dict[int, Arrays], dict[tuple[int, Along], Loop], dict[Variable, int]]:
+) -> tuple[
+    ArraySteps, dict[int, ArraySteps], dict[tuple[int, Along], AxisLoop], dict[Variable, int]
+]:
     """Equations as stages.
 
     Args:
@@ -274,7 +283,7 @@ def cut(
         all variables that depend on the run. What a loop makes is there for arrays, and for loops
         along other axes, one level later.
     """
-    axes = {id(e): axis for e in equations if (axis := along(e)) is not None}
+    axes = {id(e): axis for e in equations if (axis := axis_of(e)) is not None}
     worth: Counter[Along] = Counter()
     for e in equations:
         if (axis := axes.get(id(e))) is not None:
@@ -282,9 +291,9 @@ def cut(
     level: dict[Variable, int] = dict.fromkeys(takes, 0)
     source: dict[Variable, Along] = {}  # of what a loop makes, row by row
     after: set[Variable] = set()  # what a loop leaves
-    known = Arrays()
-    batches: dict[int, Arrays] = {}
-    loops: dict[tuple[int, Along], Loop] = {}
+    known = ArraySteps()
+    batches: dict[int, ArraySteps] = {}
+    loops: dict[tuple[int, Along], AxisLoop] = {}
     for e in equations:
         axis = axes.get(id(e))
         if axis is None:
@@ -302,10 +311,10 @@ def cut(
         here = max(of)
         level.update((v, here) for v in e.outvars)
         if axis is None:
-            batches.setdefault(here, Arrays()).equations.append(e)
+            batches.setdefault(here, ArraySteps()).equations.append(e)
             continue
         if (here, axis) not in loops:
-            loops[here, axis] = Loop(axis, engine, worth[axis] >= WORTH)
+            loops[here, axis] = AxisLoop(axis, engine, worth[axis] >= WORTH)
         loops[here, axis].equations.append(e)
         made = makes_rows(e)
         source.update((v, axis) for v in made)
@@ -313,7 +322,7 @@ def cut(
     return known, batches, loops, level
 
 
-class Staged:
+class StagedFunction:
     """A function of one run as a function of a batch of them.
 
     What is made of a run has the same bits in any batch, but to rounding what stays with JAX.
@@ -340,13 +349,13 @@ class Staged:
                 leading axis is one.
             engine: of the rounds of loops: `compiled_rounds`, or `interpreted_rounds`.
         """
-        closed, self._tree = flattened(function, *shapes)
+        closed, self._tree = as_jaxpr(function, *shapes)
         flat = closed.jaxpr
         self._takes: list[Variable] = list(flat.invars)
         self._makes: list[Variable] = list(flat.outvars)
         of_all = self._tree.children()[0] if named else self._tree
         self._of_all: int = of_all.num_leaves
-        known, batches, loops, level = cut(flat.eqns, self._takes, engine)
+        known, batches, loops, level = split_stages(flat.eqns, self._takes, engine)
         batched = self._batched = set(level)
         parts = [known, *batches.values(), *loops.values()]
         wanted = self._wanted(parts)
@@ -356,7 +365,7 @@ class Staged:
             one.connect(batched, wanted)
         for one in loops.values():
             one.connect(batched, wanted, self._named - between, unroll)
-        self._stages: list[Arrays | Loop] = []
+        self._stages: list[ArraySteps | AxisLoop] = []
         for k in range(max(level.values(), default=0) + 1):
             self._stages += [batches[k]] if k in batches else []
             self._stages += [one for (at, _), one in loops.items() if at == k]
@@ -368,26 +377,26 @@ class Staged:
         self._dropped = last_uses(touched, kept | set(self._takes))
         self.bytes_of_run = most_bytes(touched, self._takes, kept)
 
-    def _of_runs(self, one: Touched, between: set[Variable]) -> Touched:
+    def _of_runs(self, one: StageMemory, between: set[Variable]) -> StageMemory:
         """Variables of a stage by run: none that is known or kept of the first run alone."""
         here = self._batched - (self._named - between)
         takes, makes = ([v for v in variables(some) if v in here] for some in one[:2])
-        return Touched(takes, makes, one.within)
+        return StageMemory(takes, makes, one.within)
 
-    def _wanted(self, parts: Sequence[Arrays | Loop]) -> Callable[[Variable], bool]:
+    def _wanted(self, parts: Sequence[ArraySteps | AxisLoop]) -> Callable[[Variable], bool]:
         """Test for variables that are needed outside of the part that makes them."""
         out = {*variables(self._makes), *(v for p in parts for v in taken_by(p.equations))}
         return out.__contains__
 
     @property
-    def loops(self) -> list[Loop]:
+    def loops(self) -> list[AxisLoop]:
         """The loops, in an order of computation."""
-        return [one for one in self._stages if isinstance(one, Loop)]
+        return [one for one in self._stages if isinstance(one, AxisLoop)]
 
     @property
     def refused(self) -> list[ProgramError | BuildError]:
         """Reasons why parts stay with JAX, once it was called."""
-        arrays = (one for one in self._stages if isinstance(one, Arrays))
+        arrays = (one for one in self._stages if isinstance(one, ArraySteps))
         loops = [loop.refused for loop in self.loops if loop.refused]
         return [*self._known_refused, *(why for one in arrays for why in one.refused), *loops]
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robins.program.native import address
-from robins.program.nodes import Loop, Node
+from robins.program.nodes import GraphLoop, Node
 from robins.program.operations import KINDS
 from robins.program.refusal import ProgramError
 from robins.program.walk import Program, counts
@@ -233,7 +233,7 @@ class Writer:
         self._write("again", None, numbers=(s, most, begin))
         self.spans[s] = begin, len(self.written)
 
-    def _next(self, loop: Loop) -> None:
+    def _next(self, loop: GraphLoop) -> None:
         """The leaves of the next round, none written before it is read."""
         s, graph = loop.scope, self.graph
         changed = [k for k, n in enumerate(loop.next) if n != loop.leaves[k]]

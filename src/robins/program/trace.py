@@ -12,11 +12,11 @@ from jaxtyping import PyTree
 
 from robins import _float64  # noqa: F401
 from robins.program import primitives  # noqa: F401
-from robins.program.calls import Calls, forget
+from robins.program.calls import Calls, drop_templates
 from robins.program.kinds import kind_of, numbers_of
 from robins.program.nodes import Graph
 from robins.program.refusal import ProgramError
-from robins.program.walk import Leaf, Program, Walk
+from robins.program.walk import JaxprWriter, Leaf, Program
 
 # Scalar operations up to which a loop or a factorisation is written out: all of a filter of nine
 # states, not the thirty samples of an IMU between two fixes.
@@ -129,7 +129,7 @@ def lasting(made: Callable[[Zeros, Calls], list[Program]], zeros: Zeros) -> list
     calls: Calls = {}
     while True:
         programs, kept = made(zeros, calls), zeros
-        forget(calls, [program.graph for program in programs])
+        drop_templates(calls, [program.graph for program in programs])
         for program in programs:
             zero = program.graph.constant(0, "real")
             kept = {k: np.asarray(m & (program.outputs[k] == zero)) for k, m in kept.items()}
@@ -161,7 +161,7 @@ def _program(
     calls: Calls | None = None,
 ) -> Program:
     """The program of a jaxpr, some entries of its arguments known to be zero."""
-    walk = Walk(Graph(), unroll, calls)
+    walk = JaxprWriter(Graph(), unroll, calls)
     nodes = [
         walk.taken(leaf.shape, leaf.dtype, leaf.path, zeros.get(index))
         for index, leaf in enumerate(_leaves(given, "arguments"))

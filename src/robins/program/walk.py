@@ -107,7 +107,7 @@ def line_of(equation: Equation) -> str:
     return f"{frame.file_name}:{frame.start_line}" if frame else ""
 
 
-class Walk:
+class JaxprWriter:
     """A walk through jaxprs that writes into one graph.
 
     Attributes:

@@ -13,8 +13,9 @@ from typing import Any
 import xarray as xr
 
 from robins import results
-from robins.report.document import LIMIT, Origin, page
-from robins.report.embed import Drawn, dpi_for, draw
+from robins.errors import moved
+from robins.report.document import LIMIT, ReportOrigin, page
+from robins.report.embed import RenderedPicture, dpi_for, draw
 from robins.report.figures import FIGURES, drawings
 from robins.report.numbers import verdict
 from robins.report.style import Picture
@@ -23,9 +24,9 @@ from robins.report.terminal import table
 __all__ = [
     "FIGURES",
     "LIMIT",
-    "Drawn",
-    "Origin",
     "Picture",
+    "RenderedPicture",
+    "ReportOrigin",
     "add",
     "draw",
     "page",
@@ -72,9 +73,12 @@ def add(
             writer.save_file(f"figures/{picture.name}.png", drawn[-1].png())
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     versions = results.versions()
-    origin = Origin(
+    origin = ReportOrigin(
         writer.command, writer.scenario_text, writer.device, versions, now, tuple(notes)
     )
     writer.save_report(page(writer.summary, drawn, origin))
     if progress is not None:
         progress(len(makers), len(makers), "drawing figures")
+
+
+__getattr__ = moved(__name__)

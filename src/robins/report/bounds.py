@@ -28,7 +28,7 @@ _COLUMNS = 500  # of the map of information
 _FULL = 10.0  # bits; a thousandth of the prior and less is one colour
 
 
-class Line(NamedTuple):
+class BoundLine(NamedTuple):
     """A bound in the unit of figures."""
 
     values: np.ndarray  # (..., time, axis), or (axis,) of the prior
@@ -39,7 +39,7 @@ class Line(NamedTuple):
 _ROLES = ("bound", "bound_prior", "bound_unaided", "bound_without")
 
 
-def line(solution: xr.Dataset, block: str, role: str = "bound") -> Line:
+def line(solution: xr.Dataset, block: str, role: str = "bound") -> BoundLine:
     """The bound of a block, one standard deviation.
 
     Raises:
@@ -47,15 +47,15 @@ def line(solution: xr.Dataset, block: str, role: str = "bound") -> Line:
     """
     array = find(solution, role)[block]
     x = series.x_of(array, array.ndim - 2) if array.ndim > 1 else np.zeros(0)
-    return Line(*series.shown(array), x)
+    return BoundLine(*series.shown(array), x)
 
 
-def beside(solution: xr.Dataset, block: str) -> Line | None:
+def comparison_bound(solution: xr.Dataset, block: str) -> BoundLine | None:
     """The bound to draw with the filters; None if the solution has none."""
     return line(solution, block) if block in find(solution, "bound") else None
 
 
-def draw(axes: Axes, bound: Line, k: int, seconds: float, times: float = 1.0) -> np.ndarray:
+def draw(axes: Axes, bound: BoundLine, k: int, seconds: float, times: float = 1.0) -> np.ndarray:
     """Draw a multiple of the bound of an axis with the filters; returns it."""
     y = times * bound.values[:, k]
     axes.plot(*series.thin(bound.x / seconds, y), zorder=4, **_LOOK)
@@ -87,14 +87,15 @@ def sigmas(solution: xr.Dataset, block: str) -> Picture:
     for k, axes in enumerate(stack):
         lines = [(unaided.values[:, k], _NONE)]
         for i, one in enumerate(without.values[: len(names)], 1):
-            lines.append((one[:, k], style.look(i)))
+            lines.append((one[:, k], style.filter_look(i)))
         lines.append((every.values[:, k], {"color": style.colour(0), "linewidth": 1.6}))
         for y, look in lines:
             clock.plot(axes, every.x, np.where(y > 0.0, y, np.nan), **look)
         _scale(axes, every.values[:, k], without.values[..., k], unaided.values[:, k])
     keys = [style.key("all sensors", color=style.colour(0), linewidth=1.6)]
     keys += [
-        style.key(f"without {words(name)}", **style.look(i)) for i, name in enumerate(names, 1)
+        style.key(f"without {words(name)}", **style.filter_look(i))
+        for i, name in enumerate(names, 1)
     ]
     style.legend(figure, [*keys, style.key("no sensor", **_NONE)])
     caption = (
@@ -126,7 +127,7 @@ def information(solution: xr.Dataset) -> Picture:
     time = series.x_of(array, 1)
     pick = np.unique(np.linspace(0, len(time) - 1, _COLUMNS).astype(int))
     clock = series.clock(time)
-    figure, grid = style.new(1, 1, 1.1 + 0.19 * len(names))
+    figure, grid = style.new_figure(1, 1, 1.1 + 0.19 * len(names))
     axes = grid[0, 0]
     shown = axes.pcolormesh(
         time[pick] / clock.seconds,
@@ -177,7 +178,7 @@ def metrics(solution: xr.Dataset) -> dict[str, list[float]]:
     return out
 
 
-class Row(NamedTuple):
+class BoundRow(NamedTuple):
     """Bounds of one component of the state, in the unit of figures."""
 
     state: str
@@ -202,7 +203,7 @@ class Row(NamedTuple):
         return "seen" if share <= SEEN else "hardly seen" if share <= HARDLY else "not seen"
 
 
-def rows(solution: xr.Dataset, at: Sequence[int]) -> list[Row]:
+def rows(solution: xr.Dataset, at: Sequence[int]) -> list[BoundRow]:
     """One row a component, at the numbers of some epochs."""
     out, names = [], sensors(solution)
     for block in blocks(solution):
@@ -210,7 +211,7 @@ def rows(solution: xr.Dataset, at: Sequence[int]) -> list[Row]:
         every, prior, unaided, without = (line(solution, block, role) for role in _ROLES)
         for k, axis in enumerate(series.coordinate(solution, f"axis_{block}")):
             out.append(
-                Row(
+                BoundRow(
                     f"{words(block)} {axis}",
                     every.unit,
                     float(prior.values[k]),
@@ -248,8 +249,10 @@ def table(solution: xr.Dataset, at: Sequence[int]) -> Group:
             Text(row.verdict, style=_STYLES[row.verdict]),
             *(_short(v) for v in (*row.without, row.unaided)),
         )
-    told = f"On the right, what sigma would be at {last} without one of the sensors, and with none."
-    return Group(made, Text(), Text(told))
+    notes = (
+        f"On the right, what sigma would be at {last} without one of the sensors, and with none."
+    )
+    return Group(made, Text(), Text(notes))
 
 
 def _short(value: float) -> str:
@@ -259,7 +262,7 @@ def _short(value: float) -> str:
 def sentences(solution: xr.Dataset) -> list[str]:
     """Sentences on the least observable directions."""
     count, rank = solution.sizes["state"], int(find(solution, "gramian_rank")[""])
-    told = [
+    notes = [
         f"The observability Gramian has rank {rank} of {count}; the least observable directions, "
         "in units of the prior, are:"
     ]
@@ -268,8 +271,8 @@ def sentences(solution: xr.Dataset) -> list[str]:
     directions = series.coordinate(solution, "direction")
     for made_of, value in zip(directions, np.asarray(gramian), strict=True):
         weight = f"the measurements weigh {show(float(value))} times the prior"
-        told.append(f"{made_of}: {weight if value >= nothing else 'not seen'}")
-    return told
+        notes.append(f"{made_of}: {weight if value >= nothing else 'not seen'}")
+    return notes
 
 
 def csv(solution: xr.Dataset) -> str:

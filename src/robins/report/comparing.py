@@ -41,7 +41,7 @@ def comparison(summary: Mapping[str, Any]) -> Picture | None:
         return None
     columns = min(_COLUMNS, len(found))
     rows = -(-len(found) // columns)
-    figure, grid = style.new(rows, columns, 0.5 + rows * (0.5 + 0.24 * len(filters)))
+    figure, grid = style.new_figure(rows, columns, 0.5 + rows * (0.5 + 0.24 * len(filters)))
     engine: Any = figure.get_layout_engine()
     engine.set(wspace=0.07, hspace=0.06)  # else the last number of one touches the first of another
     places, uncertain = range(len(filters)), False
@@ -103,7 +103,7 @@ def trade_off(solution: xr.Dataset) -> Picture:
     gamma = series.x_of(h2, 1)
     value, reached = np.asarray(h2.values, float), np.asarray(hinf.values, float)
     best = np.fmin.reduce(value, axis=0)
-    figure, grid = style.new(2, height=5.6, sharex=True, height_ratios=(3, 2))
+    figure, grid = style.new_figure(2, height=5.6, sharex=True, height_ratios=(3, 2))
     above, below = grid[:, 0]
     keys = []
     for k, name in enumerate(series.coordinate(solution, h2.dims[0])):

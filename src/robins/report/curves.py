@@ -30,10 +30,10 @@ def within(solution: xr.Dataset, limit: str) -> Picture:
     filters = series.filters(solution)
     runs = int(data.attrs.get("runs", 0))
     tinted = runs > 1 and len(filters) <= style.TINTED
-    figure, axes, clock = series.alone(solution, data.x, "share of the runs")
+    figure, axes, clock = series.single_axes(solution, data.x, "share of the runs")
     for i in range(len(filters)):
         share = data.values[i, :, 0]
-        clock.plot(axes, data.x, share, **style.look(i))
+        clock.plot(axes, data.x, share, **style.filter_look(i))
         if tinted:
             low, high = interval(np.rint(share * runs), runs)
             x, low, high = series.thin(data.x / clock.seconds, low, high)
@@ -71,9 +71,9 @@ def worst_case(solution: xr.Dataset) -> Picture | None:
     shown = [i for i in range(len(filters)) if np.isfinite(ratio[i]).any()]
     if not shown:
         return None
-    figure, axes, clock = series.alone(solution, time, "local bound / gamma")
+    figure, axes, clock = series.single_axes(solution, time, "local bound / gamma")
     for i in shown:
-        clock.plot(axes, time, ratio[i], **style.look(i))
+        clock.plot(axes, time, ratio[i], **style.filter_look(i))
     axes.axhline(1.0, color=style.TRUTH, linewidth=0.8)
     axes.set(ylim=(-0.02, max(1.1, 1.1 * float(np.nanmax(ratio[shown])))))
     keys = style.filter_keys(filters)
@@ -171,13 +171,13 @@ def errors(solution: xr.Dataset, block: str) -> Picture:
     error = series.get(solution, "error", block)
     assert error is not None
     sigma = series.get(solution, "sigma", block)
-    best = bounds.beside(solution, block)
+    best = bounds.comparison_bound(solution, block)
     filters = series.filters(solution)
     figure, stack, clock = series.stacked(solution, error.x, error.axes, error.unit)
     for k, axes in enumerate(stack):
         lines = []
         for i in range(len(filters)):
-            clock.plot(axes, error.x, error.values[i, :, k], **style.look(i))
+            clock.plot(axes, error.x, error.values[i, :, k], **style.filter_look(i))
             lines.append(error.values[i, :, k])
             if sigma is not None:
                 _envelope(axes, sigma, i, k, clock, len(filters))
@@ -209,7 +209,7 @@ def _envelope(
     sigma: Series,
     i: int,
     k: int,
-    clock: series.Clock,
+    clock: series.TimeUnit,
     count: int,
     centre: float | np.ndarray = 0.0,
 ) -> None:
@@ -217,7 +217,7 @@ def _envelope(
     reach = 3.0 * sigma.values[i, :, k]
     x, low, high = series.thin(sigma.x / clock.seconds, centre - reach, centre + reach)
     for bound in (low, high):
-        axes.plot(x, bound, **style.look(i, linewidth=0.6))
+        axes.plot(x, bound, **style.filter_look(i, linewidth=0.6))
     if count <= 2:  # more would hide each other
         axes.fill_between(x, low, high, color=style.colour(i), alpha=0.10, linewidth=0)
 
@@ -234,7 +234,7 @@ def estimates(solution: xr.Dataset, block: str, role: str = "estimate") -> Pictu
     for k, axes in enumerate(stack):
         for i in range(len(filters)):
             y = _broken(found.values[i, :, k], turn)
-            clock.plot(axes, found.x, y, **style.look(i))
+            clock.plot(axes, found.x, y, **style.filter_look(i))
             # About an angle that turns, an envelope would be drawn across the wrap.
             if sigma is not None and turn is None:
                 _envelope(axes, sigma, i, k, clock, len(filters), centre=y)
@@ -282,7 +282,7 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
     rms = series.get(solution, "rms", block)
     assert rms is not None
     stated = series.get(solution, "mean_sigma", block)
-    best = bounds.beside(solution, block)
+    best = bounds.comparison_bound(solution, block)
     filters = series.filters(solution)
     few = len(filters) <= style.TINTED
     mean = series.get(solution, "mean_error", block) if few else None
@@ -291,7 +291,7 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
     for k, axes in enumerate(stack):
         lines = []
         for i in range(len(filters)):
-            clock.plot(axes, rms.x, rms.values[i, :, k], **style.look(i))
+            clock.plot(axes, rms.x, rms.values[i, :, k], **style.filter_look(i))
             lines.append(rms.values[i, :, k])
             if stated is not None:
                 x, y = series.thin(stated.x / clock.seconds, stated.values[i, :, k], points=600)
@@ -342,7 +342,7 @@ def height(solution: xr.Dataset) -> Picture | None:
     data = series.get(solution, "track", "alt_m")
     if data is None:
         return None
-    figure, axes, clock = series.alone(solution, data.x, "height [m]", 2.7)
+    figure, axes, clock = series.single_axes(solution, data.x, "height [m]", 2.7)
     more = []
     fixes, truth = (series.one(solution, role, "alt_m") for role in ("gnss", "reference"))
     if fixes is not None:
@@ -354,6 +354,6 @@ def height(solution: xr.Dataset) -> Picture | None:
         clock.plot(axes, series.x_of(truth, 0), np.asarray(truth, float), **look)
         more.append(style.key("reference", **look))
     for i in range(len(filters)):
-        clock.plot(axes, data.x, data.values[i, :, 0], **style.look(i))
+        clock.plot(axes, data.x, data.values[i, :, 0], **style.filter_look(i))
     style.legend(figure, _keys(filters, solution, *more))
     return Picture("height", "Height profile", "Height above the WGS-84 ellipsoid.", figure)

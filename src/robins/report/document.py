@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from robins.report import numbers
-from robins.report.embed import Drawn, Embedded, embed
+from robins.report.embed import Embedded, RenderedPicture, embed
 from robins.report.style import Picture
 
 LIMIT = 500_000  # bytes of the whole page
@@ -18,7 +18,7 @@ _LOCKED = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 _LONGEST_SCENARIO = 40_000  # characters shown; the manifest has all of it
 
 
-class Origin(NamedTuple):
+class ReportOrigin(NamedTuple):
     """Origin of a result."""
 
     command: str
@@ -30,7 +30,10 @@ class Origin(NamedTuple):
 
 
 def page(
-    summary: Mapping[str, Any], drawn: Sequence[Drawn], origin: Origin, limit: int = LIMIT
+    summary: Mapping[str, Any],
+    drawn: Sequence[RenderedPicture],
+    origin: ReportOrigin,
+    limit: int = LIMIT,
 ) -> str:
     """The report as HTML of at most `limit` bytes; pictures give way where there are too many."""
     text = _page(summary, _figures([]), origin)
@@ -38,7 +41,7 @@ def page(
     return _page(summary, _figures(embed(drawn, max(room, 0))), origin)
 
 
-def _page(summary: Mapping[str, Any], figures: str, origin: Origin) -> str:
+def _page(summary: Mapping[str, Any], figures: str, origin: ReportOrigin) -> str:
     title = escape(summary["scenario"])
     runs = "1 run" if summary["runs"] == 1 else f"{summary['runs']} runs"
     meta = [
@@ -186,7 +189,7 @@ def _counts(counts: Mapping[str, int]) -> str:
     return f"<section>\n<h2>Refused samples</h2>\n{body}\n</section>"
 
 
-def _reproduce(summary: Mapping[str, Any], origin: Origin) -> str:
+def _reproduce(summary: Mapping[str, Any], origin: ReportOrigin) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in origin.versions.items())
     command = origin.command or "(called from Python)"
     text = origin.scenario_text

@@ -33,7 +33,7 @@ _SIMPLE = 1000  # points; a drawing with more is never smaller than its dots
 _NUMBER = re.compile(rb"-?\d+\.\d{3,}")
 
 
-class Drawn(NamedTuple):
+class RenderedPicture(NamedTuple):
     """A picture and its dots, drawn once for all uses."""
 
     picture: Picture
@@ -66,14 +66,16 @@ def dpi_for(pictures: int) -> int:
 
 
 @styled
-def draw(picture: Picture, dpi: int = DPI) -> Drawn:
+def draw(picture: Picture, dpi: int = DPI) -> RenderedPicture:
     """Draw a picture; its layout stays as it is from here on."""
     picture.figure.set_dpi(dpi)
     canvas: Any = picture.figure.canvas
     canvas.draw()
     # Arranging the axes again would double the time of a drawing as lines.
     picture.figure.set_layout_engine("none")
-    return Drawn(picture, Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"), dpi)
+    return RenderedPicture(
+        picture, Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"), dpi
+    )
 
 
 def shrunk(image: Image.Image, share: float) -> Image.Image:
@@ -155,7 +157,7 @@ def _png_source(content: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(content).decode()
 
 
-class _Choice:
+class _PictureForms:
     """The forms of one picture, each made only when it is needed.
 
     Attributes:
@@ -163,7 +165,7 @@ class _Choice:
         rung: its place on the ladder.
     """
 
-    def __init__(self, drawn: Drawn):
+    def __init__(self, drawn: RenderedPicture):
         self.drawn, self.rung = drawn, 0
         self._sources: dict[int, str] = {}
         self.source = self._form(0)
@@ -209,7 +211,7 @@ def _steps(sizes: Sequence[int], limit: int) -> list[int]:
     return rungs
 
 
-def _refine(choices: Sequence[_Choice], limit: int) -> None:
+def _refine(choices: Sequence[_PictureForms], limit: int) -> None:
     """Take finer forms, the smallest picture first, as long as all fit."""
     left = [c for c in choices if c.rung]
     while left and sum(c.size for c in choices) < _SLACK * limit:
@@ -222,12 +224,12 @@ def _refine(choices: Sequence[_Choice], limit: int) -> None:
             left.remove(one)
 
 
-def embed(drawn: Sequence[Drawn], limit: int) -> list[Embedded]:
+def embed(drawn: Sequence[RenderedPicture], limit: int) -> list[Embedded]:
     """Sources for the pictures, together at most `limit` characters.
 
     The largest is made coarser until all fit; only what is coarse already is left out.
     """
-    choices = [_Choice(one) for one in drawn]
+    choices = [_PictureForms(one) for one in drawn]
     for choice, rung in zip(choices, _steps([c.size for c in choices], limit), strict=True):
         choice.take(rung)
     _refine(choices, limit)

@@ -24,14 +24,14 @@ def allan(solution: xr.Dataset, sensor: str) -> Picture:
     value, unit = series.shown(array)
     tau = series.x_of(array, 0)
     labels = series.coordinate(solution, array.dims[1])
-    figure, grid = style.new(1, len(labels), 3.5, sharex=True, sharey=True)
+    figure, grid = style.new_figure(1, len(labels), 3.5, sharex=True, sharey=True)
 
-    def told(role: str) -> np.ndarray | None:
+    def curve_of(role: str) -> np.ndarray | None:
         found = series.one(solution, role, sensor)
         return None if found is None else series.shown(found)[0]
 
-    low, high, fit = told("allan_low"), told("allan_high"), told("allan_fit")
-    slopes, parts = told("allan_slope"), find(solution, "allan_slope").get(sensor)
+    low, high, fit = curve_of("allan_low"), curve_of("allan_high"), curve_of("allan_fit")
+    slopes, parts = curve_of("allan_slope"), find(solution, "allan_slope").get(sensor)
     processes = [] if parts is None else series.coordinate(solution, parts.dims[0])
     for k, (axes, label) in enumerate(zip(grid[0], labels, strict=True)):
         if low is not None and high is not None:
@@ -101,7 +101,7 @@ def _field(solution: xr.Dataset) -> _Field:
 def size(solution: xr.Dataset) -> Picture:
     """Size of the field over time, before and after."""
     values, strength, unit, time, _ = _field(solution)
-    figure, grid = style.new(height=2.8)
+    figure, grid = style.new_figure(height=2.8)
     axes = grid[0, 0]
     every = -(-len(time) // _DOTS)
     for field, look in zip(values, _LOOKS, strict=True):
@@ -120,7 +120,7 @@ def size(solution: xr.Dataset) -> Picture:
 def planes(solution: xr.Dataset) -> Picture:
     """The samples seen along each axis of the sensor, before and after."""
     values, strength, unit, _, labels = _field(solution)
-    figure, grid = style.new(1, 3, 3.1)
+    figure, grid = style.new_figure(1, 3, 3.1)
     every = -(-len(values[0]) // _DOTS)
     around = np.linspace(0.0, 2.0 * np.pi, 181)
     for axes, (i, j) in zip(grid[0], _PLANES, strict=True):

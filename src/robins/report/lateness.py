@@ -15,7 +15,7 @@ def lateness(solution: xr.Dataset) -> Picture:
     """Histogram of lateness over bins that grow with it."""
     roles = ("lateness_steps", "lateness_edge")
     counts, edges = (np.asarray(find(solution, role)[""], float) for role in roles)
-    figure, grid = style.new(1, 1, 2.6)
+    figure, grid = style.new_figure(1, 1, 2.6)
     axes = grid[0, 0]
     names = [f"< {_time(edges[0])}", *map(_time, edges)]
     last = max(int(np.flatnonzero(counts)[-1]), 1)

@@ -87,7 +87,7 @@ def track(solution: xr.Dataset) -> Picture | None:
         return None
     filters = series.filters(solution)
     window, aspect = _window(list(places.values()))
-    figure, grid = style.new(1, 1, 1.3 + 6.2 * aspect)
+    figure, grid = style.new_figure(1, 1, 1.3 + 6.2 * aspect)
     axes = grid[0, 0]
     scale, unit = (1e-3, "km") if max(window[1] - window[0], 0.0) > 5000.0 else (1.0, "m")
     keys = []
@@ -195,8 +195,8 @@ def _frame(
     length = _round(width / 5.0)
     x, y = west + 0.04 * width, south - 0.62 * strip
     axes.plot([x, x + length], [y, y], color=style.TRUTH, linewidth=3.0, solid_capstyle="butt")
-    told = f"{length:g} {unit}"
-    axes.annotate(told, (x + length, y), (6, 0), textcoords="offset points", va="center")
+    label_text = f"{length:g} {unit}"
+    axes.annotate(label_text, (x + length, y), (6, 0), textcoords="offset points", va="center")
     arrow = {"arrowstyle": "-|>", "color": style.TRUTH, "linewidth": 1.2}
     x = east - 0.04 * width
     axes.annotate("", (x, south - 0.15 * strip), (x, south - 0.95 * strip), arrowprops=arrow)

@@ -47,8 +47,8 @@ def label(metric: str) -> Label:
     """Words and unit of a metric's name; of a share the unit at its end is that of its limit."""
     unit = None if "share" in metric.split("_") else _UNIT.search(metric)
     text = words(metric[: unit.start()] if unit else metric) or metric
-    told = "/".join(_PARTS[part] for part in unit[1].split("_per_")) if unit else ""
-    return Label(text[:1].upper() + text[1:], told)
+    texts = "/".join(_PARTS[part] for part in unit[1].split("_per_")) if unit else ""
+    return Label(text[:1].upper() + text[1:], texts)
 
 
 def words(name: str) -> str:
@@ -91,8 +91,8 @@ def _many(values: Sequence[Any]) -> str:
 def _probability(found: Probability) -> str:
     """A share with its interval, to as many digits as that leaves to it."""
     digits = max(2, 1 - math.floor(math.log10(found.high - found.low)))
-    told = (f"{x:.{digits}f}".rstrip("0").rstrip(".") for x in found[:3])
-    return "{} ({} to {})".format(*told)
+    texts = (f"{x:.{digits}f}".rstrip("0").rstrip(".") for x in found[:3])
+    return "{} ({} to {})".format(*texts)
 
 
 def _float(value: float) -> str:
@@ -152,9 +152,9 @@ def verdict(claims: Sequence[Mapping[str, Any]]) -> str:
     """One sentence on the claims."""
     if not claims:
         return "No claims are attached to this scenario."
-    told = [claim["verdict"] for claim in claims]
-    held = told.count("reproduced")
-    rest = [f"{n} {v}" for v in ("partly", "not", "undecided") if (n := told.count(v))]
+    texts = [claim["verdict"] for claim in claims]
+    held = texts.count("reproduced")
+    rest = [f"{n} {v}" for v in ("partly", "not", "undecided") if (n := texts.count(v))]
     noun = "claim" if len(claims) == 1 else "claims"
     return f"{held} of {len(claims)} {noun} reproduced" + "".join(f", {r}" for r in rest) + "."
 

@@ -18,18 +18,18 @@ def percentiles(solution: xr.Dataset, block: str) -> Picture:
     filters = series.filters(solution)
     tinted = len(filters) <= style.TINTED
     label = f"length of the error [{data.unit}]" if data.unit else "length of the error"
-    figure, axes, clock = series.alone(solution, data.x, label, 3.2)
+    figure, axes, clock = series.single_axes(solution, data.x, label, 3.2)
     low, middle, high, highest = range(4)
     # No logarithm has what is zero or infinite: a line ends where a percentile diverged.
-    told = np.where(np.isfinite(data.values) & (data.values > 0.0), data.values, np.nan)
-    for i, of in enumerate(told):
-        clock.plot(axes, data.x, of[:, middle], **style.look(i))
-        clock.plot(axes, data.x, of[:, highest], **style.look(i, linewidth=0.7))
+    lengths = np.where(np.isfinite(data.values) & (data.values > 0.0), data.values, np.nan)
+    for i, of in enumerate(lengths):
+        clock.plot(axes, data.x, of[:, middle], **style.filter_look(i))
+        clock.plot(axes, data.x, of[:, highest], **style.filter_look(i, linewidth=0.7))
         if tinted:
             tint = {"color": style.colour(i), "alpha": 0.15, "linewidth": 0}
             axes.fill_between(data.x / clock.seconds, of[:, low], of[:, high], **tint)
-    if np.any(np.isfinite(told)):
-        style.decades(axes, float(np.nanmin(told)), float(np.nanmax(told)))
+    if np.any(np.isfinite(lengths)):
+        style.decades(axes, float(np.nanmin(lengths)), float(np.nanmax(lengths)))
     more = [style.key(f"{data.axes[highest]} of the runs", color=style.GREY, linewidth=0.7)]
     style.legend(figure, [*style.filter_keys(filters), *more])
     caption = (

@@ -35,7 +35,7 @@ def budget(solution: xr.Dataset) -> Picture:
     columns = min(_COLUMNS, len(blocks))
     rows = -(-len(blocks) // columns)
     height = 0.9 + rows * (0.55 + 0.42 * len(names))
-    figure, grid = style.new(rows, columns, height, sharex=True, sharey=True)
+    figure, grid = style.new_figure(rows, columns, height, sharex=True, sharey=True)
     for number, axes in enumerate(grid.flat):
         axes.set_visible(number < len(blocks))
     for number, (axes, block) in enumerate(zip(grid.flat, blocks, strict=False)):
@@ -71,7 +71,7 @@ def scatter(solution: xr.Dataset, block: str) -> Picture:
     ends = [text.split(" to ") for text in share.attrs["ends"].split("; ")]
     columns = min(_COLUMNS, len(names))
     rows = -(-len(names) // columns)
-    figure, grid = style.new(rows, columns, 0.3 + 2.2 * rows, sharey=True)
+    figure, grid = style.new_figure(rows, columns, 0.3 + 2.2 * rows, sharey=True)
     for number, axes in enumerate(grid.flat):
         axes.set_visible(number < len(names))
         if number % columns == 0:

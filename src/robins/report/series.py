@@ -16,7 +16,7 @@ from robins.results import find
 _POINTS = 1200  # of a line; more than a figure has pixels
 
 
-class Clock(NamedTuple):
+class TimeUnit(NamedTuple):
     """A unit for a time axis."""
 
     seconds: float
@@ -93,21 +93,21 @@ def filters(solution: xr.Dataset) -> list[str]:
     return coordinate(solution, "filter") if "filter" in solution.sizes else []
 
 
-def clock(*times: np.ndarray) -> Clock:
+def clock(*times: np.ndarray) -> TimeUnit:
     """The unit in which a time axis has short numbers."""
     longest = max((np.nanmax(np.abs(t)) for t in times if np.isfinite(t).any()), default=0.0)
     if longest > 3 * 3600:
-        return Clock(3600.0, "time since start [h]")
+        return TimeUnit(3600.0, "time since start [h]")
     if longest > 1200:
-        return Clock(60.0, "time since start [min]")
-    return Clock(1.0, "time since start [s]")
+        return TimeUnit(60.0, "time since start [min]")
+    return TimeUnit(1.0, "time since start [s]")
 
 
-def alone(
+def single_axes(
     solution: xr.Dataset, x: np.ndarray, label: str, height: float = 2.8
-) -> tuple[Figure, Axes, Clock]:
+) -> tuple[Figure, Axes, TimeUnit]:
     """A figure of one pair of axes over time, outages shaded."""
-    figure, grid = style.new(1, 1, height)
+    figure, grid = style.new_figure(1, 1, height)
     axes, unit = grid[0, 0], clock(x)
     unit.shade(axes, solution)
     axes.margins(x=0.0)
@@ -117,13 +117,13 @@ def alone(
 
 def stacked(
     solution: xr.Dataset, x: np.ndarray, axes: list[str], unit: str, more: int = 0
-) -> tuple[Figure, np.ndarray, Clock]:
+) -> tuple[Figure, np.ndarray, TimeUnit]:
     """A figure of one pair of axes over time for each component, outages shaded.
 
     So many more pairs stand below. Components of several units state their own.
     """
     rows = len(axes) + more
-    figure, grid = style.new(rows, 1, 0.9 + 1.35 * rows, sharex=True)
+    figure, grid = style.new_figure(rows, 1, 0.9 + 1.35 * rows, sharex=True)
     stack, time = grid[:, 0], clock(x)
     for one in stack:
         time.shade(one, solution)

@@ -79,7 +79,7 @@ def styled(draw: Callable) -> Callable:
     return drawn
 
 
-def new(
+def new_figure(
     rows: int = 1, columns: int = 1, height: float = 2.6, **kwargs: Any
 ) -> tuple[Figure, np.ndarray]:
     """A figure without pyplot, and its axes as an array of rows and columns; height in inches."""
@@ -104,7 +104,7 @@ def line(index: int) -> Any:
     return LINES[index % len(LINES)]
 
 
-def look(index: int, **more: Any) -> dict[str, Any]:
+def filter_look(index: int, **more: Any) -> dict[str, Any]:
     """Colour and line style of the filter or axis of that number, and more properties of a line."""
     return {"color": colour(index), "linestyle": line(index), **more}
 
@@ -116,7 +116,7 @@ def key(label: str, **line_properties: Any) -> Line2D:
 
 def filter_keys(filters: Sequence[str]) -> list[Line2D]:
     """Entries for the filters, in their colours."""
-    return [key(name, **look(i)) for i, name in enumerate(filters)]
+    return [key(name, **filter_look(i)) for i, name in enumerate(filters)]
 
 
 def outage_key() -> Patch:

@@ -49,20 +49,20 @@ def curves(solution: xr.Dataset, block: str) -> Picture:
     (rms, unit), (low, _), (high, _), (stated, _) = (
         series.shown(one) for one in arrays if one is not None
     )
-    places, told, label = _axis(solution, "sweep_1")
+    places, tick_labels, label = _axis(solution, "sweep_1")
     filters = series.filters(solution)
-    figure, grid = style.new(1, 1, 3.0)
+    figure, grid = style.new_figure(1, 1, 3.0)
     axes: Axes = grid[0, 0]
     order = np.argsort(places)
     for i in range(len(filters)):
         at = places[order]
-        axes.plot(at, rms[i, order, 0], marker="o", markersize=3.5, **style.look(i))
+        axes.plot(at, rms[i, order, 0], marker="o", markersize=3.5, **style.filter_look(i))
         axes.fill_between(
             at, low[i, order, 0], high[i, order, 0], color=style.colour(i), alpha=0.18, linewidth=0
         )
         axes.plot(at, stated[i, order, 0], color=style.colour(i), linestyle=":", linewidth=0.9)
     if solution["sweep_1"].dtype.kind not in "fiu":
-        axes.set_xticks(list(places), told)
+        axes.set_xticks(list(places), tick_labels)
     finite = rms[np.isfinite(rms)]
     if finite.size and finite.min() > 0.0 and finite.max() > 30.0 * finite.min():
         axes.set_yscale("log")
@@ -90,7 +90,7 @@ def maps(solution: xr.Dataset, block: str) -> Picture:
     filters = series.filters(solution)
     columns = min(_COLUMNS, len(filters))
     rows = -(-len(filters) // columns)
-    figure, grid = style.new(
+    figure, grid = style.new_figure(
         rows, columns, 0.9 + rows * (0.6 + 0.26 * len(up)), sharex=True, sharey=True
     )
     finite = rms[np.isfinite(rms)]

@@ -52,8 +52,8 @@ def table(summary: Mapping[str, Any], width: int = 100) -> Group:
         parts += [Text(), claims, Text(numbers.verdict(summary["claims"]))]
     refused = {reason: n for reason, n in summary["counts"].items() if n}
     if refused:
-        told = ", ".join(f"{numbers.words(r)} {n}" for r, n in refused.items())
-        parts += [Text(), Text(f"Refused samples: {told}")]
+        listed = ", ".join(f"{numbers.words(r)} {n}" for r, n in refused.items())
+        parts += [Text(), Text(f"Refused samples: {listed}")]
     return Group(*parts)
 
 

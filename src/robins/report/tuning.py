@@ -14,7 +14,7 @@ from robins.report.style import Picture
 def tuning(solution: xr.Dataset) -> Picture:
     """Figure with the factor on each parameter (left) and the objective of each part (right)."""
     names = [str(name) for name in solution["parameter"].values]
-    figure, grid = style.new(1, 2, max(2.6, 1.4 + 0.3 * len(names)))
+    figure, grid = style.new_figure(1, 2, max(2.6, 1.4 + 0.3 * len(names)))
     _factors(grid[0, 0], names, solution)
     before, after = (solution[f"judged_{name}"].values for name in ("before", "after"))
     about = solution["judged_before"].attrs

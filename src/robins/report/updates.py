@@ -101,7 +101,7 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
                 reach = 3.0 * sigma.values[i, :, k]
                 shown.append(np.where(np.isfinite(y), reach, np.nan))
                 for sign in (-1.0, 1.0):
-                    clock.plot(axes, data.x, sign * reach, **style.look(i, linewidth=0.8))
+                    clock.plot(axes, data.x, sign * reach, **style.filter_look(i, linewidth=0.8))
         _compress(axes, shown)
         axes.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
     keys: list[Any] = [_dot(filters[i], i) for i in present]
@@ -186,7 +186,7 @@ def _is_smooth(array: xr.DataArray) -> bool:
 
 
 def _statistic(
-    axes: Axes, array: xr.DataArray, limits: Band | None, filters: list[str], clock: series.Clock
+    axes: Axes, array: xr.DataArray, limits: Band | None, filters: list[str], clock: series.TimeUnit
 ) -> str:
     """Draw a statistic of each filter over its band; return how much of it lies inside."""
     values, x = np.asarray(array, float), series.x_of(array, 1) / clock.seconds
@@ -195,7 +195,7 @@ def _statistic(
     joined = _is_smooth(array)
     for i in range(len(filters)):
         if joined:
-            axes.plot(*series.thin(x, values[i]), **style.look(i, linewidth=0.9))
+            axes.plot(*series.thin(x, values[i]), **style.filter_look(i, linewidth=0.9))
         else:
             _points(axes, x, values[i], i)
     if limits is None or not np.isfinite(limits.high).any():
@@ -234,7 +234,7 @@ def consistency(solution: xr.Dataset, name: str) -> Picture:
     """NEES of a run, or its average over the runs of a campaign, in its chi-square band."""
     array = series.one(solution, "consistency", name)
     assert array is not None
-    figure, axes, clock = series.alone(solution, series.x_of(array, 1), name.upper())
+    figure, axes, clock = series.single_axes(solution, series.x_of(array, 1), name.upper())
     limits = band(array, series.one(solution, "consistency_dof", name))
     filters = series.filters(solution)
     shares = _statistic(axes, array, limits, filters, clock)

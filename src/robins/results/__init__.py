@@ -42,13 +42,14 @@ solution is the stamp at its zero: GPS time since 1970-01-01 (UTC and leap secon
 1980, the log's own clock. `to_dataframe` makes a table of the arrays on one clock, `Result` too.
 """
 
+from robins.errors import moved
 from robins.results.dataframe import clocks, to_dataframe
 from robins.results.errors import ResultError
 from robins.results.manifest import SCHEMA_VERSION, versions
-from robins.results.outcome import Outcome, Progress, silent
+from robins.results.outcome import Outcome, Progress, ignore_progress
 from robins.results.probability import Probability
 from robins.results.reader import Result, read
-from robins.results.rescue import NotWritten, keeping, rescued
+from robins.results.rescue import NotWritten, keep_on_error, rescued
 from robins.results.roles import ROLES, find
 from robins.results.solution import Variables, array, variable
 from robins.results.summary import VERDICTS, plain
@@ -69,12 +70,14 @@ __all__ = [
     "array",
     "clocks",
     "find",
-    "keeping",
+    "ignore_progress",
+    "keep_on_error",
     "plain",
     "read",
     "rescued",
-    "silent",
     "to_dataframe",
     "variable",
     "versions",
 ]
+
+__getattr__ = moved(__name__)

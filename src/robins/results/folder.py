@@ -32,11 +32,11 @@ _TRIES = 20  # of a commit, against other writers of the same folder, where ther
 _LEFTOVER = re.compile(r"\.robins-(new|old)-([0-9a-f]{12})-[0-9a-f]{8}")
 
 
-class Busy(BlockingIOError):
+class TargetBusyError(BlockingIOError):
     """Another writer has the target."""
 
 
-class Stage(NamedTuple):
+class StagedFolder(NamedTuple):
     """A folder being filled, and where it will go."""
 
     path: Path
@@ -95,7 +95,7 @@ def _claim(target: Path) -> ExitStack:
     """Claim a target as its only writer until the stack is closed.
 
     Raises:
-        Busy: another one is.
+        TargetBusyError: another one is.
     """
     path = target.parent / f".robins-lock-{_key(target)}"
     while True:
@@ -107,7 +107,7 @@ def _claim(target: Path) -> ExitStack:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 who = os.pread(descriptor, 200, 0).decode("utf-8", "replace").strip()
-                raise Busy(errno.EAGAIN, who or "another process", str(target)) from None
+                raise TargetBusyError(errno.EAGAIN, who or "another process", str(target)) from None
             except OSError:  # no locks here
                 stack.callback(_unlink, path)
                 return stack.pop_all()
@@ -162,11 +162,11 @@ def _missing(folder: Path) -> Iterator[Path]:
         folder = folder.parent
 
 
-def stage(path: str | os.PathLike[str]) -> Stage:
+def stage(path: str | os.PathLike[str]) -> StagedFolder:
     """Make the hidden folder in which the content of `path` is built.
 
     Raises:
-        Busy: another writer builds one.
+        TargetBusyError: another writer builds one.
         OSError: it cannot be made there.
     """
     target = resolve(path)
@@ -186,7 +186,7 @@ def stage(path: str | os.PathLike[str]) -> Stage:
             try:
                 if lock := _lock(folder):
                     locks.enter_context(lock)
-                return Stage(folder, target, locks, parents)
+                return StagedFolder(folder, target, locks, parents)
             except (BlockingIOError, FileNotFoundError):
                 # A sweep by another writer fell between its making and its locking.
                 shutil.rmtree(folder, ignore_errors=True)
@@ -204,12 +204,12 @@ def _remove(folder: Path | None, locks: ExitStack, parents: tuple[Path, ...]) ->
             os.rmdir(parent)
 
 
-def discard(staged: Stage) -> None:
+def discard(staged: StagedFolder) -> None:
     """Delete the hidden folder and the parents made for it; the target stays as it was."""
     _remove(staged.path, staged.locks, staged.parents)
 
 
-def commit(staged: Stage) -> None:
+def commit(staged: StagedFolder) -> None:
     """Sync the hidden folder to the disk and make it the target, in place of what was there.
 
     The target is let go by `discard`, which then has nothing to delete.
@@ -233,7 +233,7 @@ def commit(staged: Stage) -> None:
         sync(staged.target.parent)
 
 
-def _swap(staged: Stage) -> None:
+def _swap(staged: StagedFolder) -> None:
     target, aside = staged.target, _hidden(staged.target, "old")
     with ExitStack() as held:
         try:

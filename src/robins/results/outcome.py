@@ -12,7 +12,7 @@ import xarray as xr
 Progress = Callable[[float, str], None]  # share done in 0..1, what is being done
 
 
-def silent(share: float, what: str) -> None:
+def ignore_progress(share: float, what: str) -> None:
     """Ignore progress."""
 
 

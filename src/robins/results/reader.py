@@ -70,7 +70,7 @@ def read(path: str | os.PathLike[str]) -> Result:
     shown = Path(path) if where == folder.resolve(path) else where
     damaged = "summary.json is damaged"
     with decoding(lambda why: ResultError(path, f"{damaged} ({why})", "make the result again")):
-        told = summary.loads(text)
-    if not isinstance(told, dict) or not isinstance(told.get("files"), dict):
+        content = summary.loads(text)
+    if not isinstance(content, dict) or not isinstance(content.get("files"), dict):
         raise ResultError(path, f"{damaged}: it lists no files", "make the result again")
-    return Result(shown, made, told, dataset)
+    return Result(shown, made, content, dataset)

@@ -26,7 +26,7 @@ class NotWritten(RobinsError, RuntimeError):
 
 
 @contextmanager
-def keeping(tree: Any) -> Generator[None, None, None]:
+def keep_on_error(tree: Any) -> Generator[None, None, None]:
     """Attach computed arrays to any error that leaves this block, for `rescued` to write.
 
     Args:
@@ -41,7 +41,7 @@ def keeping(tree: Any) -> Generator[None, None, None]:
 
 @contextmanager
 def rescued(path: str | os.PathLike[str]) -> Generator[None, None, None]:
-    """Write what an error takes along (`keeping`) where no result folder can be made at `path`.
+    """Write what an error carries (`keep_on_error`) where no result folder can be made at `path`.
 
     The arrays go into a new folder next to the result, or among the temporary files where nothing
     can be written there.

@@ -48,10 +48,10 @@ def write(path: str | os.PathLike[str], kind: str, parameters: str, state: Any) 
     """
     arrays: list[np.ndarray] = []
     body = {"kind": kind, "parameters": parameters, "state": _frozen(state, arrays)}
-    told = {"format": FORMAT, "version": VERSION, **body, "digest": _digest(body, arrays)}
+    header = {"format": FORMAT, "version": VERSION, **body, "digest": _digest(body, arrays)}
     packed = io.BytesIO()
     named: dict[str, Any] = {f"a{k}": a for k, a in enumerate(arrays)}
-    np.savez(packed, told=np.frombuffer(json.dumps(told).encode(), np.uint8), **named)
+    np.savez(packed, told=np.frombuffer(json.dumps(header).encode(), np.uint8), **named)
     target = Path(os.path.realpath(path))
     aside = target.with_name(f".robins-live-{secrets.token_hex(6)}")
     try:
@@ -80,17 +80,19 @@ def read(path: str | os.PathLike[str], kind: str) -> Snapshot:
             content = file.read(_LARGEST + 1)
     except OSError as error:
         raise cannot(path, "read the state", error) from error
-    told, arrays = _unpacked(content, path)
-    if told.get("version") != VERSION:
-        what = f"it is of version {told.get('version')} of the format, this robins reads {VERSION}"
+    header, arrays = _unpacked(content, path)
+    if header.get("version") != VERSION:
+        what = (
+            f"it is of version {header.get('version')} of the format, this robins reads {VERSION}"
+        )
         raise ResultError(path, what, "use the robins that wrote it, or start again")
-    body = {key: told.get(key) for key in ("kind", "parameters", "state")}
-    if told.get("digest") != _digest(body, arrays):
+    body = {key: header.get(key) for key in ("kind", "parameters", "state")}
+    if header.get("digest") != _digest(body, arrays):
         raise ResultError(path, "it is damaged", "start again, or restore an older one")
-    if told["kind"] != kind:
-        fix = f"load it with {told['kind']}.load"
-        raise ResultError(path, f"it holds a {told['kind']}, not a {kind}", fix)
-    return Snapshot(told["parameters"], _thawed(told["state"], arrays))
+    if header["kind"] != kind:
+        fix = f"load it with {header['kind']}.load"
+        raise ResultError(path, f"it holds a {header['kind']}, not a {kind}", fix)
+    return Snapshot(header["parameters"], _thawed(header["state"], arrays))
 
 
 def _unpacked(
@@ -104,11 +106,11 @@ def _unpacked(
         raise refuse(f"more than {_LARGEST >> 20} MiB")
     packed = arrays_of(content, refuse)
     with decoding(refuse):
-        told = json.loads(packed.pop("told").tobytes())
-    if not isinstance(told, dict) or told.get("format") != FORMAT:
+        header = json.loads(packed.pop("told").tobytes())
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise refuse("it is of another format")
     with decoding(refuse):
-        return told, [packed[f"a{k}"] for k in range(len(packed))]
+        return header, [packed[f"a{k}"] for k in range(len(packed))]
 
 
 def _digest(body: Any, arrays: list[np.ndarray]) -> str:

@@ -171,7 +171,7 @@ class ResultWriter:
             self.discard()  # nothing is left to do after a commit
 
 
-def _staged(path: Path, patience_s: float) -> folder.Stage:
+def _staged(path: Path, patience_s: float) -> folder.StagedFolder:
     """Stage of a result, when no other writer has its folder.
 
     Raises:
@@ -181,7 +181,7 @@ def _staged(path: Path, patience_s: float) -> folder.Stage:
     while True:
         try:
             return folder.stage(path)
-        except folder.Busy as busy:
+        except folder.TargetBusyError as busy:
             if monotonic() >= until:
                 raise ResultError(
                     path,

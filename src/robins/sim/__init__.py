@@ -18,6 +18,7 @@
 - `random`: streams of random numbers by seed, run and component; Gauss-Markov processes.
 """
 
+from robins.errors import moved
 from robins.sim.commands import from_commands
 from robins.sim.flexure import Flexure, simulate_flexure
 from robins.sim.gnss_sensor import GnssErrorModel, GnssFixes, as_table, fix_times, observe
@@ -25,7 +26,13 @@ from robins.sim.ideal_imu import ideal_increments, true_increments
 from robins.sim.imu_sensor import ImuTruth, corrupt, corrupt_table
 from robins.sim.manoeuvres import fly, roughen, sail
 from robins.sim.random import Component, stream
-from robins.sim.trajectory import Motion, at_lever_arm, from_velocity, from_waypoints, sine_velocity
+from robins.sim.trajectory import (
+    MotionProfile,
+    at_lever_arm,
+    from_velocity,
+    from_waypoints,
+    sine_velocity,
+)
 
 __all__ = [
     "Component",
@@ -33,7 +40,7 @@ __all__ = [
     "GnssErrorModel",
     "GnssFixes",
     "ImuTruth",
-    "Motion",
+    "MotionProfile",
     "as_table",
     "at_lever_arm",
     "corrupt",
@@ -52,3 +59,5 @@ __all__ = [
     "stream",
     "true_increments",
 ]
+
+__getattr__ = moved(__name__)

@@ -116,9 +116,9 @@ def allocate_within(
     plain = allocate(pinv, torque_b)
     full = jnp.abs(wheel_h) >= momentum_limit * (1.0 - 1e-9)
     used = jnp.any(pinv != 0.0, axis=1)
-    asked, free = plain, used
+    demanded, free = plain, used
     for _ in range(max(pinv.shape[0] - 3, 0)):  # as many as may be left out
-        free = free & ~(full & (asked * wheel_h < 0.0))  # its torque is -h'
+        free = free & ~(full & (demanded * wheel_h < 0.0))  # its torque is -h'
         A = jnp.where(free[None, :], wheel_axes_b, 0.0)
         G = u.matrix(jnp.sum(A[:, None, :] * A[None, :, :], -1))
         size = u.dot(G[0], u.cross(G[1], G[2]))  # determinant
@@ -127,8 +127,8 @@ def allocate_within(
             tuple(jnp.where(enough, G[i][j], float(i == j)) for j in range(3)) for i in range(3)
         )
         shared = jnp.stack(u.apply(u.symmetric_inverse(safe), u.scalars(torque_b)))
-        asked = jnp.where(enough, jnp.sum(A * shared[:, None], 0), plain)
-    return jnp.where(jnp.any(free != used), asked, plain)
+        demanded = jnp.where(enough, jnp.sum(A * shared[:, None], 0), plain)
+    return jnp.where(jnp.any(free != used), demanded, plain)
 
 
 def allocation_matrix(wheel_axes_b: _given.Listed, works: _given.Listed = 1.0) -> np.ndarray:
@@ -176,9 +176,9 @@ def desaturation_dipole(
     size = jnp.sum(field_b_t * field_b_t)
     there = size > 0.0
     dipole = k * jnp.cross(momentum_b, field_b_t) / jnp.where(there, size, 1.0)
-    asked = jnp.abs(dipole)
-    over = asked > limit_a_m2
-    share = jnp.where(over, limit_a_m2 / jnp.where(over, asked, 1.0), 1.0)
+    demanded = jnp.abs(dipole)
+    over = demanded > limit_a_m2
+    share = jnp.where(over, limit_a_m2 / jnp.where(over, demanded, 1.0), 1.0)
     return jnp.min(share) * dipole
 
 

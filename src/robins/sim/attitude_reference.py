@@ -21,7 +21,7 @@ from robins.filters.belief import Number
 from robins.filters.values import Numbers
 from robins.rotation import conjugate, from_dcm, from_rotvec, multiply, normalise, rotate
 from robins.sim import _given
-from robins.sim.orbit import Orbit
+from robins.sim.orbit import OrbitStates
 
 
 class Reference(NamedTuple):
@@ -32,7 +32,7 @@ class Reference(NamedTuple):
     alpha_b: Any  # (E, 3) its derivative [rad/s^2], in the wanted body axes
 
 
-def nadir(orbit: Orbit) -> Reference:
+def nadir(orbit: OrbitStates) -> Reference:
     """Towards the Earth's centre: x forward, y against the orbit's normal, z down.
 
     The rate is that of any two-body orbit, -|r x v|/r^2 about y.
@@ -123,7 +123,7 @@ PEAK_ACCELERATION = 10.0 / 3.0**0.5
 
 
 @jax.jit
-def handed_over(
+def handover_reference(
     base: Reference,
     turn_rad: Array,
     rate_rad_s: Array,

@@ -19,13 +19,13 @@ from typing import NamedTuple
 import numpy as np
 
 from robins.earth import Geodetic
-from robins.sim.trajectory import Motion, Vehicle, along, from_velocity, quaternion
+from robins.sim.trajectory import MotionProfile, Vehicle, along, from_velocity, quaternion
 
 _EASE = 0.3  # share of a ramp in which its rate rises, and in which it falls
 _STILL = 0.5  # m/s; a height is not changed below this ground speed
 
 
-class Command(NamedTuple):
+class Manoeuvre(NamedTuple):
     """One manoeuvre: what has changed by its end, and a wave on top."""
 
     duration_s: float
@@ -38,25 +38,25 @@ class Command(NamedTuple):
     ease: float = _EASE  # see `_ramp`
 
 
-def straight(duration_s: float) -> Command:
+def straight(duration_s: float) -> Manoeuvre:
     """Go on as before."""
-    return Command(duration_s)
+    return Manoeuvre(duration_s)
 
 
 stand = straight  # before the first `accelerate`, or after `stop`
 
 
-def accelerate(to_mps: float, duration_s: float) -> Command:
+def accelerate(to_mps: float, duration_s: float) -> Manoeuvre:
     """Reach a ground speed [m/s], faster or slower."""
-    return Command(duration_s, speed_mps=to_mps)
+    return Manoeuvre(duration_s, speed_mps=to_mps)
 
 
-def stop(duration_s: float) -> Command:
+def stop(duration_s: float) -> Manoeuvre:
     """Brake to a stand."""
     return accelerate(0.0, duration_s)
 
 
-def turn(by_rad: float, rate_rad_s: float, ease_s: float = 1.0) -> Command:
+def turn(by_rad: float, rate_rad_s: float, ease_s: float = 1.0) -> Manoeuvre:
     """Turn by an angle, positive clockwise, at a rate that takes `ease_s` to build up."""
     if rate_rad_s <= 0.0 or ease_s <= 0.0:
         raise ValueError(
@@ -65,32 +65,32 @@ def turn(by_rad: float, rate_rad_s: float, ease_s: float = 1.0) -> Command:
         )
     hold = abs(by_rad) / rate_rad_s
     ease = min(ease_s, hold)
-    return Command(hold + ease, turn_rad=by_rad, ease=ease / (hold + ease) if hold else _EASE)
+    return Manoeuvre(hold + ease, turn_rad=by_rad, ease=ease / (hold + ease) if hold else _EASE)
 
 
-def climb(by_m: float, duration_s: float) -> Command:
+def climb(by_m: float, duration_s: float) -> Manoeuvre:
     """Change height; negative descends."""
-    return Command(duration_s, climb_m=by_m)
+    return Manoeuvre(duration_s, climb_m=by_m)
 
 
-def weave(amplitude_rad: float, period_s: float, duration_s: float) -> Command:
+def weave(amplitude_rad: float, period_s: float, duration_s: float) -> Manoeuvre:
     """A sine in heading."""
-    return Command(duration_s, wave_heading_rad=amplitude_rad, wave_period_s=period_s)
+    return Manoeuvre(duration_s, wave_heading_rad=amplitude_rad, wave_period_s=period_s)
 
 
-def porpoise(amplitude_m: float, period_s: float, duration_s: float) -> Command:
+def porpoise(amplitude_m: float, period_s: float, duration_s: float) -> Manoeuvre:
     """A sine in height."""
-    return Command(duration_s, wave_height_m=amplitude_m, wave_period_s=period_s)
+    return Manoeuvre(duration_s, wave_height_m=amplitude_m, wave_period_s=period_s)
 
 
 def from_commands(
     start: Geodetic,
-    commands: Sequence[Command],
+    commands: Sequence[Manoeuvre],
     heading_rad: float = 0.0,
     speed_mps: float = 0.0,
     vehicle: Vehicle = "ground",
     knots_hz: float = 20.0,
-) -> Motion:
+) -> MotionProfile:
     """The motion that follows commands, from a place, heading and ground speed.
 
     Args:

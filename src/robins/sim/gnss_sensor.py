@@ -33,7 +33,7 @@ from robins.sim import _given
 _NORMALS, _CHANCES = 0, 1  # streams folded into the key of the receiver
 
 
-class _Row(IntEnum):
+class _FixRow(IntEnum):
     """Rows of the normal numbers (5, 3) of one fix."""
 
     POSITION = 0
@@ -43,7 +43,7 @@ class _Row(IntEnum):
     OUTLIER_VELOCITY = 4
 
 
-class _Chance(IntEnum):
+class _FixChance(IntEnum):
     """Uniform numbers (2,) of one fix."""
 
     DROPPED = 0
@@ -226,12 +226,12 @@ def observe(
 
     numbers = jnp.arange(len(time))
     normal, chance = jax.vmap(lambda number: _drawn(key, number))(numbers)
-    missing = chance[:, _Chance.DROPPED] < model.drop_share
+    missing = chance[:, _FixChance.DROPPED] < model.drop_share
     if model.outages_s is not None:
         begin, end = model.outages_s[None, :, 0], model.outages_s[None, :, 1]
         now = time[:, None]
         missing = missing | jnp.any((begin <= now) & (now < end), axis=1)
-    outlier = chance[:, _Chance.OUTLIER] < model.outlier_share
+    outlier = chance[:, _FixChance.OUTLIER] < model.outlier_share
     gross = jnp.where(outlier, model.outlier_size, 0.0)[:, None]
 
     def rows(sigma):
@@ -241,10 +241,10 @@ def observe(
         unit = direction / jnp.linalg.norm(direction, axis=1, keepdims=True)
         return rows(sigma) * (white + gross * unit)
 
-    error_m = error(model.sigma_m, normal[:, _Row.POSITION], normal[:, _Row.OUTLIER_POSITION])
+    error_m = error(model.sigma_m, normal[:, _FixRow.POSITION], normal[:, _FixRow.OUTLIER_POSITION])
     sigma_m = rows(model.sigma_m)
     if model.markov_sigma_m is not None:
-        slow = _markov(time, rows(model.markov_tau_s), normal[:, _Row.MARKOV])
+        slow = _markov(time, rows(model.markov_tau_s), normal[:, _FixRow.MARKOV])
         error_m = error_m + rows(model.markov_sigma_m) * slow
         sigma_m = jnp.sqrt(sigma_m**2 + rows(model.markov_sigma_m) ** 2)
     if model.stated_sigma_m is not None:
@@ -255,7 +255,7 @@ def observe(
     )
     v_measured, sigma_v = None, None
     if model.sigma_v is not None:
-        draws = normal[:, _Row.VELOCITY], normal[:, _Row.OUTLIER_VELOCITY]
+        draws = normal[:, _FixRow.VELOCITY], normal[:, _FixRow.OUTLIER_VELOCITY]
         v_measured = jnp.where(missing[:, None], jnp.nan, v + error(model.sigma_v, *draws))
         sigma_v = rows(model.sigma_v if model.stated_sigma_v is None else model.stated_sigma_v)
     return GnssFixes(lat, lon, alt, v_measured, sigma_m, sigma_v, missing, outlier, error_m)
@@ -265,7 +265,9 @@ def _drawn(key: Array, number: Array) -> tuple[Array, Array]:
     normals, chances = (
         jax.random.fold_in(jax.random.fold_in(key, which), number) for which in (_NORMALS, _CHANCES)
     )
-    return jax.random.normal(normals, (len(_Row), 3)), jax.random.uniform(chances, (len(_Chance),))
+    return jax.random.normal(normals, (len(_FixRow), 3)), jax.random.uniform(
+        chances, (len(_FixChance),)
+    )
 
 
 def _markov(time: Array, tau: Array, normal: Array) -> Array:

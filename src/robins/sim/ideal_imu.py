@@ -20,12 +20,12 @@ from robins.ins.frames import swap
 from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, nav_at, refuse_polar, step, step_each
 from robins.rotation import Real, conjugate, multiply, rotate, to_rotvec
-from robins.sim.trajectory import Motion
+from robins.sim.trajectory import MotionProfile
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
-def true_increments(motion: Motion, time_ns: np.ndarray) -> ImuTable:
+def true_increments(motion: MotionProfile, time_ns: np.ndarray) -> ImuTable:
     """Integrals of omega_ib_b and f_b over (time[k-1], time[k]], FRD.
 
     Five Gauss-Legendre points an interval: far below rounding at the rates of an IMU. The interval

@@ -37,7 +37,7 @@ from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 _ONCE, _SAMPLES = 0, 1  # streams folded into the key of the unit
 
 
-class _Once(IntEnum):
+class _SwitchOnRow(IntEnum):
     """First row of what is drawn when the unit is switched on."""
 
     MARKOV_START = 0
@@ -47,7 +47,7 @@ class _Once(IntEnum):
     G_SENSITIVITY = 6  # three rows
 
 
-class _Row(IntEnum):
+class _SampleRow(IntEnum):
     """Row of what is drawn at a sample."""
 
     WHITE = 0  # white noise, and what the ends of the processes leave open about their integrals
@@ -82,7 +82,7 @@ class _Triad(NamedTuple):
     constants: _Constants
 
 
-class Imu(NamedTuple):
+class SimulatedImu(NamedTuple):
     """A unit that was switched on: its model and what stays the same until it is switched off."""
 
     gyro: _Triad
@@ -105,7 +105,7 @@ class ImuState(NamedTuple):
     accel: _TriadState
 
 
-def begin(model: ImuErrorModel, key: Array) -> tuple[Imu, ImuState]:
+def begin(model: ImuErrorModel, key: Array) -> tuple[SimulatedImu, ImuState]:
     """Switch a unit on: draw what is constant and where its processes start.
 
     The Gauss-Markov bias starts in its steady state, the random walk and the ramp at zero.
@@ -123,11 +123,11 @@ def begin(model: ImuErrorModel, key: Array) -> tuple[Imu, ImuState]:
         _start(model.gyro, markov_of_gyro),
         _start(model.accel, markov_of_accel),
     )
-    return Imu(gyro, accel, jax.random.fold_in(key, _SAMPLES)), state
+    return SimulatedImu(gyro, accel, jax.random.fold_in(key, _SAMPLES)), state
 
 
 def sample(
-    imu: Imu,
+    imu: SimulatedImu,
     state: ImuState,
     dt_s: Float[Array, ""],
     theta: Float[Array, "3"],
@@ -207,19 +207,19 @@ def corrupt_table(imu: ImuTable, model: ImuErrorModel, key: Array) -> tuple[ImuT
 def _switch_on(errors: TriadErrors, numbers: Array) -> tuple[_Triad, Number | None]:
     """A triad and the start of its Gauss-Markov bias, from normal numbers (9, 3)."""
 
-    def drawn(row: _Once, given: Number | None, sigma: Number | None) -> Number | None:
+    def drawn(row: _SwitchOnRow, given: Number | None, sigma: Number | None) -> Number | None:
         if sigma is None:
             return given
         normal = numbers[row] if jnp.ndim(sigma) == 1 else numbers[row : row + 3]
         return _sum(given, sigma * normal)
 
-    bias = drawn(_Once.BIAS, errors.bias, errors.bias_sigma)
-    scale = drawn(_Once.SCALE, errors.scale, errors.scale_sigma)
-    sheared = drawn(_Once.MISALIGNMENT, errors.misalignment, errors.misalignment_sigma)
-    bent = drawn(_Once.G_SENSITIVITY, errors.g_sensitivity, errors.g_sensitivity_sigma)
+    bias = drawn(_SwitchOnRow.BIAS, errors.bias, errors.bias_sigma)
+    scale = drawn(_SwitchOnRow.SCALE, errors.scale, errors.scale_sigma)
+    sheared = drawn(_SwitchOnRow.MISALIGNMENT, errors.misalignment, errors.misalignment_sigma)
+    bent = drawn(_SwitchOnRow.G_SENSITIVITY, errors.g_sensitivity, errors.g_sensitivity_sigma)
     matrix = _sum(None if scale is None else jnp.diag(scale), sheared)
     constants = _Constants(bias, matrix, bent)
-    return _Triad(errors, constants), drawn(_Once.MARKOV_START, None, errors.markov_sigma)
+    return _Triad(errors, constants), drawn(_SwitchOnRow.MARKOV_START, None, errors.markov_sigma)
 
 
 def _start(errors: TriadErrors, markov: Number | None) -> _TriadState:
@@ -228,22 +228,22 @@ def _start(errors: TriadErrors, markov: Number | None) -> _TriadState:
     return _TriadState(markov, walk, residue)
 
 
-def _normals(imu: Imu, number: Array) -> Array:
+def _normals(imu: SimulatedImu, number: Array) -> Array:
     """Standard normal numbers (rows, 2, 3) of one sample, as many rows as the errors need."""
     rows = 0
     for errors in (imu.gyro.errors, imu.accel.errors):
         if errors.walk is not None:
-            rows = max(rows, _Row.WALK + 1)
+            rows = max(rows, _SampleRow.WALK + 1)
         if errors.markov_sigma is not None:
-            rows = max(rows, _Row.MARKOV + 1)
+            rows = max(rows, _SampleRow.MARKOV + 1)
         if errors.white is not None:
-            rows = max(rows, _Row.WHITE + 1)
+            rows = max(rows, _SampleRow.WHITE + 1)
     if rows == 0:
         return jnp.zeros((0, 2, 3))
     return jax.random.normal(jax.random.fold_in(imu.key, number), (rows, 2, 3))
 
 
-def _sample(imu: Imu, state: ImuState, normals, dt, theta, dv):
+def _sample(imu: SimulatedImu, state: ImuState, normals, dt, theta, dv):
     time = (state.elapsed_s, dt)
     gyro, turned, of_gyro = _report(imu.gyro, state.gyro, normals[:, 0], *time, theta, dv)
     accel, pushed, of_accel = _report(imu.accel, state.accel, normals[:, 1], *time, dv, dv)
@@ -260,14 +260,14 @@ def _report(triad: _Triad, state: _TriadState, normals, elapsed_s, dt, true, dv)
     spread_sq = None if errors.white is None else errors.white**2 * dt
     if markov is not None:
         markov, integral, rest = markov_step(
-            markov, errors.markov_sigma, errors.markov_tau_s, dt, normals[_Row.MARKOV]
+            markov, errors.markov_sigma, errors.markov_tau_s, dt, normals[_SampleRow.MARKOV]
         )
         now, added, spread_sq = _sum(now, markov), _sum(added, integral), _sum(spread_sq, rest)
     if walk is not None:
-        walk, integral, rest = walk_step(walk, errors.walk, dt, normals[_Row.WALK])
+        walk, integral, rest = walk_step(walk, errors.walk, dt, normals[_SampleRow.WALK])
         now, added, spread_sq = _sum(now, walk), _sum(added, integral), _sum(spread_sq, rest)
     if spread_sq is not None:
-        added = _sum(added, jnp.sqrt(spread_sq) * normals[_Row.WHITE])
+        added = _sum(added, jnp.sqrt(spread_sq) * normals[_SampleRow.WHITE])
     if errors.ramp is not None:
         now = _sum(now, errors.ramp * (elapsed_s + dt))
         added = _sum(added, errors.ramp * (dt * (elapsed_s + 0.5 * dt)))
@@ -288,7 +288,7 @@ def _report(triad: _Triad, state: _TriadState, normals, elapsed_s, dt, true, dv)
     return _TriadState(markov, walk, residue), out, (bias, clipped)
 
 
-def _truth(imu: Imu, seen) -> ImuTruth:
+def _truth(imu: SimulatedImu, seen) -> ImuTruth:
     none = jnp.zeros((3, 3))
 
     def of(triad: _Triad, bias: Array, clipped: Array) -> TriadTruth:

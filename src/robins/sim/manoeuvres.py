@@ -19,13 +19,13 @@ from scipy.spatial.transform import Rotation as _Rotation
 
 from robins.earth import Geodetic, gravity
 from robins.errors import require
-from robins.sim.trajectory import Motion, along, from_velocity, quaternion
+from robins.sim.trajectory import MotionProfile, along, from_velocity, quaternion
 
 _STEEPEST_RAD = np.deg2rad(85.0)
 _KNOTS_A_PERIOD = 20
 
 
-class Bank(NamedTuple):
+class BankedTurn(NamedTuple):
     """A bank angle, right wing down positive, and how long the leg lasts, rolling in included."""
 
     bank_rad: float
@@ -40,7 +40,7 @@ class Wave(NamedTuple):
     phase_rad: float = 0.0
 
 
-class Sea(NamedTuple):
+class SeaMotion(NamedTuple):
     """Motion of a ship in waves: sums of sines."""
 
     roll: Sequence[Wave] = ()  # rad
@@ -49,7 +49,7 @@ class Sea(NamedTuple):
     heave: Sequence[Wave] = ()  # m, upwards
 
 
-MODERATE_SEA = Sea(
+MODERATE_SEA = SeaMotion(
     roll=(Wave(np.deg2rad(5.0), 10.0), Wave(np.deg2rad(1.0), 6.3, 1.0)),
     pitch=(Wave(np.deg2rad(2.0), 6.0, 0.5), Wave(np.deg2rad(0.5), 4.1, 2.0)),
     yaw=(Wave(np.deg2rad(1.5), 8.0, 1.5),),
@@ -60,13 +60,13 @@ MODERATE_SEA = Sea(
 
 def fly(
     start: Geodetic,
-    banks: Sequence[Bank],
+    banks: Sequence[BankedTurn],
     speed_mps: float,
     heading_rad: float = 0.0,
     pitch_rad: float = 0.0,
     roll_s: float = 2.0,
     knots_hz: float = 50.0,
-) -> Motion:
+) -> MotionProfile:
     """An aircraft that banks as commanded, at constant ground speed, height and pitch.
 
     It begins with level wings and takes up the bank of each leg within the leg's first `roll_s`,
@@ -118,9 +118,9 @@ def sail(
     duration_s: float,
     speed_mps: float = 0.0,
     heading_rad: float = 0.0,
-    sea: Sea = MODERATE_SEA,
+    sea: SeaMotion = MODERATE_SEA,
     knots_hz: float = 20.0,
-) -> Motion:
+) -> MotionProfile:
     """A ship on a straight course at constant speed, swaying and heaving in the sea.
 
     Args:
@@ -146,8 +146,11 @@ def sail(
 
 
 def roughen(
-    motion: Motion, roll: Sequence[Wave] = (), pitch: Sequence[Wave] = (), knots_hz: float = 50.0
-) -> Motion:
+    motion: MotionProfile,
+    roll: Sequence[Wave] = (),
+    pitch: Sequence[Wave] = (),
+    knots_hz: float = 50.0,
+) -> MotionProfile:
     """The same path with small sways in roll and pitch on top, as on a road that is not even.
 
     Raises:

@@ -28,7 +28,7 @@ LOWEST_M = 100e3  # below it nothing goes round
 _DIPOLE_E = (-1410.3e-9, 4545.5e-9, -29350.0e-9)  # g11, h11, g10
 
 
-class Orbit(NamedTuple):
+class OrbitStates(NamedTuple):
     """Places and velocities at times, inertial axes."""
 
     time_s: Any  # (E,)
@@ -42,7 +42,7 @@ def circular_orbit(
     raan_rad: Number,
     arg_lat_rad: Number,
     time_s: Number,
-) -> Orbit:
+) -> OrbitStates:
     """A circular two-body orbit.
 
     Args:
@@ -63,7 +63,7 @@ def circular_orbit(
     require(time.ndim == 1, "time_s must have shape (E,)", time.shape)
     _given.number("time_s", time)
     elements = (jnp.asarray(x, float) for x in (alt_m, incl_rad, raan_rad, arg_lat_rad))
-    return Orbit(time, *_circular(*elements, time))
+    return OrbitStates(time, *_circular(*elements, time))
 
 
 @jax.jit
@@ -106,7 +106,7 @@ def _dipole(r, angle) -> Array:
 
 
 def field_along_orbit(
-    orbit: Orbit,
+    orbit: OrbitStates,
     model: str = "dipole",
     earth_angle_rad: Number = 0.0,
     decimal_year: float = 2025.0,

@@ -91,11 +91,13 @@ def observe_sar(
     seen = place.retract(metres)
     heading = wrap(heading + model.heading_sigma_rad * error[:, 2])
 
-    def told(x):
+    def as_measured(x):
         return jnp.where(there, x, jnp.nan)
 
     no_height = jnp.full_like(seen.alt, jnp.nan)
-    return SarFix(Geodetic(told(seen.lat), told(seen.lon), no_height), told(heading))
+    return SarFix(
+        Geodetic(as_measured(seen.lat), as_measured(seen.lon), no_height), as_measured(heading)
+    )
 
 
 def _directions(key, count):

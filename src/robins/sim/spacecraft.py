@@ -197,7 +197,7 @@ def advance(
     return CraftState(kinematics(state.q_ib, turn.gibbs_b), turn.momentum_i, turn.wheel_h)
 
 
-class Turn(NamedTuple):
+class TurnDynamics(NamedTuple):
     """Result of the dynamics of a step."""
 
     gibbs_b: Any  # (3,) tangent of half the turn along its axis, body axes, as three scalars
@@ -214,13 +214,13 @@ def dynamics(
     field_i_t: Float[Array, "3"],
     disturbance_b: Float[Array, "3"],
     dt_s: Number,
-) -> Turn:
+) -> TurnDynamics:
     """The first half of `advance`, whose arguments it has: how the craft turns in a step.
 
     `kinematics` is the other half. The torques of a step depend on the attitude at its beginning
     and on the turn since, so the attitude after it is not needed here.
     """
-    h0, h1 = state.wheel_h, wheels_after(craft, state.wheel_h, wheel_torque, dt_s)
+    h0, h1 = state.wheel_h, wheel_momenta_after(craft, state.wheel_h, wheel_torque, dt_s)
     W = u.matrix(craft.wheel_axes_b)
     held, gained = u.apply(W, u.scalars(h0)), u.apply(W, u.scalars(h1 - h0))
     J = u.matrix(craft.inertia_b)
@@ -254,7 +254,7 @@ def dynamics(
     k3 = slope(u.times(0.5 * dt_s, k2), 0.5)
     k4 = slope(u.times(dt_s, k3), 1.0)
     step = u.times(dt_s / 6.0, u.plus(k1, u.times(2.0, u.plus(k2, k3)), k4))
-    return Turn(step[:3], state.momentum_i + jnp.stack(u.apply(C, step[3:])), h1)
+    return TurnDynamics(step[:3], state.momentum_i + jnp.stack(u.apply(C, step[3:])), h1)
 
 
 def kinematics(q_ib: Float[Array, "4"], gibbs_b: Iterable[Array]) -> Float[Array, "4"]:
@@ -262,25 +262,25 @@ def kinematics(q_ib: Float[Array, "4"], gibbs_b: Iterable[Array]) -> Float[Array
 
     Args:
         q_ib: before, body to inertial, scalar first.
-        gibbs_b: (3,) of the turn, as `Turn` has it.
+        gibbs_b: (3,) of the turn, as `TurnDynamics` has it.
     """
     q = jnp.stack(u.product(u.scalars(q_ib), (1.0, *gibbs_b)))
     return q / jnp.sqrt(jnp.sum(q * q))
 
 
-def wheels_give(craft: Spacecraft, wheel_torque: Float[Array, "w"]) -> Float[Array, "w"]:
+def wheel_torques(craft: Spacecraft, wheel_torque: Float[Array, "w"]) -> Float[Array, "w"]:
     """Torques that the wheels give of a command [N m], while there is room left in them."""
     most = craft.wheel_torque_limit
     return craft.wheel_works * jnp.clip(wheel_torque, -most, most)
 
 
-def wheels_after(
+def wheel_momenta_after(
     craft: Spacecraft, wheel_h: Float[Array, "w"], wheel_torque: Float[Array, "w"], dt_s: Number
 ) -> Float[Array, "w"]:
     """Momenta of the wheels [N m s] after a step under a commanded torque [N m]."""
     # A wheel that was given more than its limit may lose it, but is not torn back to it.
     room = jnp.maximum(craft.wheel_momentum_limit, jnp.abs(wheel_h))
-    return jnp.clip(wheel_h - dt_s * wheels_give(craft, wheel_torque), -room, room)
+    return jnp.clip(wheel_h - dt_s * wheel_torques(craft, wheel_torque), -room, room)
 
 
 def _turned(g: u.Three, v: u.Three, sign: float) -> u.Three:

@@ -9,10 +9,10 @@ and heading of a known motion, as papers do that state one accuracy for the thre
 `StarCamera` and `photograph` go a step further down: the stars of a catalogue that are in the field
 of view, each with an error of its own, some missed and some that are none. `measure_attitude` is
 the whole sensor: the image, the stars known again, the attitude by QUEST with its covariance, and
-no answer where there are too few. Both are made of steps: `show` is the sky without any error, as a
-star simulator shows it to a sensor; `expose` is the image of it; `solve` is the attitude.
-Aberration, the motion of a star across a long exposure and double stars that melt into one are not
-simulated.
+no answer where there are too few. Both are made of steps: `visible_stars` is the sky without any
+error, as a star simulator shows it to a sensor; `expose` is the image of it; `solve` is the
+attitude. Aberration, the motion of a star across a long exposure and double stars that melt into
+one are not simulated.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def index_for(camera: StarCamera, stars: Stars, margin_rad: float = np.radians(0
     return index_stars(seen, 0.5 * float(camera.field_rad) + margin_rad)
 
 
-class Shown(NamedTuple):
+class StarField(NamedTuple):
     """Stars before a camera as they are, brightest first; N rows."""
 
     vectors_s: Any  # (N, 3) unit vectors, sensor axes
@@ -176,13 +176,13 @@ class Shown(NamedTuple):
     star: Any  # (N,) int, place in the catalogue; -1: none, and the other numbers mean nothing
 
 
-def show(
+def visible_stars(
     index: StarIndex,
     q_is: Float[Array, "4"],
     camera: StarCamera,
     most: int | None = None,
     margin_rad: float = 0.0,
-) -> Shown:
+) -> StarField:
     """The stars in the field of a camera, without any error.
 
     Args:
@@ -195,21 +195,23 @@ def show(
     """
     members = near(index, rotate(q_is, jnp.array([0.0, 0.0, 1.0])))
     vectors_s = rotate(conjugate(q_is), jnp.asarray(index.unit_i)[members])
-    there = Shown(vectors_s, jnp.asarray(index.magnitude)[members], members)
+    there = StarField(vectors_s, jnp.asarray(index.magnitude)[members], members)
     return _in_field(there, camera, camera.most_stars if most is None else most, margin_rad)
 
 
-def turned(shown: Shown, camera: StarCamera, turn_rad: Float[Array, "3"]) -> Shown:
+def turned(shown: StarField, camera: StarCamera, turn_rad: Float[Array, "3"]) -> StarField:
     """Stars before a camera that is turned a little [rad], sensor axes, from those shown.
 
-    They are the result of `show` for the turned camera, to rounding, if the margin of what is shown
-    exceeds the turn.
+    They are the result of `visible_stars` for the turned camera, to rounding, if the margin of what
+    is shown exceeds the turn.
     """
     vectors_s = rotate(conjugate(from_rotvec(turn_rad)), shown.vectors_s)
     return _in_field(shown._replace(vectors_s=vectors_s), camera, camera.most_stars)
 
 
-def _in_field(there: Shown, camera: StarCamera, most: int, margin_rad: float = 0.0) -> Shown:
+def _in_field(
+    there: StarField, camera: StarCamera, most: int, margin_rad: float = 0.0
+) -> StarField:
     """The first of those that a camera sees."""
     cos_edge = jnp.cos(0.5 * jnp.asarray(camera.field_rad, float) + margin_rad)
     seen = (there.star >= 0) & (there.vectors_s[:, 2] > cos_edge)
@@ -217,7 +219,7 @@ def _in_field(there: Shown, camera: StarCamera, most: int, margin_rad: float = 0
     # Lists are brightest first, so the first of the seen are the brightest.
     (first,) = jnp.nonzero(seen, size=most, fill_value=-1)
     star = jnp.where(first >= 0, there.star[first], -1)
-    return Shown(there.vectors_s[first], there.magnitude[first], star)
+    return StarField(there.vectors_s[first], there.magnitude[first], star)
 
 
 def photograph(
@@ -241,15 +243,15 @@ def photograph(
     q_is = multiply(q_ib, normalise(_given.rows("q_bs", camera.q_bs, 4)))
     if turn_rad is not None:
         q_is = multiply(q_is, from_rotvec(jnp.asarray(turn_rad, float)))
-    return expose(key, show(index, q_is, camera), camera)
+    return expose(key, visible_stars(index, q_is, camera), camera)
 
 
-def expose(key: Array, shown: Shown, camera: StarCamera) -> StarImage:
+def expose(key: Array, shown: StarField, camera: StarCamera) -> StarImage:
     """Image of the stars before a camera: each with its error, some missed, false ones.
 
     Args:
         key: of the frame.
-        shown: ``camera.most_stars`` rows, of `show` or `turned`.
+        shown: ``camera.most_stars`` rows, of `visible_stars` or `turned`.
         camera: the camera.
     """
     q_bs = normalise(_given.rows("q_bs", camera.q_bs, 4))

@@ -1,8 +1,8 @@
 """Smooth motion over the Earth, with velocity, acceleration and angular rate that belong to it.
 
-A `Motion` is two splines of fifth degree or more: latitude, longitude and height; and the attitude
-quaternion. All else is their derivatives, so it is consistent with the path to rounding, whatever
-the motion was made from, and what an ideal IMU feels runs without steps. Offline, NumPy,
+A `MotionProfile` is two splines of fifth degree or more: latitude, longitude and height; and the
+attitude quaternion. All else is their derivatives, so it is consistent with the path to rounding,
+whatever the motion was made from, and what an ideal IMU feels runs without steps. Offline, NumPy,
 north-east-down and forward-right-down; time in seconds from the start of the motion.
 
     motion = sine_velocity(start, amplitude_mps=60.0, period_s=30.0)
@@ -67,7 +67,7 @@ class Kinematics(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionProfile:
     """A smooth path and attitude from time zero to `duration_s`."""
 
     duration_s: float
@@ -121,7 +121,7 @@ def from_waypoints(
     alt_m: Values,
     q_nb: Values | None = None,
     vehicle: Vehicle = "ground",
-) -> Motion:
+) -> MotionProfile:
     """Motion through given points at given times.
 
     Args:
@@ -155,10 +155,10 @@ def from_waypoints(
         q = np.asarray(q_nb, float)
         if q.shape != (len(t), 4):
             raise ValueError(f"q_nb has shape {q.shape}, the waypoints need ({len(t)}, 4)")
-        return Motion(t[-1], start, path, _attitude(t, q, degree))
+        return MotionProfile(t[-1], start, path, _attitude(t, q, degree))
     fine = np.interp(np.arange(16 * len(t) - 15) / 16.0, np.arange(len(t)), t)
     level = _attitude(t, np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1)), degree)
-    k = Motion(t[-1], start, path, level).at(fine)
+    k = MotionProfile(t[-1], start, path, level).at(fine)
     speed = np.hypot(k.v_n[:, 0], k.v_n[:, 1])
     if speed.min() < _SLOWEST:
         raise ValueError(
@@ -167,10 +167,12 @@ def from_waypoints(
             "q_nb, or use robins.sim.commands"
         )
     heading, pitch = np.arctan2(k.v_n[:, 1], k.v_n[:, 0]), np.arctan2(-k.v_n[:, 2], speed)
-    return Motion(t[-1], start, path, _attitude(fine, along(k, heading, pitch, vehicle)))
+    return MotionProfile(t[-1], start, path, _attitude(fine, along(k, heading, pitch, vehicle)))
 
 
-def from_velocity(time_s: np.ndarray, v_n: np.ndarray, start: Geodetic, q_nb: np.ndarray) -> Motion:
+def from_velocity(
+    time_s: np.ndarray, v_n: np.ndarray, start: Geodetic, q_nb: np.ndarray
+) -> MotionProfile:
     """Motion of velocity (K, 3) NED [m/s] and attitude (K, 4) at dense times (K,) from zero [s].
     The times increase. Between the knots the path follows splines of sixth degree, whose rates are
     those of the velocity at the knots.
@@ -192,7 +194,7 @@ def from_velocity(time_s: np.ndarray, v_n: np.ndarray, start: Geodetic, q_nb: np
     path = rates.antiderivative()
     path.c[:, 2] += alt0  # B-splines sum to one, so this shifts the height
     origin = Geodetic(lat0, float(start.lon), alt0)
-    return Motion(float(time_s[-1]), origin, path, _attitude(time_s, q_nb))
+    return MotionProfile(float(time_s[-1]), origin, path, _attitude(time_s, q_nb))
 
 
 def sine_velocity(
@@ -202,7 +204,7 @@ def sine_velocity(
     period_s: float = 30.0,
     duration_s: float = 600.0,
     phase_rad: Values = (0.0, np.pi / 2.0, 0.0),
-) -> Motion:
+) -> MotionProfile:
     """Velocity ``mean + amplitude sin(2 pi t / period + phase)`` along north, east and down.
 
     The body points along the velocity, with its wings level. The path is that of the generator
@@ -266,8 +268,8 @@ def _column(name: str, values: Values, n: int) -> np.ndarray:
 
 
 def at_lever_arm(
-    motion: Motion, lever_b_m: Sequence[float] | np.ndarray, knots_hz: float = 100.0
-) -> Motion:
+    motion: MotionProfile, lever_b_m: Sequence[float] | np.ndarray, knots_hz: float = 100.0
+) -> MotionProfile:
     """The motion of a point that is carried along, with the axes of the body.
 
     The point's path is that of ``r_e + C_eb lever_b``, and its velocity and acceleration are the

@@ -1,13 +1,14 @@
 """Gusts and turbulence, and a vehicle carried by the wind.
 
 Horizontal vectors are north, east. `gusts` draws a wind that is held for some seconds at a time.
-`carry` moves a point mass, whose drag is linear in its velocity through the air, in such a wind
+`move_in_wind` moves a point mass, whose drag is linear in its velocity through the air, in such a
+wind
 
     v' = -(v - wind - commanded) / tau
 
-and `carried_at` reads velocity, displacement and acceleration at any instant: both are the solution
-in closed form, so the step of the wind is no step of integration. Velocity and displacement are
-continuous; the acceleration jumps where the wind does.
+and `wind_motion_at` reads velocity, displacement and acceleration at any instant: both are the
+solution in closed form, so the step of the wind is no step of integration. Velocity and
+displacement are continuous; the acceleration jumps where the wind does.
 
 `dryden` and `von_karman` draw continuous turbulence of the horizontal wind. The forms are those of
 MIL-F-8785C, section 3.7.1. With the wave number W = w/V [rad/m], the scale length L and the
@@ -54,8 +55,8 @@ _GUSTS = 0
 _ROUNDING = 1e-9  # steps; an instant this short of the next step belongs to it
 
 
-class Carried(NamedTuple):
-    """A motion from `carry`: the state where each step of the wind begins, and at the end."""
+class WindMotion(NamedTuple):
+    """Motion of `move_in_wind`: the state where each step of the wind begins, and at the end."""
 
     step_s: Any  # for how long each wind is held
     velocity: Any  # (M + 1, 2) m/s
@@ -116,13 +117,13 @@ def gusts(
     return jnp.stack([speed * jnp.cos(direction), speed * jnp.sin(direction)], 1)
 
 
-def carry(
+def move_in_wind(
     wind: Numbers,
     step_s: Number,
     commanded_m_s: Number,
     tau_s: _given.Listed,
     start_m_s: Number,
-) -> Carried:
+) -> WindMotion:
     """The motion of a point mass in a wind that is held over steps, exact.
 
     Args:
@@ -153,17 +154,17 @@ def carry(
     _, (velocity, displacement) = jax.lax.scan(step, begin, target)
     velocity = jnp.concatenate([start[None], velocity])
     displacement = jnp.concatenate([jnp.zeros((1, 2)), displacement])
-    return Carried(step_s, velocity, displacement, target, tau_s)
+    return WindMotion(step_s, velocity, displacement, target, tau_s)
 
 
-def carried_at(carried: Carried, time_s: Number) -> tuple[Array, Array, Array]:
+def wind_motion_at(carried: WindMotion, time_s: Number) -> tuple[Array, Array, Array]:
     """Velocity [m/s], displacement [m] and acceleration [m/s^2] at instants, each (..., 2).
 
     Beyond the last step its wind is held. Where two steps meet the acceleration is that of the
     later one.
 
     Args:
-        carried: from `carry`.
+        carried: from `move_in_wind`.
         time_s: (...) from zero on.
 
     Raises:

@@ -12,7 +12,7 @@ Taken = tuple[tuple[str, Any], ...]
 """Name of each sensor of a filter, and `Instrument.taken`."""
 
 
-def aboard(
+def filter_instruments(
     instruments: Iterable[Instrument], given: Any, course: Any
 ) -> tuple[tuple[Sensor, ...], Taken]:
     """Instruments as a filter believes them, and what it takes of the world, of those it has."""

@@ -50,7 +50,7 @@ def is_file(name: str) -> bool:
     return name.partition(":")[0].endswith(".py")
 
 
-class Listed(NamedTuple):
+class ListedScenario(NamedTuple):
     """A scenario file and what it is about."""
 
     path: Path
@@ -59,7 +59,7 @@ class Listed(NamedTuple):
 
 
 @cache
-def listed(system: str) -> dict[str, Listed]:
+def listed(system: str) -> dict[str, ListedScenario]:
     """Packaged scenarios of a system by name, those of a study together.
 
     A file of its folder that states no number of runs configures a replay and is no scenario.
@@ -67,11 +67,11 @@ def listed(system: str) -> dict[str, Listed]:
     Args:
         system: name; one that comes without a folder of scenarios has none.
     """
-    found: dict[str, Listed] = {}
+    found: dict[str, ListedScenario] = {}
     for path in _files(system):
-        says: dict[str, Any] = tomllib.loads(path.read_text("utf-8"))
-        if "runs" in says:
-            found[path.stem] = Listed(path, says["title"], says.get("study", ""))
+        content: dict[str, Any] = tomllib.loads(path.read_text("utf-8"))
+        if "runs" in content:
+            found[path.stem] = ListedScenario(path, content["title"], content.get("study", ""))
     studies = list(dict.fromkeys(scenario.study for scenario in found.values()))
     return dict(sorted(found.items(), key=lambda item: studies.index(item[1].study)))
 

@@ -105,7 +105,7 @@ def nees_claim(text: str, filter_: str, of: str, band: Band) -> Claim:
     return Claim(text, (filter_,), lambda metrics: metrics[filter_][metric], band)
 
 
-def judging(claims: Mapping[str, Claim], stated: Sequence[str] | None = None) -> Judge:
+def claim_judge(claims: Mapping[str, Claim], stated: Sequence[str] | None = None) -> Judge:
     """The judge of the claims stated, by id, where their filters were run.
 
     All claims are judged where none are stated. A second argument are metrics of runs that were
@@ -121,7 +121,7 @@ def judging(claims: Mapping[str, Claim], stated: Sequence[str] | None = None) ->
     return partial(_verdicts, {key: claims[key] for key in chosen})
 
 
-def about(filters: Sequence[str], judge: Judge) -> Judge:
+def judge_filters(filters: Sequence[str], judge: Judge) -> Judge:
     """Verdicts on these filters alone, whatever else was run with them."""
 
     def judged(metrics: Metrics, drawn: Sequence[Metrics] = ()) -> Verdicts:

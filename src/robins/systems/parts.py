@@ -20,7 +20,7 @@ from robins.ins.increments import Increments
 from robins.scenario import Parameters, Quantity, Span, default
 from robins.sim import _given
 from robins.sim._given import Listed
-from robins.sim.commands import Command, accelerate, climb, stop, straight, turn
+from robins.sim.commands import Manoeuvre, accelerate, climb, stop, straight, turn
 from robins.systems import quantities as q
 
 NED, FRD = ("north", "east", "down"), ("forward", "right", "down")
@@ -42,7 +42,7 @@ Names = Annotated[tuple[str, ...], pydantic.Field(min_length=1)]
 """Filters by name, one at least."""
 
 
-class Place(Parameters):
+class StartPlace(Parameters):
     """Position of a vehicle at the start; a study adds its height."""
 
     latitude: Annotated[float, Quantity("angle", least="-89 deg", most="89 deg")]
@@ -100,7 +100,7 @@ def signed(key: Array, size: Listed, draw: Draw) -> Array:
     return sigma * (jnp.where(normal < 0.0, -1.0, 1.0) if draw == "random-sign" else normal)
 
 
-class Cutting(Parameters):
+class LogPartition(Parameters):
     """Partition of a recorded log into steps of a filter."""
 
     longest_block: q.Duration = default("0.25 s")
@@ -110,7 +110,7 @@ class Cutting(Parameters):
     gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
 
 
-class Departure(Place):
+class Departure(StartPlace):
     """Position, height and heading of a vehicle at the start."""
 
     height: Annotated[float, Quantity("length", least="-1 km", most="100 km")] = default("0 m")
@@ -137,7 +137,7 @@ class Leg(Parameters):
         hold = abs(self.angle) / self.rate
         return hold + min(hold, 1.0)  # a turn takes a second to ease in and out
 
-    def command(self) -> Command:
+    def command(self) -> Manoeuvre:
         """The leg as a command of `robins.sim.commands`.
 
         Raises:
@@ -152,7 +152,7 @@ class Leg(Parameters):
 
 
 # parameters of each leg, in the order its command takes them
-_COMMANDS: dict[str, tuple[Callable[..., Command], tuple[str, ...]]] = {
+_COMMANDS: dict[str, tuple[Callable[..., Manoeuvre], tuple[str, ...]]] = {
     "stop": (stop, ("seconds",)),
     "straight": (straight, ("seconds",)),
     "accelerate": (accelerate, ("speed", "seconds")),
@@ -161,7 +161,7 @@ _COMMANDS: dict[str, tuple[Callable[..., Command], tuple[str, ...]]] = {
 }
 
 
-class Block(NamedTuple):
+class ImuBlock(NamedTuple):
     """Input of one step of a motion that is mechanised from inertial samples."""
 
     increments: Increments  # dt (K,), theta (K, 3), dv (K, 3)
@@ -186,9 +186,9 @@ def warn_of_large_angles(reached_rad: Mapping[str, float]) -> None:
     """Warn of errors [rad], by parameter, beyond 5 deg, for which linear models do not hold."""
     large = {name: size for name, size in reached_rad.items() if size > LARGEST_RAD}
     if large:
-        told = ", ".join(f"{name} may reach {np.degrees(x):.1f} deg" for name, x in large.items())
+        listed = ", ".join(f"{name} may reach {np.degrees(x):.1f} deg" for name, x in large.items())
         warnings.warn(
-            f"{told}: the filters' model is linear in these angles and good below 5 deg; expect "
+            f"{listed}: the filters' model is linear in these angles and good below 5 deg; expect "
             "biased estimates",
             stacklevel=4,
         )

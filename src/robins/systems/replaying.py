@@ -30,14 +30,14 @@ from robins.filters.whiteness import joined
 from robins.ins.blocks import Blocks
 from robins.ins.increments import after_gap
 from robins.program import BuildError, ProgramError
-from robins.program.scanned import on_each
-from robins.results import Outcome, Progress, silent, variable
+from robins.program.scanned import mapped_rows
+from robins.results import Outcome, Progress, ignore_progress, variable
 from robins.systems.judgement import Metric
 from robins.systems.study import Case, Contender, SensorAxes, StateBlock
 from robins.systems.suspects import probabilities, sentences, tables
 from robins.systems.tables import (
     EULER,
-    Update,
+    SensorUpdates,
     attitude_array,
     block_array,
     innovation_tables,
@@ -46,7 +46,7 @@ from robins.systems.tables import (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Piece:
+class LogPiece:
     """A stretch of a log without a long gap, prepared for filters; E epochs.
 
     A system derives its own, with what else it has to know of a piece.
@@ -58,25 +58,25 @@ class Piece:
     noise_scale: np.ndarray | float = 1.0  # (E,) of the process noise factor
 
 
-class Recorded(NamedTuple):
+class PreparedLog(NamedTuple):
     """A log as its filters take it."""
 
-    pieces: Sequence[Piece]
+    pieces: Sequence[LogPiece]
     contender: Callable[[str], Contender]  # by name; raises a ValueError where there is none
 
 
 PROBABILITY = "imm.probability"  # note of a bank: (modes,), kept of every step as is `WRONG`
 
-PieceT = TypeVar("PieceT", bound=Piece)
+PieceT = TypeVar("PieceT", bound=LogPiece)
 
 
-class Answer(NamedTuple):
+class FilterEstimates(NamedTuple):
     """Estimates of a filter or smoother on a log; leading axis E epochs of all its pieces."""
 
     name: str
     mean: Any
     sigma: Any  # (E, n)
-    updates: Mapping[str, Update]  # by sensor; empty for a smoother
+    updates: Mapping[str, SensorUpdates]  # by sensor; empty for a smoother
     start: Belief  # before the first step of the last piece
     log_likelihood: float
     tally: Tally  # how the steps went, of each piece
@@ -85,7 +85,7 @@ class Answer(NamedTuple):
     by_jax: str = ""  # why the interpreter could not carry the filter out
 
 
-class Reported(NamedTuple):
+class ReportedItems(NamedTuple):
     """Items that the replays of a system report of every filter."""
 
     blocks: Sequence[StateBlock]
@@ -103,7 +103,7 @@ class Reported(NamedTuple):
 # -------------------------------------------------------------------------------- log to pieces
 
 
-def prepared(
+def prepare_pieces(
     time_s: np.ndarray,
     dt_s: np.ndarray,
     longest_gap_s: float,
@@ -147,7 +147,7 @@ def noise_scale(
     return np.where(missing, across_gap, 1.0)
 
 
-def gap_counts(pieces: Sequence[Piece], problems: Sequence[str]) -> dict[str, int]:
+def gap_counts(pieces: Sequence[LogPiece], problems: Sequence[str]) -> dict[str, int]:
     """Numbers of gaps that ended a piece, and of blocks across a shorter one."""
     across = (np.sum(np.asarray(piece.noise_scale) > 1.0) for piece in pieces)
     return {
@@ -159,7 +159,7 @@ def gap_counts(pieces: Sequence[Piece], problems: Sequence[str]) -> dict[str, in
 # ----------------------------------------------------------------------------- pieces to answers
 
 
-def kept(step: Step) -> tuple[PyTree, Array, dict[str, Update]]:
+def kept(step: Step) -> tuple[PyTree, Array, dict[str, SensorUpdates]]:
     """Keep the posterior's mean and standard deviations and how the updates went, by sensor.
 
     Of a bank also how likely each mode is.
@@ -167,13 +167,13 @@ def kept(step: Step) -> tuple[PyTree, Array, dict[str, Update]]:
     return step.posterior.mean, step.posterior.sigma, updates(step, (PROBABILITY, WRONG))
 
 
-def navigated(
-    pieces: Sequence[Piece],
+def run_filters(
+    pieces: Sequence[LogPiece],
     wanted: Sequence[str],
     contender: Callable[[str], Contender],
     smoothers: Mapping[str, str] | None = None,
-    progress: Progress = silent,
-) -> dict[str, Answer]:
+    progress: Progress = ignore_progress,
+) -> dict[str, FilterEstimates]:
     """Estimates of all pieces by filters and smoothers; each filter runs over a piece once.
 
     Args:
@@ -185,7 +185,7 @@ def navigated(
     """
     causal = {name: (smoothers or {}).get(name, name) for name in wanted}
     contenders = {name: contender(name) for name in dict.fromkeys(causal.values())}
-    answers: dict[str, list[Answer]] = {name: [] for name in causal}
+    answers: dict[str, list[FilterEstimates]] = {name: [] for name in causal}
     for number, piece in enumerate(pieces):
         for done, (base, chosen) in enumerate(contenders.items()):
             share = (number + done / len(contenders)) / len(pieces)
@@ -197,19 +197,23 @@ def navigated(
     return {name: _joined(parts) for name, parts in answers.items()}
 
 
-def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answer, Answer]:
+def _of_piece(
+    piece: LogPiece, contender: Contender, smoothed: bool
+) -> tuple[FilterEstimates, FilterEstimates]:
     """Estimates of a filter on a piece, and of its smoother if that is requested."""
     filter_, case = contender.filter, contender.case(piece.world)
     with warnings.catch_warnings():
         # these are among the warnings of the outcome
         warnings.simplefilter("ignore", StepWarning)
         found, why = _ran(contender, case, everything if smoothed else kept, piece.epoch_s)
-        of_steps = on_each(kept, found.steps) if smoothed else found.steps
+        of_steps = mapped_rows(kept, found.steps) if smoothed else found.steps
     mean, sigma, seen = of_steps
     likelihood, bounds = float(found.log_likelihood), contender.bounds
     tally = found.tally.looking(seen, case.y)
     wrong = probabilities(filter_, seen)
-    answer = Answer("", mean, sigma, seen, case.start, likelihood, tally, bounds, wrong, why)
+    answer = FilterEstimates(
+        "", mean, sigma, seen, case.start, likelihood, tally, bounds, wrong, why
+    )
     if not smoothed:
         return answer, answer
     belief = rts_smoother(found, machine="vm")
@@ -226,7 +230,7 @@ def _ran(contender: Contender, case: Case, keep: Keep, time_s: np.ndarray) -> tu
         return run(*arguments, keep=keep, time_s=time_s), str(error)
 
 
-def _joined(parts: Sequence[Answer]) -> Answer:
+def _joined(parts: Sequence[FilterEstimates]) -> FilterEstimates:
     if len(parts) == 1:
         return parts[0]
     kept = "mean", "sigma", "updates", "wrong"
@@ -238,7 +242,7 @@ def _joined(parts: Sequence[Answer]) -> Answer:
     )
 
 
-def _tally_of(parts: Sequence[Answer]) -> Tally:
+def _tally_of(parts: Sequence[FilterEstimates]) -> Tally:
     looks = [a.tally.looks for a in parts]
     tally = jax.tree_util.tree_map(
         lambda *x: np.stack(x), *[a.tally._replace(looks={}) for a in parts]
@@ -246,7 +250,7 @@ def _tally_of(parts: Sequence[Answer]) -> Tally:
     return tally._replace(looks={k: joined([look[k] for look in looks]) for k in looks[0]})
 
 
-def epochs_of(pieces: Sequence[Piece]) -> np.ndarray:
+def epochs_of(pieces: Sequence[LogPiece]) -> np.ndarray:
     """(E,) epochs of all pieces, as `end_to_end`: between two is the time the later begins at."""
     rows = [a for piece in pieces for a in (np.array([piece.begin_s]), piece.epoch_s)]
     return np.concatenate(rows[1:])
@@ -271,10 +275,10 @@ def end_to_end(trees: Sequence[PyTree]) -> PyTree:
 
 def outcome(
     epoch_s: np.ndarray,
-    answers: Mapping[str, Answer],
-    reported: Reported,
+    answers: Mapping[str, FilterEstimates],
+    reported: ReportedItems,
     *,
-    metrics: Callable[[Answer], Mapping[str, Metric]],
+    metrics: Callable[[FilterEstimates], Mapping[str, Metric]],
     variables: Mapping[str, xr.Variable],
     counts: Mapping[str, int],
     notes: Sequence[str],
@@ -317,7 +321,7 @@ def outcome(
 
 
 def _tables(
-    epoch_s: np.ndarray, answers: Mapping[str, Answer], reported: Reported
+    epoch_s: np.ndarray, answers: Mapping[str, FilterEstimates], reported: ReportedItems
 ) -> dict[str, Any]:
     data: dict[str, Any] = {
         "filter": ("filter", list(answers)),
@@ -333,7 +337,7 @@ def _tables(
                 data |= block_array(role, block, values)
     if all("q_nb" in of for of in found):
         q_nb = np.stack([np.asarray(of["q_nb"]) for of in found])
-        euler = np.stack(on_each(rotation.to_euler, q_nb.reshape(-1, 4)), axis=-1)
+        euler = np.stack(mapped_rows(rotation.to_euler, q_nb.reshape(-1, 4)), axis=-1)
         euler = euler.reshape(*q_nb.shape[:-1], 3)
         data |= attitude_array(q_nb, reported.euler.frame)
     else:
@@ -344,13 +348,13 @@ def _tables(
     return data | innovation_tables(seen, reported.sensors, epoch_s)
 
 
-def _sigma(answer: Answer, block: StateBlock) -> np.ndarray | None:
+def _sigma(answer: FilterEstimates, block: StateBlock) -> np.ndarray | None:
     """(E, k) standard deviations of a block; None where the filter has no such states."""
     here = np.asarray(answer.sigma)[:, block.where]
     return here if here.shape[1] == len(block.axes) else None
 
 
-def _innovations(answer: Answer) -> dict[str, Metric]:
+def _innovations(answer: FilterEstimates) -> dict[str, Metric]:
     """Grand mean NIS with its band, and number of refusals, of each sensor with measurements.
 
     The bound of an H-infinity filter is no covariance, so it has no NIS.

@@ -67,7 +67,7 @@ class Flag(IntFlag):
     OUTLIER = 128  # the filter refused a measurement of its last step
 
 
-class Door:
+class TimestampGate:
     """Gate of samples, by their stamps and sizes."""
 
     def __init__(self, longest_gap_s: float, patience: int):
@@ -81,7 +81,7 @@ class Door:
         self.last_ns: int | None = None
         self._elsewhere_ns, self._row = 0, 0
 
-    def ask(self, time_ns: int, values: np.ndarray) -> str:
+    def check(self, time_ns: int, values: np.ndarray) -> str:
         """Reason why a sample is refused; "" for one that is taken, "anew" for one that starts
         again.
 
@@ -277,7 +277,7 @@ def _is_part(value: Part) -> bool:
     return type(value).__module__.startswith("robins.") and hasattr(value, "__dict__")
 
 
-def as_before(like: PyTree, leaves: Sequence[ArrayLike]) -> PyTree:
+def restored(like: PyTree, leaves: Sequence[ArrayLike]) -> PyTree:
     """A state of the structure of another, with these leaves.
 
     Raises:

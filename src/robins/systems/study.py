@@ -24,7 +24,7 @@ from robins.manifold import State
 from robins.results import Outcome
 from robins.scenario import Parameters
 from robins.systems.catalogue import listed
-from robins.systems.judgement import Claim, Judge, judging, standard_metrics
+from robins.systems.judgement import Claim, Judge, claim_judge, standard_metrics
 from robins.systems.parts import HowMany, Names, RunNumber, Runs
 
 
@@ -290,12 +290,12 @@ class Study(Generic[ParametersT, CourseT, WorldT]):
         return Problem(
             simulate=partial(self.simulate, given, course, seed),
             contenders={name: self.contender(given, course, name) for name in filters},
-            claims=judging(self.claims, given.claims),
+            claims=claim_judge(self.claims, given.claims),
             **vars(self.view(given, course)),
         )
 
 
-class Alignment(NamedTuple):
+class PairAlignment(NamedTuple):
     """Use of a recorded master and slave in the place of a simulation."""
 
     study: str  # whose scenarios serve as configurations
@@ -328,7 +328,7 @@ class System(NamedTuple):
     replay_finds: tuple[str, ...] = ("attitude", "track")
     # roll, pitch, yaw [rad] of the body axes as seen from the sensor's, from replay parameters
     orientation: Callable[[Any], tuple[float, float, float]] = lambda parameters: (0.0, 0.0, 0.0)
-    alignment: Alignment | None = None
+    alignment: PairAlignment | None = None
     # of a system without a scenario, (replay parameters, seed) -> simulated runs that try a filter
     # which is exported
     aboard: Callable[[Any, int], Problem] | None = None
@@ -348,5 +348,5 @@ class System(NamedTuple):
     def claims(self) -> tuple[Mapping[str, str], ...]:
         """Ids and texts of what scenarios check, each once: studies may share claims."""
         every = (item for study in self.studies.values() for item in study.claims.items())
-        told = dict.fromkeys((key, claim.text) for key, claim in every)
-        return tuple({"id": key, "text": text} for key, text in told)
+        texts = dict.fromkeys((key, claim.text) for key, claim in every)
+        return tuple({"id": key, "text": text} for key, text in texts)

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike
 from robins.filters import Filter
 from robins.filters.kalman import WRONG
 from robins.results import array
-from robins.systems.tables import Update
+from robins.systems.tables import SensorUpdates
 
 HELD = 0.5  # probability of being wrong above which a suspect raises an alarm
 _SHOWN = 4  # spans in a sentence
@@ -21,7 +21,7 @@ Wrong = Mapping[str, ArrayLike]
 """Probability that each suspect is wrong, by its name; leading axis E epochs."""
 
 
-def probabilities(filter_: Filter, updates: Mapping[str, Update]) -> dict[str, Array]:
+def probabilities(filter_: Filter, updates: Mapping[str, SensorUpdates]) -> dict[str, Array]:
     """Probability of each suspect of a filter after its last update of each step.
 
     Args:
@@ -79,20 +79,20 @@ def sentences(name: str, time_s: np.ndarray, wrong: Wrong) -> list[str]:
         time_s: (E,).
         wrong: its probabilities; NaN between the pieces of a log.
     """
-    said = []
+    worded = []
     for suspect, chance in wrong.items():
         chance = np.nan_to_num(np.asarray(chance, float))
         if found := spans(time_s, chance > HELD):
             longest = sorted(sorted(found, key=lambda one: one[0] - one[1])[:_SHOWN])
             shown = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in longest)
             more = f" and {len(found) - _SHOWN} shorter times" if len(found) > _SHOWN else ""
-            said.append(
+            worded.append(
                 f"{name} finds {words(suspect)} wrong: {shown}{more}; "
                 f"probability up to {np.max(chance):.2f}."
             )
-    if wrong and not said:
+    if wrong and not worded:
         return [f"{name} finds none of these wrong: {', '.join(map(words, wrong))}."]
-    return said
+    return worded
 
 
 def words(suspect: str) -> str:

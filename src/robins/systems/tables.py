@@ -17,7 +17,7 @@ from robins.systems.study import Output, SensorAxes, StateBlock
 EULER = StateBlock("euler", slice(0, 3), "rad", "deg", "FRD to NED", ("roll", "pitch", "heading"))
 
 
-class Update(NamedTuple):
+class SensorUpdates(NamedTuple):
     """Kept part of the `StepInfo` of one sensor's updates; leading axis E epochs."""
 
     innovation: Any  # (E, m)
@@ -28,10 +28,10 @@ class Update(NamedTuple):
     notes: Mapping[str, Any] = {}
 
 
-def updates(step: Step, notes: Collection[str] = ()) -> dict[str, Update]:
+def updates(step: Step, notes: Collection[str] = ()) -> dict[str, SensorUpdates]:
     """Kept part of a step, by sensor, with the named notes of its rules."""
     return {
-        k: Update(
+        k: SensorUpdates(
             *(i.innovation, i.sigma, i.nis, i.dof, i.code),
             {name: i.notes[name] for name in notes if name in i.notes},
         )
@@ -85,19 +85,19 @@ def attitude_array(q_nb: ArrayLike, frame: str, time: str = "time", words: str =
 
 
 def innovation_tables(
-    seen: Sequence[Mapping[str, Update]], axes: Mapping[str, SensorAxes], epoch_s: np.ndarray
+    seen: Sequence[Mapping[str, SensorUpdates]], axes: Mapping[str, SensorAxes], epoch_s: np.ndarray
 ) -> Variables:
     """Arrays and coordinates of a solution, at the epochs of each sensor's measurements.
 
     Args:
-        seen: by filter and sensor, an `Update`. A filter that has no such sensor, as a smoother has
-            none, has NaN there, and refuses nothing.
+        seen: by filter and sensor, an `SensorUpdates`. A filter that has no such sensor, as a
+            smoother has none, has NaN there, and refuses nothing.
         axes: by sensor, units and names of the innovation's components.
         epoch_s: (E,) time of each epoch.
     """
     data: dict[str, Any] = {}
     for sensor in dict.fromkeys(sensor for of in seen for sensor in of):
-        kept = Update._fields[:5]
+        kept = SensorUpdates._fields[:5]
         innovation, spread, nis, dof, code = (_every(seen, sensor, what) for what in kept)
         spoke = np.any(np.isfinite(innovation), axis=(0, 2))
         if not np.any(spoke):
@@ -115,7 +115,7 @@ def innovation_tables(
     return data
 
 
-def _every(seen: Sequence[Mapping[str, Update]], sensor: str, what: str) -> np.ndarray:
+def _every(seen: Sequence[Mapping[str, SensorUpdates]], sensor: str, what: str) -> np.ndarray:
     """Kept part of a sensor by every filter, leading axis; NaN for one without the sensor."""
     rows = [getattr(of[sensor], what) if sensor in of else None for of in seen]
     blank = np.full(np.shape(next(row for row in rows if row is not None)), np.nan)

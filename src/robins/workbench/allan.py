@@ -22,7 +22,7 @@ from robins.ins.allan import Allan, AllanFit, deviation, fit, in_field_units, st
 from robins.ins.increments import own_intervals
 from robins.logs import formats_of, open_log
 from robins.logs.clean import clean_imu
-from robins.results import Outcome, Progress, array, silent, variable
+from robins.results import Outcome, Progress, array, ignore_progress, variable
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.options import Log, Option
 
@@ -38,7 +38,7 @@ _UNITS = {"gyro": ("rad/s", "deg/h"), "accel": ("m/s^2", "ug")}
 _TURNING = np.deg2rad(2.0)  # rad/s of mean rate over a second; sensors at rest are far below
 
 
-class Still(NamedTuple):
+class RestingImu(NamedTuple):
     """Rates of a resting IMU."""
 
     rates: dict[str, np.ndarray]  # "gyro" [rad/s], "accel" [m/s^2]: (N, 3)
@@ -48,7 +48,7 @@ class Still(NamedTuple):
     body: str
 
 
-def still(path: Path, columns: Sequence[str | os.PathLike[str]] = ()) -> Still:
+def resting_imu(path: Path, columns: Sequence[str | os.PathLike[str]] = ()) -> RestingImu:
     """Read and clean the log of a resting IMU; increments become rates.
 
     Raises:
@@ -82,7 +82,7 @@ def still(path: Path, columns: Sequence[str | os.PathLike[str]] = ()) -> Still:
         rates = {sensor: values / own for sensor, values in rates.items()}
     if _moved(rates["gyro"], time_ns):
         notes.append("The sensor turned during the log: what follows is motion, not noise.")
-    return Still(rates, time_ns, {k: n for k, n in counts.items() if n}, notes, cleaned.body)
+    return RestingImu(rates, time_ns, {k: n for k, n in counts.items() if n}, notes, cleaned.body)
 
 
 def _moved(gyro: np.ndarray, time_ns: np.ndarray) -> bool:
@@ -150,7 +150,7 @@ def allan(
     *,
     terms: Annotated[str, Option("Noises to fit, of Q, N, B, K, R.", shown=True)] = "NBK",
     columns: Sequence[str | os.PathLike[str]] = (),
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> Outcome:
     """Compute the Allan deviation of a resting IMU, and the noise parameters of its data sheet.
 
@@ -169,7 +169,7 @@ def allan(
     if len(set(terms)) != len(terms) or not terms or not set(terms) <= set(_NAMES):
         raise InputError(f"give different letters out of {', '.join(_NAMES)}.", f"--terms {terms}")
     path = Path(log)
-    given = still(path, columns)
+    given = resting_imu(path, columns)
     notes = list(given.notes)
     arrays: dict[str, Any] = {}
     by_axis: dict[str, dict[str, Any]] = {axis: {} for axis in _AXES}

@@ -12,7 +12,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from robins.bench.parts.kits import held_folder, put
+from robins.bench.parts.config_files import private_folder, put
 from robins.bench.parts.station import Station, ready, serve
 from robins.bench.ports.port import address, open_port, program
 from robins.bench.recording import open_record
@@ -20,10 +20,17 @@ from robins.bench.recording.differences import Differences, FieldDifference, tab
 from robins.bench.recording.replay import Start, recorded, replay
 from robins.bench.run.outcome import outcome
 from robins.bench.run.session import Session
-from robins.bench.run.setup import Flight, changed, kit_of, read, recorded_flight, recorded_rig
-from robins.bench.run.watching import Looking, page_for, starting
-from robins.bench.status import Status
-from robins.results import Outcome, Progress, silent
+from robins.bench.run.setup import (
+    LoadedRun,
+    changed,
+    config_of,
+    read,
+    recorded_flight,
+    recorded_rig,
+)
+from robins.bench.run.watching import PageObserver, page_for, starting_state
+from robins.bench.status import BenchStatus
+from robins.results import Outcome, Progress, ignore_progress
 from robins.results.summary import plain
 from robins.systems import trust
 from robins.workbench.errors import InputError
@@ -40,7 +47,7 @@ def bench_up(
     host: str = "127.0.0.1",
     port: int = 8321,
     opened: Callable[[str], None] = print,
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
     **options: Any,
 ) -> Outcome:
     """Run a scenario on the bench: each part a process or a board on a serial line.
@@ -68,7 +75,7 @@ def bench_up(
         raise InputError("--paused waits for the page's Start", fix="give --live too.")
     flight = flight_of(scenario, settings, options)
     file = None if record is None else Path(record)
-    status = Status()
+    status = BenchStatus()
     with _onlooker(flight, status, live, host, port, opened) as watch:
         session = Session(flight, file, watch, part(progress, 0.0, 0.95), paused)
         try:
@@ -82,7 +89,7 @@ def bench_up(
     return replace(found, warnings=[*found.warnings, *filter(None, [status.refused])])
 
 
-def flight_of(scenario: str, settings: Sequence[str], options: Mapping[str, Any]) -> Flight:
+def flight_of(scenario: str, settings: Sequence[str], options: Mapping[str, Any]) -> LoadedRun:
     """Flight of a request; options that were not given stay as the scenario has them.
 
     Raises:
@@ -98,17 +105,17 @@ def flight_of(scenario: str, settings: Sequence[str], options: Mapping[str, Any]
 
 @contextlib.contextmanager
 def _onlooker(
-    flight: Flight,
-    status: Status,
+    flight: LoadedRun,
+    status: BenchStatus,
     live: bool,
     host: str,
     port: int,
     opened: Callable[[str], None],
-) -> Iterator[Looking]:
+) -> Iterator[PageObserver]:
     """The status file, and the page if it is wanted."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(status)
-        status.tell(starting(flight))
+        status.tell(starting_state(flight))
         page = None
         if live:
             try:
@@ -122,10 +129,10 @@ def _onlooker(
                 ) from error
             stack.callback(page.close)
             opened(page.url)
-        yield Looking(page, status)
+        yield PageObserver(page, status)
 
 
-class Compared(NamedTuple):
+class ReplayComparison(NamedTuple):
     """Comparison of what a part sent in the record and in its replay."""
 
     node: str
@@ -136,7 +143,7 @@ class Compared(NamedTuple):
     damages: list[str]  # why not, a sentence a record
     until_s: float  # what was compared ends there
     planned_s: float  # the run was to end there
-    told: str  # the first difference, in words, where the part was run again
+    first_difference: str  # the first difference, in words, where the part was run again
     compared: int  # frames
 
     @property
@@ -159,7 +166,10 @@ class Compared(NamedTuple):
             said = f"'{self.node}' says the same {self.frames} frames, byte for byte."
             lines.append(f"Same: {so_far}{said}")
         else:
-            lines += [f"Different: {self.told or 'see below'}\n", table(self.differences)]
+            lines += [
+                f"Different: {self.first_difference or 'see below'}\n",
+                table(self.differences),
+            ]
         return "\n".join(lines)
 
 
@@ -169,8 +179,8 @@ def bench_replay(
     node: str,
     filter_: str | None = None,
     diff: str | Path | None = None,
-    progress: Progress = silent,
-) -> Compared:
+    progress: Progress = ignore_progress,
+) -> ReplayComparison:
     """Run a part again on a record and compare its answers; or compare it in two records.
 
     Args:
@@ -191,7 +201,7 @@ def bench_replay(
     if node not in rig.parts:
         raise InputError(f"there is no part '{node}', only {', '.join(rig.parts)}", "--node")
     wire = rig.wire
-    step_ns, told = int(first.header["step_ns"]), None
+    step_ns, first_difference = int(first.header["step_ns"]), None
     if second is None:
         flight = recorded_flight(first.header, record, filter_)
         if once := rig.once(flight.setup, node):
@@ -205,19 +215,19 @@ def bench_replay(
                 start,
                 progress=lambda k, n: progress(k / max(n, 1), "hearing"),
             )
-        frames, told = heard.compared, heard.first_difference
+        frames, first_difference = heard.compared, heard.first_difference
     else:
         frames = Differences(wire, step_ns)
         for pair in zip_longest(recorded(first.entries, node), recorded(second.entries, node)):
             frames.take_both(*pair)
     found = frames.found()
-    same = not found if second is not None else told is None
+    same = not found if second is not None else first_difference is None
     damages = [
         f"{path} is not whole: {one.why}"
         for path, one in ((record, first), (diff, second))
         if one is not None and not one.whole
     ]
-    return Compared(
+    return ReplayComparison(
         node=node,
         frames=frames.frames[1],
         same=same,
@@ -226,17 +236,17 @@ def bench_replay(
         damages=damages,
         until_s=min(frames.until_ns) * 1e-9,
         planned_s=int(first.header["steps"]) * step_ns * 1e-9,
-        told=told or "",
+        first_difference=first_difference or "",
         compared=min(frames.frames),
     )
 
 
 @contextlib.contextmanager
-def _starter(flight: Flight, part: str, other: Path | None) -> Iterator[Start]:
+def _starter(flight: LoadedRun, part: str, other: Path | None) -> Iterator[Start]:
     """Function that starts a part of a recorded run, or the program that stood in for it."""
-    with held_folder() as folder:
+    with private_folder() as folder:
         path = folder / "kit"
-        put(kit_of(flight), path)
+        put(config_of(flight), path)
 
         @contextlib.contextmanager
         def start(port: str) -> Iterator[subprocess.Popen]:
@@ -281,7 +291,7 @@ def bench_node(
     if name not in rig.parts:
         raise InputError(f"no part '{name}', only {', '.join(rig.parts)}")
     at = address(port)
-    kit = kit_of(flight)
+    kit = config_of(flight)
     made = Station(ready(rig.part(name, kit), kit.frames), rig.wire)
     with open_port(at, timeout_s=None) as line:
         opened()

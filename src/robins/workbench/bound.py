@@ -15,10 +15,10 @@ from typing import Annotated
 from robins import _float64, units
 from robins.campaign.bound import bound as bound_of
 from robins.report import bounds
-from robins.results import Outcome, Progress, silent
+from robins.results import Outcome, Progress, ignore_progress
 from robins.workbench.errors import refusing
 from robins.workbench.options import Option, Scenario
-from robins.workbench.scenarios import asked, check_filters, read_scenario
+from robins.workbench.scenarios import check_filters, read_scenario, request_fields
 
 
 def bound(
@@ -34,7 +34,7 @@ def bound(
     seed: int = 0,
     settings: Sequence[str] = (),
     filter_name: str = "",
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> Outcome:
     """Compute the covariance bound and observability of SCENARIO; no filter can do better.
 
@@ -75,5 +75,5 @@ def bound(
         runs=runs,
         tables=[bounds.table(solution, epochs)],
         last_lines=[f"Next:   robins run {name}   shows how near the filters come"],
-        **asked(one.text, settings),
+        **request_fields(one.text, settings),
     )

@@ -24,7 +24,7 @@ from robins.logs import formats_of, open_log
 from robins.logs.clean import clean_mag
 from robins.logs.mounting import turned
 from robins.logs.tables import tables_of
-from robins.results import Outcome, Progress, array, silent, variable
+from robins.results import Outcome, Progress, array, ignore_progress, variable
 from robins.units import parse
 from robins.workbench.doctor import mounting_of, parted, typed
 from robins.workbench.errors import InputError, refusing
@@ -41,7 +41,7 @@ _WAYS = {
 }
 
 
-class Turned(NamedTuple):
+class MagnetometerSamples(NamedTuple):
     """Samples of a magnetometer, forward-right-down as a replay of the log has them."""
 
     time_s: np.ndarray  # (N,) since the first sample of the log
@@ -56,7 +56,7 @@ def samples(
     begin_s: float,
     end_s: float,
     columns: Sequence[str | os.PathLike[str]] = (),
-) -> Turned:
+) -> MagnetometerSamples:
     """Read and clean the field of a log between two times from its first sample.
 
     Raises:
@@ -88,8 +88,10 @@ def samples(
             f"no sample from {begin_s:g} s {until}; the log ends at {last:g} s.", names
         )
     inertial = any(isinstance(table, ImuTable) for table in held)
-    told = {reason: count for reason, count in counts.items() if count}
-    return Turned(time_s[inside], table.field_t[inside], told, [str(f) for f in findings], inertial)
+    reasons = {reason: count for reason, count in counts.items() if count}
+    return MagnetometerSamples(
+        time_s[inside], table.field_t[inside], reasons, [str(f) for f in findings], inertial
+    )
 
 
 def advice(found: Calibration) -> list[str]:
@@ -147,7 +149,7 @@ def as_toml(found: Calibration, source: str) -> str:
     )
 
 
-def solution_of(given: Turned, found: Calibration) -> xr.Dataset:
+def solution_of(given: MagnetometerSamples, found: Calibration) -> xr.Dataset:
     """The field before and after."""
     about: dict[str, Any] = {"frame": "FRD", "axes": _AXES, "display_unit": "uT"}
     after = calibrated(given.field_t, found.offset_t, found.matrix)
@@ -196,7 +198,7 @@ def calibrate(
     ] = None,
     horizontal: Annotated[bool, Option("The vehicle cannot tilt: it turned about z only.")] = False,
     columns: Sequence[str | os.PathLike[str]] = (),
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> Outcome:
     """Calibrate hard and soft iron from a log in which the sensor is turned about all its axes.
 

@@ -16,32 +16,32 @@ import numpy as np
 from robins import _float64, scenario
 from robins.campaign import check_machine, retention
 from robins.campaign.bound import bound_sigma
-from robins.campaign.gather import State, blank, example_of, gather
+from robins.campaign.gather import CampaignState, blank_statistics, example_of, gather
 from robins.campaign.machine import first_run, first_worlds, machine_for
 from robins.campaign.outcome import outcome_of
 from robins.campaign.plan import (
     KEPT,
     NAME,
+    CampaignPlan,
     Chunk,
-    Plan,
     Shard,
     check_code,
     code_of,
-    needed,
     read,
+    require_plan,
     write,
 )
 from robins.campaign.retention import by_stem, content_of, kept
-from robins.campaign.shards import Damaged, unpack
+from robins.campaign.shards import DamagedShardError, unpack
 from robins.campaign.statistics import Statistics
 from robins.campaign.store import Store, open_store
 from robins.campaign.work import Worker, missing
 from robins.foreign import decoding
-from robins.results import Outcome, Progress, silent
-from robins.systems.judgement import about
+from robins.results import Outcome, Progress, ignore_progress
+from robins.systems.judgement import judge_filters
 from robins.systems.study import Problem
 from robins.workbench.errors import InputError
-from robins.workbench.scenarios import beside, check_filters, read_scenario
+from robins.workbench.scenarios import check_filters, read_scenario, with_default_filter
 
 Where = str | os.PathLike[str]
 SWEEP = "sweep.json"  # in the folder of several campaigns
@@ -57,7 +57,7 @@ def plan_campaign(
     filters: Sequence[str] = (),
     settings: Sequence[str] = (),
     machine: str = "",
-) -> Plan:
+) -> CampaignPlan:
     """Start a campaign in a store, or extend the one that is there by more runs or filters.
 
     Args:
@@ -79,12 +79,12 @@ def plan_campaign(
     store = open_store(where)
     one = read_scenario(name, settings if runs is None else (*settings, f"runs={runs}"))
     text = scenario.text_of(scenario.override(scenario.mapping_of(one.text), settings))
-    chosen = check_filters(one.label, one.study.filters, filters or beside(one))
+    chosen = check_filters(one.label, one.study.filters, filters or with_default_filter(one))
     wanted: int = one.parameters.runs
     before = read(store)
     if before is None:
         by = machine_for(one.problem(chosen, seed), machine)
-        plan = Plan(
+        plan = CampaignPlan(
             asked=name,
             scenario=one.label,
             text=text,
@@ -122,11 +122,11 @@ def plan_campaign(
 
 def _of_runs(text: str) -> str:
     """Scenario text that any run depends on, and its title: what is kept may change at any time."""
-    said = scenario.mapping_of(text)
-    return scenario.text_of({k: v for k, v in said.items() if k not in KEPT})
+    tables = scenario.mapping_of(text)
+    return scenario.text_of({k: v for k, v in tables.items() if k not in KEPT})
 
 
-def problem_of(plan: Plan, filters: Sequence[str] = ()) -> Problem:
+def problem_of(plan: CampaignPlan, filters: Sequence[str] = ()) -> Problem:
     """The problem of a campaign, with its filters or some of them.
 
     Raises:
@@ -134,10 +134,10 @@ def problem_of(plan: Plan, filters: Sequence[str] = ()) -> Problem:
     """
     one = read_scenario(plan.asked, (), plan.text, named_in=NAME)
     problem = one.problem(filters or plan.filters, plan.seed)
-    return replace(problem, claims=about(one.own, problem.claims))
+    return replace(problem, claims=judge_filters(one.own, problem.claims))
 
 
-def ready(where: Where) -> tuple[Store, Plan]:
+def ready(where: Where) -> tuple[Store, CampaignPlan]:
     """A campaign that this code may go on with.
 
     Raises:
@@ -149,7 +149,7 @@ def ready(where: Where) -> tuple[Store, Plan]:
     return store, plan
 
 
-def opened(where: Where) -> tuple[Store, Plan]:
+def opened(where: Where) -> tuple[Store, CampaignPlan]:
     """A campaign that is there, whatever code began it.
 
     Raises:
@@ -162,7 +162,7 @@ def opened(where: Where) -> tuple[Store, Plan]:
             f"name one, such as {where}/{sweep[1][0]}.",
         )
     store = open_store(where)
-    return store, needed(store)
+    return store, require_plan(store)
 
 
 def campaign_work(where: Where) -> Iterator[tuple[int, int]]:
@@ -206,7 +206,7 @@ def sweep_of(where: Where) -> tuple[list[str], list[str]] | None:
     return vary, points
 
 
-class Status(NamedTuple):
+class CampaignStatus(NamedTuple):
     """Progress of a campaign; runs are counted by filter."""
 
     scenario: str
@@ -223,11 +223,11 @@ class Status(NamedTuple):
     digest: str | None
 
 
-def campaign_status(where: Where) -> Status:
+def campaign_status(where: Where) -> CampaignStatus:
     """Read and check all shards of a campaign, and report its progress."""
     store, plan = opened(where)
     found, there = gather(store, plan), kept(store, by_stem(plan.shards))
-    return Status(
+    return CampaignStatus(
         plan.scenario,
         plan.seed,
         plan.machine,
@@ -243,7 +243,7 @@ def campaign_status(where: Where) -> Status:
     )
 
 
-def diverged_of(found: State, name: str) -> list[int]:
+def diverged_of(found: CampaignState, name: str) -> list[int]:
     """Numbers of the runs in which a filter diverged, of a campaign without gaps."""
     one = found.found[name]
     if found.lacking or not one.runs:
@@ -296,7 +296,7 @@ def _bound(problem: Problem, machine: str) -> np.ndarray | None:
     return bound_sigma(problem, of, first_run(first_worlds(problem, 1)), machine)
 
 
-def campaign_show(where: Where, run: int, *, progress: Progress = silent) -> Outcome:
+def campaign_show(where: Where, run: int, *, progress: Progress = ignore_progress) -> Outcome:
     """One run alone with its histories, as they were kept or computed again, with the same bits.
 
     Raises:
@@ -328,17 +328,17 @@ def campaign_show(where: Where, run: int, *, progress: Progress = silent) -> Out
 
 def _kept(store: Store, shard: Shard, run: int, problem: Problem) -> Statistics | None:
     """A run with its histories as they were kept; None where they are not, or are damaged."""
-    content, one = content_of(store, shard, run), blank(problem)
+    content, one = content_of(store, shard, run), blank_statistics(problem)
     if content is None:
         return None
     try:
         unpack(content, one, example_of(problem, shard.filter))
-    except Damaged:
+    except DamagedShardError:
         return None
     return one
 
 
-class Verified(NamedTuple):
+class CampaignVerification(NamedTuple):
     """Result of the verification of a campaign."""
 
     shards: int
@@ -347,7 +347,9 @@ class Verified(NamedTuple):
     different: list[str]
 
 
-def campaign_verify(where: Where, share: float = 0.01, *, progress: Progress = silent) -> Verified:
+def campaign_verify(
+    where: Where, share: float = 0.01, *, progress: Progress = ignore_progress
+) -> CampaignVerification:
     """Check all shards and histories, compute a share again by chance, and compare the bits.
 
     Raises:
@@ -373,10 +375,12 @@ def campaign_verify(where: Where, share: float = 0.01, *, progress: Progress = s
         if worker.packed(shard, chunk, statistics) != store.get(shard.name):
             different.append(shard.name)
     spoilt = [*damaged, *retention.damaged(store, by_stem(plan.shards))]
-    return Verified(len(whole) + len(damaged), spoilt, [s.name for _, s in drawn], different)
+    return CampaignVerification(
+        len(whole) + len(damaged), spoilt, [s.name for _, s in drawn], different
+    )
 
 
-def mend(where: Where) -> int:
+def remove_damaged(where: Where) -> int:
     """Remove damaged shards, and those of damaged histories, to be computed again; how many."""
     store, plan = ready(where)
     spoilt = retention.damaged(store, by_stem(plan.shards))

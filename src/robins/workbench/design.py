@@ -17,9 +17,9 @@ import numpy as np
 import xarray as xr
 
 from robins.filters.synthesis import METHODS, Attempt, Design, TradeOff, trade_off
-from robins.results import Outcome, Progress, array, silent, variable
+from robins.results import Outcome, Progress, array, ignore_progress, variable
 from robins.results.summary import dumps, plain
-from robins.workbench.design_problem import Problem, read_problem
+from robins.workbench.design_problem import DesignProblem, read_problem
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.options import Option
 
@@ -58,7 +58,7 @@ def metrics_of(found: TradeOff) -> dict[str, dict[str, Any]]:
     return columns
 
 
-def solution_of(problem: Problem, found: TradeOff) -> xr.Dataset:
+def solution_of(problem: DesignProblem, found: TradeOff) -> xr.Dataset:
     """Norms as arrays (design, gamma); the first is the method."""
     methods = list(dict.fromkeys(a.method for a in found.attempts))
 
@@ -82,7 +82,7 @@ def solution_of(problem: Problem, found: TradeOff) -> xr.Dataset:
     )
 
 
-def gains_of(problem: Problem, found: TradeOff) -> dict[str, Any]:
+def gains_of(problem: DesignProblem, found: TradeOff) -> dict[str, Any]:
     """Every gain with full digits, and the methods without one."""
     made = [("kalman", found.kalman)]
     made += [(o.method, o.design) for o in found.attempts if o.design is not None]
@@ -95,7 +95,7 @@ def gains_of(problem: Problem, found: TradeOff) -> dict[str, Any]:
         "least_gamma_of": _whose(found),
         "least_gamma_proved": found.least.proved,
         "least_gamma_step": found.least.step,
-        "designs": [_told(name, design) for name, design in made],
+        "designs": [_design_row(name, design) for name, design in made],
         "not_reached": [
             {"method": o.method, "gamma": o.gamma, "why": o.why, "least": o.least} for o in refused
         ],
@@ -103,14 +103,14 @@ def gains_of(problem: Problem, found: TradeOff) -> dict[str, Any]:
     }
 
 
-def _told(name: str, design: Design) -> dict[str, Any]:
-    told: dict[str, Any] = {"method": name, "gamma": design.gamma, "order": design.order}
+def _design_row(name: str, design: Design) -> dict[str, Any]:
+    row: dict[str, Any] = {"method": name, "gamma": design.gamma, "order": design.order}
     if design.filter is None:
-        told["K"] = design.gain
+        row["K"] = design.gain
     else:
-        told |= dict(zip(("Ah", "Bh", "Gh"), design.filter, strict=True))
-    told |= {number.rstrip("_"): getattr(design, number) for number in _NUMBERS}
-    return told | {"status": design.status}
+        row |= dict(zip(("Ah", "Bh", "Gh"), design.filter, strict=True))
+    row |= {number.rstrip("_"): getattr(design, number) for number in _NUMBERS}
+    return row | {"status": design.status}
 
 
 def table_of(found: TradeOff) -> str:
@@ -125,7 +125,7 @@ def table_of(found: TradeOff) -> str:
     return text.getvalue()
 
 
-def advice(problem: Problem, found: TradeOff) -> list[str]:
+def advice(problem: DesignProblem, found: TradeOff) -> list[str]:
     """Conclusions from the numbers, in sentences."""
     own, gain = found.kalman, _unit(problem.unit_gain)
     least = found.least
@@ -193,7 +193,7 @@ def design(
     methods: Annotated[
         Sequence[str], Option("Which methods to compare.", metavar="a,b", names=True)
     ] = (),
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> Outcome:
     """Design constant gains for PROBLEM, a TOML file with the matrices of a plant or an example.
 
@@ -237,7 +237,7 @@ def design(
     )
 
 
-def _next(given: str, problem: Problem, found: TradeOff) -> str:
+def _next(given: str, problem: DesignProblem, found: TradeOff) -> str:
     usable = [o for g in found.gammas if (o := found.best(g)) is not None and o.design is not None]
     if not usable:
         within = f"{1.05 * found.least.reached:.4g}"

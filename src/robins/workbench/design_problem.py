@@ -21,7 +21,7 @@ _NEEDED = {"prediction": ("A", "Bw", "Bn", "C"), "current": ("A", "Bw", "Bn", "C
 _OTHERS = {"title", "form", "gamma", "units"}
 
 
-class Problem(NamedTuple):
+class DesignProblem(NamedTuple):
     """Design problem."""
 
     name: str  # of the file or example
@@ -42,7 +42,7 @@ class Problem(NamedTuple):
         return f"{self.unit_z}/({self.unit_n})"
 
 
-def read_problem(given: str) -> Problem:
+def read_problem(given: str) -> DesignProblem:
     """Read a problem by the path of its file or by its name.
 
     Raises:
@@ -70,7 +70,7 @@ def read_problem(given: str) -> Problem:
         raise InputError(f"{error}.", given) from error
 
 
-def _problem(name: str, table: Mapping[str, Any], text: str) -> Problem:
+def _problem(name: str, table: Mapping[str, Any], text: str) -> DesignProblem:
     form = table.get("form")
     if form not in _FORMS:
         raise ValueError(
@@ -92,7 +92,7 @@ def _problem(name: str, table: Mapping[str, Any], text: str) -> Problem:
         raise ValueError('units must be a table with z and n, such as {z = "m", n = "m/s^2"}')
     if not all(isinstance(unit, str) and unit for unit in units.values()):
         raise ValueError("units must be text")
-    return Problem(
+    return DesignProblem(
         name, str(table.get("title", name)), form, made, blocks, _gammas(table.get("gamma")),
         units.get("z", "1"), units.get("n", "1"), text,
     )  # fmt: skip

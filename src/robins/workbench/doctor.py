@@ -33,7 +33,7 @@ from robins.workbench.options import Logs
 SEVERITIES = ("error", "warning", "note")
 
 
-class Examined(NamedTuple):
+class LogExamination(NamedTuple):
     """Contents of the files of a log, and the findings of the doctor."""
 
     files: list[str]
@@ -58,7 +58,7 @@ class Examined(NamedTuple):
         }
 
 
-def examine(paths: Logs, columns: Sequence[str | os.PathLike[str]] = ()) -> Examined:
+def examine(paths: Logs, columns: Sequence[str | os.PathLike[str]] = ()) -> LogExamination:
     """Examine a log as an engineer would: units, axes, gravity, rates, gaps, time, sigmas.
 
     The exit status is 2 if a run on it would be wrong, 0 otherwise. A .toml file among LOG... gives
@@ -89,7 +89,7 @@ def examine(paths: Logs, columns: Sequence[str | os.PathLike[str]] = ()) -> Exam
         by_kind(files, opened, [])
     except logs.LogError as error:
         findings.append(logs.Finding("error", "second_of_kind", error.file, "", "", f"{error}."))
-    return Examined([str(path) for path in paths], tables, by_severity(findings))
+    return LogExamination([str(path) for path in paths], tables, by_severity(findings))
 
 
 def unit_file(

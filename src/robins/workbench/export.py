@@ -22,7 +22,7 @@ from robins.bench.rigs import RIGS, rig_of
 from robins.bench.run.setup import changed, read
 from robins.bench.wire.c_header import firmware
 from robins.export.folder import Request, files_of, with_adjustable, write_folder
-from robins.export.single_precision import Cost
+from robins.export.single_precision import PrecisionCost
 from robins.program import DOUBLE, SINGLE
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.options import MOST_OF_SEED, Option, Scenario
@@ -31,7 +31,7 @@ from robins.workbench.scenarios import check_filters, find_scenario, read_scenar
 SMALL = 200  # scalar operations up to which a loop is written out where the code is to be small
 
 
-class Exported(NamedTuple):
+class FilterExport(NamedTuple):
     """Files written, and remarks on them."""
 
     folder: Path
@@ -40,7 +40,7 @@ class Exported(NamedTuple):
     scalars: Mapping[str, int]  # of each entry point, nodes of its program
     bytes: int  # of the C
     real: str  # the type of its reals
-    cost: Cost | None  # of single precision
+    cost: PrecisionCost | None  # of single precision
     program: Path | None = None  # that stands for a part of the bench
 
 
@@ -57,7 +57,7 @@ def export_filter(
     ] = (),
     seed: Annotated[int, Option("Of the recorded run.", least=0, most=MOST_OF_SEED)] = 0,
     settings: Sequence[str] = (),
-) -> Exported:
+) -> FilterExport:
     """Write a filter of SCENARIO as C99, with a test of it for your own compiler.
 
     DIR gets one file of C that needs math.h alone, a header that names all fields with their units,
@@ -98,7 +98,7 @@ def export_filter(
             raise InputError(what, "--float32", "leave it out with --board")
         asked = _aboard(rig, name, filter_name, seed, settings)
     else:
-        asked = _asked(name, filter_name, seed, settings)
+        asked = _export_request(name, filter_name, seed, settings)
     problem, wanted, label = asked.problem, asked.filter, asked.label
     if why := problem.contenders[wanted].on_host:
         what = f"filter '{wanted}' cannot be exported: {why}, which no program in C does"
@@ -113,7 +113,7 @@ def export_filter(
     made = _built(to, rig.exported) if rig else None
     scalars = {entry.name: len(entry.program.live) for entry in library.entries}
     size = len(texts[f"{library.name}.c"])
-    return Exported(to, tuple(files), wanted, scalars, size, precision.kind, found, made)
+    return FilterExport(to, tuple(files), wanted, scalars, size, precision.kind, found, made)
 
 
 def _rig_for(name: str) -> Rig:
@@ -158,7 +158,7 @@ def _aboard(rig: Rig, name: str, filter_name: str, seed: int, settings: Sequence
     return Request(made.problem, flight.setup.filter, label, made.library, made.files)
 
 
-def _asked(name: str, filter_name: str, seed: int, settings: Sequence[str]) -> Request:
+def _export_request(name: str, filter_name: str, seed: int, settings: Sequence[str]) -> Request:
     """The problem by which a filter is tried."""
     system, label, text = find_scenario(name, recorded=True)
     if system.aboard is not None and system.replay_parameters is not None:

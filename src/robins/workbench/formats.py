@@ -27,7 +27,7 @@ _NED_TO_ENU = np.array([0.0, 1.0, 1.0, 0.0]) / np.sqrt(2.0)  # half a turn about
 _HEIGHTS = "Heights are above the WGS-84 ellipsoid, not above the sea."
 
 
-class Track(NamedTuple):
+class ExportTrack(NamedTuple):
     """A way over the Earth; E places, NaN between the pieces of a log."""
 
     name: str
@@ -63,7 +63,7 @@ class Track(NamedTuple):
             )
 
 
-class Format(NamedTuple):
+class ExportFormat(NamedTuple):
     """A format that a result can be exported in."""
 
     text: str
@@ -74,7 +74,7 @@ class Format(NamedTuple):
 _NEEDED = {"attitude": "attitudes", "track": "places on the Earth"}
 
 
-def tracks(solution: xr.Dataset) -> list[Track]:
+def tracks(solution: xr.Dataset) -> list[ExportTrack]:
     """The ways of the filters, the reference and the fixes."""
     found = []
     for role, name in (("track", ""), ("reference", "reference"), ("gnss", "GNSS fixes")):
@@ -86,7 +86,7 @@ def tracks(solution: xr.Dataset) -> list[Track]:
         date = utc(solution, clock)
         names = _filters(solution) if "filter" in lat.dims else [name]
         rows = zip(names, *(np.atleast_2d(x.values) for x in (lat, lon, alt)), strict=True)
-        found += [Track(one, text, clock, a, o, h, date) for one, a, o, h in rows]
+        found += [ExportTrack(one, text, clock, a, o, h, date) for one, a, o, h in rows]
     return [track for track in found if np.any(track.whole)]
 
 
@@ -158,15 +158,17 @@ def with_exports(outcome: Outcome, formats: Sequence[str], name: str) -> Outcome
 
 def _remarks(solution: xr.Dataset, formats: Sequence[str]) -> list[str]:
     """Sentences on what the files do not contain."""
-    said, ways = [], tracks(solution)
+    remarks, ways = [], tracks(solution)
     if "tum" in formats and not ways:
-        said.append("The files .tum hold attitudes only: no place was found, x, y and z are zero.")
+        remarks.append(
+            "The files .tum hold attitudes only: no place was found, x, y and z are zero."
+        )
     maps = [name for name in ("kml", "gpx") if name in formats]
     if maps and ways and ways[0].utc is None:
-        said.append(
+        remarks.append(
             f"The tracks in {' and '.join(maps)} have no times: the stamps of the log have no date."
         )
-    return said
+    return remarks
 
 
 def _csv(solution: xr.Dataset, name: str) -> dict[str, bytes]:
@@ -197,16 +199,16 @@ def _tum(solution: xr.Dataset, name: str) -> dict[str, bytes]:
     found = {}
     for one in _filters(solution):
         q_nb = attitude.sel(filter=one).values
-        place, q, told = np.zeros((len(q_nb), 3)), q_nb, "zero: no place was found"
+        place, q, note = np.zeros((len(q_nb), 3)), q_nb, "zero: no place was found"
         if origin is not None and one in ways:
             place, q = _about(origin, ways[one], q_nb)
             lat, lon, alt = *np.degrees(origin[:2]), origin[2]
-            told = f"{ways[one].text}, m east, north, up of"
-            told += f" {lat:.9f} deg, {lon:.9f} deg, {alt:.4f} m (WGS-84)"
+            note = f"{ways[one].text}, m east, north, up of"
+            note += f" {lat:.9f} deg, {lon:.9f} deg, {alt:.4f} m (WGS-84)"
         lines = [
             f"# {name}, {one}; written by robins {__version__}",
             f"# t: s since {since}",
-            f"# x y z: {told}",
+            f"# x y z: {note}",
             f"# qx qy qz qw: scalar last, turns {axes} axes into east, north, up",
             "# t x y z qx qy qz qw",
         ]
@@ -221,7 +223,7 @@ def _tum(solution: xr.Dataset, name: str) -> dict[str, bytes]:
 
 
 def _about(
-    origin: tuple[float, float, float], track: Track, q_nb: np.ndarray
+    origin: tuple[float, float, float], track: ExportTrack, q_nb: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places (E, 3) [m] east, north, up of an origin, and q_nb (E, 4) with the axes of NED there.
 
@@ -240,8 +242,8 @@ def _kml(solution: xr.Dataset, name: str) -> dict[str, bytes]:
     root = ElementTree.Element("kml", {"xmlns": _KML, "xmlns:gx": _GX})
     document = _child(root, "Document")
     _child(document, "name", name)
-    told = f"{_HEIGHTS} So the tracks are drawn on the ground. Written by robins {__version__}."
-    _child(document, "description", told)
+    note = f"{_HEIGHTS} So the tracks are drawn on the ground. Written by robins {__version__}."
+    _child(document, "description", note)
     for number, track in enumerate(tracks(solution)):
         mark = _child(document, "Placemark")
         _child(mark, "name", track.name)
@@ -258,7 +260,7 @@ def _kml(solution: xr.Dataset, name: str) -> dict[str, bytes]:
                 places = (f"{lon},{lat},{alt}" for lat, lon, alt in rows)
                 _child(line, "coordinates", " ".join(places))
                 continue
-            line = _child(several, "gx:Track")
+            line = _child(several, "gx:ExportTrack")
             _child(line, "altitudeMode", "clampToGround")
             for date in dates:
                 _child(line, "when", date)
@@ -290,10 +292,10 @@ def _gpx(solution: xr.Dataset, name: str) -> dict[str, bytes]:
 
 
 FORMATS = {
-    "csv": Format("a table for each filter", "", _csv),
-    "tum": Format("t x y z qx qy qz qw, a file for each filter", "attitude", _tum),
-    "kml": Format("tracks for globes and maps", "track", _kml),
-    "gpx": Format("tracks, GPX 1.1", "track", _gpx),
+    "csv": ExportFormat("a table for each filter", "", _csv),
+    "tum": ExportFormat("t x y z qx qy qz qw, a file for each filter", "attitude", _tum),
+    "kml": ExportFormat("tracks for globes and maps", "track", _kml),
+    "gpx": ExportFormat("tracks, GPX 1.1", "track", _gpx),
 }
 """Formats in which a result can be exported."""
 

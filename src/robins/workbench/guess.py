@@ -27,7 +27,7 @@ from robins import logs
 from robins.dataset import ImuTable
 from robins.logs.archives import head_of, kind_of_archive
 from robins.logs.declared import format_of
-from robins.logs.opening import beginning
+from robins.logs.opening import read_beginning
 from robins.logs.quantities import CLOCKS, GROUPS, QUANTITIES, parts
 from robins.logs.tables import Table, tables_of
 from robins.logs.text import Head
@@ -113,7 +113,7 @@ def guess(path: Log) -> str:
         InputError: there are no headings, or none that is known; it is a recording, not a table.
         robins.logs.LogError: the file cannot be read.
     """
-    start = Head(os.fspath(path), [], beginning(path))
+    start = Head(os.fspath(path), [], read_beginning(path))
     for row in logs.FORMATS if not kind_of_archive(start.start) else ():
         if row.binary and row.recognise(start):
             mend = "give it to the commands as it is; no columns are needed."

@@ -24,9 +24,9 @@ BENCH, _BENCH = "bench", "vehicles part by part over serial lines, `robins bench
 
 def overview() -> dict[str, tuple[str, dict[str, str]]]:
     """A sentence on every system, on the bench and on design, and titles of what each can run."""
-    told = {name: (text, titles(name)) for name, text in catalogue.summaries().items()}
+    entries = {name: (text, titles(name)) for name, text in catalogue.summaries().items()}
     design = "gains between H2 and H-infinity, `robins design`"
-    return told | {"bench": (_BENCH, rigs() | _benches()), "design": (design, designs())}
+    return entries | {"bench": (_BENCH, rigs() | _benches()), "design": (design, designs())}
 
 
 def inventory(system: Annotated[str | None, Option(metavar="[SYSTEM]")] = None) -> dict[str, Any]:
@@ -44,20 +44,20 @@ def inventory(system: Annotated[str | None, Option(metavar="[SYSTEM]")] = None) 
     if system == BENCH or (system in rigs() and system not in catalogue.summaries()):
         return {"name": BENCH, "summary": _BENCH, "rigs": rigs(), "scenarios": _benches()}
     if system is not None:
-        return _told(system)
-    told = [_told(name) for name in catalogue.summaries()]
+        return _system_entry(system)
+    entries = [_system_entry(name) for name in catalogue.summaries()]
     return {
-        "scenarios": [name for one in told for name in one["scenarios"]],
-        "systems": told,
-        "filters": list(dict.fromkeys(name for one in told for name in one["filters"])),
-        "claims": [claim | {"system": one["name"]} for one in told for claim in one["claims"]],
+        "scenarios": [name for one in entries for name in one["scenarios"]],
+        "systems": entries,
+        "filters": list(dict.fromkeys(name for one in entries for name in one["filters"])),
+        "claims": [claim | {"system": one["name"]} for one in entries for claim in one["claims"]],
         "rigs": list(rigs()),
         "bench": list(_benches()),
         "designs": list(designs()),
     }
 
 
-def _told(name: str) -> dict[str, Any]:
+def _system_entry(name: str) -> dict[str, Any]:
     from robins.systems.finding import find_system  # imports a system, which an overview need not
 
     system = find_system(name)

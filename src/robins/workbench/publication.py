@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from functools import partial
 
 from robins import report, results
-from robins.results import Outcome, Progress, Result, silent
+from robins.results import Outcome, Progress, Result, ignore_progress
 
 
 @contextmanager
@@ -16,7 +16,7 @@ def publishing(
     out: str | os.PathLike[str],
     *,
     command: str = "",
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
     patience_s: float = 0.0,
 ) -> Iterator[Callable[[Outcome], Result]]:
     """Hold a result folder while something is computed for it.
@@ -53,7 +53,7 @@ def publish(
     out: str | os.PathLike[str],
     *,
     command: str = "",
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
     patience_s: float = 0.0,
 ) -> Result:
     """Write an outcome as a result folder with figures and a page; see `publishing`.
@@ -68,7 +68,7 @@ def publish(
 def _write(writer: results.ResultWriter, progress: Progress, outcome: Outcome) -> Result:
     variables = {} if outcome.solution is None else outcome.solution.variables
     arrays = {str(name): variable.values for name, variable in variables.items()}
-    with results.keeping({"solution": arrays, "metrics": outcome.metrics}):
+    with results.keep_on_error({"solution": arrays, "metrics": outcome.metrics}):
         writer.scenario_text, writer.device = outcome.parameters, outcome.device
         writer.save_summary(outcome.summary)
         if outcome.solution is not None:

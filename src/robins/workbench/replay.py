@@ -22,19 +22,19 @@ from robins.dataset import Dataset
 from robins.ins.frames import to_ned_frd
 from robins.logs import Finding
 from robins.logs.doctor import Use
-from robins.results import Outcome, Progress, silent
+from robins.results import Outcome, Progress, ignore_progress
 from robins.systems.finding import find_system
 from robins.workbench.doctor import parted
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.formats import require_formats, with_exports
 from robins.workbench.options import Logs, Option
 from robins.workbench.publication import part
-from robins.workbench.scenarios import asked, check_filters, find_scenario
+from robins.workbench.scenarios import check_filters, find_scenario, request_fields
 
 Findings = Callable[[Sequence[Finding]], None]
 
 
-def unheard(findings: Sequence[Finding]) -> None:
+def ignore_findings(findings: Sequence[Finding]) -> None:
     """Ignore the findings of the doctor."""
 
 
@@ -55,8 +55,8 @@ def replay(
     seed: int = 0,
     settings: Sequence[str] = (),
     filters: Sequence[str] = (),
-    progress: Progress = silent,
-    findings: Findings = unheard,
+    progress: Progress = ignore_progress,
+    findings: Findings = ignore_findings,
 ) -> Outcome:
     """Navigate a recorded log: LOG... are its files, inertial samples and GNSS fixes.
 
@@ -94,8 +94,10 @@ def replay(
     with refusing(dataset.name):
         found = opened.system.replay(dataset, opened.parameters, chosen, part(progress, 0.1, 1.0))
     label = f"{system}/{dataset.name}"
-    told = {"scenario": label, "seed": seed, "last_lines": [f"Next:   {then}"]}
-    return with_exports(replace(found, **told, **asked(opened.text, settings)), exports, label)
+    labels = {"scenario": label, "seed": seed, "last_lines": [f"Next:   {then}"]}
+    return with_exports(
+        replace(found, **labels, **request_fields(opened.text, settings)), exports, label
+    )
 
 
 class OpenLog(NamedTuple):
@@ -108,7 +110,7 @@ class OpenLog(NamedTuple):
     source: str  # its file
     parameters: Any  # as read, with the settings
 
-    def read(self, findings: Findings = unheard) -> Any:
+    def read(self, findings: Findings = ignore_findings) -> Any:
         """Contents of its files, examined and cleaned.
 
         Raises:
@@ -162,8 +164,8 @@ def align(
     settings: Sequence[str] = (),
     columns: Sequence[str | os.PathLike[str]] = (),
     seed: int = 0,
-    progress: Progress = silent,
-    findings: Findings = unheard,
+    progress: Progress = ignore_progress,
+    findings: Findings = ignore_findings,
 ) -> Outcome:
     """Align a recorded slave to its recorded master: doctor, clean, filter, measure.
 
@@ -195,8 +197,8 @@ def align(
         found = alignment.align(dataset, parameters, chosen, part(progress, 0.1, 1.0))
     then = f"robins run COPY   simulates such a pair; COPY is {name} with your units"
     label = f"{system.name}/{dataset.name}"
-    told = {"scenario": label, "seed": seed, "last_lines": [f"Next:   {then}"]}
-    return replace(found, **told, **asked(text, settings))
+    labels = {"scenario": label, "seed": seed, "last_lines": [f"Next:   {then}"]}
+    return replace(found, **labels, **request_fields(text, settings))
 
 
 def _examine(dataset: Dataset, findings: Findings, use: Use = "any") -> None:

@@ -17,10 +17,16 @@ from typing import Annotated
 from robins import _float64
 from robins.campaign import check_machine, simulate
 from robins.campaign.machine import machine_for
-from robins.results import Outcome, Progress, silent
-from robins.systems.judgement import about
+from robins.results import Outcome, Progress, ignore_progress
+from robins.systems.judgement import judge_filters
 from robins.workbench.options import Option, Runs, Scenario
-from robins.workbench.scenarios import Simulated, asked, beside, check_filters, read_scenario
+from robins.workbench.scenarios import (
+    Simulated,
+    check_filters,
+    read_scenario,
+    request_fields,
+    with_default_filter,
+)
 
 
 def run(
@@ -31,7 +37,7 @@ def run(
     seed: int = 0,
     settings: Sequence[str] = (),
     filters: Sequence[str] = (),
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> Outcome:
     """Simulate SCENARIO with several filters.
 
@@ -58,11 +64,11 @@ def run(
     _float64.require()
     check_machine(machine)
     one = read_scenario(name, settings if runs is None else (*settings, f"runs={runs}"))
-    chosen = check_filters(one.label, one.study.filters, filters or beside(one))
+    chosen = check_filters(one.label, one.study.filters, filters or with_default_filter(one))
     progress(0.0, "setting up the simulation")
     problem = one.problem(chosen, seed)
     if not filters:  # the default was not there when the claims were stated
-        problem = replace(problem, claims=about(one.own, problem.claims))
+        problem = replace(problem, claims=judge_filters(one.own, problem.claims))
     total = one.parameters.runs
     found = simulate(problem, total, progress=progress, machine=machine_for(problem, machine))
     return replace(
@@ -75,7 +81,7 @@ def run(
             f"Machine: {found.machine}   --machine chooses another",
             f"Next:   robins run {name} --seed {seed + 1}   repeats it with other noise",
         ],
-        **asked(one.text, settings),
+        **request_fields(one.text, settings),
     )
 
 
@@ -93,7 +99,7 @@ def demo(
     filters: Annotated[
         Sequence[str], Option("Which filters. [default: ekf]", metavar="a,b", names=True)
     ] = (),
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> Outcome:
     """Simulate a drive with a GNSS outage and navigate it: a first look, which needs no data.
 

@@ -151,12 +151,12 @@ def check_filters(where: str, known: Sequence[str], wanted: Sequence[str]) -> tu
     return tuple(dict.fromkeys(wanted))
 
 
-def beside(one: Simulated) -> tuple[str, ...]:
+def with_default_filter(one: Simulated) -> tuple[str, ...]:
     """Filters of a scenario and, where the study has it, the default of the system."""
     return (*one.own, *(name for name in (one.system.default,) if name in one.study.filters))
 
 
-def asked(text: str, settings: Sequence[str]) -> dict[str, Any]:
+def request_fields(text: str, settings: Sequence[str]) -> dict[str, Any]:
     """Fields of an outcome: the scenario as it was run, and the machine that ran it."""
     effective = scenario.text_of(scenario.override(scenario.mapping_of(text), settings))
     return {"parameters": effective if settings else text, "device": jax.devices()[0].device_kind}

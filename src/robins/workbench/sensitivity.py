@@ -16,9 +16,9 @@ import jax
 
 from robins import _float64
 from robins.campaign.sensitivity import (
-    Budget,
+    SensitivityRuns,
     between,
-    depends,
+    course_differs,
     follows,
     indices,
     labelled,
@@ -28,10 +28,10 @@ from robins.campaign.sensitivity import (
     untraceable,
 )
 from robins.report import sensitivity as page
-from robins.results import Outcome, Progress, silent
+from robins.results import Outcome, Progress, ignore_progress
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.options import MOST_OF_SEED, Filter, Option, Scenario
-from robins.workbench.scenarios import asked, check_filters, read_scenario
+from robins.workbench.scenarios import check_filters, read_scenario, request_fields
 
 MOST = 1 << 14  # samples
 _TRACED = 0.1  # share of the time after which batches are computed
@@ -39,7 +39,7 @@ _RANGE = re.compile(r"(.+?)\s+to\s+(.+)")
 _NUMBER = re.compile(r"([-+0-9.eE]+)\s*(.*)")
 
 
-class Uncertain(NamedTuple):
+class UncertainParameter(NamedTuple):
     """A parameter, and the quantities between which it may be anything."""
 
     key: str
@@ -57,7 +57,7 @@ class Uncertain(NamedTuple):
         return f"{self.key}={self.text(self.low)}", f"{self.key}={self.text(self.high)}"
 
 
-def uncertain(text: str) -> Uncertain:
+def uncertain(text: str) -> UncertainParameter:
     """Read ``key=low to high``; the unit of the high end serves for both.
 
     Raises:
@@ -79,7 +79,7 @@ def uncertain(text: str) -> Uncertain:
     (low, first), (high, unit) = found
     if first not in ("", unit):
         raise InputError("has two units", f"--vary {text}", "write both ends in one unit.")
-    return Uncertain(key.strip(), low, high, unit)
+    return UncertainParameter(key.strip(), low, high, unit)
 
 
 def sensitivity(
@@ -97,7 +97,7 @@ def sensitivity(
     ] = 256,
     settings: Sequence[str] = (),
     seed: Annotated[int, Option("Of all noise and points.", least=0, most=MOST_OF_SEED)] = 0,
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> Outcome:
     """Attribute the variance of a filter's error to the parameters of SCENARIO.
 
@@ -134,14 +134,14 @@ def sensitivity(
         with refusing(f"--vary {one.key}"):
             ranges.append(between(low, high))
             laid = [study.lay_out(end) for end in (low, high)]
-        if any(depends(course, again, end) for end in laid):
+        if any(course_differs(course, again, end) for end in laid):
             raise InputError(
                 "decides the motion or what else all runs share, so it cannot vary with the rest "
                 "of the world",
                 f"--vary {one.key}",
                 "`robins sweep` lays out the scenario again for each of its values.",
             )
-    budget = Budget(study, given, course, view, contender, seed, tuple(ranges))
+    budget = SensitivityRuns(study, given, course, view, contender, seed, tuple(ranges))
     points = sobol_points(len(every), samples, seed)
     count = points.shape[0] * samples
 
@@ -182,11 +182,11 @@ def sensitivity(
             "Table:  {out}/sensitivity.csv   all indices with their bounds; points.csv has samples",
             *_next(name, wanted, every, page.greatest(solution)),
         ],
-        **asked(read.text, settings),
+        **request_fields(read.text, settings),
     )
 
 
-def _checked(vary: Sequence[str], samples: int) -> list[Uncertain]:
+def _checked(vary: Sequence[str], samples: int) -> list[UncertainParameter]:
     every = [uncertain(text) for text in vary]
     keys = [one.key for one in every]
     if not every or len(set(keys)) < len(keys):
@@ -204,7 +204,7 @@ def _checked(vary: Sequence[str], samples: int) -> list[Uncertain]:
     return every
 
 
-def _refused(budget: Budget, every: Sequence[Uncertain]) -> InputError:
+def _refused(budget: SensitivityRuns, every: Sequence[UncertainParameter]) -> InputError:
     """Error for worlds that cannot be traced, with the reason."""
     names = [every[k].key for k in untraceable(budget)] or [one.key for one in every]
     return InputError(
@@ -215,7 +215,9 @@ def _refused(budget: Budget, every: Sequence[Uncertain]) -> InputError:
     )
 
 
-def _next(name: str, filter_: str, every: Sequence[Uncertain], greatest: int | None) -> list[str]:
+def _next(
+    name: str, filter_: str, every: Sequence[UncertainParameter], greatest: int | None
+) -> list[str]:
     """Suggestion for the next step: the parameter that counts most somewhere."""
     if greatest is None:
         return []

@@ -15,15 +15,15 @@ import xarray as xr
 from robins import units
 from robins.campaign.gather import gather
 from robins.campaign.machine import available_cores
-from robins.campaign.plan import Plan
+from robins.campaign.plan import CampaignPlan
 from robins.campaign.statistics import Statistics, rms_with_bounds
 from robins.campaign.store import Store, open_store
 from robins.report.numbers import csv_of
-from robins.results import Outcome, Progress, array, silent
+from robins.results import Outcome, Progress, array, ignore_progress
 from robins.systems.study import StateBlock
 from robins.workbench.campaign import (
     SWEEP,
-    Status,
+    CampaignStatus,
     Where,
     campaign_report,
     campaign_status,
@@ -33,14 +33,14 @@ from robins.workbench.campaign import (
     sweep_of,
 )
 from robins.workbench.errors import InputError
-from robins.workbench.scenarios import asked
+from robins.workbench.scenarios import request_fields
 from robins.workbench.workers import fill
 
 MOST = 400  # points; more are a campaign of another kind
 _QUANTITY = re.compile(r"\s*([-+0-9.eE]+)\s*(.*?)\s*")
 
 
-class Varied(NamedTuple):
+class SweptParameter(NamedTuple):
     """A parameter, and the values that it is given."""
 
     key: str
@@ -60,7 +60,7 @@ class Varied(NamedTuple):
         return [number for number, _ in found], shared.pop() or "1"
 
 
-def varied(text: str) -> Varied:
+def varied(text: str) -> SweptParameter:
     """Read ``key=a,b,c``.
 
     Raises:
@@ -76,10 +76,10 @@ def varied(text: str) -> Varied:
         )
     if len(set(values)) < len(values):
         raise InputError("has a value twice", f"--vary {text}", "name each once.")
-    return Varied(key.strip(), values)
+    return SweptParameter(key.strip(), values)
 
 
-class Point(NamedTuple):
+class SweepPoint(NamedTuple):
     """One choice of values, and the folder of its campaign."""
 
     place: tuple[int, ...]
@@ -87,11 +87,11 @@ class Point(NamedTuple):
     where: str
 
 
-def points(where: Where, vary: Sequence[Varied]) -> Iterator[Point]:
+def points(where: Where, vary: Sequence[SweptParameter]) -> Iterator[SweepPoint]:
     """All choices, the last parameter first to change."""
     for place in itertools.product(*(range(len(v.values)) for v in vary)):
         settings = tuple(f"{v.key}={v.values[k]}" for v, k in zip(vary, place, strict=True))
-        yield Point(place, settings, f"{where}/{name_of(place)}")
+        yield SweepPoint(place, settings, f"{where}/{name_of(place)}")
 
 
 def name_of(place: Sequence[int]) -> str:
@@ -107,7 +107,7 @@ def sweep(
     workers: int | None = None,
     machine: str = "",
     settings: Sequence[str] = (),
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
     **options: Any,
 ) -> Outcome:
     """Run a scenario for each value of one or two parameters, with the same random numbers.
@@ -135,14 +135,14 @@ def sweep(
         raise InputError("a sweep is over one parameter or two", "--vary", "give it once or twice.")
     if len(every) > MOST:
         raise InputError(f"has {len(every)} points, more than {MOST}", "--vary", "name fewer.")
-    campaigns: list[tuple[str, Plan]] = []
+    campaigns: list[tuple[str, CampaignPlan]] = []
     for k, point in enumerate(every):
         progress(0.1 * k / len(every), f"planning {', '.join(point.settings)}")
         more = (*settings, *point.settings)
         plan = plan_campaign(point.where, name, settings=more, machine=machine, **options)
         campaigns.append((point.where, plan))
-    said = {"vary": list(vary), "points": [name_of(point.place) for point in every]}
-    open_store(where).put(SWEEP, json.dumps(said).encode(), anew=True)
+    content = {"vary": list(vary), "points": [name_of(point.place) for point in every]}
+    open_store(where).put(SWEEP, json.dumps(content).encode(), overwrite=True)
 
     def filling(share: float, what: str) -> None:
         progress(0.1 + 0.9 * share, what)
@@ -151,9 +151,9 @@ def sweep(
     return _outcome(chosen, every)
 
 
-def status(where: Where) -> Status | dict[str, Status]:
+def status(where: Where) -> CampaignStatus | dict[str, CampaignStatus]:
     """Progress of a campaign, or of those of a sweep by the settings of its points."""
-    every = _asked(where)
+    every = _sweep_request(where)
     if every is None:
         return campaign_status(where)
     return {", ".join(point.settings): campaign_status(point.where) for point in every[1]}
@@ -165,11 +165,11 @@ def report(where: Where) -> Outcome:
     Raises:
         InputError: there is no run of some filter.
     """
-    every = _asked(where)
+    every = _sweep_request(where)
     return campaign_report(where) if every is None else _outcome(*every)
 
 
-def _asked(where: Where) -> tuple[list[Varied], list[Point]] | None:
+def _sweep_request(where: Where) -> tuple[list[SweptParameter], list[SweepPoint]] | None:
     """Varied parameters of a folder's sweep, and its points; None where there is one campaign."""
     sweep = sweep_of(where)
     if sweep is None:
@@ -178,7 +178,7 @@ def _asked(where: Where) -> tuple[list[Varied], list[Point]] | None:
     return chosen, list(points(where, chosen))
 
 
-class Rms(NamedTuple):
+class RmsBounds(NamedTuple):
     """RMS error of a filter and a block at one point, over runs and epochs, with 95 % bounds."""
 
     rms: float
@@ -187,7 +187,7 @@ class Rms(NamedTuple):
     stated: float  # root of the mean variance that the filter states
 
     @classmethod
-    def of(cls, found: Statistics, block: StateBlock) -> Rms:
+    def of(cls, found: Statistics, block: StateBlock) -> RmsBounds:
         """RMS of the length of the error over the components of a block, in SI."""
         squares = np.sum(found.run_rms[:, block.where] ** 2, axis=1)
         stated = np.sum(found.sigma[found.counted, block.where] ** 2, axis=1)
@@ -195,14 +195,14 @@ class Rms(NamedTuple):
         return cls(rms, low, high, float(np.sqrt(np.mean(stated))))
 
 
-def _outcome(vary: Sequence[Varied], every: Sequence[Point]) -> Outcome:
+def _outcome(vary: Sequence[SweptParameter], every: Sequence[SweepPoint]) -> Outcome:
     """The errors of all filters at all points."""
     plans = {point: ready(point.where)[1] for point in every}
     plan = plans[every[0]]
     blocks = problem_of(plan).blocks
     sizes = (*(len(v.values) for v in vary), 1)[:2]
     shape = (len(plan.filters), *sizes)
-    figures = {b.name: np.full((*shape, len(Rms._fields)), np.nan) for b in blocks}
+    figures = {b.name: np.full((*shape, len(RmsBounds._fields)), np.nan) for b in blocks}
     rows: list[list[Any]] = []
     lost: dict[str, int] = dict.fromkeys(plan.filters, 0)
     for point in every:
@@ -214,14 +214,14 @@ def _outcome(vary: Sequence[Varied], every: Sequence[Point]) -> Outcome:
                 raise InputError(f"has no run of '{filter_}' yet", point.where, "run it again.")
             lost[filter_] += one.diverged
             for b in blocks:
-                figure = Rms.of(one, b)
+                figure = RmsBounds.of(one, b)
                 figures[b.name][(f, *(*point.place, 0)[:2])] = figure
                 shown = [units.convert(x, b.units, b.display_unit) for x in figure]
                 values = [v.values[k] for v, k in zip(vary, point.place, strict=True)]
                 rows.append([filter_, *values, b.name, b.display_unit, *shown, one.runs])
-    head = ["filter", *(v.key for v in vary), "block", "unit", *Rms._fields, "runs"]
+    head = ["filter", *(v.key for v in vary), "block", "unit", *RmsBounds._fields, "runs"]
     first = problem_of(plan)
-    told = asked(plan.text, ())
+    request = request_fields(plan.text, ())
     return Outcome(
         solution=_solution(plan, vary, blocks, figures),
         metrics={
@@ -245,20 +245,20 @@ def _outcome(vary: Sequence[Varied], every: Sequence[Point]) -> Outcome:
         seed=plan.seed,
         runs=plan.runs,
         machine=plan.machine,
-        parameters=told["parameters"],
+        parameters=request["parameters"],
         device=jax.devices()[0].device_kind,
         last_lines=["Table:  {out}/sweep.csv   all points, with 95 % bounds"],
     )
 
 
 def _solution(
-    plan: Plan,
-    vary: Sequence[Varied],
+    plan: CampaignPlan,
+    vary: Sequence[SweptParameter],
     blocks: Sequence[StateBlock],
     figures: dict[str, np.ndarray],
 ) -> xr.Dataset:
     data: dict[str, Any] = {"filter": ("filter", list(plan.filters))}
-    for k, one in enumerate([*vary, Varied("", ("",))][:2], 1):
+    for k, one in enumerate([*vary, SweptParameter("", ("",))][:2], 1):
         numbers, unit = one.coordinate
         about = {"units": unit, "long_name": one.key} if unit else {"long_name": one.key}
         data[f"sweep_{k}"] = xr.Variable(f"sweep_{k}", numbers, about)

@@ -20,18 +20,18 @@ from scipy.special import ndtri
 from robins import _float64, scenario, units
 from robins.campaign.tuning import Tuned, choose
 from robins.report.numbers import csv_of
-from robins.results import Outcome, Progress, array, silent
+from robins.results import Outcome, Progress, array, ignore_progress
 from robins.workbench.errors import refusing
 from robins.workbench.options import Filter, Option
 from robins.workbench.publication import part
-from robins.workbench.replay import Findings, open_log, unheard
-from robins.workbench.scenarios import asked
+from robins.workbench.replay import Findings, ignore_findings, open_log
+from robins.workbench.scenarios import request_fields
 from robins.workbench.tune_objectives import (
     COMPONENTS,
     DENSITY,
     FIRST_BLOCK,
     INNOVATIONS,
-    Asked,
+    TuningRequest,
     on_log,
     on_runs,
     overridden,
@@ -57,8 +57,8 @@ def tune(
     columns: Sequence[str | os.PathLike[str]] = (),
     settings: Sequence[str] = (),
     seed: int = 0,
-    progress: Progress = silent,
-    findings: Findings = unheard,
+    progress: Progress = ignore_progress,
+    findings: Findings = ignore_findings,
 ) -> Outcome:
     """Find factors on parameters of a filter with which it is best.
 
@@ -110,7 +110,7 @@ def _is_log(names: Sequence[str | os.PathLike[str]]) -> bool:
     return os.path.isfile(name) and not name.endswith(".toml")
 
 
-def _outcome(of: Asked, found: Tuned, seed: int) -> Outcome:
+def _outcome(of: TuningRequest, found: Tuned, seed: int) -> Outcome:
     stays = not found.better
     x = np.zeros(len(found.x)) if stays else found.x
     now = settings_at(of.vary, x)
@@ -134,7 +134,7 @@ def _outcome(of: Asked, found: Tuned, seed: int) -> Outcome:
         f"{of.filter} tuned": _metrics(of, found.before if stays else found.after)
         | {f"{v.key} times": band[0] for v, band in zip(of.vary, bands, strict=True) if not stays},
     }
-    told = [
+    lines = [
         f"{v.key}: {scenario.setting(v.key, v.start).partition('=')[2]} times {band[0]:.3g} "
         f"({band[1]:.3g} to {band[2]:.3g} at 95 %)"
         for v, band in zip(of.vary, bands, strict=True)
@@ -145,9 +145,9 @@ def _outcome(of: Asked, found: Tuned, seed: int) -> Outcome:
         metrics=rows,
         files={"tuned.toml": text.encode(), "tuning.csv": csv_of(_table(of, bands, now))},
         notes=[
-            *told,
+            *lines,
             f"Held out: {change}.",
-            of.told,
+            of.data_note,
             f"Small is made: {of.by}; by {how}, {found.evaluations} evaluations.",
             *found.notes,
         ],
@@ -157,11 +157,11 @@ def _outcome(of: Asked, found: Tuned, seed: int) -> Outcome:
         runs=len(found.before),
         title=f"{of.filter} tuned",
         last_lines=["Tuned:  {out}/tuned.toml   with these values"],
-        **asked(of.text, of.settings),
+        **request_fields(of.text, of.settings),
     )
 
 
-def _change(of: Asked, found: Tuned) -> str:
+def _change(of: TuningRequest, found: Tuned) -> str:
     """Change of the objective on the data held out, in words."""
     if of.by == worded(INNOVATIONS):
         total = total_of(INNOVATIONS, ())
@@ -175,7 +175,7 @@ def _change(of: Asked, found: Tuned) -> str:
     return f"{of.by} {less:+.2f} % (at most {least:+.2f} % at 95 %), {over}"
 
 
-def _metrics(of: Asked, parts: np.ndarray) -> dict[str, Any]:
+def _metrics(of: TuningRequest, parts: np.ndarray) -> dict[str, Any]:
     """Figures of the data held out: log density, and by block RMS error and stated over it."""
     mean = np.mean(parts, axis=0)
     out: dict[str, Any] = {"log_density": float(mean[DENSITY] / mean[COMPONENTS])}
@@ -191,7 +191,7 @@ def _metrics(of: Asked, parts: np.ndarray) -> dict[str, Any]:
 
 
 def _table(
-    of: Asked, bands: Sequence[tuple[float, float, float]], now: Sequence[str]
+    of: TuningRequest, bands: Sequence[tuple[float, float, float]], now: Sequence[str]
 ) -> Sequence[Sequence[Any]]:
     rows: list[Sequence[Any]] = [("parameter", "as written", "factor", "low", "high", "now")]
     for v, band, line in zip(of.vary, bands, now, strict=True):
@@ -200,7 +200,7 @@ def _table(
     return rows
 
 
-def _solution(of: Asked, found: Tuned, bands: np.ndarray) -> xr.Dataset:
+def _solution(of: TuningRequest, found: Tuned, bands: np.ndarray) -> xr.Dataset:
     """Factors with their intervals, and the objective of each part that was held out."""
     total = of.objective.total
     label = "minus log density" if of.by == worded(INNOVATIONS) else "ln of the RMS error"

@@ -20,8 +20,8 @@ from robins import scenario
 from robins.campaign.machine import one_by_one
 from robins.campaign.many_runs import ManyRuns
 from robins.campaign.monte_carlo import Blocks, blocks_of, one_record
-from robins.campaign.sensitivity import depends
-from robins.campaign.tuning import Data, Objective, TooLittle, Tree, Trial
+from robins.campaign.sensitivity import course_differs
+from robins.campaign.tuning import Data, Objective, Tree, Trial, UndeterminedError
 from robins.filters import Filter, run
 from robins.filters.analysis.predictive import predicted, scored
 from robins.filters.values import as_data, content, kind, value
@@ -38,7 +38,7 @@ DENSITY, COMPONENTS = 0, 1
 FIRST_BLOCK = 2
 
 
-class Varied(NamedTuple):
+class TunedParameter(NamedTuple):
     """A parameter to be tuned, and where it begins, as a scenario writes it."""
 
     key: str
@@ -49,7 +49,7 @@ class Varied(NamedTuple):
         return scenario.setting(self.key, scenario.scaled(self.key, self.start, factor))
 
 
-def varied(texts: Sequence[str], parameters: Any, text: str) -> list[Varied]:
+def varied(texts: Sequence[str], parameters: Any, text: str) -> list[TunedParameter]:
     """Read texts ``key`` or ``key=value``.
 
     Raises:
@@ -64,17 +64,17 @@ def varied(texts: Sequence[str], parameters: Any, text: str) -> list[Varied]:
         here = scenario.override({}, [f"at={value}"])["at"] if equals else None
         start = here if equals else scenario.written(parameters, scenario.mapping_of(text), key)
         scenario.scaled(key, start, 2.0)  # it must be a number
-        found.append(Varied(key, start))
+        found.append(TunedParameter(key, start))
     if len({v.key for v in found}) < len(found):
         raise InputError("names a parameter twice", "--vary", "name each once.")
     return found
 
 
-class Asked(NamedTuple):
+class TuningRequest(NamedTuple):
     """Request of a tuning and its data: the same for simulated runs and for a log."""
 
     filter: str
-    vary: list[Varied]
+    vary: list[TunedParameter]
     objective: Objective
     chosen_on: Data
     judged_on: Data
@@ -84,7 +84,7 @@ class Asked(NamedTuple):
     text: str  # TOML of the scenario or configuration
     settings: Sequence[str]
     label: str
-    told: str  # a sentence on the data
+    data_note: str  # a sentence on the data
     checked: Callable[[Sequence[str]], Any]  # settings -> parameters; raises where they do not fit
 
 
@@ -115,7 +115,7 @@ def on_runs(
     by: str,
     settings: Sequence[str],
     progress: Progress,
-) -> Asked:
+) -> TuningRequest:
     """Request for simulated runs; arguments as of `robins.workbench.tune`.
 
     Raises:
@@ -131,7 +131,7 @@ def on_runs(
     if by not in (ERROR, INNOVATIONS, *names):
         known = ", ".join([ERROR, INNOVATIONS, *names])
         raise InputError(f"is none of {known}", f"--by {by}", "choose one of these.")
-    measured = OfRuns(blocks_of(problem), problem.count_from, problem.count_to)
+    measured = RunMeasure(blocks_of(problem), problem.count_from, problem.count_to)
     progress(0.0, "simulating")
     worlds = ManyRuns(lambda _, k: problem.simulate(k))([()], np.arange(2 * runs))
 
@@ -142,14 +142,14 @@ def on_runs(
     ends = [parsed(settings_at(tuned, x)) for x in np.outer((0.0, 1.0), np.ones(len(tuned)))]
     course = lay_out(ends[0])
     # a filter's assumptions on the course, such as its process noise, are its inputs
-    moves = depends(course, *map(lay_out, ends))
+    moves = course_differs(course, *map(lay_out, ends))
 
     def trial(x: np.ndarray) -> Trial:
         given = parsed(settings_at(tuned, x))
         c = read.study.contender(given, lay_out(given) if moves else course, chosen)
         return _trial(c.filter, c.model, as_data(c.case), c.reported)
 
-    return Asked(
+    return TuningRequest(
         filter=chosen,
         vary=tuned,
         objective=Objective(trial, measured, total_of(by, names)),
@@ -161,7 +161,7 @@ def on_runs(
         text=read.text,
         settings=settings,
         label=read.label,
-        told=f"Chosen on runs 0 to {runs - 1}, judged on runs {runs} to {2 * runs - 1}, which "
+        data_note=f"Chosen on runs 0 to {runs - 1}, judged on runs {runs} to {2 * runs - 1}, which "
         "tuning did not see. The simulated world stays as the scenario says it; only what the "
         "filter believes is tuned.",
         checked=parsed,
@@ -179,13 +179,13 @@ def overridden(text: str, settings: Sequence[str]) -> dict[str, Any]:
     return scenario.override(scenario.mapping_of(text), settings)
 
 
-def settings_at(tuned: Sequence[Varied], x: np.ndarray) -> list[str]:
+def settings_at(tuned: Sequence[TunedParameter], x: np.ndarray) -> list[str]:
     """The texts that set the parameters to what they are at some log factors."""
     return [v.setting(math.exp(one)) for v, one in zip(tuned, x, strict=True)]
 
 
 @value
-class OfRuns:
+class RunMeasure:
     """Measures of each run: see above."""
 
     blocks: Blocks = kind()
@@ -216,12 +216,12 @@ def on_log(
     by: str,
     settings: Sequence[str],
     findings: Findings,
-) -> Asked:
+) -> TuningRequest:
     """Request for a recorded log; arguments as of `robins.workbench.tune`.
 
     Raises:
         InputError, robins.scenario.ScenarioError: it cannot be done.
-        TooLittle: there are too few measurements to hold some out.
+        UndeterminedError: there are too few measurements to hold some out.
     """
     system = opened.system
     if system.recorded is None:
@@ -250,15 +250,15 @@ def on_log(
     segments = min(SEGMENTS, count // _FEWEST)
     held = np.arange(segments) % 3 == 2
     if np.sum(held) < 3:
-        raise TooLittle(
+        raise UndeterminedError(
             f"the log says too little: {count} components are measured, and {9 * _FEWEST} are the "
             "least that can be parted into what is chosen on and what is held out"
         )
     label = f"{system.name}/{dataset.name}"
-    return Asked(
+    return TuningRequest(
         filter=chosen,
         vary=tuned,
-        objective=Objective(trial, OfSegments(segments), total_of(INNOVATIONS, ())),
+        objective=Objective(trial, SegmentMeasure(segments), total_of(INNOVATIONS, ())),
         chosen_on=Data(np.zeros(1), np.flatnonzero(~held)),
         judged_on=Data(np.zeros(1), np.flatnonzero(held)),
         parts="segments",
@@ -267,7 +267,7 @@ def on_log(
         text=opened.text,
         settings=settings,
         label=label,
-        told=f"The log is cut into {segments} segments of equally many steps. The filter runs "
+        data_note=f"The log is cut into {segments} segments of equally many steps. The filter runs "
         "through all; every third is held out: its innovations say nothing for tuning and alone "
         "judge.",
         checked=parsed,
@@ -291,7 +291,7 @@ def _steps(filter_: Any, model: Any, given: Sequence[Any]) -> Array:
 
 
 @value
-class OfSegments:
+class SegmentMeasure:
     """The same of segments of equally many steps."""
 
     segments: int = kind()

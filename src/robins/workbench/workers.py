@@ -13,13 +13,13 @@ from time import monotonic, sleep
 from typing import IO, Any
 
 from robins.campaign.machine import available_cores
-from robins.campaign.plan import Plan
+from robins.campaign.plan import CampaignPlan
 from robins.campaign.store import GOES_ON, open_store
 from robins.campaign.work import missing
 from robins.errors import RobinsError
-from robins.results import Outcome, Progress, silent
+from robins.results import Outcome, Progress, ignore_progress
 from robins.systems import trust
-from robins.workbench.campaign import campaign_report, mend, plan_campaign
+from robins.workbench.campaign import campaign_report, plan_campaign, remove_damaged
 
 POLL_S = 0.2
 DEATHS = 3  # of workers, without a shard between them, after which a campaign fails
@@ -75,7 +75,7 @@ class _Process:
         return self._process.poll()
 
     @property
-    def said(self) -> str:
+    def error_output(self) -> str:
         """Text of its error output."""
         self._errors.seek(0)
         return self._errors.read().decode("utf-8", "replace").strip()
@@ -94,7 +94,7 @@ def campaign_run(
     name: str,
     *,
     workers: int | None = None,
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
     **options: Any,
 ) -> Outcome:
     """Begin a campaign or go on with it, until all its runs are there; see `plan_campaign`.
@@ -114,9 +114,9 @@ def campaign_run(
 
 def fill(
     where: str | os.PathLike[str],
-    campaigns: Sequence[tuple[str, Plan]],
+    campaigns: Sequence[tuple[str, CampaignPlan]],
     workers: int,
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> None:
     """Compute by workers what is missing or damaged of a campaign, or of those of a sweep.
 
@@ -126,7 +126,7 @@ def fill(
         RobinsError: a worker failed, or one after the other was killed.
     """
     for one, _ in campaigns:
-        mend(one)
+        remove_damaged(one)
     all_shards = [(open_store(one), plan.shards) for one, plan in campaigns]
     total = sum(len(some) for _, shards in all_shards for some in shards.values())
     runs = sum(plan.runs for _, plan in campaigns)
@@ -164,8 +164,10 @@ def _judged(process: _Process, where: str) -> int:
     """
     status = process.status or 0
     if status > 0:
-        said: Sequence[str] = process.said.splitlines()
-        why = said[-1].removeprefix("robins: ") if said else f"it ended with {status}"
+        error_output: Sequence[str] = process.error_output.splitlines()
+        why = (
+            error_output[-1].removeprefix("robins: ") if error_output else f"it ended with {status}"
+        )
         raise _failed(why, where)
     return int(status < 0)
 

@@ -45,8 +45,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         scenario, whole = Path(folder) / "eventful.toml", Path(folder) / "whole.mcap"
         scenario.write_text(SCENARIO)
-        ran = Session(read(str(scenario)), whole).run()
-        assert not ran.failure, ran.failure
+        result = Session(read(str(scenario)), whole).run()
+        assert not result.failure, result.failure
         record = read_record(whole)
     # how the faults were made is no matter of who hears what came of them
     header = {k: v for k, v in record.header.items() if k != "run"}

@@ -280,7 +280,7 @@ def boastful(answer):
 
 
 def silent(answer):
-    return programs.Answer("solver_error", np.nan, {})
+    return programs.SolverAnswer("solver_error", np.nan, {})
 
 
 def doubtful(answer):

@@ -86,7 +86,7 @@ def cheap(*asked):
         spoilt("Y", 9.0),  # errors grow
         spoilt("Y", 0.9),  # gamma is exceeded
         cheap,  # the bound is
-        lambda *_: programs.Answer("solver_error", np.nan, {}),
+        lambda *_: programs.SolverAnswer("solver_error", np.nan, {}),
     ],
     ids=["grows", "gamma", "bound", "none"],
 )

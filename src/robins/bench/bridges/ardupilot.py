@@ -108,7 +108,7 @@ def encode(state: BodyState) -> bytes:
         BridgeError: a number is NaN or infinite, or there are too few or too many.
     """
     name = "JSON"
-    told: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "timestamp": finite("time_s", state.time_s, name),
         "imu": {
             "gyro": vector("omega_ib_b_rad_s", state.omega_ib_b_rad_s, name),
@@ -119,20 +119,20 @@ def encode(state: BodyState) -> bytes:
         "velocity": vector("v_n_m_s", state.v_n_m_s, name),
     }
     if state.airspeed_m_s is not None:
-        told["airspeed"] = finite("airspeed_m_s", state.airspeed_m_s, name)
+        fields["airspeed"] = finite("airspeed_m_s", state.airspeed_m_s, name)
     if state.wind_n_m_s is not None:
-        told["velocity_wind"] = vector("wind_n_m_s", state.wind_n_m_s, name)
+        fields["velocity_wind"] = vector("wind_n_m_s", state.wind_n_m_s, name)
     if state.apparent_wind is not None:
         both = vector("apparent_wind", state.apparent_wind, name, 2)
-        told["windvane"] = dict(zip(("direction", "speed"), both, strict=True))
+        fields["windvane"] = dict(zip(("direction", "speed"), both, strict=True))
     if len(state.rangefinders_m) > RANGEFINDERS:
         raise BridgeError(f"rangefinders_m has {RANGEFINDERS} at most", name)
     for number, range_m in enumerate(state.rangefinders_m, 1):
-        told[f"rng_{number}"] = finite("rangefinders_m", range_m, name)
+        fields[f"rng_{number}"] = finite("rangefinders_m", range_m, name)
     if state.battery is not None:
         both = vector("battery", state.battery, name, 2)
-        told["battery"] = dict(zip(("voltage", "current"), both, strict=True))
-    return b"\n" + json.dumps(told, separators=(",", ":")).encode() + b"\n"
+        fields["battery"] = dict(zip(("voltage", "current"), both, strict=True))
+    return b"\n" + json.dumps(fields, separators=(",", ":")).encode() + b"\n"
 
 
 @dataclass

@@ -236,8 +236,8 @@ class Px4Simulator:
         kind = one.get_type()
         if kind == "HIL_ACTUATOR_CONTROLS":
             self.counts.actuators += 1
-            told = Actuators(one.time_usec, tuple(one.controls), one.mode, one.flags)
-            self._waiting.append(told)
+            command = Actuators(one.time_usec, tuple(one.controls), one.mode, one.flags)
+            self._waiting.append(command)
         elif kind == "HEARTBEAT":
             self.counts.heartbeats += 1
         elif kind == "BAD_DATA":

@@ -86,8 +86,8 @@ def topic_key(
     if convention == "ros2dds":
         return topic[1:]
     package, _, message = name_of(kind).split("/")
-    told = "TypeHashNotSupported" if distro == "humble" else hash_of(kind, distro)
-    return f"{domain}{topic}/{package}::msg::dds_::{message}_/{told}"
+    type_hash = "TypeHashNotSupported" if distro == "humble" else hash_of(kind, distro)
+    return f"{domain}{topic}/{package}::msg::dds_::{message}_/{type_hash}"
 
 
 def attachment(sequence: int, time_ns: int, gid: bytes) -> bytes:
@@ -182,7 +182,7 @@ class Ros2Topics:
             attached = attachment(self._sequence, time.time_ns(), self._gid)
         self._publishers[key].put(data, attachment=attached)
 
-    def heard(self, topic: str) -> bool:
+    def has_subscriber(self, topic: str) -> bool:
         """True if a topic, on which we have published, has a subscriber."""
         kind = self._kinds.get(topic)
         publisher = None if kind is None else self._publishers.get(self._key(topic, kind))

@@ -7,20 +7,23 @@
 """
 
 from robins.bench.broker.broker import Broker, Wiring
-from robins.bench.broker.faults import LinkFault, Said, Table
-from robins.bench.broker.injector import Injector, Piece
+from robins.bench.broker.faults import DeviceFault, FaultTable, LinkFault
+from robins.bench.broker.injector import Injector, LineOutput
 from robins.bench.broker.link import BenchError, Health, Link, LinkLost
+from robins.errors import moved
 
 __all__ = [
     "BenchError",
     "Broker",
+    "DeviceFault",
+    "FaultTable",
     "Health",
     "Injector",
+    "LineOutput",
     "Link",
     "LinkFault",
     "LinkLost",
-    "Piece",
-    "Said",
-    "Table",
     "Wiring",
 ]
+
+__getattr__ = moved(__name__)

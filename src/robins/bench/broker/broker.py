@@ -15,10 +15,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
+from robins.bench.broker.console import OperatorMessageError
 from robins.bench.broker.injector import Injector
 from robins.bench.broker.link import BenchError, Link, LinkLost
-from robins.bench.broker.revive import History, beginning, catch_up
-from robins.bench.broker.says import SayError
+from robins.bench.broker.restart import SentFrames, beginning, catch_up
 from robins.bench.wire.frames import Frame
 from robins.bench.wire.schema import BARE, Wire
 
@@ -26,7 +26,7 @@ Sends = Mapping[str, tuple[str, ...]]  # messages that a part sends
 Takes = Mapping[str, Mapping[str, int]]  # messages that it takes, and how many steps older
 _REMEMBERED = 64  # steps, whose messages are known if they come again
 _REPORT_S = 10.0  # between two reports of the parts that are waited for
-_GLANCE_S = 0.05  # period of polling everything but the wire while nothing comes
+_POLL_S = 0.05  # period of polling everything but the wire while nothing comes
 _CLOCK_NS = time.monotonic_ns
 
 
@@ -69,10 +69,10 @@ class Broker:
         step_ns: int,
         injector: Injector,
         observe: Callable[[str, int, bytes], None],
-        glance: Callable[[], None],
+        poll_processes: Callable[[], None],
         done: Callable[[str, int, int, int, int], None],
         meanwhile: Callable[[], None] = lambda: None,
-        keep: Mapping[str, History] | None = None,
+        keep: Mapping[str, SentFrames] | None = None,
         idle_s: Callable[[str], float] = lambda part: math.inf,
         waiting: Callable[[Sequence[str], float], None] = lambda parts, since_s: None,
     ):
@@ -84,7 +84,7 @@ class Broker:
             step_ns: length of a step.
             injector: the faults that the links have.
             observe: called with each message that passes: name, time [ns], payload.
-            glance: called now and then while nothing comes, and once a step.
+            poll_processes: called now and then while nothing comes, and once a step.
             done: called with each answer: part, step, when ticked, when answered [ns of the wall
                 clock], time it computed [ns].
             meanwhile: called when there is nothing to do but to wait for a part: what need not be
@@ -101,7 +101,7 @@ class Broker:
         self.off: set[str] = set()
         self._run = 0
         self._injector, self._observe = injector, observe
-        self._glance, self._tell, self._meanwhile = glance, done, meanwhile
+        self._poll, self._answered_by, self._meanwhile = poll_processes, done, meanwhile
         self._idle_s, self._waiting = idle_s, waiting
         self._sources = {p: wiring.sources(p) & set(links) for p in links}
         self._takers = {
@@ -152,7 +152,7 @@ class Broker:
                     f"no hello from {', '.join(idle)} in {patience_s:g} s: is it connected, "
                     "at this speed, and does it run? (`robins bench ports` lists the ports)"
                 )
-            self.poll(_GLANCE_S)
+            self.poll(_POLL_S)
 
     def _greet(self, name: str, frame: Frame) -> None:
         link, said, wire = self.links[name], BARE.decode("hello", frame.payload), self.wiring.wire
@@ -198,7 +198,7 @@ class Broker:
         self._routed[self.time_ns] = set()
         if len(self._routed) > _REMEMBERED:
             del self._routed[next(iter(self._routed))]
-        self._glance()
+        self._poll()
         for name, link in self.links.items():
             if name in self.off:
                 continue
@@ -206,7 +206,7 @@ class Broker:
             self._take(name, link.held(self.time_ns))
         self._advance()
         while len(self._done) < len(self.links):
-            self.poll(_GLANCE_S if patience_ns is None else min(_GLANCE_S, patience_ns * 1e-9))
+            self.poll(_POLL_S if patience_ns is None else min(_POLL_S, patience_ns * 1e-9))
             self._wait(patience_ns, again_ns, most_ns)
 
     def _wait(self, patience_ns: int | None, again_ns: int, most_ns: int) -> None:
@@ -251,24 +251,25 @@ class Broker:
         It goes out with the ticks of the next step, to parts that take it with a lag of one.
 
         Raises:
-            SayError: the bench does not send this message, or a number is beyond its limits.
+            OperatorMessageError: the bench does not send this message, or a number is beyond its
+                limits.
         """
         if message not in self.wiring.console:
-            raise SayError(f"message: the bench does not say '{message}'")
+            raise OperatorMessageError(f"message: the bench does not say '{message}'")
         if why := self.wiring.wire.unsound(message, payload):
-            raise SayError(f"message '{message}': {why.text}")
+            raise OperatorMessageError(f"message '{message}': {why.text}")
         self._observe(message, self.time_ns, payload)
         for taker in self._takers[message]:
             if taker not in self.off:
                 self._put(self.links[taker], message, payload, self.time_ns)
 
-    def revive(self, name: str, patience_s: float, glance: Callable[[], None]) -> None:
+    def revive(self, name: str, patience_s: float, poll_processes: Callable[[], None]) -> None:
         """Bring a restarted part to the state of the old one; the run waits.
 
         Args:
             name: of the part.
             patience_s: for its hello, and for each answer.
-            glance: called now and then.
+            poll_processes: called now and then.
 
         Raises:
             BenchError: it does not answer.
@@ -276,9 +277,11 @@ class Broker:
         """
         answered = self._step if name in self._done else self._step - 1
         begin, idle_s = beginning(self._run, self.step_ns), partial(self._idle_s, name)
-        told = self._kept[name].told
+        sent_frames = self._kept[name].sent_frames
         try:
-            catch_up(self.links[name], told, begin, answered, patience_s, glance, idle_s)
+            catch_up(
+                self.links[name], sent_frames, begin, answered, patience_s, poll_processes, idle_s
+            )
         except OSError as error:
             raise LinkLost(name, error) from None
 
@@ -331,8 +334,8 @@ class Broker:
             self._take(link.name, found)
         for fd in dict.fromkeys([*writable, *slow]):
             self._flush(by_fd[fd])
-        if time.monotonic() - self._glanced > _GLANCE_S:
-            self._glance()
+        if time.monotonic() - self._glanced > _POLL_S:
+            self._poll()
             self._glanced = time.monotonic()
 
     def _take(self, name: str, found: list[tuple[str, Frame]]) -> None:
@@ -371,7 +374,7 @@ class Broker:
         if said["step"] != self._step or name not in self._ticked or name in self._done:
             return
         at = self._ticked[name][0]
-        self._tell(name, self._step, at, _CLOCK_NS(), said["compute"])
+        self._answered_by(name, self._step, at, _CLOCK_NS(), said["compute"])
         self._end(name)
 
     def _route(self, message: str, frame: Frame, age: int) -> None:

@@ -36,7 +36,7 @@ PROCESS = ("killed", "power")
 """Faults that no frame meets."""
 
 
-class Said(NamedTuple):
+class DeviceFault(NamedTuple):
     """A fault of a sensor or an actuator: its frames are sound, their content is not.
 
     Attributes:
@@ -61,25 +61,25 @@ def nothing(said: Values, fault: Any, now_ns: int) -> Values:
     return {name: np.full(np.shape(x), np.nan) for name, x in said.items()}
 
 
-class Table(NamedTuple):
+class FaultTable(NamedTuple):
     """Faults that a rig can have.
 
     Attributes:
         wire: its messages.
         sends: messages by part.
         takes: messages by part.
-        said: faults of its sensors and actuators, by kind.
+        device_faults: faults of its sensors and actuators, by kind.
     """
 
     wire: Wire = BARE
     sends: Mapping[str, tuple[str, ...]] = {}
     takes: Mapping[str, tuple[str, ...]] = {}
-    said: Mapping[str, Said] = {}
+    device_faults: Mapping[str, DeviceFault] = {}
 
     @property
     def kinds(self) -> dict[str, tuple[str, ...]]:
         """All kinds of faults, with what each takes."""
-        return _LINE | {kind: (*_PLACE, *one.takes) for kind, one in self.said.items()}
+        return _LINE | {kind: (*_PLACE, *one.takes) for kind, one in self.device_faults.items()}
 
     def carried(self, link: str, direction: Direction) -> tuple[str, ...]:
         """Names of the messages on the link of a part, in one direction."""
@@ -105,7 +105,7 @@ class LinkFault(Parameters):
     the frames that are hit, at random.
     """
 
-    table: ClassVar[Table] = Table()
+    table: ClassVar[FaultTable] = FaultTable()
 
     kind: str
     begin: Annotated[float, Quantity("time", least="0 s")]
@@ -121,7 +121,9 @@ class LinkFault(Parameters):
     @classmethod
     def _at_its_speaker(cls, given: Any) -> Any:
         """Add link and message to a fault of a sensor or an actuator that leaves them out."""
-        if isinstance(given, Mapping) and (said := cls.table.said.get(given.get("kind", ""))):
+        if isinstance(given, Mapping) and (
+            said := cls.table.device_faults.get(given.get("kind", ""))
+        ):
             return {"link": said.link, "message": said.message, **given}
         return given
 
@@ -129,7 +131,7 @@ class LinkFault(Parameters):
     def _sound(self) -> LinkFault:
         if self.end is not None and self.end <= self.begin:
             raise ValueError(f"end ({self.end:g} s) must come after begin ({self.begin:g} s)")
-        said = self.table.said.get(self.kind)
+        said = self.table.device_faults.get(self.kind)
         allowed = ("kind", "begin", "end", *self.table.kinds[self.kind])
         if "end" in self.model_fields_set and self.kind == "killed":
             raise ValueError("end: a part is killed once, at begin: leave end out")
@@ -158,7 +160,7 @@ class LinkFault(Parameters):
         return self.begin_ns <= now_ns < self.end_ns
 
 
-def faults_of(table: Table, **more: Any) -> type[LinkFault]:
+def faults_of(table: FaultTable, **more: Any) -> type[LinkFault]:
     """The faults of a rig as parameters.
 
     Args:
@@ -187,7 +189,7 @@ def _check_place(fault: LinkFault) -> None:
         raise ValueError(
             f"message: there is no '{fault.message}' to meet{spared}, only {', '.join(names)}"
         )
-    said = table.said.get(fault.kind)
+    said = table.device_faults.get(fault.kind)
     if said is not None and fault.message != said.message:
         raise ValueError(f"message: a fault of kind '{fault.kind}' is one of '{said.message}'")
     if fault.link is not None and fault.message is not None:

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robins.bench.broker.faults import PROCESS, Direction, LinkFault, Stage, Table
+from robins.bench.broker.faults import PROCESS, Direction, FaultTable, LinkFault, Stage
 from robins.bench.wire.frames import Frame, encode_frame
 from robins.bench.wire.schema import FIRST_DATA
 
@@ -28,16 +28,16 @@ _CHANCE, _BITS = 0, 1  # what noise is for
 _BLOCK = 256  # chances drawn at once
 
 
-class Piece(NamedTuple):
+class LineOutput(NamedTuple):
     """Output of the injector: bytes as the line damaged them, or a frame that gets a new header."""
 
     raw: bytes | None
     frame: Frame | None
 
 
-class _Held(NamedTuple):
+class _HeldFrame(NamedTuple):
     due_ns: float | int
-    piece: Piece
+    piece: LineOutput
     type: int
     fault: int | None  # a reorder, which waits for the next frame of this type
 
@@ -68,7 +68,7 @@ class Injector:
         counts: frames hit so far, by kind and link; parts for "killed" and "power".
     """
 
-    def __init__(self, table: Table, faults: Iterable[LinkFault] = (), seed: int = 0) -> None:
+    def __init__(self, table: FaultTable, faults: Iterable[LinkFault] = (), seed: int = 0) -> None:
         """Take the faults of a run.
 
         Args:
@@ -83,14 +83,14 @@ class Injector:
             raise ValueError(f"seed must be from 0 to 2^64 - 1, got {seed}")
         self.counts: Counter[tuple[str, str]] = Counter()
         self._seed, self._table, self._wire = seed, table, table.wire
-        repeated = [one.message for one in table.said.values() if one.stage == "repeated"]
+        repeated = [one.message for one in table.device_faults.values() if one.stage == "repeated"]
         self._repeated = {table.wire.numbers[name] for name in repeated}
         self._faults: list[_Fault] = []
         self._added = 0
         self._met: Counter[tuple[int, str, str]] = Counter()
         self._chances: dict[tuple[int, str, str], np.ndarray] = {}
         self._said: dict[tuple[str, str, int], bytes] = {}
-        self._held: dict[tuple[str, str], list[_Held]] = {}
+        self._held: dict[tuple[str, str], list[_HeldFrame]] = {}
         self._killed: set[int] = set()
         for fault in faults:
             self.add(fault)
@@ -133,7 +133,7 @@ class Injector:
 
     def pass_on(
         self, link: str, direction: Direction, frame: Frame, raw: bytes, now_ns: int
-    ) -> list[Piece]:
+    ) -> list[LineOutput]:
         """Pieces that become of a frame: one or two; none if it is lost or held back.
 
         Args:
@@ -145,23 +145,23 @@ class Injector:
         """
         kind = frame.header.type
         if kind < FIRST_DATA:
-            return [Piece(None, frame)]
+            return [LineOutput(None, frame)]
         where = link, direction
         met = [one for one in self._faults if one.meets(link, direction, kind, now_ns)]
         if met or kind in self._repeated:
-            payload = self._say(where, kind, frame.payload, met, now_ns)
+            payload = self._spoilt(where, kind, frame.payload, met, now_ns)
             if payload is not frame.payload:
                 frame = frame._replace(payload=payload)
                 raw = encode_frame(*frame)
-        pieces = [Piece(None, frame)]
+        pieces = [LineOutput(None, frame)]
         for one in met:
-            if pieces and one.is_.kind not in self._table.said:
+            if pieces and one.is_.kind not in self._table.device_faults:
                 pieces = self._spoil(where, kind, one, pieces, raw, now_ns)
         if pieces and where in self._held:
             pieces += self._overtaken(where, kind)
         return pieces
 
-    def release(self, link: str, direction: Direction, now_ns: int) -> list[Piece]:
+    def release(self, link: str, direction: Direction, now_ns: int) -> list[LineOutput]:
         """Frames that were held back and are due, the earliest first."""
         held = self._held.get((link, direction))
         if not held:
@@ -194,14 +194,14 @@ class Injector:
 
     # ------------------------------------------------------------------- payloads
 
-    def _say(
+    def _spoilt(
         self, where: tuple[str, str], kind: int, payload: bytes, met: list[_Fault], now_ns: int
     ) -> bytes:
         """Payload of a sensor or an actuator under its faults; see `Stage`."""
         name = self._wire.names.get(kind)
         if name is None or len(payload) != self._wire.size_of(name):
             return payload  # no such message; its receiver will refuse it
-        says = self._table.said
+        says = self._table.device_faults
         hits = [
             one.is_ for one in met if one.is_.kind in says and self._hit(where, one) is not None
         ]
@@ -236,10 +236,10 @@ class Injector:
         where: tuple[str, str],
         kind: int,
         one: _Fault,
-        pieces: list[Piece],
+        pieces: list[LineOutput],
         raw: bytes,
         now_ns: int,
-    ) -> list[Piece]:
+    ) -> list[LineOutput]:
         """Pieces of a frame after a fault of the line."""
         fault, held = one.is_, self._held.setdefault(where, [])
         waits = any(h.fault == one.number and h.type == kind for h in held)
@@ -250,17 +250,17 @@ class Injector:
             return pieces
         if fault.kind == "bit errors":
             noise = self._noise(where, one, count, _BITS)
-            return [Piece(_inverted(p.raw or raw, fault.bits, noise), None) for p in pieces]
+            return [LineOutput(_inverted(p.raw or raw, fault.bits, noise), None) for p in pieces]
         if fault.kind == "duplication":
             return pieces * 2
         if fault.kind == "delay" and fault.delay is not None:
             due = now_ns + round(fault.delay * _SECOND_NS)
-            held += [_Held(due, piece, kind, None) for piece in pieces]
+            held += [_HeldFrame(due, piece, kind, None) for piece in pieces]
         elif fault.kind == "reorder":
-            held += [_Held(one.end_ns, piece, kind, one.number) for piece in pieces]
+            held += [_HeldFrame(one.end_ns, piece, kind, one.number) for piece in pieces]
         return []  # held, or lost
 
-    def _overtaken(self, where: tuple[str, str], kind: int) -> list[Piece]:
+    def _overtaken(self, where: tuple[str, str], kind: int) -> list[LineOutput]:
         """Frames that waited for one of this kind."""
         held = self._held[where]
         out = [one.piece for one in held if one.fault is not None and one.type == kind]

@@ -13,11 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from robins.bench.broker.injector import Injector, Piece
-from robins.bench.ports.line import Line
+from robins.bench.broker.injector import Injector, LineOutput
+from robins.bench.ports.line import SerialLine
 from robins.bench.wire.frames import Frame, Header, encode_frame
 from robins.bench.wire.receiver import Receiver, Sequence
-from robins.bench.wire.records import Unsound
+from robins.bench.wire.records import PayloadFault
 from robins.bench.wire.schema import FIRST_DATA, Wire
 from robins.errors import RobinsError
 
@@ -42,7 +42,7 @@ _MOST = 65536  # bytes read at once
 Watcher = Callable[[str, Direction, bytes, int], None]
 """Observer of all that goes over a link, as it was on the line: link, direction, the bytes of a
 whole frame or bytes that are none, time [ns]."""
-Refuser = Callable[[str, str, Unsound], None]
+Refuser = Callable[[str, str, PayloadFault], None]
 """Receiver of the refused frames: link, message, reason."""
 
 
@@ -100,7 +100,7 @@ class Link:
         self.health = Health()
         self.greeted = False
         self._injector, self._watch = injector, watch
-        self._lines = None if baud is None else (Line(baud), Line(baud))
+        self._lines = None if baud is None else (SerialLine(baud), SerialLine(baud))
         self._run = 0
         self._out, self._ready = bytearray(), bytearray()  # for the line, and through it
         self.restart(0)
@@ -144,7 +144,7 @@ class Link:
         """Put on the line what a fault held back until now."""
         return self._pass(self._injector.release(self.name, "to", now_ns), now_ns)
 
-    def _pass(self, pieces: list[Piece], time_ns: int) -> bytes:
+    def _pass(self, pieces: list[LineOutput], time_ns: int) -> bytes:
         out = b""
         for piece in pieces:
             raw = encode_frame(*piece.frame) if piece.frame is not None else piece.raw
@@ -269,7 +269,9 @@ class Link:
         self._most_lost = 0
         return self._sequence.take(frame.header.sequence, here, most)
 
-    def _arrive(self, pieces: list[Piece], found: list[tuple[str, Frame]], now_ns: int) -> None:
+    def _arrive(
+        self, pieces: list[LineOutput], found: list[tuple[str, Frame]], now_ns: int
+    ) -> None:
         for piece in pieces:
             frames = self._spoilt.feed(piece.raw or b"") if piece.frame is None else [piece.frame]
             for frame in frames:

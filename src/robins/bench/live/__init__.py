@@ -1,6 +1,6 @@
 """The live page: a running bench in a browser, from a process of its own.
 
-- `Live`: the handle of the bench; starts the server, feeds it, takes its commands, never waits.
+- `LivePage`: the handle of the bench; starts the server, feeds it, takes its commands, never waits.
 - `signals`: signals and plots of the page.
 - `feed`: data between the bench and the server.
 - `hub`, `commands`, `guard`, `server`: the server; they need the extra "live".
@@ -8,6 +8,9 @@
 """
 
 from robins.bench.live.feed import Signal
-from robins.bench.live.handle import Live
+from robins.bench.live.handle import LivePage
+from robins.errors import moved
 
-__all__ = ["Live", "Signal"]
+__all__ = ["LivePage", "Signal"]
+
+__getattr__ = moved(__name__)

@@ -1,4 +1,4 @@
-"""The server process of the live page; `robins.bench.live.Live` starts it.
+"""The server process of the live page; `robins.bench.live.LivePage` starts it.
 
 By hand, `python -m robins.bench.live` serves a page that waits for a bench.
 """

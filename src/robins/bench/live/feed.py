@@ -108,7 +108,7 @@ RECENT = 300  # samples that a page which comes later is shown each, and those b
 EVENTS = 200  # lines of the same
 
 
-class Kind(IntEnum):
+class FrameKind(IntEnum):
     """Type of the body of a frame."""
 
     HELLO = 0
@@ -118,7 +118,7 @@ class Kind(IntEnum):
     HISTORY = 4
 
 
-def pack(kind: Kind, body: bytes) -> bytes:
+def pack(kind: FrameKind, body: bytes) -> bytes:
     """A body with its head."""
     return HEAD.pack(len(body), kind) + body
 

@@ -19,8 +19,8 @@ import numpy as np
 
 from robins.bench.live import feed
 from robins.bench.live.events import Events
-from robins.bench.live.feed import JsonObject, Kind, Signal, as_json, check
-from robins.bench.live.history import History
+from robins.bench.live.feed import FrameKind, JsonObject, Signal, as_json, check
+from robins.bench.live.history import SampleHistory
 
 START_S = 20.0  # most that a server may take to listen
 END_S = 3.0  # most that it may take to end before it is killed
@@ -30,7 +30,7 @@ SEND_BUFFER = 1 << 16  # a browser that does not read holds up no more than this
 Level = Literal["info", "warning", "alarm"]
 
 
-class Live:
+class LivePage:
     """A page that shows a running bench, served by another process.
 
     The server has its own session, so Ctrl-C leaves it to the bench to end it, and it ends by
@@ -85,7 +85,7 @@ class Live:
         self._says = tuple(says)
         self._sequence = 0
         self._recent: deque[bytes] = deque()
-        self._history = History(len(signals))  # of the samples before
+        self._history = SampleHistory(len(signals))  # of the samples before
         self._events = Events()
         self._last_status: bytes | None = None
         self._commands: deque[dict[str, Any]] = deque(maxlen=100)
@@ -161,7 +161,7 @@ class Live:
         self._sequence = 0
         for old in (self._recent, self._samples, self._lines, self._commands):
             old.clear()
-        self._history, self._before = History(len(self._signals)), b""
+        self._history, self._before = SampleHistory(len(self._signals)), b""
         self._events.kept.clear()
         self._last_status = self._status = None
         self._hello = self._make_hello()
@@ -222,7 +222,7 @@ class Live:
             self._end(kill=False)
             self._at.close()
 
-    def __enter__(self) -> Live:
+    def __enter__(self) -> LivePage:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -284,15 +284,15 @@ class Live:
     def _next(self) -> bytes:
         """Next bytes, in the order in which a page needs them; empty: nothing waits."""
         if self._hello is not None:
-            kind, body, self._hello = Kind.HELLO, self._hello, None
+            kind, body, self._hello = FrameKind.HELLO, self._hello, None
         elif self._before:
-            kind, body, self._before = Kind.HISTORY, self._before, b""
+            kind, body, self._before = FrameKind.HISTORY, self._before, b""
         elif self._lines:
-            kind, body = Kind.EVENT, self._lines.popleft()
+            kind, body = FrameKind.EVENT, self._lines.popleft()
         elif self._status is not None:
-            kind, body, self._status = Kind.STATUS, self._status, None
+            kind, body, self._status = FrameKind.STATUS, self._status, None
         elif self._samples:
-            kind, body = Kind.SAMPLE, self._samples.popleft()
+            kind, body = FrameKind.SAMPLE, self._samples.popleft()
         else:
             return b""
         return feed.pack(kind, body)

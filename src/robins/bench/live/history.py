@@ -25,7 +25,7 @@ BLOCK = 128  # samples are taken in together, since each call of NumPy costs as 
 HISTORY_HEAD = struct.Struct("<6I")
 
 
-class History:
+class SampleHistory:
     """Least and greatest values of the samples of a run, in buckets; see above.
 
     Attributes:
@@ -58,7 +58,7 @@ class History:
         return head + b"".join(column.astype("<f8").tobytes() for column in columns)
 
     @classmethod
-    def unpack(cls, packed: bytes) -> History:
+    def unpack(cls, packed: bytes) -> SampleHistory:
         """Restore a packed history."""
         _, _, n, signals, per, samples = HISTORY_HEAD.unpack_from(packed)
         made = cls(signals)

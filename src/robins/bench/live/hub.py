@@ -12,8 +12,8 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 
 from robins.bench.live.events import Events
-from robins.bench.live.feed import EVENTS, MARK, RECENT, JsonObject, Kind, sequence_of, to_json
-from robins.bench.live.history import History
+from robins.bench.live.feed import EVENTS, MARK, RECENT, FrameKind, JsonObject, sequence_of, to_json
+from robins.bench.live.history import SampleHistory
 
 QUEUE = 2 * RECENT  # samples that wait for a page
 
@@ -97,7 +97,7 @@ class Hub:
         self.says: list[str] = []
         self._hello: JsonObject | None = None
         self.events = Events()
-        self._history = History(0)
+        self._history = SampleHistory(0)
         self._recent: deque[bytes] = deque()
         self._status: JsonObject | None = None
         self._expected: int | None = None  # number of the next sample
@@ -105,20 +105,20 @@ class Hub:
 
     def take(self, kind: int, body: bytes) -> None:
         """Take a frame from the bench."""
-        if kind == Kind.SAMPLE:
+        if kind == FrameKind.SAMPLE:
             return self._take_sample(body)
-        if kind == Kind.HISTORY:
-            self._history = History.unpack(body)
+        if kind == FrameKind.HISTORY:
+            self._history = SampleHistory.unpack(body)
             return self._greet_all()
-        said = json.loads(body)
-        if kind == Kind.HELLO:
-            self._take_hello(said)
-        elif kind == Kind.STATUS:
-            self._status = said
-            self._tell_latest("status", {"kind": "status", "status": said})
-        elif kind == Kind.EVENT:
-            self.events.keep(said)
-            self._tell({"kind": "event", **said})
+        greeting = json.loads(body)
+        if kind == FrameKind.HELLO:
+            self._take_hello(greeting)
+        elif kind == FrameKind.STATUS:
+            self._status = greeting
+            self._send_latest("status", {"kind": "status", "status": greeting})
+        elif kind == FrameKind.EVENT:
+            self.events.keep(greeting)
+            self._send_all({"kind": "event", **greeting})
         return None
 
     def join(self, client: Client) -> None:
@@ -134,7 +134,7 @@ class Hub:
     def acknowledge(self, alarms: list[int]) -> None:
         """Send each page the alarms that were acknowledged."""
         self.events.acknowledge(alarms)
-        self._tell({"kind": "acknowledged", "alarms": alarms})
+        self._send_all({"kind": "acknowledged", "alarms": alarms})
 
     def beat(self) -> None:
         """Send each page a sign of life, and the counts of dropped samples."""
@@ -149,16 +149,16 @@ class Hub:
 
     def end(self) -> None:
         """Notify each page that the bench is gone."""
-        self._tell({"kind": "ended"})
+        self._send_all({"kind": "ended"})
 
-    def _take_hello(self, said: JsonObject) -> None:
-        self._hello = said
-        self.faults, self.says = said["faults"], said["says"]
-        self._dropped = said["dropped"]
+    def _take_hello(self, greeting: JsonObject) -> None:
+        self._hello = greeting
+        self.faults, self.says = greeting["faults"], greeting["says"]
+        self._dropped = greeting["dropped"]
         self._expected = None
         self._status = None
         self.events = Events()
-        self._history = History(len(said["signals"]))
+        self._history = SampleHistory(len(greeting["signals"]))
         self._recent.clear()
         self._greet_all()
 
@@ -192,12 +192,12 @@ class Hub:
         )
         return text, self._history.pack(hello["run"]), self._recent
 
-    def _tell(self, message: JsonObject) -> None:
+    def _send_all(self, message: JsonObject) -> None:
         text = to_json(message)
         for client in self.clients:
             client.line(text)
 
-    def _tell_latest(self, key: str, message: JsonObject) -> None:
+    def _send_latest(self, key: str, message: JsonObject) -> None:
         text = to_json(message)
         for client in self.clients:
             client.latest(key, text)

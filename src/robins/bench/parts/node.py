@@ -1,6 +1,6 @@
 """A part of the vehicle as a process of its own, connected by its port alone.
 
-python -m robins.bench.parts.node satellite gyro /dev/pts/5,460800 kit
+python -m robins.bench.parts.node satellite gyro /dev/pts/5,460800 config
 
 With a folder it saves its memory there, and with a step too it goes on from the memory of that
 step.
@@ -17,8 +17,8 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from robins.bench.parts.kits import take
-from robins.bench.parts.station import Station, path_of, put_aside, ready, serve
+from robins.bench.parts.config_files import take
+from robins.bench.parts.station import Station, path_of, ready, save_memory, serve
 from robins.bench.ports.port import address, open_port
 from robins.bench.rigs import rig_of
 from robins.errors import RobinsError
@@ -28,7 +28,7 @@ _PRIORITY = 50
 RARELY = 100_000  # allocations between two collections of garbage
 
 
-def be_realtime() -> str:
+def set_realtime() -> str:
     """Request a real-time scheduler; returns the reason of a refusal, or an empty string."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
@@ -40,7 +40,7 @@ def be_realtime() -> str:
 @contextlib.contextmanager
 def realtime(wanted: bool) -> Iterator[str]:
     """A real-time scheduler for a while, if it is wanted; gives why it was refused, or nothing."""
-    why = be_realtime() if wanted else ""
+    why = set_realtime() if wanted else ""
     try:
         yield why
     finally:
@@ -49,7 +49,7 @@ def realtime(wanted: bool) -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def few_collections() -> Iterator[None]:
+def fewer_collections() -> Iterator[None]:
     """Hardly any collection of garbage in the middle of a step: counted references free what a run
     makes, and each collection looks at all of JAX.
     """
@@ -72,18 +72,18 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _be(arguments: Sequence[str]) -> int:
-    rig_name, name, port, kit_path, *more = arguments
+    rig_name, name, port, config_path, *more = arguments
     # An interrupt of the terminal is for the bench, which then stops its parts.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     rig = rig_of(rig_name)
-    kit = take(Path(kit_path))
-    part = ready(rig.part(name, kit), kit.frames)
+    config = take(Path(config_path))
+    part = ready(rig.part(name, config), config.frames)
     station = Station(part, rig.wire)
     if more:
         folder, since = Path(more[0]), int(more[1])
         memory = None if since < 0 else path_of(folder, name, since).read_bytes()
-        station = Station(part, rig.wire, memory, partial(put_aside, folder, name))
-    if os.environ.get(REALTIME) and (why := be_realtime()):
+        station = Station(part, rig.wire, memory, partial(save_memory, folder, name))
+    if os.environ.get(REALTIME) and (why := set_realtime()):
         print(why, file=sys.stderr)
     gc.collect()
     gc.freeze()  # all that was imported and compiled stays, and need not be looked at again

@@ -41,7 +41,7 @@ def path_of(folder: Path, part: str, step: int) -> Path:
     return folder / f"{part}.{step}.memory"
 
 
-def put_aside(folder: Path, part: str, step: int, memory: bytes) -> None:
+def save_memory(folder: Path, part: str, step: int, memory: bytes) -> None:
     """Write a memory, whole or not at all; the one before it stays, older ones go.
 
     Where it cannot be written, those that are there stay, and the run goes on.
@@ -98,7 +98,7 @@ class Station:
         part: Part,
         wire: Wire,
         memory: bytes | None = None,
-        put_aside: Callable[[int, bytes], None] | None = None,
+        save_memory: Callable[[int, bytes], None] | None = None,
     ):
         """Set up the station of a part.
 
@@ -106,9 +106,9 @@ class Station:
             part: the part.
             wire: the messages of its rig.
             memory: of the process that it replaces; None: it starts without one.
-            put_aside: takes the step and the memory now and then; None: memories are not saved.
+            save_memory: takes the step and the memory now and then; None: memories are not saved.
         """
-        self.part, self._wire, self._put_aside = part, wire, put_aside
+        self.part, self._wire, self._put_aside = part, wire, save_memory
         self.counts: Counter[str] = Counter()
         self.over = False
         self._receiver = Receiver()

@@ -4,7 +4,7 @@
 - `line`: bytes that get through at the baud rate. `cable`: two paths, joined; also a program.
 """
 
-from robins.bench.ports.line import Line
+from robins.bench.ports.line import SerialLine
 from robins.bench.ports.port import (
     Address,
     Pair,
@@ -15,15 +15,18 @@ from robins.bench.ports.port import (
     open_pair,
     open_port,
 )
+from robins.errors import moved
 
 __all__ = [
     "Address",
-    "Line",
     "Pair",
     "PortError",
     "PortInfo",
+    "SerialLine",
     "address",
     "list_ports",
     "open_pair",
     "open_port",
 ]
+
+__getattr__ = moved(__name__)

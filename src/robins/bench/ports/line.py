@@ -14,7 +14,7 @@ _SECOND_NS = 1_000_000_000
 BITS_PER_BYTE = 10  # a start bit, eight, a stop bit
 
 
-class Line:
+class SerialLine:
     """One direction of a serial line.
 
     It holds at most ``most`` bytes; what is sent beyond is dropped, the newest first, as by a

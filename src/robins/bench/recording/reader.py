@@ -77,7 +77,9 @@ def open_record(path: str | Path) -> Record:
     return _read(Path(path), lambda reader: Entries(Path(path)))
 
 
-def _read(path: Path, entries: Callable[[_Reader], Sequence[layout.Entry] | Entries]) -> Record:
+def _read(
+    path: Path, entries: Callable[[_RecordReader], Sequence[layout.Entry] | Entries]
+) -> Record:
     with _opened(path) as reader:
         header, kept = _header(str(path), reader), entries(reader)
         for _ in reader.records():
@@ -87,7 +89,7 @@ def _read(path: Path, entries: Callable[[_Reader], Sequence[layout.Entry] | Entr
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[_Reader]:
+def _opened(path: Path) -> Iterator[_RecordReader]:
     """Open a file as a reader of its records.
 
     Raises:
@@ -95,12 +97,12 @@ def _opened(path: Path) -> Iterator[_Reader]:
     """
     try:
         with path.open("rb") as file:
-            yield _Reader(file)
+            yield _RecordReader(file)
     except OSError as error:
         raise layout.RecordingError(f"'{path}' cannot be read: {error.strerror or error}") from None
 
 
-def _header(path: str, reader: _Reader) -> dict[str, Any]:
+def _header(path: str, reader: _RecordReader) -> dict[str, Any]:
     """The header of the run.
 
     Raises:
@@ -144,7 +146,7 @@ def _header(path: str, reader: _Reader) -> dict[str, Any]:
     return header
 
 
-class _Reader:
+class _RecordReader:
     """Goes through a file, record by record."""
 
     def __init__(self, file: BinaryIO) -> None:
@@ -259,8 +261,8 @@ class _Reader:
         place, content = self._topics[channel], data[layout.MESSAGE.size :]
         if place == _EVENTS:
             with decoding(_Damage):
-                told = json.loads(content)
-                event = layout.Event(log_ns, told["kind"], told["text"], told["fields"])
+                fields = json.loads(content)
+                event = layout.Event(log_ns, fields["kind"], fields["text"], fields["fields"])
             self.events.append(event)
         elif place is not None:
             self.entries.append(layout.Entry(log_ns, *place, content))

@@ -61,7 +61,7 @@ class Replayed(NamedTuple):
         return self.first_difference is None
 
 
-class _Row(NamedTuple):
+class _LinkRow(NamedTuple):
     """Bytes on the line of a part."""
 
     life: int  # number of the part's start, from 0
@@ -117,7 +117,7 @@ def replay(
     for (_, begin), rows in groupby(_rows(entries, part), _life_of):
         step_ns = int(BARE.decode("begin", begin.payload)["step"])
         compared = compared or Differences(wire, step_ns)
-        life = _Life(wire, begin, step_ns, compared, says)
+        life = _PartLifetime(wire, begin, step_ns, compared, says)
         with open_pair() as pair, start(pair.path) as process:
             _Replay(wire, part, pair, process, patience_s, life).run(rows, count)
         first = first or life.first_difference()
@@ -139,20 +139,20 @@ def recorded(entries: Iterable[Entry], part: str) -> Iterator[Frame]:
         newest = -1
         for row in rows:
             for frame in () if row.to else row.found:
-                if _is_said(frame, row.begin) and frame.header.sequence > newest:
+                if _is_recorded(frame, row.begin) and frame.header.sequence > newest:
                     newest = frame.header.sequence
                     yield frame
 
 
-def _life_of(row: _Row) -> tuple[int, Frame]:
+def _life_of(row: _LinkRow) -> tuple[int, Frame]:
     return row.life, row.begin
 
 
-def _is_said(frame: Frame, begin: Frame) -> bool:
+def _is_recorded(frame: Frame, begin: Frame) -> bool:
     return frame.header.type >= FIRST_DATA and frame.header.run == begin.header.run
 
 
-def _rows(entries: Iterable[Entry], part: str) -> Iterator[_Row]:
+def _rows(entries: Iterable[Entry], part: str) -> Iterator[_LinkRow]:
     """The record of a part from its first begin on.
 
     A begin that comes before the first tick answers a hello that was repeated; a later one begins
@@ -178,7 +178,7 @@ def _rows(entries: Iterable[Entry], part: str) -> Iterator[_Row]:
         else:
             found = back.feed(entry.data)
         if begin is not None:
-            row = _Row(life, begin, entry.direction == "to", entry.data, found)
+            row = _LinkRow(life, begin, entry.direction == "to", entry.data, found)
             ticked = ticked or (row.to and bool(row.ticks()))
             yield row
     if begin is None:
@@ -193,7 +193,13 @@ class _Replay:
     """Replay of one life of a part."""
 
     def __init__(
-        self, wire: Wire, part: str, pair: Pair, process: Any, patience_s: float, life: _Life
+        self,
+        wire: Wire,
+        part: str,
+        pair: Pair,
+        process: Any,
+        patience_s: float,
+        life: _PartLifetime,
     ):
         self._wire, self._part, self._pair, self._process = wire, part, pair, process
         self._patience_s, self._life = patience_s, life
@@ -202,7 +208,7 @@ class _Replay:
         self._waiting: list[Frame] = []
         self._where = "before its hello"
 
-    def run(self, rows: Iterable[_Row], count: Callable[[], None]) -> None:
+    def run(self, rows: Iterable[_LinkRow], count: Callable[[], None]) -> None:
         """Send the part its recorded input; the life gets its answers then and now."""
         self._greet()
         latest, last = -1, self._life.begin.header
@@ -307,7 +313,7 @@ class _Replay:
 # ---------------------------------------------------------------------------------------- compare
 
 
-class _Life:
+class _PartLifetime:
     """Comparison of a part's answers then and now, from one begin to the next.
 
     Attributes:
@@ -338,13 +344,13 @@ class _Life:
         """Note a tick that was sent to it."""
         self._tick = step
 
-    def said(self, row: _Row) -> None:
+    def said(self, row: _LinkRow) -> None:
         """Take a recorded answer."""
         for frame in row.found:
             head = frame.header
             # the bench may have received a frame twice: a fault doubled it, or the part died after
             # it and its replacement sent it again
-            if _is_said(frame, self.begin) and head.sequence > self._newest:
+            if _is_recorded(frame, self.begin) and head.sequence > self._newest:
                 self._newest = head.sequence
                 self._compared.take(0, frame)
                 self._then[head.sequence] = frame
@@ -373,36 +379,38 @@ class _Life:
     def first_difference(self) -> str | None:
         """The first frame that is not the same, in words, at the end."""
         for number, frame in self._then.items():
-            told = f"{_place(self, frame)}: {_told(self._wire, frame)}"
-            self._differs(number, f"{told} was recorded and is not said now")
+            place_text = f"{_place(self, frame)}: {_frame_text(self._wire, frame)}"
+            self._differs(number, f"{place_text} was recorded and is not said now")
         # a record that was cut, or a part that died, ends in the middle of an answer
         whole = self._tick <= self._answered
         for number, frame in self._now.items():
             if whole or number < self._newest:
-                told = f"{_place(self, frame)}: {_told(self._wire, frame)}"
-                self._differs(number, f"{told} is said now and was not recorded")
+                place_text = f"{_place(self, frame)}: {_frame_text(self._wire, frame)}"
+                self._differs(number, f"{place_text} is said now and was not recorded")
         return None if self._first is None else self._first[1]
 
 
-def _in_words(wire: Wire, life: _Life, then: Frame, now: Frame) -> str:
+def _in_words(wire: Wire, life: _PartLifetime, then: Frame, now: Frame) -> str:
     where = _place(life, then)
     if then.header != now.header:
-        return f"{where}: {_told(wire, then)} was recorded, {_told(wire, now)} is said now"
+        return (
+            f"{where}: {_frame_text(wire, then)} was recorded, {_frame_text(wire, now)} is said now"
+        )
     found = differences(wire, [then], [now], life.step_ns)
     if not found:  # a NaN has many bit patterns
-        return f"{where}: {_told(wire, then)} has the same numbers in other bytes"
+        return f"{where}: {_frame_text(wire, then)} has the same numbers in other bytes"
     d = found[0]
     if not d.field:
-        return f"{where}: {_told(wire, then)} has other bytes"
+        return f"{where}: {_frame_text(wire, then)} has other bytes"
     return f"{where}: {name_of(d)} was {d.a!r}, is {d.b!r}"
 
 
-def _place(life: _Life, frame: Frame) -> str:
+def _place(life: _PartLifetime, frame: Frame) -> str:
     time_ns = frame.header.time_ns
     return f"step {time_ns // life.step_ns - 1} ({time_ns * 1e-9:g} s)"
 
 
-def _told(wire: Wire, frame: Frame) -> str:
+def _frame_text(wire: Wire, frame: Frame) -> str:
     head = frame.header
     name = wire.names.get(head.type, f"message {head.type}")
     return f"'{name}' of {head.time_ns * 1e-9:g} s, number {head.sequence},"

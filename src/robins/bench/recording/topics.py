@@ -51,7 +51,7 @@ class Topic(NamedTuple):
     stamp: str = ""  # field of the message that has its time [ns]; "": that of the frame
 
 
-class Made(NamedTuple):
+class ConvertedMessage(NamedTuple):
     """A message of a topic."""
 
     topic: str
@@ -131,7 +131,7 @@ class Topics:
             number = wire.numbers[row.message]
             self._by_number.setdefault(number, []).append((row, _schema(row, wire.message(number))))
 
-    def of(self, entry: Entry) -> list[Made]:
+    def of(self, entry: Entry) -> list[ConvertedMessage]:
         """Messages that the rows make of an entry; none if it is no sound frame."""
         if not self._by_number or entry.direction != "from" or len(entry.data) < 2:
             return []
@@ -150,7 +150,7 @@ class Topics:
                 self.failed += 1
                 continue
             encoding = MessageEncoding.JSON if row.type == JSON else MessageEncoding.CDR
-            made.append(Made(row.topic, encoding, schema, head.time_ns, data))
+            made.append(ConvertedMessage(row.topic, encoding, schema, head.time_ns, data))
         return made
 
 

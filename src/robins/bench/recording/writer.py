@@ -130,8 +130,8 @@ class Recorder:
             RecordingError: JSON cannot hold its fields.
             OSError: as `write`.
         """
-        told = {"kind": event.kind, "text": event.text, "fields": event.fields}
-        text = layout.json_text(f"event '{event.kind}'", told)
+        content = {"kind": event.kind, "text": event.text, "fields": event.fields}
+        text = layout.json_text(f"event '{event.kind}'", content)
         channel = self._channel(layout.EVENTS, MessageEncoding.JSON, self._kinds[1])
         self._add(channel, event.received_ns, event.received_ns, text.encode())
 

@@ -1,16 +1,19 @@
 """A run on the bench.
 
 - `setup`: its parameters.
-- `session`: its execution. `crew`: its processes. `clocks`: the start of each step.
+- `session`: its execution. `part_processes`: its processes. `clocks`: the start of each step.
 - `telemetry`, `outcome`: its results, in a `room` on disk if it is long.
 - `watching`: the page and the status file.
 """
 
 from robins.bench.accounting import Latencies
-from robins.bench.evaluation import Ran
-from robins.bench.rig import Flight
+from robins.bench.evaluation import RunResult
+from robins.bench.rig import LoadedRun
 from robins.bench.run.clocks import LockStep, RealTime
 from robins.bench.run.session import Session
 from robins.bench.run.setup import Setup
+from robins.errors import moved
 
-__all__ = ["Flight", "Latencies", "LockStep", "Ran", "RealTime", "Session", "Setup"]
+__all__ = ["Latencies", "LoadedRun", "LockStep", "RealTime", "RunResult", "Session", "Setup"]
+
+__getattr__ = moved(__name__)

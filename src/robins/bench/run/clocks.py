@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Literal
 
 from robins.bench.broker.link import BenchError
-from robins.bench.rig import Flight
+from robins.bench.rig import LoadedRun
 
 Overrun = Literal["continue", "skip", "abort"]
 _BEHIND_S, _BEHIND_PERIODS = 1.0, 10.0  # the longer: from so much on a run is behind its clock
@@ -121,7 +121,7 @@ class RealTime:
         return True
 
 
-def clock_of(flight: Flight) -> LockStep | RealTime:
+def clock_of(flight: LoadedRun) -> LockStep | RealTime:
     """The clock of a run."""
     setup = flight.setup
     if setup.clock == "lockstep":

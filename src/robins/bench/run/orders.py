@@ -7,11 +7,11 @@ from typing import Any
 
 from robins.bench.broker.faults import LinkFault
 from robins.bench.broker.injector import Injector
-from robins.bench.evaluation import Spoken
-from robins.bench.rig import Flight
+from robins.bench.evaluation import OperatorEvent
+from robins.bench.rig import LoadedRun
 from robins.bench.wire.fields import Values
 
-Due = tuple[str, bytes, bool]
+QueuedMessage = tuple[str, bytes, bool]
 """Name and payload of an operator message that is due; true where the scenario has planned it."""
 
 
@@ -19,17 +19,17 @@ class Orders:
     """Faults and messages of a run.
 
     Attributes:
-        said: messages sent.
+        operator_events: messages sent.
     """
 
-    def __init__(self, flight: Flight, injector: Injector, step_ns: int):
+    def __init__(self, flight: LoadedRun, injector: Injector, step_ns: int):
         """Take the faults of a run, and the operator messages of its scenario."""
-        self.said: list[Spoken] = []
+        self.operator_events: list[OperatorEvent] = []
         self._rig, self._injector, self._step_ns = flight.rig, injector, step_ns
         self._labels: list[tuple[str, LinkFault]] = []
         says = ((one.step(step_ns), one) for one in flight.setup.says)
         self._planned = sorted(says, key=lambda known: known[0])
-        self._ordered: list[Due] = []
+        self._ordered: list[QueuedMessage] = []
 
     # ------------------------------------------------------------------------------------ faults
 
@@ -65,9 +65,9 @@ class Orders:
         Raises:
             SayError: it cannot be sent.
         """
-        self._ordered.append((message, self._rig.desk.payload(message, values), False))
+        self._ordered.append((message, self._rig.operator_console.payload(message, values), False))
 
-    def due(self, step: int) -> list[Due]:
+    def due(self, step: int) -> list[QueuedMessage]:
         """Messages sent before a step, in order: of the same message the last one stands."""
         if step == 0:
             return []
@@ -76,15 +76,17 @@ class Orders:
         found = [(one.message, one.payload, True) for one in planned] + self._ordered
         self._ordered = []
         decode = self._rig.wire.decode
-        self.said += [Spoken(step, name, decode(name, payload)) for name, payload, _ in found]
+        self.operator_events += [
+            OperatorEvent(step, name, decode(name, payload)) for name, payload, _ in found
+        ]
         return found
 
 
 def in_words(message: str, values: Values) -> str:
     """Text of an operator message for the user."""
-    told = ((name, [float(x) for x in _flat(value)]) for name, value in values.items())
+    pairs = ((name, [float(x) for x in _flat(value)]) for name, value in values.items())
     return f"'{message}': " + "; ".join(
-        f"{name} {' '.join(f'{x:.6g}' for x in some)}" for name, some in told
+        f"{name} {' '.join(f'{x:.6g}' for x in some)}" for name, some in pairs
     )
 
 

@@ -17,21 +17,21 @@ from robins.bench.broker.broker import Broker, Wiring
 from robins.bench.broker.faults import LinkFault
 from robins.bench.broker.injector import Injector
 from robins.bench.broker.link import BenchError, Direction, Link
-from robins.bench.broker.revive import History
-from robins.bench.evaluation import Ran
-from robins.bench.parts.node import few_collections, realtime
+from robins.bench.broker.restart import SentFrames
+from robins.bench.evaluation import RunResult
+from robins.bench.parts.node import fewer_collections, realtime
 from robins.bench.ports.port import BAUD, Pair, open_pair, open_port, parted
 from robins.bench.recording import Entry, Event, Recorder
 from robins.bench.recording.topics import completed
-from robins.bench.rig import Flight, Kit, Rig
+from robins.bench.rig import LoadedRun, Rig, RunConfig
 from robins.bench.run.clocks import clock_of
-from robins.bench.run.crew import Crew, Death
 from robins.bench.run.orders import Orders, in_words
-from robins.bench.run.setup import counted_from, kit_of, steps_of
+from robins.bench.run.processes import PartProcesses, ProcessExit
+from robins.bench.run.setup import config_of, counted_from, steps_of
 from robins.bench.run.switching import switch
-from robins.bench.run.telemetry import Telemetry, know_truth
+from robins.bench.run.telemetry import Telemetry, require_truth
 from robins.bench.wire.frames import VERSION
-from robins.bench.wire.records import Unsound
+from robins.bench.wire.records import PayloadFault
 
 HELLO_S = 120.0  # for the hello of a part that does not compute
 REVIVED_S = 60.0
@@ -39,11 +39,11 @@ _ANEW = '; on_death = "restart" would restart it'
 _LONG_S = 9.0  # of waiting for a hello, before it is an event
 _TELL_S = 0.2  # between two words on how far it is
 _MOST_DEATHS, _MINUTE_S = 3, 60.0  # of one part, by itself, until the run fails
-_GLANCE_NS = 50_000_000  # how often processes are looked at
+_POLL_NS = 50_000_000  # how often processes are looked at
 
 
 @runtime_checkable
-class Watch(Protocol):
+class RunObserver(Protocol):
     """Observer of a run, such as the live page; its calls must return at once."""
 
     def event(self, kind: str, time_s: float, text: str) -> None:
@@ -56,14 +56,14 @@ class Watch(Protocol):
         """The run is over."""
 
     def commands(self, session: Session) -> list[dict[str, Any]]:
-        """Commands of the observer; see `robins.bench.live.Live.commands`."""
+        """Commands of the observer; see `robins.bench.live.LivePage.commands`."""
         ...
 
 
-class _DiedAgainError(Exception):
+class _RestartFailedError(Exception):
     """A restarted part has died before it reached the state of the old one."""
 
-    def __init__(self, death: Death):
+    def __init__(self, death: ProcessExit):
         super().__init__(str(death))
         self.death = death
 
@@ -76,8 +76,8 @@ class Session:
         latencies: so far.
         telemetry: so far.
         injector: its faults; more may be added while it runs.
-        kit: input of its parts.
-        crew: the processes.
+        config: input of its parts.
+        part_processes: the processes.
         clock: decides when a step begins.
         done: steps so far.
         step_ms: duration of the last step.
@@ -87,12 +87,12 @@ class Session:
 
     def __init__(
         self,
-        flight: Flight,
+        flight: LoadedRun,
         record: Path | None = None,
-        watch: Watch | None = None,
+        watch: RunObserver | None = None,
         progress: Callable[[float, str], None] | None = None,
         paused: bool = False,
-        kit: Kit | None = None,
+        config: RunConfig | None = None,
     ):
         """Make ready.
 
@@ -102,7 +102,7 @@ class Session:
             watch: the observer.
             progress: called with the share that is done, and the present activity.
             paused: whether it waits for a "start" of the observer.
-            kit: of the same run, if it has been made before.
+            config: of the same run, if it has been made before.
 
         Raises:
             ScenarioError: the length of the run does not fit the scenario.
@@ -114,14 +114,16 @@ class Session:
         self.steps = steps_of(flight)
         setup = flight.setup
         self.ports, programs = parted(setup.ports)
-        if kit is None:
+        if config is None:
             self._tell(0.0, "preparing")
-            kit = kit_of(flight)
-        self.kit = kit
-        self.telemetry = Telemetry(self.rig, self.steps, kit.step_ns, record)
-        self.crew = Crew(self.rig, kit, setup.fifo, setup.on_death == "restart", programs)
+            config = config_of(flight)
+        self.config = config
+        self.telemetry = Telemetry(self.rig, self.steps, config.step_ns, record)
+        self.part_processes = PartProcesses(
+            self.rig, config, setup.fifo, setup.on_death == "restart", programs
+        )
         self.injector = Injector(self.rig.table, setup.faults, setup.seed)
-        self._orders = Orders(flight, self.injector, kit.step_ns)
+        self._orders = Orders(flight, self.injector, config.step_ns)
         self.clock = clock_of(flight)
         self._broker: Broker | None = None  # until the links are open
         self._record_path = record
@@ -132,7 +134,7 @@ class Session:
         self.run_number = int.from_bytes(os.urandom(4), "little") or 1
         self.done = 0
         self.step_ms = self.pace = 0.0
-        self._histories: dict[str, History] = {}  # of parts that are restarted if they die
+        self._histories: dict[str, SentFrames] = {}  # of parts that are restarted if they die
         self._died: dict[str, list[float]] = {}  # when, of late, by part; not of those killed
         self._barred: set[tuple[str, str]] = set()  # links and messages that were reported
         self._paused, self._stop = paused, False
@@ -144,8 +146,8 @@ class Session:
 
     # --------------------------------------------------------------------------------- going
 
-    def run(self) -> Ran:
-        """Execute the run; a failure is in `Ran.failure`, with all results until then.
+    def run(self) -> RunResult:
+        """Execute the run; a failure is in `RunResult.failure`, with all results until then.
 
         Raises:
             KeyboardInterrupt: after all processes have ended and the record is whole.
@@ -153,7 +155,7 @@ class Session:
         failure, done, seconds = "", 0, 0.0
         with contextlib.ExitStack() as stack:
             self._recorder = self._open_record(stack)
-            stack.enter_context(self.crew)
+            stack.enter_context(self.part_processes)
             self._broker = self._wire(stack)
             began = time.monotonic()
             try:
@@ -161,10 +163,10 @@ class Session:
                 began = time.monotonic()
                 done = self._go()
                 counted = slice(counted_from(self.flight, done), done)
-                know_truth(self.rig, self.telemetry.flown, counted, self.time_s)
+                require_truth(self.rig, self.telemetry.series, counted, self.time_s)
             except BenchError as error:
                 failure = str(error)
-                done = done or max(self.broker.time_ns // self.kit.step_ns - 1, 0)
+                done = done or max(self.broker.time_ns // self.config.step_ns - 1, 0)
                 self.event("failed", failure)
             finally:
                 seconds = time.monotonic() - began
@@ -173,9 +175,9 @@ class Session:
                     self._catch_up()
                 if self._watch is not None:
                     self._watch.over(self, bool(failure))
-        return Ran(
-            flown=self.telemetry.flown.until(done),
-            kit=self.kit,
+        return RunResult(
+            series=self.telemetry.series.until(done),
+            config=self.config,
             steps=done,
             seconds=seconds,
             latencies=self.latencies,
@@ -186,13 +188,13 @@ class Session:
             deaths=self.deaths,
             failure=failure,
             stopped=self._stop and done < self.steps,
-            said=tuple(self._orders.said),
+            operator_events=tuple(self._orders.operator_events),
         )
 
     def _go(self) -> int:
         """All steps."""
         told, counted, since = 0.0, 0, time.monotonic()
-        with few_collections(), realtime(self.flight.setup.fifo) as refused:
+        with fewer_collections(), realtime(self.flight.setup.fifo) as refused:
             if refused:
                 self.event("scheduler", refused)
             for k in range(self.steps):
@@ -225,8 +227,16 @@ class Session:
 
     def _obey(self, step: int) -> None:
         """Execute the commands of the observer; wait while it is paused."""
-        time_ns = (step + 1) * self.kit.step_ns
-        switch(self.injector, self.crew, self.broker, time_ns, self._speaks, self._bury, self.event)
+        time_ns = (step + 1) * self.config.step_ns
+        switch(
+            self.injector,
+            self.part_processes,
+            self.broker,
+            time_ns,
+            self._speaks,
+            self._reap,
+            self.event,
+        )
         if self._watch is not None:
             began = time.monotonic_ns()
             while True:
@@ -248,12 +258,12 @@ class Session:
         elif what == "clear":
             self._orders.clear(label)
         elif what == "inject":
-            begin = self.time_s + self.kit.step_ns * 1e-9  # of the next step
+            begin = self.time_s + self.config.step_ns * 1e-9  # of the next step
             self._orders.inject(str(label), command["fault"], begin, command.get("duration_s"))
         elif what == "say":
             self._catch_up()
-            of = self.rig.shown.says[str(label)]
-            self._orders.say(*of(self.telemetry.flown, self.kit, self.done - 1))
+            of = self.rig.shown.console_messages[str(label)]
+            self._orders.say(*of(self.telemetry.series, self.config, self.done - 1))
         self.event("command", f"{what} {label or ''}".strip())
 
     def say(self, message: str, **values: Any) -> None:
@@ -279,7 +289,7 @@ class Session:
         """State of a part: "up", "board" or "dead"."""
         if part in self.ports:
             return "board"
-        off = self.crew.process(part) is None or part in self.broker.off
+        off = self.part_processes.process(part) is None or part in self.broker.off
         return "dead" if off else "up"
 
     # ------------------------------------------------------------------------------- making ready
@@ -295,11 +305,11 @@ class Session:
             "run": self.run_number,
             "setup": setup.model_dump(mode="json", exclude_unset=True),
             "loop": given.model_dump(mode="json", exclude_unset=True),
-            "step_ns": self.kit.step_ns,
+            "step_ns": self.config.step_ns,
             "steps": self.steps,
         }
         wire = self.rig.wire
-        rows = completed(self.rig.topics(self.kit), wire, self.rig.sends)
+        rows = completed(self.rig.topics(self.config), wire, self.rig.sends)
         recorder = Recorder(self._record_path, wire, header, topics=rows, overwrite=True)
         return stack.enter_context(recorder)
 
@@ -317,18 +327,20 @@ class Session:
             self._start(part, pair)
         if setup.on_death == "restart":
             own = set(links) - set(self.ports)
-            self._histories = {p: History(partial(self.crew.remembers, p)) for p in own}
+            self._histories = {
+                p: SentFrames(partial(self.part_processes.remembers, p)) for p in own
+            }
         return Broker(
             links,
-            wiring(self.rig, self.kit),
-            self.kit.step_ns,
+            wiring(self.rig, self.config),
+            self.config.step_ns,
             self.injector,
             self._observe,
-            self._glance,
+            self._poll,
             self._answered,
             self._catch_up,
             self._histories,
-            self.crew.idle_s,
+            self.part_processes.idle_s,
             self._waiting,
         )
 
@@ -347,7 +359,7 @@ class Session:
 
     def _start(self, part: str, pair: Pair) -> None:
         self._speaks[part] = f"{pair.path},{self.flight.setup.baud or BAUD}"
-        self.crew.start(part, self._speaks[part])
+        self.part_processes.start(part, self._speaks[part])
 
     # -------------------------------------------------------------------------------- looking on
 
@@ -384,7 +396,7 @@ class Session:
         if self._recorder is not None:
             self._passed.append((Entry(self._wall_ns(), link, direction, data), time_ns))
 
-    def _refused(self, link: str, message: str, why: Unsound) -> None:
+    def _refused(self, link: str, message: str, why: PayloadFault) -> None:
         """Report a frame that contradicts its table; those like it that follow are only counted.
 
         Raises:
@@ -419,28 +431,28 @@ class Session:
         self.latencies.tick(part, step, None, at_ns)
         self.latencies.done(part, step, now_ns, compute_ns)
 
-    def _glance(self) -> None:
+    def _poll(self) -> None:
         now = time.monotonic_ns()
-        if now - self._glanced_ns > _GLANCE_NS:
+        if now - self._glanced_ns > _POLL_NS:
             self._glanced_ns = now
             if self._recorder is not None and self._paused:
                 self._recorder.flush()  # nothing comes that would
-            self._bury()
+            self._reap()
 
-    def _bury(self, until: str | None = None) -> None:
+    def _reap(self, until: str | None = None) -> None:
         """Handle processes that have ended, by the policy of the setup.
 
         Raises:
             BenchError: one has, and the run is to fail.
         """
-        deaths = self.crew.deaths()
+        deaths = self.part_processes.deaths()
         while until is not None and until not in [d.part for d in deaths]:
             time.sleep(0.001)
-            deaths += self.crew.deaths()
+            deaths += self.part_processes.deaths()
         for death in deaths:
-            self._mourn(death, by_itself=death.part != until)
+            self._handle_exit(death, by_itself=death.part != until)
 
-    def _mourn(self, death: Death, by_itself: bool) -> None:
+    def _handle_exit(self, death: ProcessExit, by_itself: bool) -> None:
         part, setup = death.part, self.flight.setup
         while True:
             self.deaths += 1
@@ -456,26 +468,26 @@ class Session:
             if len(self._died.get(part, ())) >= _MOST_DEATHS:
                 raise BenchError(f"{fatal}; that is its third death in a minute")
             since = self._histories[part].since
-            self.crew.start(part, self._speaks[part], since)
+            self.part_processes.start(part, self._speaks[part], since)
             try:
-                self.broker.revive(part, REVIVED_S, partial(self._still_lives, part))
-            except _DiedAgainError as again:
+                self.broker.revive(part, REVIVED_S, partial(self._require_alive, part))
+            except _RestartFailedError as again:
                 death, by_itself = again.death, True
                 continue
             told = "all" if since < 0 else f"all since step {since}"
             return self.event("restarted", f"'{part}' was restarted and told {told} again")
 
-    def _still_lives(self, part: str) -> None:
+    def _require_alive(self, part: str) -> None:
         """Check that a restarted part has not died at once; others wait for their turn.
 
         Raises:
-            _DiedAgainError: it has.
+            _RestartFailedError: it has.
         """
-        if died := self.crew.deaths(part):
-            raise _DiedAgainError(died[0])
+        if died := self.part_processes.deaths(part):
+            raise _RestartFailedError(died[0])
 
 
-def wiring(rig: Rig, kit: Kit) -> Wiring:
+def wiring(rig: Rig, config: RunConfig) -> Wiring:
     """Links of a rig: which part sends which message to which."""
-    takes = {part: dict(rig.part(part, kit).takes) for part in rig.parts}
+    takes = {part: dict(rig.part(part, config).takes) for part in rig.parts}
     return Wiring(rig.wire, rig.sends, takes, rig.console)

@@ -24,11 +24,11 @@ from typing import Annotated, Any, ClassVar, Literal
 import pydantic
 
 from robins import scenario
+from robins.bench.broker.console import OperatorMessage
 from robins.bench.broker.faults import LinkFault
 from robins.bench.broker.link import BenchError
-from robins.bench.broker.says import Saying
 from robins.bench.ports.port import program
-from robins.bench.rig import Flight, Kit, Rig
+from robins.bench.rig import LoadedRun, Rig, RunConfig
 from robins.bench.rigs import RIGS, rig_of
 from robins.errors import RobinsError, hint
 from robins.scenario import Parameters, Quantity, ScenarioError
@@ -79,7 +79,7 @@ class Setup(Parameters):
     baud: Annotated[int, pydantic.Field(ge=300, le=100_000_000)] | None = None
     ports: dict[str, str] = pydantic.Field(default_factory=dict)
     faults: tuple[LinkFault, ...] = ()
-    says: tuple[Saying, ...] = ()
+    says: tuple[OperatorMessage, ...] = ()
 
     @pydantic.model_validator(mode="after")
     def _sound(self) -> Setup:
@@ -107,7 +107,7 @@ def setup_of(rig: Rig) -> type[Setup]:
         "flies": (str, next(iter(rig.flies()), "")),
         "filter": (str, rig.filters()[0]),
         "faults": (tuple[rig.fault, ...], ()),
-        "says": (tuple[rig.saying, ...], ()),
+        "says": (tuple[rig.operator_message, ...], ()),
         **rig.options(),
     }
     made = pydantic.create_model("Setup", __base__=Setup, **fields)
@@ -140,8 +140,8 @@ def calling(rig: Rig, name: str, otherwise: str = "") -> Iterator[None]:
         ) from error
 
 
-def kit_of(flight: Flight) -> Kit:
-    """Kit from which the parts of a run are made.
+def config_of(flight: LoadedRun) -> RunConfig:
+    """Config from which the parts of a run are made.
 
     Raises:
         BenchError: the rig cannot prepare it; names the line that failed.
@@ -155,7 +155,7 @@ def built_in() -> dict[str, Path]:
     return {name: path for rig in RIGS for name, path in rig_of(rig).scenarios().items()}
 
 
-def read(name: str, settings: tuple[str, ...] = ()) -> Flight:
+def read(name: str, settings: tuple[str, ...] = ()) -> LoadedRun:
     """A run by the name of a scenario of the bench or of a system, a file of either, or a rig.
 
     Args:
@@ -174,11 +174,11 @@ def read(name: str, settings: tuple[str, ...] = ()) -> Flight:
             {"set": settings} | ({"flies": flies} if flies else {})
         )
         title = Path(name).name.replace(".py:", ":") if is_file(name) else name
-        return Flight(title, rig, setup, _flies(rig, setup), "")
+        return LoadedRun(title, rig, setup, _flies(rig, setup), "")
     setup = scenario.parse(setup_of(rig), text, settings, source=name)
     _require_programs(setup.ports, name)
     title = name if name in built_in() else Path(name).stem
-    return Flight(title, rig, setup, _flies(rig, setup), text)
+    return LoadedRun(title, rig, setup, _flies(rig, setup), text)
 
 
 def _require_programs(ports: Mapping[str, str], named_in: str | os.PathLike[str]) -> None:
@@ -197,7 +197,7 @@ def _text(name: str) -> tuple[str, Rig]:
     if is_file(name) or name in RIGS:
         return "", rig_of(name)
     ours = built_in()
-    theirs = {flown: rig for rig in RIGS for flown in rig_of(rig).flies()}
+    theirs = {series: rig for rig in RIGS for series in rig_of(rig).flies()}
     if name in theirs:
         return "", rig_of(theirs[name])
     if name not in ours and not name.endswith(".toml"):
@@ -226,7 +226,7 @@ def _flies(rig: Rig, setup: Setup) -> Parameters:
     return scenario.parse(rig.given, text, setup.set, source=flies or rig.name)
 
 
-def changed(flight: Flight, options: Mapping[str, Any]) -> Flight:
+def changed(flight: LoadedRun, options: Mapping[str, Any]) -> LoadedRun:
     """The same run with other options of its setup, in SI; ``ports`` are added to.
 
     Raises:
@@ -241,21 +241,21 @@ def changed(flight: Flight, options: Mapping[str, Any]) -> Flight:
     try:
         setup = setup_of(flight.rig).model_validate({**given, **options, "ports": ports})
     except pydantic.ValidationError as error:
-        told = [
+        faults_found = [
             str(e["ctx"]["error"] if "ctx" in e and "error" in e["ctx"] else e["msg"])
             for e in error.errors(include_url=False)
         ]
-        raise ScenarioError(told) from None
+        raise ScenarioError(faults_found) from None
     return flight._replace(setup=setup)
 
 
-def counted_from(flight: Flight, steps: int) -> int:
+def counted_from(flight: LoadedRun, steps: int) -> int:
     """First step that counts in figures of merit: that of the scenario, else of the second half."""
     first = flight.timing.counted_from
     return first if first < steps else steps // 2
 
 
-def steps_of(flight: Flight) -> int:
+def steps_of(flight: LoadedRun) -> int:
     """Steps of a run.
 
     Raises:
@@ -280,7 +280,7 @@ def steps_of(flight: Flight) -> int:
 
 def recorded_flight(
     header: Mapping[str, Any], record: str | os.PathLike[str], filter_: str | None = None
-) -> Flight:
+) -> LoadedRun:
     """The run of a record, from its header; or the same with another filter.
 
     Raises:
@@ -297,7 +297,7 @@ def recorded_flight(
             [f"the record was made by another version of robins ({header.get('robins')}): {error}"]
         ) from None
     _require_programs(setup.ports, record)
-    flight = Flight(str(header["name"]), rig, setup, given, "")
+    flight = LoadedRun(str(header["name"]), rig, setup, given, "")
     return flight if filter_ is None else changed(flight, {"filter": filter_})
 
 

@@ -18,7 +18,7 @@ class FaultSpans:
     def __init__(self) -> None:
         self._ends: dict[tuple[str, float], float | None] = {}
 
-    def hear(self, active: Iterable[tuple[str, float]], time_s: float) -> None:
+    def observe(self, active: Iterable[tuple[str, float]], time_s: float) -> None:
         """Take what is on after a step.
 
         Args:
@@ -35,7 +35,7 @@ class FaultSpans:
                 self._ends.pop(next(iter(self._ends)))
 
     @property
-    def told(self) -> list[JsonObject]:
+    def for_page(self) -> list[JsonObject]:
         """Spans for the page; one that is still active has no end."""
         return [
             {"label": label, "begin_s": begin, "end_s": end}

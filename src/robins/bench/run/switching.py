@@ -11,18 +11,18 @@ from collections.abc import Callable, Mapping
 
 from robins.bench.broker.broker import Broker
 from robins.bench.broker.injector import Injector
-from robins.bench.run.crew import Crew
+from robins.bench.run.processes import PartProcesses
 
 HELLO_S = 60.0  # for the hello of a part that is switched on
 
 
 def switch(
     injector: Injector,
-    crew: Crew,
+    part_processes: PartProcesses,
     broker: Broker,
     time_ns: int,
     speaks: Mapping[str, str],
-    bury: Callable[[str], None],
+    reap: Callable[[str], None],
     event: Callable[[str, str], None],
 ) -> None:
     """Apply the faults of processes, before a step.
@@ -32,11 +32,11 @@ def switch(
 
     Args:
         injector: the faults of the run.
-        crew: its processes.
+        part_processes: its processes.
         broker: its hub.
         time_ns: of the run, that of the end of the step.
         speaks: the ports of the parts that are processes.
-        bury: waits until a part has died, and does what the run is to do then.
+        reap: waits until a part has died, and does what the run is to do then.
         event: notes an event by its kind and text.
 
     Raises:
@@ -44,17 +44,17 @@ def switch(
     """
     for part in injector.killed(time_ns):
         event("killed", f"'{part}' is killed, as a fault")
-        crew.kill(part)
-        bury(part)
+        part_processes.kill(part)
+        reap(part)
     off = injector.off(time_ns) & speaks.keys()
     for part in sorted(off - broker.off):
         event("power", f"'{part}' is switched off, as a fault")
         injector.counts["power", part] += 1
-        crew.kill(part)
-        while not crew.deaths(part):
+        part_processes.kill(part)
+        while not part_processes.deaths(part):
             time.sleep(0.001)
         broker.switch_off(part)
-        crew.start(part, speaks[part])
+        part_processes.start(part, speaks[part])
     for part in sorted(broker.off - off):
         broker.switch_on(part, HELLO_S)
         event("power", f"'{part}' is switched on, and begins anew")

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from robins.bench.broker.link import BenchError
-from robins.bench.evaluation import Flown
+from robins.bench.evaluation import MessageSeries
 from robins.bench.rig import Rig
-from robins.bench.run.room import Room
+from robins.bench.run.number_store import NumberStore
 
 _OFTEN = 1 << 12  # messages, after which the memory of those before is let go
 
@@ -41,17 +41,17 @@ class Telemetry:
 
         time_s = np.arange(1, steps + 1) * (step_ns * 1e-9)
         shapes = {f"{m.name}.{f.name}": form(f) for m in every for f in m.fields}
-        self._room = Room(shapes, None if beside is None else beside.absolute().parent)
+        self._room = NumberStore(shapes, None if beside is None else beside.absolute().parent)
         self._heard = 0
-        self.flown = Flown(time_s, self._room.arrays)
+        self.series = MessageSeries(time_s, self._room.arrays)
 
     def observe(self, message: str, time_ns: int, payload: bytes) -> None:
         """Take a message that passes."""
         fields = self._fields.get(message)
         k = time_ns // self._step_ns - 1
-        if fields is None or not 0 <= k < len(self.flown.time_s):
+        if fields is None or not 0 <= k < len(self.series.time_s):
             return
-        said, arrays = self._wire.decode(message, payload), self.flown.arrays
+        said, arrays = self._wire.decode(message, payload), self.series.arrays
         for field, name in fields:
             arrays[name][k] = said[field]
         self._heard += 1
@@ -59,7 +59,7 @@ class Telemetry:
             self._room.forget()
 
 
-def know_truth(rig: Rig, flown: Flown, counted: slice, time_s: float) -> None:
+def require_truth(rig: Rig, series: MessageSeries, counted: slice, time_s: float) -> None:
     """Require that the truth is known in some step that counts.
 
     Raises:
@@ -67,14 +67,14 @@ def know_truth(rig: Rig, flown: Flown, counted: slice, time_s: float) -> None:
     """
     if not (truth := rig.truth):
         return
-    first = next(x for name, x in flown.items() if name.startswith(f"{truth}."))
+    first = next(x for name, x in series.items() if name.startswith(f"{truth}."))
     known = first[counted]
     if len(known) and not np.any(np.all(np.isfinite(known.reshape(len(known), -1)), axis=-1)):
         speaker = next(part for part, sent in rig.sends.items() if truth in sent)
         raise BenchError(f"no true {truth} was received from '{speaker}' up to {time_s:.1f} s")
 
 
-def difference(flown: Flown, inside: Mapping[str, np.ndarray]) -> float:
+def difference(series: MessageSeries, inside: Mapping[str, np.ndarray]) -> float:
     """Greatest difference of a run from the same inside one program, over what both know.
 
     Infinite where one has a number and the other none. Components that only one has, such as those
@@ -82,7 +82,7 @@ def difference(flown: Flown, inside: Mapping[str, np.ndarray]) -> float:
     """
     worst = 0.0
     for name, wanted in inside.items():
-        a, b = flown[name], wanted[: len(flown[name])]
+        a, b = series[name], wanted[: len(series[name])]
         if a.ndim > 1:
             a, b = (x[:, : min(a.shape[1], b.shape[1])] for x in (a, b))
         off = np.abs(a - b)

@@ -4,28 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from robins.bench.evaluation import Ran
-from robins.bench.rig import Flight
+from robins.bench.evaluation import RunResult
+from robins.bench.rig import LoadedRun
 from robins.scenario import Parameters, Span
 
 
-def doubts(flight: Flight, ran: Ran) -> list[str]:
+def doubts(flight: LoadedRun, result: RunResult) -> list[str]:
     """Sentences on planned events that did not happen, and on a clock that was not kept.
 
     Of a run that failed the reason is known, so only the latter.
     """
-    behind = [event for event in ran.events if event.kind == "behind"]
+    behind = [event for event in result.events if event.kind == "behind"]
     late = [f"At {one.fields['time_s']:g} s {one.text}" for one in behind[-1:]]
-    return late if ran.failure else [*late, *_missed(flight, ran)]
+    return late if result.failure else [*late, *_missed(flight, result)]
 
 
-def _missed(flight: Flight, ran: Ran) -> Iterator[str]:
-    step_ns, setup = ran.kit.step_ns, flight.setup
-    end_s = ran.steps * step_ns * 1e-9
+def _missed(flight: LoadedRun, result: RunResult) -> Iterator[str]:
+    step_ns, setup = result.config.step_ns, flight.setup
+    end_s = result.steps * step_ns * 1e-9
     for fault in setup.faults:
         what = f"The fault '{fault.kind}' at {fault.link or 'all links'}"
-        hit = (kind == fault.kind and fault.link in (None, link) for kind, link in ran.injected)
-        if fault.begin_ns > ran.steps * step_ns:
+        hit = (kind == fault.kind and fault.link in (None, link) for kind, link in result.injected)
+        if fault.begin_ns > result.steps * step_ns:
             yield _after(what, fault.begin, end_s)
         elif not any(hit):
             yield f"{what}, from {fault.begin:g} s on, met nothing: the run tests nothing of it"
@@ -33,7 +33,7 @@ def _missed(flight: Flight, ran: Ran) -> Iterator[str]:
         if span.begin >= end_s:
             yield _after(f"'{name}' of what flies", span.begin, end_s)
     for one in setup.says:
-        if one.step(step_ns) >= ran.steps:
+        if one.step(step_ns) >= result.steps:
             what = f"'{one.message}' was to be said at {one.at:g} s"
             yield f"{what}, after the end of the run at {end_s:g} s"
 

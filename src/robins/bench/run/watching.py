@@ -7,13 +7,13 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
-from robins.bench.live import Live, Signal
+from robins.bench.live import LivePage, Signal
 from robins.bench.live.feed import JsonObject
-from robins.bench.rig import Flight, Rig
+from robins.bench.rig import LoadedRun, Rig
 from robins.bench.run.session import Session
 from robins.bench.run.setup import steps_of
 from robins.bench.run.spans import FaultSpans
-from robins.bench.status import STARTING, Status
+from robins.bench.status import STARTING, BenchStatus
 
 _EACH_S = 0.05  # samples for the page come no faster than that
 _STATUS_S = 0.5
@@ -29,7 +29,7 @@ WARNINGS = ("missed", "refused", "command", "power", "waiting")
 
 @runtime_checkable
 class Page(Protocol):
-    """Interface of a live page; see `robins.bench.live.Live`."""
+    """Interface of a live page; see `robins.bench.live.LivePage`."""
 
     url: str
 
@@ -50,10 +50,10 @@ class Page(Protocol):
         """Keep its server alive."""
 
 
-class Looking:
-    """Observer of a run for the page and the status file; a `robins.bench.run.session.Watch`."""
+class PageObserver:
+    """Observer of a run, for page and status file; a `robins.bench.run.session.RunObserver`."""
 
-    def __init__(self, page: Page | None, status: Status):
+    def __init__(self, page: Page | None, status: BenchStatus):
         """Take the page, if there is one."""
         self._page, self._status = page, status
         self._told = 0.0
@@ -107,22 +107,22 @@ class Looking:
         """A step is over."""
         if self._page is not None:
             active = ((label, fault.begin) for label, fault in session.active_faults())
-            self._spans.hear(active, session.time_s)
-            view, flown = session.rig.shown, session.telemetry.flown
+            self._spans.observe(active, session.time_s)
+            view, series = session.rig.shown, session.telemetry.series
             if not self._listens:
                 self._alarms, self._listens = view.alarms(), True
-            for level, text in self._alarms.hear(flown, step) if self._alarms else ():
+            for level, text in self._alarms.observe(series, step) if self._alarms else ():
                 self._page.event(level, session.time_s, text)
             now = time.monotonic()
             if now >= self._due:  # a step that comes a little late does not make the next one wait
                 self._due = max(self._due + _EACH_S, now - _EACH_S)
-                values = view.sample(flown, session.kit, self._since, step)
+                values = view.sample(series, session.config, self._since, step)
                 self._page.push(session.time_s, [*values, session.step_ms])
                 self._since = step + 1
         self._tell(session, step + 1)
 
     def _state(self, session: Session, done: int) -> JsonObject:
-        return state(session, done) | {"fault_spans": self._spans.told}
+        return state(session, done) | {"fault_spans": self._spans.for_page}
 
     def _tell(self, session: Session, done: int) -> None:
         now = time.monotonic()
@@ -156,7 +156,7 @@ def state(session: Session, done: int) -> JsonObject:
             {"label": label, "until_s": fault.end} for label, fault in session.active_faults()
         ],
         "counts": {
-            **session.rig.shown.counts(session.telemetry.flown, done),
+            **session.rig.shown.counts(session.telemetry.series, done),
             "wrong_frames": sum(counted["wrong"] for counted in health.values()),
             "lost_frames": sum(counted["lost"] for counted in health.values()),
             "processes_died": session.deaths,
@@ -171,7 +171,7 @@ def _clock(session: Session) -> str:
     return f"real time, {setup.rate or 1.0 / session.flight.timing.step_s:g} Hz"
 
 
-def starting(flight: Flight) -> JsonObject:
+def starting_state(flight: LoadedRun) -> JsonObject:
     """The same before there are any parts.
 
     Raises:
@@ -193,7 +193,7 @@ def starting(flight: Flight) -> JsonObject:
 
 def report(session: Session, done: int, url: str) -> JsonObject:
     """State of the bench for the status file."""
-    return starting(session.flight) | {
+    return starting_state(session.flight) | {
         "state": "paused" if session.paused else "running",
         "time_s": session.time_s,
         "step": done,
@@ -201,7 +201,7 @@ def report(session: Session, done: int, url: str) -> JsonObject:
         "url": url,
         "parts": {
             name: {
-                "process": session.crew.process(name),
+                "process": session.part_processes.process(name),
                 "port": session.flight.setup.ports.get(name, ""),
                 **counted,
             }
@@ -215,13 +215,13 @@ def _health(session: Session) -> dict[str, dict[str, int]]:
     return {link: {k: getattr(one.health, k) for k in names} for link, one in links}
 
 
-def page_for(rig: Rig, given: Any, title: str, run: int, host: str, port: int) -> Live:
+def page_for(rig: Rig, given: Any, title: str, run: int, host: str, port: int) -> LivePage:
     """A live page for a run.
 
     Raises:
-        ImportError, OSError, RuntimeError: as of `Live`.
+        ImportError, OSError, RuntimeError: as of `LivePage`.
     """
     shown, signals = rig.shown, [*rig.shown.signals(given), STEP]
-    page = Live(signals, title, run, host, port, shown.offered, tuple(shown.says))
+    page = LivePage(signals, title, run, host, port, shown.offered, tuple(shown.console_messages))
     page.status(_PREPARING)
     return page

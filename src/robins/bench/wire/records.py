@@ -18,7 +18,7 @@ class RecordError(RobinsError, ValueError):
     """Values or bytes that are not those of the message."""
 
 
-class Unsound(NamedTuple):
+class PayloadFault(NamedTuple):
     """Reason why a payload contradicts the table of its message."""
 
     text: str
@@ -34,7 +34,7 @@ class _Number(NamedTuple):
     field: Field
 
 
-class Record:
+class MessageCodec:
     """The payloads of one message."""
 
     def __init__(self, of: Message):
@@ -85,7 +85,7 @@ class Record:
             at += f.length * SIZES[f.kind]
         return out
 
-    def unsound(self, payload: bytes) -> Unsound | None:
+    def unsound(self, payload: bytes) -> PayloadFault | None:
         """Check of every frame: its length, and least and most of each number; None: sound.
 
         An infinity is beyond every limit; NaN passes only where the table has it for a missing
@@ -93,11 +93,11 @@ class Record:
         """
         if len(payload) != self.size:
             why = f"it has {len(payload)} bytes, '{self.message.name}' has {self.size}"
-            return Unsound(why, False)
+            return PayloadFault(why, False)
         for x, n in zip(self._all.unpack(payload), self._numbers, strict=True):
             if not n.least <= x <= n.most and not (n.field.missing and math.isnan(x)):
                 unit = "" if n.field.unit == "1" else f" {n.field.unit}"
-                return Unsound(f"{n.name} is {x:g}{unit}, not {n.field.span}", True)
+                return PayloadFault(f"{n.name} is {x:g}{unit}, not {n.field.span}", True)
         return None
 
 

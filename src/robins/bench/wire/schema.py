@@ -13,7 +13,7 @@ import fastcrc
 
 from robins.bench.wire.fields import Field, Message, Values, message
 from robins.bench.wire.frames import VERSION
-from robins.bench.wire.records import Record, Unsound
+from robins.bench.wire.records import MessageCodec, PayloadFault
 from robins.errors import RobinsError
 
 FIRST_DATA = 16
@@ -87,7 +87,7 @@ class Wire:
             raise WireError(f"message '{wrong[0]}': its number must be from {FIRST_DATA} to 255")
         if len(set(self.parts)) < len(self.parts) or len(self.parts) > 256:
             raise WireError(f"parts must be 255 at most and have names of their own: {self.parts}")
-        self._records = {m.name: Record(m) for m in self.messages}
+        self._records = {m.name: MessageCodec(m) for m in self.messages}
 
     @property
     def data(self) -> tuple[Message, ...]:
@@ -111,7 +111,7 @@ class Wire:
         return self._record(name).size
 
     def encode(self, name: str, values: Values) -> bytes:
-        """The payload of a message; see `Record.encode`.
+        """The payload of a message; see `MessageCodec.encode`.
 
         Raises:
             KeyError: there is no such message.
@@ -120,7 +120,7 @@ class Wire:
         return self._record(name).encode(values)
 
     def decode(self, name: str, payload: bytes) -> Values:
-        """The values of a payload; see `Record.decode`.
+        """The values of a payload; see `MessageCodec.decode`.
 
         Raises:
             KeyError: there is no such message.
@@ -128,7 +128,7 @@ class Wire:
         """
         return self._record(name).decode(payload)
 
-    def unsound(self, name: str, payload: bytes) -> Unsound | None:
+    def unsound(self, name: str, payload: bytes) -> PayloadFault | None:
         """Reason why a payload contradicts the table of its message; None: it is sound.
 
         Raises:
@@ -136,7 +136,7 @@ class Wire:
         """
         return self._record(name).unsound(payload)
 
-    def _record(self, which: str | int) -> Record:
+    def _record(self, which: str | int) -> MessageCodec:
         name = self.names.get(which) if isinstance(which, int) else which
         if name not in self._records:
             there = ", ".join(self.numbers)

@@ -41,7 +41,7 @@ class Bound(NamedTuple):
     sigma = Belief.sigma
 
 
-class Sight(NamedTuple):
+class LinearisedSensor(NamedTuple):
     """Sensor along a trajectory, leading axis E."""
 
     H: Array  # (E, m, n)
@@ -77,7 +77,7 @@ class Linearised(NamedTuple):
 
     F: Array  # (E, n, n) transition into each step
     noise: Array  # (E, n, q) factor, Q = noise noise'
-    sights: tuple[Sight | None, ...]  # by sensor of the model; None without measurements
+    sights: tuple[LinearisedSensor | None, ...]  # by sensor of the model; None without measurements
 
 
 def linearised(
@@ -118,7 +118,7 @@ def linearised(
                 continue
             o = way.observation(Belief(now, unit), sensor, y[sensor.name], aux.get(sensor.name))
             size = o.size - jnp.sum(jnp.abs(o.spread), axis=1)  # without the unit sigmas
-            sights.append(Sight(o.spread, o.noise, o.present, size))
+            sights.append(LinearisedSensor(o.spread, o.noise, o.present, size))
         return Linearised(moved.spread, moved.noise, tuple(sights))
 
     return jax.lax.map(at, rows)
@@ -198,5 +198,5 @@ def _conditioned(factor: Array, known: tuple[int, ...]) -> Array:
         return factor
     rows = jnp.eye(factor.shape[0])[np.array(known)]
     m = len(known)
-    exact = Sight(rows, jnp.zeros((m, 0)), jnp.ones(m, bool), jnp.zeros(m))
+    exact = LinearisedSensor(rows, jnp.zeros((m, 0)), jnp.ones(m, bool), jnp.zeros(m))
     return exact.updated_factor(factor, jnp.ones((), bool))

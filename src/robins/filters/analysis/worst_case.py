@@ -110,7 +110,7 @@ def _used(info: Mapping[str, StepInfo]) -> Array:
     return jnp.any(jnp.stack(some), axis=0) if some else jnp.array(False)
 
 
-class Channel(NamedTuple):
+class SensorChannel(NamedTuple):
     """Sensor over a run: e becomes (I - K H) e - K W v at each step, v of unit variance."""
 
     K: np.ndarray  # (T, n, m) gain, zero columns where nothing was used
@@ -122,7 +122,7 @@ def error_operator(
     S0: np.ndarray,
     F: np.ndarray,
     G: np.ndarray,
-    channels: Sequence[Channel],
+    channels: Sequence[SensorChannel],
     weight: np.ndarray,
     gain_on: np.ndarray | None = None,
 ) -> np.ndarray:
@@ -210,7 +210,7 @@ def worst_case_gain(
 
 def _linearised(
     model: Model, start: Belief, steps: Step, weight: Weight, u: Data, aux: Mapping[str, Data]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Channel], np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[SensorChannel], np.ndarray]:
     """S0, F, G, channels and L of `error_operator` along a run."""
     prediction = steps.prediction
     if prediction.origin is not None:
@@ -224,7 +224,7 @@ def _linearised(
             continue
         info = steps.info[sensor.name]
         H, W, mean = _sensor_along(sensor, mean, info, aux.get(sensor.name))
-        channels.append(Channel(np.asarray(info.gain), np.asarray(H), np.asarray(W)))
+        channels.append(SensorChannel(np.asarray(info.gain), np.asarray(H), np.asarray(W)))
     name = "worst_case_gain"
     rows = as_weight(weight, name)
     L = np.asarray(jax.vmap(lambda mean: rows_of(rows, mean, name))(steps.posterior.mean))

@@ -37,13 +37,13 @@ from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
-from robins.filters.composite.bank import EVERY, Row, bank, louder, transitions
+from robins.filters.composite.bank import EVERY, HypothesisRow, bank, scale_transitions, transitions
 from robins.filters.composite.offsets import (
-    Supposed,
-    narrowed,
-    sensors_off,
-    supposing,
-    with_offsets,
+    OffsetHypothesis,
+    marginal,
+    offset_hypotheses,
+    offset_transitions,
+    under_hypothesis,
 )
 from robins.filters.kalman import Filter, Form, kalman
 from robins.filters.linearise import Linearisation, Transition, taylor
@@ -73,9 +73,9 @@ class Excited(Rule):
     name = "excited"
 
     def process(self, memory: Memory, transition: Transition):
-        return memory, transition._replace(noise=self.louder(transition.noise))
+        return memory, transition._replace(noise=self.scale_noise(transition.noise))
 
-    def louder(self, noise: Array) -> Array:
+    def scale_noise(self, noise: Array) -> Array:
         """A factor (n, q) of the process noise, each part of its rows times its scale."""
         for i, part in enumerate(self.parts):
             rows = slice(*part[1:]) if part[:1] == (slice,) else np.asarray(part, int)
@@ -98,7 +98,7 @@ def excited(parts: Sequence[Part], scales: ArrayLike) -> Rule:
     return Excited(number("scales of excited must be real", scales), kinds)
 
 
-def changes(scales: Sequence[float | int], up: float = UP, back: float = BACK) -> np.ndarray:
+def scale_changes(scales: Sequence[float | int], up: float = UP, back: float = BACK) -> np.ndarray:
     """(n, n) probabilities of a change in one step between modes of these scales.
 
     From any to each that is not quieter up, to each that is quieter back.
@@ -106,7 +106,7 @@ def changes(scales: Sequence[float | int], up: float = UP, back: float = BACK) -
     Raises:
         ValueError: they are no probabilities.
     """
-    change = transitions(len(scales), [(EVERY, EVERY, louder(scales, up, back))])
+    change = transitions(len(scales), [(EVERY, EVERY, scale_transitions(scales, up, back))])
     good = 0.0 < up < 1.0 and 0.0 < back < 1.0 and bool(np.all(np.diag(change) > 0.0))
     require(good, "up and back of adaptive must leave a mode a chance to stay", (up, back))
     return change
@@ -121,12 +121,12 @@ class Adapted:
     form: Form = kind()
     off: tuple[str, ...] = kind()
 
-    def __call__(self, row: tuple[Excited, Supposed | None]) -> Filter:
+    def __call__(self, row: tuple[Excited, OffsetHypothesis | None]) -> Filter:
         noise, of = row
         if of is None:
             return kalman(self.way, (noise, self.weight), self.form)
         weighed = kalman(self.way, (self.weight,), self.form)
-        return supposing(weighed, self.off, of, Partial(Excited.louder, noise))
+        return under_hypothesis(weighed, self.off, of, Partial(Excited.scale_noise, noise))
 
 
 def adaptive(
@@ -171,17 +171,20 @@ def adaptive(
     require(named, 'parts of adaptive must be named, as in {"gyros": [0, 1, 2]}', parts)
     quiet, names = np.full(len(parts), s[0]), tuple(off)
     own = zip(np.eye(len(parts)) > 0.0, parts, strict=True)
-    plain = [Row(quiet), *(Row(np.where(i, x, quiet), (name,)) for i, name in own for x in s[1:])]
-    change = changes([float(np.max(row.numbers)) for row in plain], up, back)
+    plain = [
+        HypothesisRow(quiet),
+        *(HypothesisRow(np.where(i, x, quiet), (name,)) for i, name in own for x in s[1:]),
+    ]
+    change = scale_changes([float(np.max(row.numbers)) for row in plain], up, back)
     way, weight = taylor() if linearise is None else linearise, huber(robust, patience=patience)
     make = Adapted(way, weight, form, names)
 
-    def loud(row: Row) -> Rule:
+    def loud(row: HypothesisRow) -> Rule:
         return excited(list(parts.values()), row.numbers)
 
     if not names:
-        return bank(make, [Row((loud(row), None), row.wrong) for row in plain], change)
-    each = [*plain, *(Row(quiet, (name,)) for name in names for _ in ("begins", "lasts"))]
-    off_of = map(Supposed, *sensors_off(len(plain), len(names)))
-    rows = [Row((loud(row), of), row.wrong) for row, of in zip(each, off_of, strict=True)]
-    return narrowed(bank(make, rows, with_offsets(change, len(names))), names)
+        return bank(make, [HypothesisRow((loud(row), None), row.wrong) for row in plain], change)
+    each = [*plain, *(HypothesisRow(quiet, (name,)) for name in names for _ in ("begins", "lasts"))]
+    off_of = map(OffsetHypothesis, *offset_hypotheses(len(plain), len(names)))
+    rows = [HypothesisRow((loud(row), of), row.wrong) for row, of in zip(each, off_of, strict=True)]
+    return marginal(bank(make, rows, offset_transitions(change, len(names))), names)

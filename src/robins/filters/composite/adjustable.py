@@ -20,7 +20,7 @@ from robins.filters.values import kind, number, value
 
 
 @value
-class Adjusted:
+class AdjustableMemory:
     """Memory of a filter with numbers in its state."""
 
     inner: Data  # memory of the filter itself
@@ -37,7 +37,7 @@ class Adjustable(Around):
         """A state of the filter inside with its numbers."""
         named = named_numbers(self.inner)
         numbers = {name: jnp.asarray(named[name], float) for name in self.names}
-        return state._replace(memory=Adjusted(state.memory, numbers))
+        return state._replace(memory=AdjustableMemory(state.memory, numbers))
 
     def filter_of(self, state: FilterState) -> Filter:
         """The filter inside with the numbers of a state."""

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike
 
-from robins.filters.composite.imm import Family, Mode, imm
+from robins.filters.composite.imm import Mode, ModeFamily, imm
 from robins.filters.kalman import Filter
 from robins.filters.model import Data
 from robins.filters.values import Numbers, kind, value
@@ -20,7 +20,7 @@ EVERY = slice(None)
 
 
 @value
-class Row:
+class HypothesisRow:
     """A hypothesis."""
 
     numbers: Data  # of its mode
@@ -28,14 +28,14 @@ class Row:
     wrong: tuple[str, ...] = kind(default=())
 
 
-def stacked(rows: Sequence[Row]) -> Data:
+def stacked(rows: Sequence[HypothesisRow]) -> Data:
     """The numbers of all rows, with a leading axis of hypotheses."""
     return jax.tree_util.tree_map(lambda *x: np.stack(x), *(row.numbers for row in rows))
 
 
 def bank(
     make: Callable[[Data], Filter | Mode],
-    rows: Sequence[Row],
+    rows: Sequence[HypothesisRow],
     change: Numbers,
     start: ArrayLike | None = None,
     likeliest: bool = False,
@@ -43,7 +43,7 @@ def bank(
     """An interacting multiple model over hypotheses that differ in numbers.
 
     Args:
-        make: makes a mode of the numbers of a row (`Family`).
+        make: makes a mode of the numbers of a row (`ModeFamily`).
         rows: the hypotheses; the names in them are the `Filter.suspects`.
         change: (rows, rows) probabilities of a change in one step, by `transitions`.
         start: (rows,) probabilities at the start; by default those that last under `change`.
@@ -51,8 +51,8 @@ def bank(
     """
     names = dict.fromkeys(name for row in rows for name in row.wrong)
     wrong = {name: [i for i, row in enumerate(rows) if name in row.wrong] for name in names}
-    first = lasting(np.asarray(change)) if start is None else start
-    return imm(Family(make, stacked(rows)), change, first, likeliest, wrong)
+    first = stationary(np.asarray(change)) if start is None else start
+    return imm(ModeFamily(make, stacked(rows)), change, first, likeliest, wrong)
 
 
 def transitions(
@@ -77,7 +77,7 @@ def transitions(
     return p
 
 
-def louder(scales: Sequence[float | int], up: float, back: float) -> np.ndarray:
+def scale_transitions(scales: Sequence[float | int], up: float, back: float) -> np.ndarray:
     """Probabilities of a change between modes of these scales: up to none quieter, back to quieter.
 
     The diagonal is left to `transitions`.
@@ -86,7 +86,7 @@ def louder(scales: Sequence[float | int], up: float, back: float) -> np.ndarray:
     return np.where(s[None] < s[:, None], back, up)
 
 
-def lasting(change: np.ndarray) -> np.ndarray:
+def stationary(change: np.ndarray) -> np.ndarray:
     """(count,) stationary probabilities of `transitions`."""
     count = len(change)
     A = np.vstack([change.T - np.eye(count), np.ones(count)])

@@ -103,7 +103,7 @@ def local_dims(channels: Sequence[Channel], dims: Mapping[str, int]) -> list[dic
 # ------------------------------------------------------------------------------ filters of filters
 
 
-class Joined(NamedTuple):
+class JoinedMemory(NamedTuple):
     """Memory of a filter of channels besides the fused belief."""
 
     members: tuple[FilterState, ...]  # by channel; a master last, where there is one
@@ -112,7 +112,7 @@ class Joined(NamedTuple):
     singular: Array  # (members,) steps not taken because information was infinite
 
 
-class Moved(NamedTuple):
+class JoinedPrediction(NamedTuple):
     """Members after a prediction, and how it went with each filter that predicted."""
 
     members: tuple[FilterState, ...]
@@ -125,7 +125,7 @@ class Moved(NamedTuple):
 
 @value
 class JoinedFilter(Composite):
-    """Local filters whose beliefs are fused after each step; its memory is a `Joined`.
+    """Local filters whose beliefs are fused after each step; its memory is a `JoinedMemory`.
 
     Attributes:
         channels: the local filters, each with its sensors.
@@ -134,7 +134,7 @@ class JoinedFilter(Composite):
         apart: ``(beliefs, i) -> bool``, whether local filter i contradicts another.
         first_shares: ``belief -> shares`` at the start.
         parted: ``(belief, shares) -> beliefs`` by member.
-        moved: ``(state, motion, u) -> Moved``.
+        moved: ``(state, motion, u) -> JoinedPrediction``.
     """
 
     channels: tuple[Channel, ...]
@@ -145,7 +145,7 @@ class JoinedFilter(Composite):
         raise NotImplementedError(f"{type(self).__name__} must have `fuse`")
 
     def apart(self, beliefs: Sequence[Belief], i: int) -> Array:
-        return are_apart(beliefs, i, None)
+        return disagree(beliefs, i, None)
 
     def first_shares(self, belief: Belief) -> Array:
         raise NotImplementedError(f"{type(self).__name__} must have `first_shares`")
@@ -153,7 +153,7 @@ class JoinedFilter(Composite):
     def parted(self, belief: Belief, shares: Array) -> list[Belief]:
         raise NotImplementedError(f"{type(self).__name__} must have `parted`")
 
-    def moved(self, state: FilterState, motion: Motion, u: Data) -> Moved:
+    def moved(self, state: FilterState, motion: Motion, u: Data) -> JoinedPrediction:
         raise NotImplementedError(f"{type(self).__name__} must have `moved`")
 
     @property
@@ -174,10 +174,10 @@ class JoinedFilter(Composite):
         each = zip(self.filters, self.parted(belief, shares), given, strict=True)
         members = tuple(f.init(own, d) for f, own, d in each)
         silent, singular = (jnp.zeros(len(x), int) for x in (self.channels, members))
-        return FilterState(belief, Joined(members, shares, silent, singular))
+        return FilterState(belief, JoinedMemory(members, shares, silent, singular))
 
     def members(self, state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
-        joined: Joined = state.memory
+        joined: JoinedMemory = state.memory
 
         def follow(beliefs: Sequence[Belief], belief: Belief) -> FilterState:
             each = zip(self.filters, joined.members, beliefs, strict=True)
@@ -189,24 +189,24 @@ class JoinedFilter(Composite):
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
         return self.members(state)[1](self.parted(belief, state.memory.shares), belief)
 
-    def moved_apart(
+    def predict_separately(
         self, begun: Sequence[FilterState], motions: Sequence[Motion], u: Data, shares: Array
-    ) -> Moved:
+    ) -> JoinedPrediction:
         """Members that each predict, from where they begin."""
         each = zip(self.filters, begun, motions, strict=True)
         done = [f.predict(member, motion, u) for f, member, motion in each]
         members = tuple(member for member, _ in done)
         codes = tuple(prediction.code for _, prediction in done)
-        return Moved(members, codes, self.fuse([m.belief for m in members]), shares)
+        return JoinedPrediction(members, codes, self.fuse([m.belief for m in members]), shares)
 
     def _predict(self, state: FilterState, motion: Motion, u: Data) -> Advanced:
-        return concluded(state, self.moved(state, motion, u))
+        return conclude_prediction(state, self.moved(state, motion, u))
 
     def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data) -> Updated:
         owner = owners(self.channels)
         if sensor.name not in owner:
             raise ValueError(f"no channel uses sensor '{sensor.name}'; there are {sorted(owner)}")
-        joined: Joined = state.memory
+        joined: JoinedMemory = state.memory
         i = owner[sensor.name]
         before = joined.members[i]
         after, info = self.channels[i].filter.update(before, sensor, y, aux)
@@ -251,7 +251,7 @@ class JoinedFilter(Composite):
 FAR = 5.0  # standard deviations of a difference of local filters that chance does not make
 
 
-def are_apart(beliefs: Sequence[Belief], index: int, common: int | None) -> Array:
+def disagree(beliefs: Sequence[Belief], index: int, common: int | None) -> Array:
     """() bool: a local filter differs from another by more than `FAR` standard deviations.
 
     The errors of local filters with the same process noise are not negatively correlated, so that
@@ -266,12 +266,14 @@ def are_apart(beliefs: Sequence[Belief], index: int, common: int | None) -> Arra
     return found
 
 
-def concluded(state: FilterState, moved: Moved) -> tuple[FilterState, Prediction]:
+def conclude_prediction(
+    state: FilterState, moved: JoinedPrediction
+) -> tuple[FilterState, Prediction]:
     """The end of the `predict` of a joined filter: taken by all members, or by none.
 
     A member that cannot take the step keeps its memory of that (`Rule.settle`).
     """
-    joined: Joined = state.memory
+    joined: JoinedMemory = state.memory
     joined = joined._replace(silent=joined.silent + 1)
     done = int(Code.DONE)
     singular = jnp.stack([is_singular(m.belief) for m in moved.members])
@@ -291,11 +293,11 @@ def concluded(state: FilterState, moved: Moved) -> tuple[FilterState, Prediction
 
 
 def _refused(state: FilterState, singular: Array) -> FilterState:
-    joined: Joined = state.memory
+    joined: JoinedMemory = state.memory
     return state._replace(memory=joined._replace(singular=joined.singular + singular.astype(int)))
 
 
-def followed_by(
+def composed_motion(
     motion: Motion,
     noise: Callable[[Array], Array],
     state: Callable[[State], State] = lambda x: x,
@@ -319,7 +321,7 @@ def followed_by(
 # ------------------------------------------------------------------------- sensors of the master
 
 
-class Mastered(NamedTuple):
+class MasterMemory(NamedTuple):
     """Memory of a joined filter with sensors at its master, besides the belief given out."""
 
     joined: FilterState  # its belief is the one given out
@@ -352,7 +354,7 @@ class AtMaster(Composite):
             "at_master wants a filter of channels: one without locals uses the sensor itself",
         )
         own = self.master.init(belief, {k: m for k, m in dims.items() if k in self.sensors})
-        return FilterState(joined.belief, Mastered(joined, own))
+        return FilterState(joined.belief, MasterMemory(joined, own))
 
     def check_order(self, dims: Mapping[str, int]) -> None:
         """Refuse a model that has not the sensors, or not as its last ones."""
@@ -366,28 +368,28 @@ class AtMaster(Composite):
             )
 
     def _predict(self, state: FilterState, motion: Motion, u: Data) -> Advanced:
-        mastered: Mastered = state.memory
+        mastered: MasterMemory = state.memory
         joined, prediction = self.joined.predict(mastered.joined, motion, u)
         return FilterState(joined.belief, mastered._replace(joined=joined)), prediction
 
     def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data) -> Updated:
-        mastered: Mastered = state.memory
+        mastered: MasterMemory = state.memory
         if sensor.name not in self.sensors:
             joined, info = self.joined.update(mastered.joined, sensor, y, aux)
             return FilterState(joined.belief, mastered._replace(joined=joined)), info
         begun = self.master.reset(mastered.master, state.belief)
         own, info = self.master.update(begun, sensor, y, aux)
         joined = mastered.joined._replace(belief=own.belief)
-        return FilterState(own.belief, Mastered(joined, own)), info
+        return FilterState(own.belief, MasterMemory(joined, own)), info
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
-        mastered: Mastered = state.memory
+        mastered: MasterMemory = state.memory
         joined = self.joined.reset(mastered.joined, belief)
         own = self.master.reset(mastered.master, belief)
-        return FilterState(joined.belief, Mastered(joined, own))
+        return FilterState(joined.belief, MasterMemory(joined, own))
 
     def members(self, state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
-        mastered: Mastered = state.memory
+        mastered: MasterMemory = state.memory
         beliefs, follow = self.joined.members(mastered.joined)
 
         def followed(beliefs: Sequence[Belief], belief: Belief) -> FilterState:

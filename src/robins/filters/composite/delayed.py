@@ -30,14 +30,14 @@ T = TypeVar("T")
 _WHOLE = 1e-6  # how far an age may be off a whole number: the rounding of a ratio of times
 
 
-class Late(NamedTuple):
+class DelayedMeasurement(NamedTuple):
     """A measurement and how many steps ago it was made; 0 is now."""
 
     value: Data  # as the sensor reads it, NaN where missing
     age: ArrayLike  # whole steps
 
 
-class _Past(NamedTuple):
+class _StepBuffer(NamedTuple):
     """The last steps, each with a leading axis of ``depth + 1``; step k lies at k mod that."""
 
     before: FilterState  # the state a step begins with
@@ -50,11 +50,11 @@ class _Past(NamedTuple):
     log_likelihood: Array  # (., sensors)
 
 
-class Delay(NamedTuple):
+class DelayMemory(NamedTuple):
     """Memory of a delayed filter."""
 
     inner: Data  # memory of the filter itself
-    past: _Past
+    past: _StepBuffer
     now: Array  # number of the present step
     reach: Array  # how many steps back there are to go
     model: Model  # its numbers, as last seen
@@ -78,11 +78,11 @@ class _Place(NamedTuple):
         return self.used & ~self.at_once
 
 
-class _Redone(NamedTuple):
+class _RepeatedSteps(NamedTuple):
     """Results of the steps that are repeated."""
 
     inner: FilterState
-    before: FilterState  # as in `_Past`
+    before: FilterState  # as in `_StepBuffer`
     log_likelihood: Array  # likewise
     own: StepInfo  # of the late measurement
     taken: Array  # bool, all predictions were
@@ -114,7 +114,7 @@ class Delayed(Around):
         """Start with an empty buffer; the present step has no prediction to repeat."""
         size, extra = self.size, _numbers(self.aux)
         asked = jnp.zeros((size, len(self.names)), bool)
-        past = _Past(
+        past = _StepBuffer(
             before=_rows(inner, size),
             moved=jnp.zeros(size, bool),
             u=_rows(_numbers(self.u), size),
@@ -125,7 +125,7 @@ class Delayed(Around):
             log_likelihood=jnp.zeros(asked.shape),
         )
         zero = jnp.zeros((), int)
-        return _outer(inner, Delay(inner.memory, past, zero, zero, known))
+        return _outer(inner, DelayMemory(inner.memory, past, zero, zero, known))
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
         return self.begin(self.inner.init(belief, dims), _numbers(self.model))
@@ -149,13 +149,13 @@ class Delayed(Around):
         inner, prediction = self.inner.predict(inner, motion, u)
         reach = jnp.minimum(held.reach + 1, self.depth)
         known = Model(_numbers(motion), held.model.sensors)
-        new = _outer(inner, Delay(inner.memory, past, now, reach, known))
+        new = _outer(inner, DelayMemory(inner.memory, past, now, reach, known))
         return new, prediction._replace(transition=None, origin=None)
 
-    def opened(self, past: _Past, at: Array, inner: FilterState, u: Data) -> _Past:
+    def opened(self, past: _StepBuffer, at: Array, inner: FilterState, u: Data) -> _StepBuffer:
         """Open a row for a step that begins."""
         none = jnp.zeros(len(self.names), bool)
-        entry = _Past(
+        entry = _StepBuffer(
             before=inner,
             moved=jnp.ones((), bool),
             u=_numbers(u),
@@ -174,16 +174,16 @@ class Delayed(Around):
         """Enter a measurement in its step, and filter again from there."""
         held = state.memory
         which, known = self.recognised(held.model, sensor, aux)
-        value, age = y if isinstance(y, Late) else (y, jnp.zeros(()))
+        value, age = y if isinstance(y, DelayedMeasurement) else (y, jnp.zeros(()))
         place = self.placed(held, which, value, age)
         fresh = jax.tree_util.tree_map(lambda v: jnp.where(place.at_once, v, jnp.nan), value)
         inner, info = self.inner.update(_inner(state), sensor, fresh, aux)
         past = _entered(held.past, place, sensor.name, value, aux, info)
         redone = self.redone(past, place, known, inner, info)
-        told = _told(past, place, redone)
+        told = _update_info(past, place, redone)
         inner = redone.inner
         past = past._replace(before=redone.before, log_likelihood=redone.log_likelihood)
-        return _outer(inner, Delay(inner.memory, past, held.now, held.reach, known)), told
+        return _outer(inner, DelayMemory(inner.memory, past, held.now, held.reach, known)), told
 
     def recognised(self, model: Model, sensor: Sensor, aux: Data) -> tuple[int, Model]:
         """Index of a sensor, and the model with its numbers.
@@ -201,7 +201,7 @@ class Delayed(Around):
         sensors = tuple(mine if s.name == sensor.name else s for s in model.sensors)
         return which, Model(model.motion, sensors)
 
-    def placed(self, held: Delay, which: int, value: Data, age: ArrayLike) -> _Place:
+    def placed(self, held: DelayMemory, which: int, value: Data, age: ArrayLike) -> _Place:
         """Place of a measurement of this age."""
         age = jnp.asarray(age, float)
         there = jnp.any(jnp.stack([jnp.any(jnp.isfinite(x)) for x in jax.tree.leaves(value)]))
@@ -217,8 +217,8 @@ class Delayed(Around):
         return _Place(which, at, now, steps, there, too_old, used, at_once)
 
     def redone(
-        self, past: _Past, place: _Place, known: Model, inner: FilterState, info: StepInfo
-    ) -> _Redone:
+        self, past: _StepBuffer, place: _Place, known: Model, inner: FilterState, info: StepInfo
+    ) -> _RepeatedSteps:
         """The steps from that of the measurement on, filtered again where they must be."""
         inner = select(place.again, _row(past.before, place.at), inner)
         fine = (jnp.ones((), bool), jnp.asarray(int(Code.DONE)))
@@ -226,12 +226,12 @@ class Delayed(Around):
             0,
             jnp.where(place.again, place.steps + 1, 0),
             lambda i, done: self.step_again(past, place, known, i, done),
-            _Redone(inner, past.before, past.log_likelihood, info, *fine),
+            _RepeatedSteps(inner, past.before, past.log_likelihood, info, *fine),
         )
 
     def step_again(
-        self, past: _Past, place: _Place, known: Model, i: Array, done: _Redone
-    ) -> _Redone:
+        self, past: _StepBuffer, place: _Place, known: Model, i: Array, done: _RepeatedSteps
+    ) -> _RepeatedSteps:
         """The step that is i steps after that of the measurement."""
         inner, before, gained, own, taken, failed = done
         j = (place.at + i) % self.size
@@ -248,7 +248,7 @@ class Delayed(Around):
             failed = _first_failure(failed, row.asked[k] & ~told, seen.code)
             if k == place.which:
                 own = select(i == 0, seen, own)
-        return _Redone(inner, before, gained, own, taken, failed)
+        return _RepeatedSteps(inner, before, gained, own, taken, failed)
 
 
 def delayed(
@@ -256,9 +256,9 @@ def delayed(
 ) -> Filter:
     """A filter that takes measurements up to ``depth`` steps late, in any order.
 
-    Give a late measurement as `Late`; a plain one is of age 0. However they come in, the belief and
-    the sum of the log-likelihoods are those of a run in which each came in its own step, sensors in
-    the model's order. A rule that counts its updates sees one of each sensor in a
+    Give a late measurement as `DelayedMeasurement`; a plain one is of age 0. However they come in,
+    the belief and the sum of the log-likelihoods are those of a run in which each came in its own
+    step, sensors in the model's order. A rule that counts its updates sees one of each sensor in a
     step, as in `run`.
 
     A measurement older than the buffer, or than the start, has the code ``TOO_OLD``. ``REFUSED``
@@ -296,8 +296,8 @@ def delayed(
 
 
 def _entered(
-    past: _Past, place: _Place, name: str, value: Data, aux: Data, info: StepInfo
-) -> _Past:
+    past: _StepBuffer, place: _Place, name: str, value: Data, aux: Data, info: StepInfo
+) -> _StepBuffer:
     """Enter a measurement in its own step, and in this one where its sensor is due too."""
     now, at, which, used = place.now, place.at, place.which, place.used
 
@@ -317,7 +317,7 @@ def _entered(
     )
 
 
-def _told(past: _Past, place: _Place, redone: _Redone) -> StepInfo:
+def _update_info(past: _StepBuffer, place: _Place, redone: _RepeatedSteps) -> StepInfo:
     """Information of an update: of its own step, with what it changes in the whole."""
     own, again = redone.own, place.again
     total = jnp.sum(past.log_likelihood), jnp.sum(redone.log_likelihood)
@@ -336,7 +336,7 @@ def _inner(state: FilterState) -> FilterState:
     return state._replace(memory=state.memory.inner)
 
 
-def _outer(inner: FilterState, memory: Delay) -> FilterState:
+def _outer(inner: FilterState, memory: DelayMemory) -> FilterState:
     return inner._replace(memory=memory)
 
 

@@ -32,7 +32,13 @@ from jaxtyping import Array
 from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.checks import one_of
-from robins.filters.composite.channels import Channel, JoinedFilter, Moved, are_apart, owners
+from robins.filters.composite.channels import (
+    Channel,
+    JoinedFilter,
+    JoinedPrediction,
+    disagree,
+    owners,
+)
 from robins.filters.composite.fusion import (
     Criterion,
     check_criterion,
@@ -76,9 +82,9 @@ class SideBySide(JoinedFilter):
             for c, m in zip(self.channels, members, strict=True)
         ]
 
-    def moved(self, state: FilterState, motion: Motion, u: Data) -> Moved:
+    def moved(self, state: FilterState, motion: Motion, u: Data) -> JoinedPrediction:
         motions = [motion] * len(self.channels)
-        return self.moved_apart(self.fed_back(state), motions, u, state.memory.shares)
+        return self.predict_separately(self.fed_back(state), motions, u, state.memory.shares)
 
 
 @value
@@ -96,7 +102,7 @@ class Distributed(SideBySide):
         return super().first_shares(belief)
 
     def apart(self, beliefs: Sequence[Belief], i: int) -> Array:
-        return are_apart(beliefs, i, self.common)
+        return disagree(beliefs, i, self.common)
 
     def fuse(self, beliefs: Sequence[Belief]) -> Belief:
         if self.common is None:

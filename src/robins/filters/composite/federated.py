@@ -55,8 +55,8 @@ from robins.filters.checks import one_of
 from robins.filters.composite.channels import (
     Channel,
     JoinedFilter,
-    Moved,
-    followed_by,
+    JoinedPrediction,
+    composed_motion,
     owners,
 )
 from robins.filters.composite.fusion import Sharing, check_sharing, information_sum, part
@@ -255,18 +255,20 @@ class Federated(JoinedFilter):
         beliefs = self.parted(state.belief, a) if reset else _rescaled(members, self.keep)
         return [f.reset(m, b) for f, m, b in zip(self.filters, members, beliefs, strict=True)]
 
-    def moved(self, state: FilterState, motion: Motion, u: Data) -> Moved:
+    def moved(self, state: FilterState, motion: Motion, u: Data) -> JoinedPrediction:
         a = self.next_shares(state)
         if self.late:
-            return self.moved_together(state, motion, u, a)
+            return self.predict_fused(state, motion, u, a)
 
         def own(i: int) -> Motion:
-            return followed_by(motion, lambda noise: part(noise, a, self.sharing)[i])
+            return composed_motion(motion, lambda noise: part(noise, a, self.sharing)[i])
 
         motions = [own(i) for i in range(len(self.filters))]
-        return self.moved_apart(self.begun(state, a), motions, u, a)
+        return self.predict_separately(self.begun(state, a), motions, u, a)
 
-    def moved_together(self, state: FilterState, motion: Motion, u: Data, a: Array) -> Moved:
+    def predict_fused(
+        self, state: FilterState, motion: Motion, u: Data, a: Array
+    ) -> JoinedPrediction:
         """Predict what was fused, then share it out."""
         _, common = self.centre.predict(self.centre.init(state.belief, {}), motion, u)
         members, codes, own = [], [], False
@@ -285,7 +287,9 @@ class Federated(JoinedFilter):
         # Half sharing does not add up to what was shared, and rules may have changed a share.
         lossless = not own and (self.sharing != "half" or a.shape[1] == 1)
         fused = common.belief if lossless else self.fuse([m.belief for m in members])
-        return Moved(tuple(members), tuple(codes), fused, a, common.transition, common.code)
+        return JoinedPrediction(
+            tuple(members), tuple(codes), fused, a, common.transition, common.code
+        )
 
 
 def federated(
@@ -389,7 +393,7 @@ def _through(motion: Motion, common: Belief, mine: Belief) -> Motion:
     def moved(x: State) -> State:
         return manifold.retract(common.mean, T @ manifold.local(common.mean, x))
 
-    return followed_by(motion, lambda noise: T @ noise, moved, lambda F: T @ F)
+    return composed_motion(motion, lambda noise: T @ noise, moved, lambda F: T @ F)
 
 
 def _has_master(mode: str, shares: Any, master: Numbers) -> bool:

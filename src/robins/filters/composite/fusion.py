@@ -65,11 +65,11 @@ def fuse(beliefs: Sequence[Belief]) -> Belief:
     Raises:
         ValueError: there is none, or a covariance is singular: infinite information has no sum.
     """
-    beliefs = _looked_at(beliefs, "fuse")
+    beliefs = _checked_beliefs(beliefs, "fuse")
     return information_sum(beliefs)
 
 
-def _looked_at(beliefs: Sequence[Belief], doing: str) -> list[Belief]:
+def _checked_beliefs(beliefs: Sequence[Belief], doing: str) -> list[Belief]:
     beliefs = list(beliefs)
     require(beliefs, f"nothing to {doing}: at least one belief is wanted")
     if is_known(beliefs):
@@ -263,7 +263,7 @@ def covariance_intersection(
     Raises:
         ValueError: there is no belief, one is singular, or the criterion is none of these.
     """
-    beliefs = _looked_at(beliefs, "intersect")
+    beliefs = _checked_beliefs(beliefs, "intersect")
     return information_sum(beliefs, intersection_weights(beliefs, criterion))
 
 

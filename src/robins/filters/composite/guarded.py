@@ -70,7 +70,7 @@ _CHANCE = 0.5
 _SURE = 36.0
 
 
-class Watch(NamedTuple):
+class GuardMemory(NamedTuple):
     """Memory of a guarded filter."""
 
     filter: FilterState
@@ -129,7 +129,7 @@ class Guarded(Composite):
             raise ValueError(f"guarded: no sensor {unknown[0]!r}; this model has {sorted(dims)}")
         count = len(_members(self.groups, belief.factor.shape[0]))
         without = {name: m for name, m in dims.items() if name not in self.assumed}
-        watch = Watch(
+        watch = GuardMemory(
             self.filter.init(belief, dims),
             self.reference.init(belief, without),
             jnp.zeros(count),
@@ -140,7 +140,7 @@ class Guarded(Composite):
         )
         return _given_out(watch)
 
-    def taken_over(self, watch: Watch) -> FilterState:
+    def taken_over(self, watch: GuardMemory) -> FilterState:
         """The filter gone on from what the reference believes.
 
         Where both are filters of as many locals, local by local: a joined filter that is reset to
@@ -152,7 +152,7 @@ class Guarded(Composite):
             return follow(others, watch.reference.belief)
         return self.filter.reset(watch.filter, watch.reference.belief)
 
-    def judged(self, watch: Watch, failed: Array, renewed: Array | float) -> Watch:
+    def judged(self, watch: GuardMemory, failed: Array, renewed: Array | float) -> GuardMemory:
         """Watch after a step, in which the filter may go on from its reference."""
         square, gained = _difference(watch.filter.belief, watch.reference.belief)
         renewed = jnp.broadcast_to(jnp.asarray(renewed), square.shape)
@@ -170,13 +170,13 @@ class Guarded(Composite):
 
     def learnt(
         self,
-        watch: Watch,
+        watch: GuardMemory,
         mean: np.ndarray,
         renewed: Array,
         square: Array,
         gained: Array,
         sure: Array,
-    ) -> Watch:
+    ) -> GuardMemory:
         """The sums after a step, each by group: a mean over its components."""
         looks = mean @ renewed
         # One clock for all, or a group that no judge sees would never forget.
@@ -197,7 +197,7 @@ class Guarded(Composite):
         return jnp.where((dof > 0) & (was > 0.0), share, 0.0)
 
     def _predict(self, state: FilterState, motion: Motion, u: Data) -> Advanced:
-        watch: Watch = state.memory
+        watch: GuardMemory = state.memory
         mine, first = self.filter.predict(watch.filter, motion, u)
         other, second = self.reference.predict(watch.reference, motion, u)
         # Without its reference a filter cannot be judged: they take a step together.
@@ -207,7 +207,7 @@ class Guarded(Composite):
         return new, Prediction(None, new.belief, second.code)
 
     def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data) -> Updated:
-        watch: Watch = state.memory
+        watch: GuardMemory = state.memory
         mine, info = self.filter.update(watch.filter, sensor, y, aux)
         notes, failed = dict(info.notes), is_failure(info.code)
         both = watch._replace(filter=mine)
@@ -228,7 +228,7 @@ class Guarded(Composite):
         return _given_out(new), said._replace(notes=notes)
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
-        watch: Watch = state.memory
+        watch: GuardMemory = state.memory
         return _given_out(
             watch._replace(
                 filter=self.filter.reset(watch.filter, belief),
@@ -314,7 +314,7 @@ def _two_sides(
     return assumed, judging
 
 
-def _given_out(watch: Watch) -> FilterState:
+def _given_out(watch: GuardMemory) -> FilterState:
     w, mine, other = watch.weight, watch.filter.belief, watch.reference.belief
     mean = manifold.retract(other.mean, w * manifold.local(other.mean, mine.mean))
     # (1 - f) P_u + f P_c; f is above 0 and at most 1 - SLACK

@@ -61,7 +61,7 @@ class Mode:
 
 
 @value
-class Several:
+class SeparateModes:
     """Modes of any kind, each a part of the program; their states are a tuple."""
 
     modes: tuple[Mode, ...]
@@ -98,14 +98,14 @@ class Several:
         """State of one mode."""
         return states[i]
 
-    def exchanged(self, i: int, filter_: Filter) -> Several:
+    def exchanged(self, i: int, filter_: Filter) -> SeparateModes:
         """The modes with another filter in one of them."""
         own = replace(self.modes[i], filter_=filter_)
-        return Several((*self.modes[:i], own, *self.modes[i + 1 :]))
+        return SeparateModes((*self.modes[:i], own, *self.modes[i + 1 :]))
 
 
 @value
-class Family:
+class ModeFamily:
     """Modes that differ in numbers only.
 
     Filters of different kinds are each a part of the program. Those of a family are one part,
@@ -141,7 +141,7 @@ class Family:
         return self.of(_at(jax.tree_util.tree_map(np.asarray, self.numbers), i))
 
     def every(self, of: Of, states: Data, *rows: Data) -> Every:
-        """Step of all modes, as `Several.every`; one mode is traced, for all, and states have a
+        """Step of all modes, as `SeparateModes.every`: one mode is traced for all; states have a
         leading axis.
         """
         numbers = jax.tree_util.tree_map(jnp.asarray, self.numbers)
@@ -158,11 +158,11 @@ class Family:
         """State of one mode."""
         return _at(states, i)
 
-    def exchanged(self, i: int, filter_: Filter) -> Family:
+    def exchanged(self, i: int, filter_: Filter) -> ModeFamily:
         """The modes with another filter in one of them, which differs in numbers only."""
         modes = jax.vmap(self.of)(jax.tree_util.tree_map(jnp.asarray, self.numbers))
         put = jax.tree_util.tree_map(lambda x, new: x.at[i].set(new), modes.filter_, filter_)
-        return Family(_as_mode, replace(modes, filter_=put))
+        return ModeFamily(_as_mode, replace(modes, filter_=put))
 
 
 def _as_mode(one: Filter | Mode) -> Mode:
@@ -202,7 +202,7 @@ def mode(filter_: Filter, motion: Motion | None = None, sensors: Sequence[Sensor
 class Imm(Filter):
     """The filter of `imm`."""
 
-    modes: Several | Family
+    modes: SeparateModes | ModeFamily
     log_change: Numbers  # (modes, modes)
     log_first: Numbers  # (modes,)
     likeliest: bool = kind()
@@ -265,14 +265,16 @@ class Imm(Filter):
         notes["imm.probability"] = probability = jnp.exp(log_post)
         if self.wrong:
             notes[WRONG] = self._by_name(probability)
-        info = self.told(seen, log_prior, log_post, used)._replace(notes=notes)
+        info = self.mixture_info(seen, log_prior, log_post, used)._replace(notes=notes)
         # Where no mode has moved the mixture stands bit for bit.
         was, now = self.modes.beliefs(states), self.modes.beliefs(after)
         same = jnp.all(each_row(equal, now, was))
         belief = select(same, state.belief, _mixture(now, log_post))
         return FilterState(belief, Interaction(after, log_post)), info
 
-    def told(self, seen: StepInfo, log_prior: Array, log_post: Array, used: Array) -> StepInfo:
+    def mixture_info(
+        self, seen: StepInfo, log_prior: Array, log_post: Array, used: Array
+    ) -> StepInfo:
         """Information of the modes as one."""
         info = _at(seen, 0) if self.modes.size == 1 else _seen(seen, log_prior, log_post, used)
         if not self.likeliest:
@@ -297,17 +299,17 @@ class Imm(Filter):
         for i in range(self.modes.size):
             first = self.modes.state(start.memory.states, i)
             last = self.modes.state(final.memory.states, i)
-            anew = None if again is None else partial(self.anew, again, i)
+            anew = None if again is None else partial(self.rerun_mode, again, i)
             self.modes.mode(i).filter_.report(first, last, anew, time)
 
-    def anew(self, again: Again, i: int, filter_: Filter) -> FilterState:
+    def rerun_mode(self, again: Again, i: int, filter_: Filter) -> FilterState:
         """The final state of mode i in a run with another filter in its place."""
         final = again(replace(self, modes=self.modes.exchanged(i, filter_)))
         return self.modes.state(final.memory.states, i)
 
 
 def imm(
-    modes: Sequence[Filter | Mode] | Family,
+    modes: Sequence[Filter | Mode] | ModeFamily,
     transition: Given,
     start: Given | None = None,
     likeliest: bool = False,
@@ -328,7 +330,8 @@ def imm(
     step fails is out until the next mixing; the code is a failure only where all fail.
 
     Args:
-        modes: filters, or what `mode` makes of one; a `Family` where they differ in numbers only.
+        modes: filters, or what `mode` makes of one; a `ModeFamily` where they differ in numbers
+            only.
         transition: (modes, modes), row i the probabilities to change from i in one step.
         start: (modes,) probabilities before the first prediction; all equal where not given.
         likeliest: innovation, factor, NIS and what was used are those of the mode that is likeliest
@@ -342,7 +345,7 @@ def imm(
             one; `wrong` numbers a mode that is not there. When a run begins: a mode brings a sensor
             that the model does not have.
     """
-    all_ = modes if isinstance(modes, Family) else Several(tuple(map(_as_mode, modes)))
+    all_ = modes if isinstance(modes, ModeFamily) else SeparateModes(tuple(map(_as_mode, modes)))
     count = all_.size
     require(count, "imm needs at least one mode")
     even = np.full(count, 1.0 / count)

@@ -80,10 +80,10 @@ def matched(beliefs: Belief, weight: Array, about: State) -> Belief:
     """The Gaussian with the first two moments of a mixture (leading axis r)."""
     mean = mean_of(beliefs.mean, weight, about)
     blocks = deviations(beliefs.mean, beliefs.factor, weight, mean)
-    return Belief(mean, linalg.tria(wide(blocks)))
+    return Belief(mean, linalg.tria(side_by_side(blocks)))
 
 
-def wide(blocks: Array) -> Array:
+def side_by_side(blocks: Array) -> Array:
     """(r, n, k) blocks side by side, (n, r k)."""
     r, n, k = blocks.shape
     return jnp.moveaxis(blocks, 0, 1).reshape(n, r * k)
@@ -106,7 +106,7 @@ def innovation(seen: StepInfo, weight: Array, used: Array) -> Innovation:
     residual = jnp.where(counts & ~missing[None], seen.innovation, 0.0)
     mean = weight @ residual
     residual = jnp.where(used[None], residual, mean[None])
-    factor = linalg.tria(wide(deviations(residual, seen.factor, weight, mean)))
+    factor = linalg.tria(side_by_side(deviations(residual, seen.factor, weight, mean)))
     white = linalg.solve_lower(factor, jnp.where(used, mean, 0.0)[:, None])[:, 0]
     spread = jnp.where(counts, seen.expected, 0.0) ** 2 + (residual - mean[None]) ** 2
     expected, mean = jnp.sqrt(weight @ spread), jnp.where(missing, jnp.nan, mean)

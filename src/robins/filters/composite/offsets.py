@@ -45,14 +45,14 @@ WANDERS = 0.03  # by which it wanders in a step, in the same
 BEGIN, END = 1e-3, 1e-2  # probabilities in a step that an offset begins, and that it ends
 
 
-class Wide(NamedTuple):
+class Augmented(NamedTuple):
     """A state, and by how much each sensor is off."""
 
     state: Any
     offset: tuple[Array, ...]  # (m,) of each sensor, in standard deviations of its noise
 
 
-class Supposed(NamedTuple):
+class OffsetHypothesis(NamedTuple):
     """A hypothesis, or with a leading axis those of a bank."""
 
     off: Any  # (sensors,) one where the records are off, else zero
@@ -62,15 +62,15 @@ class Supposed(NamedTuple):
 # ------------------------------------------------------------------------------------- the bank
 
 
-def sensors_off(plain: int, sensors: int) -> Supposed:
+def offset_hypotheses(plain: int, sensors: int) -> OffsetHypothesis:
     """The hypotheses of a bank: of each sensor two, behind plain ones in which none is off."""
     none, each = np.zeros((plain, sensors)), np.repeat(np.eye(sensors), 2, axis=0)
     second = np.tile([0.0, 1.0], sensors)[:, None]
-    return Supposed(np.vstack([none, each]), np.vstack([none, second * each]))
+    return OffsetHypothesis(np.vstack([none, each]), np.vstack([none, second * each]))
 
 
-def with_offsets(change: np.ndarray, sensors: int) -> np.ndarray:
-    """Probabilities of a change in one step, with those of the hypotheses of `sensors_off`.
+def offset_transitions(change: np.ndarray, sensors: int) -> np.ndarray:
+    """Probabilities of a change in one step, with those of the hypotheses of `offset_hypotheses`.
 
     Args:
         change: (plain, plain) between modes without offsets, the first that in which all is right.
@@ -82,83 +82,83 @@ def with_offsets(change: np.ndarray, sensors: int) -> np.ndarray:
     plain, count = len(change), len(change) + 2 * sensors
     begins = plain + 2 * np.arange(sensors)
     at = np.arange(count)
-    told = slice(plain)
-    edges = [(told, told, change), (slice(plain, None), 0, END), (EVERY, begins, BEGIN)]
+    plain_rows = slice(plain)
+    edges = [(plain_rows, plain_rows, change), (slice(plain, None), 0, END), (EVERY, begins, BEGIN)]
     return transitions(count, edges, np.where(np.isin(at, begins), at + 1, at))
 
 
 # ----------------------------------------------------------------------------- the model of a mode
 
 
-def _components(x: Wide, each: Array) -> Array:
+def _components(x: Augmented, each: Array) -> Array:
     """A number of each sensor, for every component of its offset."""
     return jnp.concatenate([jnp.broadcast_to(each[i], b.shape) for i, b in enumerate(x.offset)])
 
 
-def _kept(x: Wide, of: Supposed) -> tuple[Array, ...]:
+def _kept(x: Augmented, of: OffsetHypothesis) -> tuple[Array, ...]:
     return tuple(of.lasts[i] * b for i, b in enumerate(x.offset))
 
 
-def _drawn(x: Wide, of: Supposed) -> Array:
+def _drawn(x: Augmented, of: OffsetHypothesis) -> Array:
     return jnp.diag(_components(x, jnp.where(of.lasts > 0.0, WANDERS, BEGINS)))
 
 
 Scaled = Partial  # what a mode makes of a factor of the process noise
 
 
-def _step(motion: Motion, of: Supposed, x: Wide, u: Data) -> Wide:
-    return Wide(motion.moved(x.state, u), _kept(x, of))
+def _step(motion: Motion, of: OffsetHypothesis, x: Augmented, u: Data) -> Augmented:
+    return Augmented(motion.moved(x.state, u), _kept(x, of))
 
 
-def _noise(motion: Motion, of: Supposed, scaled: Scaled, x: Wide, u: Data) -> Array:
+def _noise(motion: Motion, of: OffsetHypothesis, scaled: Scaled, x: Augmented, u: Data) -> Array:
     return linalg.block_diagonal(scaled(motion.noise_factor(x.state, u)), _drawn(x, of))
 
 
-def _step_linear(motion: Motion, of: Supposed, scaled: Scaled, x: Wide, u: Data):
+def _step_linear(motion: Motion, of: OffsetHypothesis, scaled: Scaled, x: Augmented, u: Data):
     assert motion.linear is not None
     state, F, noise = motion.linear(x.state, u)
     F = linalg.block_diagonal(F, jnp.diag(_components(x, of.lasts)))
     noise = linalg.block_diagonal(scaled(linalg.as_factor(noise)), _drawn(x, of))
-    return Wide(state, _kept(x, of)), F, noise
+    return Augmented(state, _kept(x, of)), F, noise
 
 
-def _read(sensor: Sensor, x: Wide, aux: Data):
+def _read(sensor: Sensor, x: Augmented, aux: Data):
     return sensor.reading(x.state, aux)
 
 
-def _read_noise(sensor: Sensor, x: Wide, aux: Data):
+def _read_noise(sensor: Sensor, x: Augmented, aux: Data):
     return sensor.noise_factor(x.state, aux)
 
 
 @value
-class ReadOff:
+class OffsetReading:
     """A reading that is off by an offset of the state."""
 
     sensor: Sensor
     off: Numbers  # () one where it is, else zero
     at: int = kind()  # which offset
 
-    def __call__(self, x: Wide, aux: Data):
+    def __call__(self, x: Augmented, aux: Data):
         noise = self.sensor.noise_factor(x.state, aux)
         sigma = jnp.sqrt(jnp.sum(noise**2, axis=1))
         by = jnp.asarray(self.off) * sigma * x.offset[self.at]
         return manifold.retract(self.sensor.reading(x.state, aux), by)
 
 
-def _wide_sensor(sensor: Sensor, names: Sequence[str], of: Supposed) -> Sensor:
+def _augmented_sensor(sensor: Sensor, names: Sequence[str], of: OffsetHypothesis) -> Sensor:
     """Sensor of the augmented state; a `linear` of its own is not used."""
     read: Any = Partial(_read, sensor)
     if sensor.name in names:
         at = names.index(sensor.name)
-        read = ReadOff(sensor, of.off[at], at)
+        read = OffsetReading(sensor, of.off[at], at)
     return Sensor(read, Partial(_read_noise, sensor), sensor.dim, sensor.name)
 
 
 @value
-class Supposing(Around):
-    """The filter of `supposing`."""
+class UnderHypothesis(Around):
+    """The filter of `under_hypothesis`."""
 
-    of: Supposed
+    of: OffsetHypothesis
     scaled: Scaled
     names: tuple[str, ...] = kind()
 
@@ -172,11 +172,13 @@ class Supposing(Around):
 
     @jax.jit
     def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None) -> Updated:
-        return self.inner.update(state, _wide_sensor(sensor, self.names, self.of), y, aux)
+        return self.inner.update(state, _augmented_sensor(sensor, self.names, self.of), y, aux)
 
 
-def supposing(filter_: Filter, names: Sequence[str], of: Supposed, scaled: Scaled) -> Filter:
-    """A filter of the `Wide` state under a hypothesis, given motion and sensors of the state.
+def under_hypothesis(
+    filter_: Filter, names: Sequence[str], of: OffsetHypothesis, scaled: Scaled
+) -> Filter:
+    """A filter of the `Augmented` state under a hypothesis, given motion and sensors of the state.
 
     Args:
         filter_: of any state, as `kalman` makes it.
@@ -184,22 +186,22 @@ def supposing(filter_: Filter, names: Sequence[str], of: Supposed, scaled: Scale
         of: the hypothesis; its numbers may be traced.
         scaled: what the mode makes of a factor of the process noise; data of a program.
     """
-    return Supposing(filter_, of, scaled, tuple(names))
+    return UnderHypothesis(filter_, of, scaled, tuple(names))
 
 
-def _widened(belief: Belief, offset: tuple[Array, ...], factor: Array) -> Belief:
-    return Belief(Wide(belief.mean, offset), linalg.block_diagonal(belief.factor, factor))
+def _augmented(belief: Belief, offset: tuple[Array, ...], factor: Array) -> Belief:
+    return Belief(Augmented(belief.mean, offset), linalg.block_diagonal(belief.factor, factor))
 
 
-def _narrow(wide: FilterState) -> FilterState:
+def _marginal_belief(wide: FilterState) -> FilterState:
     mean, n = wide.belief.mean.state, manifold.dim(wide.belief.mean.state)
     # the first rows of a lower triangle are the factor of the first components
     return FilterState(Belief(mean, wide.belief.factor[:n, :n]), wide, (), wide.current)
 
 
 @value
-class Narrowed(Around):
-    """The filter of `narrowed`."""
+class Marginal(Around):
+    """The filter of `marginal`."""
 
     names: tuple[str, ...] = kind()
 
@@ -213,28 +215,30 @@ class Narrowed(Around):
             )
         offset = tuple(jnp.zeros(dims[name]) for name in self.names)
         factor = BEGINS * jnp.eye(sum(dims[name] for name in self.names))
-        return _narrow(self.inner.init(_widened(belief, offset, factor), dims))
+        return _marginal_belief(self.inner.init(_augmented(belief, offset, factor), dims))
 
     @jax.jit
     def predict(self, state: FilterState, motion: Motion, u: Data = None) -> Advanced:
         wide, prediction = self.inner.predict(state.memory, motion, u)
-        new = _narrow(wide)
+        new = _marginal_belief(wide)
         return new, Prediction(None, new.belief, prediction.code)
 
     @jax.jit
     def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None) -> Updated:
         wide, info = self.inner.update(state.memory, sensor, y, aux)
-        new = _narrow(wide)
+        new = _marginal_belief(wide)
         return new, info._replace(gain=info.gain[: len(new.belief.factor)])
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
         wide = state.memory.belief
         factor = linalg.tria(wide.factor[len(belief.factor) :])
-        return _narrow(self.inner.reset(state.memory, _widened(belief, wide.mean.offset, factor)))
+        return _marginal_belief(
+            self.inner.reset(state.memory, _augmented(belief, wide.mean.offset, factor))
+        )
 
 
-def narrowed(filter_: Filter, names: Sequence[str]) -> Filter:
-    """A filter of the state made of one of the `Wide` state; what it believes of offsets it keeps.
+def marginal(filter_: Filter, names: Sequence[str]) -> Filter:
+    """Filter of the state, made of one of the `Augmented` state, that keeps its belief of offsets.
 
     Args:
         filter_: of the wide state.
@@ -243,4 +247,4 @@ def narrowed(filter_: Filter, names: Sequence[str]) -> Filter:
     Raises:
         ValueError: when a run begins: the model has no sensor of one of these names.
     """
-    return Narrowed(filter_, tuple(names))
+    return Marginal(filter_, tuple(names))

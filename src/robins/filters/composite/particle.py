@@ -43,7 +43,7 @@ from robins.manifold import State
 _GENERATOR = "threefry2x32"  # named, so that a key gives the same draws under any setting of JAX
 
 
-class Cloud(NamedTuple):
+class ParticleCloud(NamedTuple):
     """Memory of a particle filter."""
 
     particles: Belief  # leading axis; rows of sampled components are zero in the factors
@@ -93,9 +93,9 @@ class Particle(Filter):
             lambda x: jnp.broadcast_to(x, (self.count, *jnp.shape(x))), belief
         )
         weight = jnp.full(self.count, self.even())
-        return FilterState(belief, Cloud(self.drawn(now, *same), weight, key))
+        return FilterState(belief, ParticleCloud(self.drawn(now, *same), weight, key))
 
-    def gaussian(self, cloud: Cloud) -> Belief:
+    def gaussian(self, cloud: ParticleCloud) -> Belief:
         """The cloud's moments."""
         return _moments(cloud, self.order(cloud.particles.factor.shape[1])[1])
 
@@ -148,7 +148,7 @@ class Particle(Filter):
         sound = jax.vmap(finite)(after)
         log_weight, total = log_normalised(jnp.where(sound, log_weight, -jnp.inf))
         taken = jnp.isfinite(total)
-        cloud = Cloud(_each(sound, after, before), log_weight, key)
+        cloud = ParticleCloud(_each(sound, after, before), log_weight, key)
         new = FilterState(self.gaussian(cloud), cloud)
         new = select(taken, new, state._replace(memory=state.memory._replace(key=key)))
         code = jnp.where(taken, int(Code.DONE), int(Code.NOT_FINITE))
@@ -169,11 +169,13 @@ class Particle(Filter):
         gained = jnp.where(sound, infos.log_likelihood, -jnp.inf)
         log_post, total = log_normalised(log_prior + gained)
         lost = ~jnp.isfinite(total)
-        cloud = Cloud(_each(sound, after, before), log_post, key)
+        cloud = ParticleCloud(_each(sound, after, before), log_post, key)
         cloud = select(lost, state.memory, cloud)
         used = jnp.any(infos.used & sound[:, None], axis=0) & ~lost
         belief = select(jnp.any(used), self.gaussian(cloud), state.belief)
-        info = _told(state, jnp.where(sound, log_prior, -jnp.inf), infos, cross, cloud, used, total)
+        info = _update_info(
+            state, jnp.where(sound, log_prior, -jnp.inf), infos, cross, cloud, used, total
+        )
         return FilterState(belief, cloud), info
 
 
@@ -187,10 +189,10 @@ def particle(
 ) -> Filter:
     """A particle filter; its belief is the Gaussian with the moments of the weighted cloud.
 
-    The cloud itself is the state's memory, a `Cloud`. The log-likelihood of an update is the
-    logarithm of the mean weight it gives; ``particle.ess`` notes the effective number of particles,
-    1 / sum w^2. Before a prediction the cloud is resampled (systematic: Kitagawa 1996) if that
-    number has fallen below ``resample * count``.
+    The cloud itself is the state's memory, a `ParticleCloud`. The log-likelihood of an update is
+    the logarithm of the mean weight it gives; ``particle.ess`` notes the effective number of
+    particles, 1 / sum w^2. Before a prediction the cloud is resampled (systematic: Kitagawa 1996)
+    if that number has fallen below ``resample * count``.
 
     A particle that leaves the finite numbers gets no weight. A measurement that no particle can
     explain, not even as the logarithm of a likelihood, is not used (``NOT_FINITE``).
@@ -276,19 +278,19 @@ def _effective(weight: Array) -> Array:
     return 1.0 / jnp.sum(weight**2)
 
 
-def _moments(cloud: Cloud, k: int) -> Belief:
+def _moments(cloud: ParticleCloud, k: int) -> Belief:
     """The cloud's Gaussian; the first k columns of its factors are zero."""
     best = jax.tree_util.tree_map(lambda x: x[jnp.argmax(cloud.log_weight)], cloud.particles.mean)
     slim = cloud.particles._replace(factor=cloud.particles.factor[:, :, k:])
     return matched(slim, jnp.exp(cloud.log_weight), best)
 
 
-def _told(
+def _update_info(
     state: FilterState,
     log_prior: Array,
     infos: StepInfo,
     cross: Array,
-    cloud: Cloud,
+    cloud: ParticleCloud,
     used: Array,
     total: Array,
 ) -> StepInfo:

@@ -23,7 +23,7 @@ _SOLID = 1e-6  # least pivot that is divided by, as a share of a state's deviati
 _FLOOR = 1e-10  # least deviation otherwise, as the same share
 
 
-class White(NamedTuple):
+class WhitenedInnovation(NamedTuple):
     """A measurement whitened by R^-1/2, so that traces have no unit."""
 
     residual: Array  # (m,) R^-1/2 r
@@ -44,7 +44,7 @@ class White(NamedTuple):
         return jnp.sum(self.counts).astype(float)
 
 
-def whitened(o: Observation) -> White:
+def whitened(o: Observation) -> WhitenedInnovation:
     """Innovation and its expectation in units of the noise, for components that have noise."""
     root, counts = _root(o.noise, o.accepted & o.present)
     n = o.spread.shape[1]
@@ -58,7 +58,7 @@ def whitened(o: Observation) -> White:
     deviation = jnp.where(counts, jnp.sqrt(jnp.sum(o.noise**2, axis=1)), 1.0)
     largest = jnp.max(jnp.where(counts, o.size / deviation, 0.0))
     size = jnp.where(counts, jnp.maximum(o.size, largest * deviation), o.size)
-    return White(white[:, 0], white[:, 2 : n + 2], left_over, counts, seen, size)
+    return WhitenedInnovation(white[:, 0], white[:, 2 : n + 2], left_over, counts, seen, size)
 
 
 def _root(noise: Array, taken: Array) -> tuple[Array, Array]:
@@ -79,13 +79,13 @@ def _root(noise: Array, taken: Array) -> tuple[Array, Array]:
     )
 
 
-def averaged(power: Array, white: White, keep: Number) -> Array:
+def averaged(power: Array, white: WhitenedInnovation, keep: Number) -> Array:
     """Exponential average of squared residuals; components that do not count stay."""
     fresh = keep * power + (1.0 - keep) * white.residual**2
     return jnp.where(white.counts, fresh, power)
 
 
-def significant(power: Array, white: White, keep: Number, sigmas: Number) -> Array:
+def significant(power: Array, white: WhitenedInnovation, keep: Number, sigmas: Number) -> Array:
     """() bool: averaged squares exceed their expectation by so many standard deviations.
 
     An average with weights (1 - keep) keep^i of squares of m unit normals has mean m and relative
@@ -96,7 +96,7 @@ def significant(power: Array, white: White, keep: Number, sigmas: Number) -> Arr
     return exceeds(power, white, 1.0 + sigmas * deviation)
 
 
-def exceeds(power: Array, white: White, level: Array) -> Array:
+def exceeds(power: Array, white: WhitenedInnovation, level: Array) -> Array:
     """() bool: averaged squares exceed so many times their expectation."""
     return power > level * (white.predicted + white.dof)
 
@@ -119,7 +119,7 @@ def chance_levels(keep: float, most: int, probability: float) -> np.ndarray:
     return np.concatenate([[np.inf], levels])
 
 
-def total(power: Array, white: White) -> Array:
+def total(power: Array, white: WhitenedInnovation) -> Array:
     """Trace of the averaged power."""
     return jnp.sum(jnp.where(white.counts, power, 0.0))
 
@@ -150,7 +150,7 @@ def seen_by(spread: Array, S: Array) -> Array:
 
 
 def faded(
-    S: Array, white: White, N: Array, form: str, weights: Numbers | None, limit: Number
+    S: Array, white: WhitenedInnovation, N: Array, form: str, weights: Numbers | None, limit: Number
 ) -> tuple[Array, Array]:
     """Factor S of P faded such that its share of the innovation has the power N, and lambda.
 

@@ -143,7 +143,7 @@ def reweighted(o: Observation, weight: Callable[[Array], Array], iterations: int
 
 
 @value
-class Opening(Rule):
+class PatientRule(Rule):
     """The rule of `opening`."""
 
     inner: Rule
@@ -189,7 +189,7 @@ def opening(rule: Rule, patience: Number | None) -> Rule:
     if patience is None:
         return rule
     negative = f"{rule.name} patience must not be negative"
-    return Opening(rule, number(negative, patience, lambda p: p >= 0))
+    return PatientRule(rule, number(negative, patience, lambda p: p >= 0))
 
 
 def widened_to_dof(due: Array, prior: Belief, o: Observation, seen: Normalised) -> Belief:

@@ -19,7 +19,7 @@ from robins.filters.trees import select
 from robins.filters.values import Numbers, finite_leaf, value
 
 
-class Fixed(NamedTuple):
+class GainMemory(NamedTuple):
     """Memory of the rule. Gains are data: another one in a state compiles nothing."""
 
     gains: dict[str, Array]  # (n, m) by sensor
@@ -33,7 +33,7 @@ class ConstantGain(Rule):
 
     name = "constant_gain"
 
-    def init(self, belief: Belief, dims: Mapping[str, int]) -> Fixed:
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> GainMemory:
         n = belief.factor.shape[0]
         for name, K in self.gains.items():
             require(name in dims, f"constant_gain: no sensor '{name}'; this model has {list(dims)}")
@@ -42,9 +42,9 @@ class ConstantGain(Rule):
                     f"constant_gain: the gain of '{name}' is {K.shape}, state and sensor need "
                     f"({n}, {dims[name]})"
                 )
-        return Fixed({name: jnp.asarray(K) for name, K in self.gains.items()})
+        return GainMemory({name: jnp.asarray(K) for name, K in self.gains.items()})
 
-    def after(self, memory: Fixed, posterior: Belief, info: StepInfo, o: Observation):
+    def after(self, memory: GainMemory, posterior: Belief, info: StepInfo, o: Observation):
         if o.sensor not in memory.gains:
             return memory, posterior, info
         return memory, *corrected(memory.gains[o.sensor], posterior, info, o)
@@ -103,10 +103,10 @@ def with_gains(state: FilterState, gains: Mapping[str, Given]) -> FilterState:
     Raises:
         ValueError: the filter has no `constant_gain` rule, or names or shapes differ.
     """
-    if not any(isinstance(one, Fixed) for one in state.memory):
+    if not any(isinstance(one, GainMemory) for one in state.memory):
         raise ValueError("this filter has no constant_gain rule whose gains could be exchanged")
 
-    def exchanged(memory: Fixed) -> Fixed:
+    def exchanged(memory: GainMemory) -> GainMemory:
         new = {name: jnp.asarray(K, float) for name, K in gains.items()}
         shapes = [{k: v.shape for k, v in of.items()} for of in (new, memory.gains)]
         if shapes[0] != shapes[1]:
@@ -115,5 +115,5 @@ def with_gains(state: FilterState, gains: Mapping[str, Given]) -> FilterState:
             )
         return memory._replace(gains=new)
 
-    held = tuple(exchanged(one) if isinstance(one, Fixed) else one for one in state.memory)
+    held = tuple(exchanged(one) if isinstance(one, GainMemory) else one for one in state.memory)
     return state._replace(memory=held)

@@ -34,7 +34,7 @@ Robust = Literal["huber", "gate"]
 PUBLISHED = 3.0
 
 
-class Verdict(IntEnum):
+class DiscriminatorVerdict(IntEnum):
     """Judgement of a measurement by the discriminator, noted as ``discriminator.state``."""
 
     CLEAN = 0
@@ -42,7 +42,7 @@ class Verdict(IntEnum):
     MODEL = 2
 
 
-class _Memory(NamedTuple):
+class _DiscriminatorMemory(NamedTuple):
     power: dict[str, Array]  # (m,) averaged squares of each sensor's whitened residuals
     counter: dict[str, Array]  # () measurements in a row that were too large to be chance
 
@@ -62,12 +62,12 @@ class Discriminator(Rule):
 
     name = "discriminator"
 
-    def init(self, belief: Belief, dims: Mapping[str, int]) -> _Memory:
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> _DiscriminatorMemory:
         _fading.check_size(self.name, self.weights, belief)
         power = {name: jnp.ones(m) for name, m in dims.items()}
-        return _Memory(power, {name: jnp.zeros((), int) for name in dims})
+        return _DiscriminatorMemory(power, {name: jnp.zeros((), int) for name in dims})
 
-    def before(self, memory: _Memory, prior: Belief, o: Observation):
+    def before(self, memory: _DiscriminatorMemory, prior: Belief, o: Observation):
         seen = normalised(o)
         quantile = within(self.quantile, o.residual)[seen.dof]
         longer = jnp.where(seen.nis > quantile, memory.counter[o.sensor] + 1, 0)
@@ -90,9 +90,15 @@ class Discriminator(Rule):
         else:
             o, weight = weighed(o, jnp.where(outlier, scale_to_quantile(o, quantile, seen), 1.0))
         wrong = (factor > 1.0) | (some & (row >= self.patience))
-        state = jnp.where(outlier, int(Verdict.OUTLIER), jnp.where(wrong, int(Verdict.MODEL), 0))
+        state = jnp.where(
+            outlier,
+            int(DiscriminatorVerdict.OUTLIER),
+            jnp.where(wrong, int(DiscriminatorVerdict.MODEL), 0),
+        )
         o = o.noted(self.name, weight=weight, lambda_=factor, counter=count, state=state)
-        memory = _Memory({**memory.power, o.sensor: power}, {**memory.counter, o.sensor: count})
+        memory = _DiscriminatorMemory(
+            {**memory.power, o.sensor: power}, {**memory.counter, o.sensor: count}
+        )
         return memory, Belief(prior.mean, S), o
 
 
@@ -124,8 +130,8 @@ def discriminator(
     than ``patience`` measurements is taken for an error of the model.
 
     Notes: ``discriminator.weight`` (1 / s, 0 if refused), ``.lambda``, ``.counter`` (c) and
-    ``.state`` (a `Verdict`: 2 if faded, or c >= patience). Components missing, refused before or
-    without noise do not count. ``probability=1, limit=1`` is the Kalman filter.
+    ``.state`` (a `DiscriminatorVerdict`: 2 if faded, or c >= patience). Components missing, refused
+    before or without noise do not count. ``probability=1, limit=1`` is the Kalman filter.
 
     Args:
         patience: most measurements in a row with a fault of the sensor, plus one; 1: no outliers.

@@ -27,7 +27,7 @@ Scope = Literal["joint", "component"]
 _OPEN = 100.0
 
 
-class _Channel(NamedTuple):
+class _SensorMemory(NamedTuple):
     """Memory of a sensor; g is () for a joint gate, (m,) for one by component."""
 
     refused: Array  # (g) refusals in a row
@@ -50,9 +50,9 @@ class Gate(Rule):
     name = "gate"
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
-        def channel(m: int) -> _Channel:
+        def channel(m: int) -> _SensorMemory:
             shape, residual = () if self.joint else (m,), jnp.zeros((self.kept, m))
-            return _Channel(jnp.zeros(shape, int), jnp.zeros(()), residual, residual > 0.0)
+            return _SensorMemory(jnp.zeros(shape, int), jnp.zeros(()), residual, residual > 0.0)
 
         return {name: channel(m) for name, m in dims.items()}
 
@@ -69,7 +69,7 @@ class Gate(Rule):
             prior = self.recovered(due, due & used, ratio, q, prior, o)
         most = jnp.max(refused, initial=0)
         o = o.noted("gate", ratio=worst, refused=most, recovered=jnp.any(due))
-        memory = {**memory, o.sensor: _Channel(refused, worst, residual, known)}
+        memory = {**memory, o.sensor: _SensorMemory(refused, worst, residual, known)}
         return memory, prior, o._replace(accepted=o.accepted & passed)
 
     def judge(self, o: Observation):
@@ -83,7 +83,7 @@ class Gate(Rule):
         return self.limit[1], square / variance / self.limit[1], seen.used, seen.used
 
     def due(
-        self, was: _Channel, over: Array, used: Array, o: Observation
+        self, was: _SensorMemory, over: Array, used: Array, o: Observation
     ) -> tuple[Array, Array, Array]:
         """Recoveries that are due, and the refusals remembered."""
         due, scatter = over & (was.refused.astype(float) >= self.patience), self.scatter

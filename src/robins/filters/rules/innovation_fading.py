@@ -24,7 +24,7 @@ class Window(NamedTuple):
     filled: Array  # (m,) int, samples in it
 
 
-class Memory(NamedTuple):
+class InnovationMemory(NamedTuple):
     """Windows by sensor, and state of the step."""
 
     windows: dict[str, Window]
@@ -42,16 +42,16 @@ class InnovationFading(Rule):
 
     name = "innovation_fading"
 
-    def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> InnovationMemory:
         windows = {
             name: Window(jnp.zeros((self.window, m)), jnp.zeros(m, int)) for name, m in dims.items()
         }
-        return Memory(windows, jnp.zeros((), bool), belief.sigma)
+        return InnovationMemory(windows, jnp.zeros((), bool), belief.sigma)
 
-    def process(self, memory: Memory, transition: Transition):
+    def process(self, memory: InnovationMemory, transition: Transition):
         return memory._replace(faded=jnp.zeros((), bool)), transition
 
-    def before(self, memory: Memory, prior: Belief, o: Observation):
+    def before(self, memory: InnovationMemory, prior: Belief, o: Observation):
         R, old = variance(o.noise), memory.windows[o.sensor]
         here = o.accepted & o.present & (R > 0.0)
         e = jnp.where(here, o.residual, 0.0)

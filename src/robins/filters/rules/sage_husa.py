@@ -19,7 +19,7 @@ from robins.filters.rules import _variances
 from robins.filters.values import Numbers, is_known, kind, value
 
 
-class Scale(NamedTuple):
+class VarianceScale(NamedTuple):
     """Variances as multiples of the nominal ones, and the samples of each."""
 
     ratio: Array  # (k,)
@@ -49,18 +49,18 @@ class SageHusa(Rule):
 
     name = "sage_husa"
 
-    def learnt(self, old: Scale, sample: Array, here: Array) -> Scale:
+    def learnt(self, old: VarianceScale, sample: Array, here: Array) -> VarianceScale:
         """Scale after a sample of the components that are here."""
         k, b = (old.samples + 1).astype(float), self.forgetting
         d = 1.0 / (k + 1.0) if self.endless else (1.0 - b) / (1.0 - b ** (k + 1.0))
         new = jnp.clip((1.0 - d) * old.ratio + d * sample, self.floor, self.ceiling)
-        return Scale(jnp.where(here, new, old.ratio), old.samples + here.astype(int))
+        return VarianceScale(jnp.where(here, new, old.ratio), old.samples + here.astype(int))
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
         n = belief.factor.shape[0]
 
-        def nominal(k: int) -> Scale:
-            return Scale(jnp.ones(k), jnp.zeros(k, int))
+        def nominal(k: int) -> VarianceScale:
+            return VarianceScale(jnp.ones(k), jnp.zeros(k, int))
 
         sensors = {name: nominal(m) for name, m in dims.items()} if self.of_sensor else {}
         nothing = jnp.zeros(n)

@@ -22,7 +22,7 @@ Form = Literal["outside", "lumped", "multiple", "projected"]
 Power = Literal["classic", "ewma"]
 
 
-class _Memory(NamedTuple):
+class _StrongTrackingMemory(NamedTuple):
     power: dict[str, Array]  # (m,) averaged squares of each sensor's whitened residuals
     begun: dict[str, Array]  # (m,) bool: the average has a first value
     moved: Array  # (n, 2n + 1) F S and its excess
@@ -44,10 +44,10 @@ class StrongTracking(Rule):
 
     name = "strong_tracking"
 
-    def init(self, belief: Belief, dims: Mapping[str, int]) -> _Memory:
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> _StrongTrackingMemory:
         n = belief.factor.shape[0]
         _fading.check_size("strong_tracking", self.weights, belief)
-        return _Memory(
+        return _StrongTrackingMemory(
             power={name: jnp.ones(m) for name, m in dims.items()},
             begun={name: jnp.full(m, self.power != "classic") for name, m in dims.items()},
             moved=jnp.zeros((n, 2 * n + 1)),
@@ -55,7 +55,7 @@ class StrongTracking(Rule):
             fresh=jnp.array(False),
         )
 
-    def process(self, memory: _Memory, transition: Transition):
+    def process(self, memory: _StrongTrackingMemory, transition: Transition):
         if self.form != "outside":
             return memory, transition
         moved = jnp.concatenate([transition.spread, transition.excess], axis=1)
@@ -63,7 +63,7 @@ class StrongTracking(Rule):
         noise = of_width(transition.noise, len(transition.noise))
         return memory._replace(moved=moved, noise=noise, fresh=jnp.array(True)), transition
 
-    def before(self, memory: _Memory, prior: Belief, o: Observation):
+    def before(self, memory: _StrongTrackingMemory, prior: Belief, o: Observation):
         white = _fading.whitened(o)
         V, begun = memory.power[o.sensor], memory.begun[o.sensor]
         first = white.counts & ~begun
@@ -82,7 +82,9 @@ class StrongTracking(Rule):
         )
         return memory, Belief(prior.mean, S), o.noted(self.name, lambda_=factor)
 
-    def after(self, memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
+    def after(
+        self, memory: _StrongTrackingMemory, posterior: Belief, info: StepInfo, o: Observation
+    ):
         return memory._replace(fresh=memory.fresh & ~jnp.any(info.used)), posterior, info
 
 
@@ -149,7 +151,11 @@ def strong_tracking(
 
 
 def _faded_outside(
-    memory: _Memory, S: Array, white: _fading.White, N: Array, limit: Numbers
+    memory: _StrongTrackingMemory,
+    S: Array,
+    white: _fading.WhitenedInnovation,
+    N: Array,
+    limit: Numbers,
 ) -> tuple[Array, Array]:
     """P + (lambda - 1) F P F' = lambda F P F' + Q; after the first update lambda P."""
     n = len(S)

@@ -36,12 +36,14 @@ from robins.filters.synthesis.inequalities import Aim
 from robins.filters.synthesis.least import least_gamma
 from robins.filters.synthesis.norms import Number, h2_norm, meets, spectral_radius
 from robins.filters.synthesis.plant import Plant, error_system
-from robins.filters.synthesis.programs import Answer, Form, solve
+from robins.filters.synthesis.programs import Form, SolverAnswer, solve
 from robins.filters.synthesis.riccati import check_gamma
 from robins.filters.synthesis.scaling import Scales, balanced
 
 ObserverForm = Literal["common", "slack"]
-Reading = Callable[[Answer, Scales], np.ndarray | FullOrder]  # a gain or filter, in plant units
+Reading = Callable[
+    [SolverAnswer, Scales], np.ndarray | FullOrder
+]  # a gain or filter, in plant units
 
 
 def _attempt(
@@ -90,7 +92,7 @@ def _aim(gamma: Number) -> Aim:
     return "h2" if np.isinf(gamma) else "mixed"
 
 
-def _bound(answer: Answer, scales: Scales) -> float:
+def _bound(answer: SolverAnswer, scales: Scales) -> float:
     """Bound on the H2 norm, in the plant's units."""
     return scales.h2(np.sqrt(max(answer.value, 0.0)))
 
@@ -114,7 +116,7 @@ def observer(plant: Plant, gamma: Number, form: ObserverForm = "common") -> Desi
     return _attempt(plant, form, _aim(gamma), float(gamma), f"lmi-{form}", (gain_of,))
 
 
-def gain_of(answer: Answer, scales: Scales) -> np.ndarray:
+def gain_of(answer: SolverAnswer, scales: Scales) -> np.ndarray:
     """K = X^-1 Y or G^-1 Y, in the plant's units."""
     found = answer.unknowns
     return scales.gain(np.linalg.solve(found["X" if "X" in found else "G"], found["Y"]))
@@ -270,13 +272,13 @@ def refuse_unstable(plant: Plant) -> None:
         )
 
 
-def _of_variables(answer: Answer, scales: Scales) -> FullOrder:
+def _of_variables(answer: SolverAnswer, scales: Scales) -> FullOrder:
     """(8)."""
     R, P, S, Q, U = (answer.unknowns[name] for name in "RPSQU")
     return scales.full_order(np.linalg.solve(R - P, S), np.linalg.solve(R - P, Q), U)
 
 
-def _in_the_limit(plant: Plant, answer: Answer, scales: Scales) -> FullOrder:
+def _in_the_limit(plant: Plant, answer: SolverAnswer, scales: Scales) -> FullOrder:
     """(8) for R = 0, where (7) is the observer's inequality."""
     scaled = scales.plant(plant)
     Bh = -np.linalg.solve(answer.unknowns["P"], answer.unknowns["Q"])

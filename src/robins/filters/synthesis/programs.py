@@ -36,7 +36,7 @@ class MissingExtra(RobinsError, ImportError):
     bad_input = False
 
 
-class Answer(NamedTuple):
+class SolverAnswer(NamedTuple):
     """The answer of a solver, unchecked."""
 
     status: str
@@ -44,7 +44,7 @@ class Answer(NamedTuple):
     unknowns: dict[str, np.ndarray]  # by the symbols of the equations; empty without a solution
 
 
-class Program(NamedTuple):
+class DesignProgram(NamedTuple):
     """A problem, the parameters to fill in and the unknowns to read."""
 
     problem: cvxpy.Problem
@@ -52,7 +52,7 @@ class Program(NamedTuple):
     unknowns: dict[str, cvxpy.Variable]
 
 
-def solve(plant: Plant, form: Form, aim: Aim) -> Answer:
+def solve(plant: Plant, form: Form, aim: Aim) -> SolverAnswer:
     """Solve a design program: "common" is (9) and (10), "slack" their slack form, "full" (6), (7).
 
     Numbers of the plant should be of order one, and the gain from n to z at most 1
@@ -73,16 +73,16 @@ def solve(plant: Plant, form: Form, aim: Aim) -> Answer:
                 warnings.simplefilter("ignore")
                 program.problem.solve(solver=cp.CLARABEL, warm_start=False, **_CLARABEL)
         except cp.SolverError:
-            return Answer("solver_error", np.nan, {})
+            return SolverAnswer("solver_error", np.nan, {})
         found = {name: unknown.value for name, unknown in program.unknowns.items()}
         status = str(program.problem.status)
         if any(value is None or not np.isfinite(value).all() for value in found.values()):
-            return Answer(status, np.nan, {})
-        return Answer(status, float(program.problem.value), found)  # type: ignore[arg-type]
+            return SolverAnswer(status, np.nan, {})
+        return SolverAnswer(status, float(program.problem.value), found)  # type: ignore[arg-type]
 
 
 @lru_cache(maxsize=64)
-def build(form: Form, aim: Aim, n: int, p: int, q: int, m: int, r: int) -> Program:
+def build(form: Form, aim: Aim, n: int, p: int, q: int, m: int, r: int) -> DesignProgram:
     """Program for n states, p and q components of w and n, m measurements and r outputs."""
     cp = packages()
     sizes = (n, n), (n, p), (n, q), (m, n), (m, p), (m, q), (r, n)
@@ -92,7 +92,7 @@ def build(form: Form, aim: Aim, n: int, p: int, q: int, m: int, r: int) -> Progr
     cost = cp.trace(unknowns["H"])
     problem = cp.Problem(cp.Minimize(cost), [matrix >> 0 for matrix in matrices])
     used = {p.name() for p in problem.parameters()}
-    return Program(problem, {k: v for k, v in parameters.items() if k in used}, unknowns)
+    return DesignProgram(problem, {k: v for k, v in parameters.items() if k in used}, unknowns)
 
 
 def packages() -> ModuleType:

@@ -14,10 +14,12 @@ import numpy as np
 from robins.program.kinds import Equation
 from robins.program.nodes import Node
 from robins.program.refusal import ProgramError
-from robins.program.walk import Nodes, Walk, rule
+from robins.program.walk import JaxprWriter, Nodes, rule
 
 
-def per_matrix(walk: Walk, function: Callable[..., Sequence[Nodes]], *stacks: Nodes) -> list[Nodes]:
+def per_matrix(
+    walk: JaxprWriter, function: Callable[..., Sequence[Nodes]], *stacks: Nodes
+) -> list[Nodes]:
     """A function of matrices over their leading axes."""
     lead = stacks[0].shape[:-2]
     flat = [s.reshape(-1, *s.shape[-2:]) for s in stacks]
@@ -26,7 +28,7 @@ def per_matrix(walk: Walk, function: Callable[..., Sequence[Nodes]], *stacks: No
 
 
 def call(
-    walk: Walk,
+    walk: JaxprWriter,
     routine: str,
     sizes: list[int],
     arrays: list[Nodes],
@@ -41,7 +43,7 @@ def call(
     return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
 
 
-def dot(walk: Walk, a: list[Node], b: list[Node]) -> Node:
+def dot(walk: JaxprWriter, a: list[Node], b: list[Node]) -> Node:
     """The sum of products, from first to last."""
     graph = walk.graph
     total = graph.constant(0, graph.kind[a[0]] if a else "real")
@@ -51,7 +53,7 @@ def dot(walk: Walk, a: list[Node], b: list[Node]) -> Node:
 
 
 @rule("dot_general")
-def _dot_general(walk: Walk, equation: Equation, a: Nodes, b: Nodes) -> Nodes:
+def _dot_general(walk: JaxprWriter, equation: Equation, a: Nodes, b: Nodes) -> Nodes:
     (over_a, over_b), (with_a, with_b) = equation.params["dimension_numbers"]
 
     def arranged(x: Nodes, batch: Sequence[int], over: Sequence[int]) -> Nodes:
@@ -67,7 +69,7 @@ def _dot_general(walk: Walk, equation: Equation, a: Nodes, b: Nodes) -> Nodes:
     return np.array(found, dtype=np.int64).reshape(shape)
 
 
-def _product(walk: Walk, A: Nodes, B: Nodes) -> Nodes:
+def _product(walk: JaxprWriter, A: Nodes, B: Nodes) -> Nodes:
     """A B' of nodes (m, k) and (n, k)."""
     (m, depth), n = A.shape, B.shape[0]
     zero = [n for n in {*A.ravel().tolist(), *B.ravel().tolist()} if walk.graph._is(n, 0)]
@@ -80,11 +82,11 @@ def _product(walk: Walk, A: Nodes, B: Nodes) -> Nodes:
 
 
 @rule("cholesky")
-def _cholesky(walk: Walk, equation: Equation, P: Nodes) -> list[Nodes]:
+def _cholesky(walk: JaxprWriter, equation: Equation, P: Nodes) -> list[Nodes]:
     return per_matrix(walk, _cholesky_of, P)
 
 
-def _cholesky_of(walk: Walk, P: Nodes) -> tuple[Nodes, ...]:
+def _cholesky_of(walk: JaxprWriter, P: Nodes) -> tuple[Nodes, ...]:
     """Lower factor by rows; all NaN where a pivot is not positive, as JAX returns it."""
     n, apply = len(P), walk.graph.apply
     if walk.stays_whole(n**3 // 3):
@@ -107,10 +109,10 @@ def _cholesky_of(walk: Walk, P: Nodes) -> tuple[Nodes, ...]:
 
 
 @rule("triangular_solve")
-def _triangular_solve(walk: Walk, equation: Equation, A: Nodes, B: Nodes) -> list[Nodes]:
+def _triangular_solve(walk: JaxprWriter, equation: Equation, A: Nodes, B: Nodes) -> list[Nodes]:
     p = equation.params
 
-    def one(walk: Walk, A: Nodes, B: Nodes) -> tuple[Nodes]:
+    def one(walk: JaxprWriter, A: Nodes, B: Nodes) -> tuple[Nodes]:
         lower = p["lower"]
         if p["transpose_a"]:
             A, lower = A.T, not lower
@@ -125,7 +127,7 @@ def _triangular_solve(walk: Walk, equation: Equation, A: Nodes, B: Nodes) -> lis
     return per_matrix(walk, one, A, B)
 
 
-def _solve_lower(walk: Walk, A: Nodes, B: Nodes, unit: bool) -> Nodes:
+def _solve_lower(walk: JaxprWriter, A: Nodes, B: Nodes, unit: bool) -> Nodes:
     apply, n = walk.graph.apply, len(A)
     if unit:
         A = np.where(np.eye(n, dtype=bool), walk.graph.constant(1, "real"), A)
@@ -142,13 +144,13 @@ def _solve_lower(walk: Walk, A: Nodes, B: Nodes, unit: bool) -> Nodes:
 
 
 @rule("qr")
-def _qr(walk: Walk, equation: Equation, A: Nodes) -> list[Nodes]:
+def _qr(walk: JaxprWriter, equation: Equation, A: Nodes) -> list[Nodes]:
     p = equation.params
     if p.get("pivoting"):
         raise ProgramError("a QR with exchange of columns", "", "use one without")
     wanted = type(equation.outvars[0]).__name__ != "DropVar"
 
-    def one(walk: Walk, A: Nodes) -> tuple[Nodes, Nodes]:
+    def one(walk: JaxprWriter, A: Nodes) -> tuple[Nodes, Nodes]:
         return _householder(walk, A, wanted, p["full_matrices"])
 
     return per_matrix(walk, one, A)
@@ -157,7 +159,7 @@ def _qr(walk: Walk, equation: Equation, A: Nodes) -> list[Nodes]:
 TINY = 1e-290  # of a sum of squares: what is shorter than its root is nothing
 
 
-def _householder(walk: Walk, A: Nodes, wanted: bool, full: bool) -> tuple[Nodes, Nodes]:
+def _householder(walk: JaxprWriter, A: Nodes, wanted: bool, full: bool) -> tuple[Nodes, Nodes]:
     """Q and R by reflections, with the signs of LAPACK's dgeqrf.
 
     H = I + g v v' takes a column to beta = -sign(alpha) |column|, with v = (alpha - beta, tail)
@@ -203,7 +205,7 @@ def _householder(walk: Walk, A: Nodes, wanted: bool, full: bool) -> tuple[Nodes,
     return Q, np.where(upper, R[:width], zero)
 
 
-def _reflect(walk: Walk, A: Nodes, j: int, v: list[tuple[int, Node]], g: Node) -> None:
+def _reflect(walk: JaxprWriter, A: Nodes, j: int, v: list[tuple[int, Node]], g: Node) -> None:
     """Add g v v' a to a column a, in place."""
     apply = walk.graph.apply
     along = apply("mul", g, dot(walk, [x for _, x in v], [A[i, j].item() for i, _ in v]))
@@ -212,13 +214,13 @@ def _reflect(walk: Walk, A: Nodes, j: int, v: list[tuple[int, Node]], g: Node) -
 
 
 @rule("eigh")
-def _eigh(walk: Walk, equation: Equation, A: Nodes) -> list[Nodes]:
+def _eigh(walk: JaxprWriter, equation: Equation, A: Nodes) -> list[Nodes]:
     """Vectors as columns, and values from least to greatest."""
     if equation.params.get("subset_by_index") not in (None, (0, A.shape[-1])):
         raise ProgramError("some of the eigenvalues of a matrix", "", "take all of them")
     lower = equation.params["lower"]
 
-    def one(walk: Walk, A: Nodes) -> tuple[Nodes, Nodes]:
+    def one(walk: JaxprWriter, A: Nodes) -> tuple[Nodes, Nodes]:
         n = len(A)
         if n == 1:
             return np.full((1, 1), walk.graph.constant(1, "real")), A[0]
@@ -230,10 +232,10 @@ def _eigh(walk: Walk, equation: Equation, A: Nodes) -> list[Nodes]:
 
 
 @rule("lu")
-def _lu(walk: Walk, equation: Equation, A: Nodes) -> list[Nodes]:
+def _lu(walk: JaxprWriter, equation: Equation, A: Nodes) -> list[Nodes]:
     """Triangles in one matrix, exchanges, and the permutation that they make."""
 
-    def one(walk: Walk, A: Nodes) -> tuple[Nodes, Nodes, Nodes]:
+    def one(walk: JaxprWriter, A: Nodes) -> tuple[Nodes, Nodes, Nodes]:
         m, n = A.shape
         shapes = [(m, n), (min(m, n),), (m,)]
         factors, *rows = call(walk, "lu", [m, n], [A], shapes)

@@ -7,7 +7,7 @@ import numpy as np
 from robins.program.kinds import Equation, kind_of
 from robins.program.nodes import Node
 from robins.program.refusal import ProgramError
-from robins.program.walk import RULES, Nodes, Walk, rule
+from robins.program.walk import RULES, JaxprWriter, Nodes, rule
 
 # Primitives that are one operation of `OPERATIONS`, by their names in JAX.
 SAME = {
@@ -25,7 +25,7 @@ SAME = {
 
 
 def _same(op: str):
-    def of(walk: Walk, equation: Equation, *arrays: Nodes) -> Nodes:
+    def of(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> Nodes:
         return walk.apply(op, *arrays)
 
     return of
@@ -35,33 +35,33 @@ RULES.update({name: _same(op) for name, op in SAME.items()})
 
 
 @rule("gt")
-def _gt(walk: Walk, equation: Equation, a: Nodes, b: Nodes) -> Nodes:
+def _gt(walk: JaxprWriter, equation: Equation, a: Nodes, b: Nodes) -> Nodes:
     return walk.apply("lt", b, a)
 
 
 @rule("ge")
-def _ge(walk: Walk, equation: Equation, a: Nodes, b: Nodes) -> Nodes:
+def _ge(walk: JaxprWriter, equation: Equation, a: Nodes, b: Nodes) -> Nodes:
     return walk.apply("le", b, a)
 
 
 @rule("square")
-def _square(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+def _square(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     return walk.apply("mul", a, a)
 
 
 @rule("rsqrt")
-def _rsqrt(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+def _rsqrt(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     return walk.apply("div", walk.constants(1.0), walk.apply("sqrt", a))
 
 
 @rule("logistic")
-def _logistic(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+def _logistic(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     one = walk.constants(1.0)
     return walk.apply("div", one, walk.apply("add", one, walk.apply("exp", walk.apply("neg", a))))
 
 
 @rule("integer_pow")
-def _integer_pow(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+def _integer_pow(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     """Whole power by squaring, in the order in which JAX multiplies."""
     y = equation.params["y"]
     one = walk.each(lambda n: walk.graph.constant(1, walk.graph.kind[n]), a)
@@ -77,18 +77,18 @@ def _integer_pow(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
 
 
 @rule("round")
-def _round(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+def _round(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     to_even = equation.params["rounding_method"].name == "TO_NEAREST_EVEN"
     return walk.apply("round_even" if to_even else "round_away", a)
 
 
 @rule("clamp")
-def _clamp(walk: Walk, equation: Equation, low: Nodes, a: Nodes, high: Nodes) -> Nodes:
+def _clamp(walk: JaxprWriter, equation: Equation, low: Nodes, a: Nodes, high: Nodes) -> Nodes:
     return walk.apply("min", walk.apply("max", a, low), high)
 
 
 @rule("select_n")
-def _select_n(walk: Walk, equation: Equation, which: Nodes, *cases: Nodes) -> Nodes:
+def _select_n(walk: JaxprWriter, equation: Equation, which: Nodes, *cases: Nodes) -> Nodes:
     graph = walk.graph
     if len(cases) == 2 and equation.invars[0].aval.dtype == np.bool_:
         return walk.select(which, cases[1], cases[0])
@@ -100,7 +100,7 @@ def _select_n(walk: Walk, equation: Equation, which: Nodes, *cases: Nodes) -> No
 
 
 @rule("convert_element_type")
-def _convert(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+def _convert(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     """Convert: reals are cut, at the ends of the new type too; whole numbers wrap round."""
     graph, given = walk.graph, equation.invars[0].aval.dtype
     dtype = np.dtype(equation.params["new_dtype"])
@@ -116,7 +116,7 @@ def _convert(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
 
 
 @rule("shift_right_logical")
-def _shift_right(walk: Walk, equation: Equation, a: Nodes, by: Nodes) -> Nodes:
+def _shift_right(walk: JaxprWriter, equation: Equation, a: Nodes, by: Nodes) -> Nodes:
     """Zeros come in from the left: of a signed number its bits are moved, as those of a word."""
     graph, dtype = walk.graph, equation.invars[0].aval.dtype
     if dtype.kind == "u":
@@ -129,7 +129,7 @@ def _shift_right(walk: Walk, equation: Equation, a: Nodes, by: Nodes) -> Nodes:
 
 
 @rule("bitcast_convert_type")
-def _bits(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+def _bits(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     kind = kind_of(equation.params["new_dtype"])
     given = equation.invars[0].aval.dtype
     if given.itemsize != np.dtype(equation.params["new_dtype"]).itemsize:
@@ -139,7 +139,7 @@ def _bits(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
 
 @rule("stop_gradient", "copy", "copy_p", "reduce_precision", "device_put", "optimization_barrier")
 @rule("name")
-def _as_it_is(walk: Walk, equation: Equation, *arrays: Nodes) -> list[Nodes]:
+def _as_it_is(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> list[Nodes]:
     if equation.primitive.name == "reduce_precision" and equation.params["mantissa_bits"] < 52:
         raise ProgramError("numbers are rounded to fewer bits", "", "leave them in float64")
     return list(arrays)
@@ -148,7 +148,7 @@ def _as_it_is(walk: Walk, equation: Equation, *arrays: Nodes) -> list[Nodes]:
 @rule(
     "digamma", "igamma", "igammac", "random_gamma_grad", "bessel_i0e", "regularized_incomplete_beta"
 )
-def _special(walk: Walk, equation: Equation, *arrays: Nodes) -> Nodes:
+def _special(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> Nodes:
     """Functions of two and more pages: only of numbers that are known."""
     import jax
 

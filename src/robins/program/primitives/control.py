@@ -11,7 +11,7 @@ from jax.extend import core as jex
 from robins.program.kinds import Equation
 from robins.program.nodes import Node
 from robins.program.primitives.reductions import fold
-from robins.program.walk import Nodes, Walk, rule
+from robins.program.walk import JaxprWriter, Nodes, rule
 
 LONGEST = 100_000  # rounds of a loop that are written out
 
@@ -30,7 +30,7 @@ def called(equation: Equation) -> jex.ClosedJaxpr | None:
 
 @rule("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat")
 @rule("checkpoint", "custom_vjp_call_jaxpr", "custom_vmap_call", "custom_lin", "remat2")
-def _call(walk: Walk, equation: Equation, *args: Nodes) -> list[Nodes]:
+def _call(walk: JaxprWriter, equation: Equation, *args: Nodes) -> list[Nodes]:
     """A function called is a function written in its place."""
     p = equation.params
     inner = next(p[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr", "call") if k in p)
@@ -38,7 +38,7 @@ def _call(walk: Walk, equation: Equation, *args: Nodes) -> list[Nodes]:
 
 
 @rule("custom_linear_solve")
-def _linear_solve(walk: Walk, equation: Equation, *args: Nodes) -> list[Nodes]:
+def _linear_solve(walk: JaxprWriter, equation: Equation, *args: Nodes) -> list[Nodes]:
     lengths, jaxprs = equation.params["const_lengths"], equation.params["jaxprs"]
     begin = lengths.matvec + lengths.vecmat
     consts = args[begin : begin + lengths.solve]
@@ -46,7 +46,7 @@ def _linear_solve(walk: Walk, equation: Equation, *args: Nodes) -> list[Nodes]:
 
 
 @rule("platform_index")
-def _platform(walk: Walk, equation: Equation) -> Nodes:
+def _platform(walk: JaxprWriter, equation: Equation) -> Nodes:
     """The branch of a function written for several platforms that is meant for processors."""
     platforms = equation.params["platforms"]
     default = next((k for k, names in enumerate(platforms) if names is None), len(platforms) - 1)
@@ -55,7 +55,7 @@ def _platform(walk: Walk, equation: Equation) -> Nodes:
 
 
 @rule("cond")
-def _cond(walk: Walk, equation: Equation, index: Nodes, *args: Nodes) -> list[Nodes]:
+def _cond(walk: JaxprWriter, equation: Equation, index: Nodes, *args: Nodes) -> list[Nodes]:
     """Conditional: the branch of a known index; else all, and a choice of their results."""
     branches, graph = equation.params["branches"], walk.graph
     last = len(branches) - 1
@@ -86,7 +86,7 @@ def _shaped(nodes: list[Node], like: Iterable[Nodes]) -> list[Nodes]:
     return out
 
 
-def _converted(walk: Walk, arrays: list[Nodes], like: list[Nodes]) -> list[Nodes]:
+def _converted(walk: JaxprWriter, arrays: list[Nodes], like: list[Nodes]) -> list[Nodes]:
     """Arrays that a round leaves, in the kinds that it began with."""
     graph = walk.graph
     return [
@@ -96,7 +96,7 @@ def _converted(walk: Walk, arrays: list[Nodes], like: list[Nodes]) -> list[Nodes
 
 
 @rule("scan")
-def _scan(walk: Walk, equation: Equation, *args: Nodes) -> list[Nodes]:
+def _scan(walk: JaxprWriter, equation: Equation, *args: Nodes) -> list[Nodes]:
     p = equation.params
     fixed, carried = p["num_consts"], p["num_carry"]
     consts, carry, rows = args[:fixed], list(args[fixed:][:carried]), args[fixed + carried :]
@@ -105,7 +105,7 @@ def _scan(walk: Walk, equation: Equation, *args: Nodes) -> list[Nodes]:
 
 
 @rule("each_row")
-def _each_row(walk: Walk, equation: Equation, *args: Nodes) -> list[Nodes]:
+def _each_row(walk: JaxprWriter, equation: Equation, *args: Nodes) -> list[Nodes]:
     """A scan that carries nothing (`robins.linalg.rows`)."""
     p = equation.params
     shared, order = p["shared"], range(p["count"])
@@ -113,7 +113,7 @@ def _each_row(walk: Walk, equation: Equation, *args: Nodes) -> list[Nodes]:
 
 
 def _rounds(
-    walk: Walk,
+    walk: JaxprWriter,
     body: jex.ClosedJaxpr,
     order: range,
     consts: Sequence[Nodes],
@@ -135,7 +135,7 @@ def _rounds(
 
 
 def _rolled(
-    walk: Walk,
+    walk: JaxprWriter,
     body: jex.ClosedJaxpr,
     order: range,
     consts: Sequence[Nodes],
@@ -165,7 +165,7 @@ def _rolled(
 
 
 @rule("while")
-def _while(walk: Walk, equation: Equation, *args: Nodes) -> list[Nodes]:
+def _while(walk: JaxprWriter, equation: Equation, *args: Nodes) -> list[Nodes]:
     """Written out where it is known when it ends, and that is soon; else a loop of C.
 
     In a batch each member goes on for as long as its own condition holds.

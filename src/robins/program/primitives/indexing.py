@@ -14,12 +14,12 @@ import numpy as np
 
 from robins.program.kinds import Equation
 from robins.program.nodes import Node
-from robins.program.walk import Nodes, Walk, rule
+from robins.program.walk import JaxprWriter, Nodes, rule
 
 SIZES = tuple[int, ...]
 
 
-def _clamped(walk: Walk, index: Node, most: int) -> Node:
+def _clamped(walk: JaxprWriter, index: Node, most: int) -> Node:
     """An index between 0 and the most it may be."""
     graph = walk.graph
     kind = graph.kind[index]
@@ -29,7 +29,7 @@ def _clamped(walk: Walk, index: Node, most: int) -> Node:
     return graph.apply("min", lowest, graph.constant(most, kind))
 
 
-def window(walk: Walk, a: Nodes, start: list[Node], sizes: SIZES) -> Nodes:
+def window(walk: JaxprWriter, a: Nodes, start: list[Node], sizes: SIZES) -> Nodes:
     """A window of an array, moved inside where it would reach beyond."""
     graph = walk.graph
     for axis, (index, size) in enumerate(zip(start, sizes, strict=True)):
@@ -45,7 +45,7 @@ def window(walk: Walk, a: Nodes, start: list[Node], sizes: SIZES) -> Nodes:
     return a
 
 
-def _inside(walk: Walk, start: list[Node], shape: SIZES, sizes: SIZES) -> Node:
+def _inside(walk: JaxprWriter, start: list[Node], shape: SIZES, sizes: SIZES) -> Node:
     """Flag of a window that lies inside an array."""
     graph = walk.graph
     found = graph.constant(True, "flag")
@@ -60,7 +60,7 @@ def _inside(walk: Walk, start: list[Node], shape: SIZES, sizes: SIZES) -> Node:
 
 
 def _places(
-    walk: Walk, start: list[Node], shape: SIZES, sizes: SIZES
+    walk: JaxprWriter, start: list[Node], shape: SIZES, sizes: SIZES
 ) -> Iterator[tuple[tuple[slice, ...], Node]]:
     """Every window that a start may mean, and whether it does."""
     graph = walk.graph
@@ -77,12 +77,14 @@ def _places(
 
 
 @rule("dynamic_slice")
-def _dynamic_slice(walk: Walk, equation: Equation, a: Nodes, *start: Nodes) -> Nodes:
+def _dynamic_slice(walk: JaxprWriter, equation: Equation, a: Nodes, *start: Nodes) -> Nodes:
     return window(walk, a, [s.item() for s in start], tuple(equation.params["slice_sizes"]))
 
 
 @rule("dynamic_update_slice")
-def _dynamic_update(walk: Walk, equation: Equation, a: Nodes, new: Nodes, *start: Nodes) -> Nodes:
+def _dynamic_update(
+    walk: JaxprWriter, equation: Equation, a: Nodes, new: Nodes, *start: Nodes
+) -> Nodes:
     out = a.copy()
     most = [n - size for n, size in zip(a.shape, new.shape, strict=True)]
     inside = [_clamped(walk, s.item(), m) for s, m in zip(start, most, strict=True)]
@@ -98,7 +100,7 @@ def _drops(equation: Equation) -> bool:
 
 
 def _starts(
-    walk: Walk,
+    walk: JaxprWriter,
     indices: Nodes,
     batch: tuple[int, ...],
     rank: int,
@@ -181,7 +183,7 @@ def scattered(
 
 
 @rule("gather")
-def _gather(walk: Walk, equation: Equation, a: Nodes, indices: Nodes) -> Nodes:
+def _gather(walk: JaxprWriter, equation: Equation, a: Nodes, indices: Nodes) -> Nodes:
     known = walk.known(indices)
     if known is not None:
         at = gathered(equation, known, np.arange(a.size).reshape(a.shape))
@@ -231,7 +233,7 @@ JOINED = {
 
 
 @rule(*JOINED)
-def _scatter(walk: Walk, equation: Equation, a: Nodes, indices: Nodes, new: Nodes) -> Nodes:
+def _scatter(walk: JaxprWriter, equation: Equation, a: Nodes, indices: Nodes, new: Nodes) -> Nodes:
     d, join = equation.params["dimension_numbers"], JOINED[equation.primitive.name]
     windows = [int(k) for k in d.update_window_dims]
     others = [k for k in range(new.ndim) if k not in windows]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from robins.program.kinds import Equation
-from robins.program.walk import Nodes, Walk, rule
+from robins.program.walk import JaxprWriter, Nodes, rule
 
 
 @rule("broadcast_in_dim")
-def _broadcast(walk: Walk, equation: Equation, a: Nodes, *dynamic: Nodes) -> Nodes:
+def _broadcast(walk: JaxprWriter, equation: Equation, a: Nodes, *dynamic: Nodes) -> Nodes:
     shape = tuple(equation.params["shape"])
     axes = equation.params["broadcast_dimensions"]
     wide = [1] * len(shape)
@@ -19,49 +19,49 @@ def _broadcast(walk: Walk, equation: Equation, a: Nodes, *dynamic: Nodes) -> Nod
 
 
 @rule("reshape")
-def _reshape(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+def _reshape(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     return a.reshape(equation.params["new_sizes"])
 
 
 @rule("transpose")
-def _transpose(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+def _transpose(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     return a.transpose(equation.params["permutation"])
 
 
 @rule("squeeze")
-def _squeeze(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+def _squeeze(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     return a.squeeze(tuple(equation.params["dimensions"]))
 
 
 @rule("expand_dims")
-def _expand(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+def _expand(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     return np.expand_dims(a, tuple(equation.params["dimensions"]))
 
 
 @rule("slice")
-def _slice(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+def _slice(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     p = equation.params
     strides = p["strides"] or (1,) * a.ndim
     return a[tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]
 
 
 @rule("concatenate")
-def _concatenate(walk: Walk, equation: Equation, *arrays: Nodes) -> Nodes:
+def _concatenate(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> Nodes:
     return np.concatenate(arrays, axis=equation.params["dimension"])
 
 
 @rule("stack")
-def _stack(walk: Walk, equation: Equation, *arrays: Nodes) -> Nodes:
+def _stack(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> Nodes:
     return np.stack(arrays, axis=equation.params["axis"])
 
 
 @rule("tile")
-def _tile(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+def _tile(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     return np.tile(a, equation.params["reps"])
 
 
 @rule("split", "unstack")
-def _split(walk: Walk, equation: Equation, a: Nodes) -> list[Nodes]:
+def _split(walk: JaxprWriter, equation: Equation, a: Nodes) -> list[Nodes]:
     if equation.primitive.name == "unstack":
         return [np.asarray(row) for row in np.moveaxis(a, equation.params["axis"], 0)]
     ends = np.cumsum(equation.params["sizes"])[:-1]
@@ -69,12 +69,12 @@ def _split(walk: Walk, equation: Equation, a: Nodes) -> list[Nodes]:
 
 
 @rule("rev")
-def _rev(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+def _rev(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     return np.flip(a, tuple(equation.params["dimensions"]))
 
 
 @rule("iota")
-def _iota(walk: Walk, equation: Equation, *dynamic: Nodes) -> Nodes:
+def _iota(walk: JaxprWriter, equation: Equation, *dynamic: Nodes) -> Nodes:
     p = equation.params
     along = [1] * len(p["shape"])
     along[p["dimension"]] = -1
@@ -83,7 +83,7 @@ def _iota(walk: Walk, equation: Equation, *dynamic: Nodes) -> Nodes:
 
 
 @rule("pad")
-def _pad(walk: Walk, equation: Equation, a: Nodes, filling: Nodes) -> Nodes:
+def _pad(walk: JaxprWriter, equation: Equation, a: Nodes, filling: Nodes) -> Nodes:
     config = equation.params["padding_config"]
     sizes = [
         max(0, low + high + n + max(0, n - 1) * inner)

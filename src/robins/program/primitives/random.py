@@ -23,12 +23,12 @@ import numpy as np
 from robins.program.kinds import Equation, kind_of
 from robins.program.nodes import Node
 from robins.program.refusal import ProgramError
-from robins.program.walk import Nodes, Walk, rule
+from robins.program.walk import JaxprWriter, Nodes, rule
 
 HALF = 32  # bits of a word
 
 
-def joined(walk: Walk, first: Node, second: Node) -> Node:
+def joined(walk: JaxprWriter, first: Node, second: Node) -> Node:
     """Two words as one number of 64 bits."""
     graph = walk.graph
     wide = graph.convert(first, "word64")
@@ -36,14 +36,16 @@ def joined(walk: Walk, first: Node, second: Node) -> Node:
     return graph.apply("or", high, graph.convert(second, "word64"))
 
 
-def words(walk: Walk, both: Node) -> tuple[Node, Node]:
+def words(walk: JaxprWriter, both: Node) -> tuple[Node, Node]:
     """The two words of a number of 64 bits."""
     graph = walk.graph
     high = graph.apply("shift_right", both, graph.constant(HALF, "word64"))
     return graph.convert(high, "word"), graph.convert(both, "word")
 
 
-def numbered(walk: Walk, keys: Nodes, shape: tuple[int, ...], row: Node | None = None) -> Nodes:
+def numbered(
+    walk: JaxprWriter, keys: Nodes, shape: tuple[int, ...], row: Node | None = None
+) -> Nodes:
     """Numbers of a generator for each key and the counts from 0, in the order of a shape.
 
     Where a row is given, of this shape, the numbers go on from those of the rows before it.
@@ -65,7 +67,7 @@ def numbered(walk: Walk, keys: Nodes, shape: tuple[int, ...], row: Node | None =
 
 
 @rule("random_seed")
-def _seed(walk: Walk, equation: Equation, seeds: Nodes) -> Nodes:
+def _seed(walk: JaxprWriter, equation: Equation, seeds: Nodes) -> Nodes:
     kind_of(equation.outvars[0].aval.dtype)  # refuses other generators
     graph, narrow = walk.graph, equation.invars[0].aval.dtype.itemsize < 8
 
@@ -76,36 +78,36 @@ def _seed(walk: Walk, equation: Equation, seeds: Nodes) -> Nodes:
 
 
 @rule("random_wrap")
-def _wrap(walk: Walk, equation: Equation, data: Nodes) -> Nodes:
+def _wrap(walk: JaxprWriter, equation: Equation, data: Nodes) -> Nodes:
     kind_of(equation.outvars[0].aval.dtype)
     return walk.each(lambda a, b: joined(walk, a, b), data[..., 0], data[..., 1])
 
 
 @rule("random_unwrap")
-def _unwrap(walk: Walk, equation: Equation, keys: Nodes) -> Nodes:
+def _unwrap(walk: JaxprWriter, equation: Equation, keys: Nodes) -> Nodes:
     found = [words(walk, key) for key in keys.ravel().tolist()]
     return np.array(found, dtype=np.int64).reshape((*keys.shape, 2))
 
 
 @rule("random_fold_in")
-def _fold_in(walk: Walk, equation: Equation, keys: Nodes, numbers: Nodes) -> Nodes:
+def _fold_in(walk: JaxprWriter, equation: Equation, keys: Nodes, numbers: Nodes) -> Nodes:
     graph = walk.graph
     wide = walk.each(lambda n: graph.convert(graph.convert(n, "word"), "word64"), numbers)
     return walk.apply("threefry", keys, wide)
 
 
 @rule("random_split")
-def _split(walk: Walk, equation: Equation, keys: Nodes) -> Nodes:
+def _split(walk: JaxprWriter, equation: Equation, keys: Nodes) -> Nodes:
     return numbered(walk, keys, tuple(equation.params["shape"]))
 
 
 @rule("random_bits")
-def _bits(walk: Walk, equation: Equation, keys: Nodes) -> Nodes:
+def _bits(walk: JaxprWriter, equation: Equation, keys: Nodes) -> Nodes:
     return bits_of(walk, keys, tuple(equation.params["shape"]), equation.outvars[0].aval.dtype)
 
 
 def bits_of(
-    walk: Walk, keys: Nodes, shape: tuple[int, ...], dtype: Any, row: Node | None = None
+    walk: JaxprWriter, keys: Nodes, shape: tuple[int, ...], dtype: Any, row: Node | None = None
 ) -> Nodes:
     """Random bits; of a row those that its entries have in the whole array."""
     kind = kind_of(dtype)
@@ -116,7 +118,7 @@ def bits_of(
 
 
 @rule("threefry2x32")
-def _threefry(walk: Walk, equation: Equation, *words_of: Nodes) -> list[Nodes]:
+def _threefry(walk: JaxprWriter, equation: Equation, *words_of: Nodes) -> list[Nodes]:
     """The generator itself, on two words of a key and two of a number."""
 
     def both(*four: Node) -> Node:

@@ -8,7 +8,7 @@ import numpy as np
 
 from robins.program.kinds import Equation, kind_of
 from robins.program.nodes import Node
-from robins.program.walk import RULES, Nodes, Walk, rule
+from robins.program.walk import RULES, JaxprWriter, Nodes, rule
 
 REDUCED = {
     "reduce_sum": ("add", 0),
@@ -21,7 +21,7 @@ REDUCED = {
 }
 
 
-def _empty(walk: Walk, kind: str, number: float | int) -> Node:
+def _empty(walk: JaxprWriter, kind: str, number: float | int) -> Node:
     """Value of a reduction of nothing."""
     if kind == "whole" and not np.isfinite(number):
         number = np.iinfo(np.int64).min if number < 0 else np.iinfo(np.int64).max
@@ -29,7 +29,7 @@ def _empty(walk: Walk, kind: str, number: float | int) -> Node:
 
 
 def fold(
-    walk: Walk, op: str, number: float | int, a: Nodes, axes: tuple[int, ...], kind: str
+    walk: JaxprWriter, op: str, number: float | int, a: Nodes, axes: tuple[int, ...], kind: str
 ) -> Nodes:
     """An array with some axes reduced, in the order of its entries."""
     kept = [axis for axis in range(a.ndim) if axis not in axes]
@@ -42,7 +42,7 @@ def fold(
     return np.array(found, dtype=np.int64).reshape(rows.shape[:-1])
 
 
-def _finite(walk: Walk, row: list[Node]) -> list[Node]:
+def _finite(walk: JaxprWriter, row: list[Node]) -> list[Node]:
     """Flags of which all must hold, with those that numbers are finite made one.
 
     x - x is zero of a finite number, NaN of any other: a sum of them is zero if all are finite, and
@@ -59,7 +59,7 @@ def _finite(walk: Walk, row: list[Node]) -> list[Node]:
 
 
 def _reduced(op: str, number: float | int):
-    def of(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+    def of(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
         kind = kind_of(equation.invars[0].aval.dtype)
         return fold(walk, op, number, a, tuple(map(int, equation.params["axes"])), kind)
 
@@ -72,7 +72,7 @@ CUMULATED = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"
 
 
 def _cumulated(op: str):
-    def of(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+    def of(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
         axis, back = equation.params["axis"], equation.params["reverse"]
         rows = np.moveaxis(np.flip(a, axis) if back else a, axis, 0)
         out = [np.asarray(row) for row in rows]
@@ -88,7 +88,7 @@ RULES.update({name: _cumulated(op) for name, op in CUMULATED.items()})
 
 
 @rule("argmax", "argmin")
-def _arg(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
+def _arg(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     """The first place of the extreme; a NaN is more extreme than any number."""
     graph, (axis,) = walk.graph, equation.params["axes"]
     most = equation.primitive.name == "argmax"
@@ -111,7 +111,7 @@ def _arg(walk: Walk, equation: Equation, a: Nodes) -> Nodes:
 
 
 @rule("sort")
-def _sort(walk: Walk, equation: Equation, *arrays: Nodes) -> list[Nodes]:
+def _sort(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> list[Nodes]:
     """Stable, by exchanges of neighbours: n (n - 1) / 2 comparisons, none of them a branch."""
     axis, keys = equation.params["dimension"], equation.params["num_keys"]
     graph = walk.graph

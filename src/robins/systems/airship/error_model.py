@@ -18,10 +18,10 @@ that of `robins.earth`, which above the ellipsoid has a small north component.
 Eq. (40) in print has two slips: the last cross product has the true rates in the place of their
 errors, which all but cancels the term before it, and the rates of dlat and dlon are exchanged.
 
-As a filter (`Fed`) the SINS navigates along with the estimate of its errors; once a step the
-estimate is taken off the SINS, and the errors start again at zero. It is the total-state form of
-`model` written differently, so it serves as its check; the paper's local filters are not built on
-it.
+As a filter (`CorrectedSins`) the SINS navigates along with the estimate of its errors; once a step
+the estimate is taken off the SINS, and the errors start again at zero. It is the total-state form
+of `model` written differently, so it serves as its check; the paper's local filters are not built
+on it.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from robins.manifold import wrap
 from robins.rotation import Rotation, conjugate, rotate
 from robins.systems.airship.model import States, believed_noise, walk
 from robins.systems.airship.parameters import Airship
-from robins.systems.airship.world import Course, start_sigma
+from robins.systems.airship.world import AirshipCourse, start_sigma
 
 PHI, VELOCITY = slice(0, 3), slice(3, 6)
 LON, LAT, ALT = 6, 7, 8
@@ -139,7 +139,7 @@ def error_rate(
 
     here = surroundings(sins.lat, sins.alt, v)
     true = surroundings(sins.lat - x[LAT], sins.alt - x[ALT], v - dv)
-    d = Surroundings(*(a - b for a, b in zip(here, true, strict=True)))
+    d = EarthRates(*(a - b for a, b in zip(here, true, strict=True)))
 
     w_nc = (jnp.eye(3) - C_cn) @ here.omega_in + C_cn @ d.omega_in - gyro_c
     dv_rate = f_c - C_cn.T @ (f_c - accel_c) - jnp.cross(d.coriolis, v)
@@ -209,7 +209,7 @@ def error_from_tangent(lat_rad: ArrayLike, alt_m: ArrayLike) -> Float[Array, "9 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Fed:
+class CorrectedSins:
     """A SINS and its errors x = (phi, dv, dlon, dlat, dalt), computed minus true; ENU, SI."""
 
     sins: Nav
@@ -221,11 +221,11 @@ class Fed:
         "x": "errors of the SINS, ENU: rad; m/s; longitude, latitude rad; height m",
     }
 
-    def retract(self, delta: Array) -> Fed:
+    def retract(self, delta: Array) -> CorrectedSins:
         """Add to the errors."""
-        return Fed(self.sins, self.x + delta)
+        return CorrectedSins(self.sins, self.x + delta)
 
-    def local(self, other: Fed) -> Array:
+    def local(self, other: CorrectedSins) -> Array:
         """Errors of this SINS, were the other state true, less those it has here."""
         return error_between(self.sins, other.nav) - self.x
 
@@ -235,12 +235,12 @@ class Fed:
         return corrected(self.sins, self.x)
 
 
-def _motion(given: Airship, course: Course) -> Motion:
-    """Motion of a `Fed`; input of a step: one increment. Wants the rule `feedback`."""
+def _motion(given: Airship, course: AirshipCourse) -> Motion:
+    """Motion of a `CorrectedSins`; input of a step: one increment. Wants the rule `feedback`."""
     return Motion(_step, Partial(_noise, believed_noise(given), course.datum.metres))
 
 
-def _step(fed: Fed, block: Increments) -> Fed:
+def _step(fed: CorrectedSins, block: Increments) -> CorrectedSins:
     """The SINS over the block, and its errors by (40) about the middle of it."""
     before, after = fed.sins, navigate(fed.sins, block)
     half = Rotation.from_rotvec(0.5 * block.theta)
@@ -251,10 +251,12 @@ def _step(fed: Fed, block: Increments) -> Fed:
         Geodetic(0.5 * (p.lat + q.lat), p.lon, 0.5 * (p.alt + q.alt)),
     )
     force_b = rotate(conjugate(half.wxyz), block.dv / block.dt)
-    return Fed(after, step(fed.x, sins_at(middle, force_b), block.dt))
+    return CorrectedSins(after, step(fed.x, sins_at(middle, force_b), block.dt))
 
 
-def _noise(noise: InsNoise, metres_per_radian: Array, fed: Fed, block: Increments) -> Array:
+def _noise(
+    noise: InsNoise, metres_per_radian: Array, fed: CorrectedSins, block: Increments
+) -> Array:
     """Process noise as of the total state; longitude and latitude in radians."""
     per_metre = jnp.concatenate([jnp.ones(6), 1.0 / metres_per_radian[::-1], jnp.ones(1)])
     return per_metre[:, None] * walk(noise, block.dt)
@@ -268,7 +270,7 @@ class Feedback(Rule):
 
     def settle(self, memory: Memory, belief: Belief):
         nav = belief.mean.nav
-        return memory, Belief(Fed(nav, jnp.zeros(9)), belief.factor), int(Code.DONE)
+        return memory, Belief(CorrectedSins(nav, jnp.zeros(9)), belief.factor), int(Code.DONE)
 
 
 def feedback() -> Rule:
@@ -276,13 +278,13 @@ def feedback() -> Rule:
     return Feedback()
 
 
-def _start_sigma(given: Airship, course: Course) -> list[Numbers]:
+def _start_sigma(given: Airship, course: AirshipCourse) -> list[Numbers]:
     """East, north, up; longitude and latitude in radians."""
     enu = start_sigma(given).reshape(3, 3)[:, [1, 0, 2]].ravel()
     return [enu / np.array([*np.ones(6), *course.datum.metres[::-1], 1.0])]
 
 
-def _reported(course: Course) -> np.ndarray:
+def _reported(course: AirshipCourse) -> np.ndarray:
     """True minus estimated in metres: errors of velocity and position are the other way round."""
     north, east = course.datum.metres
     return np.diag([1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -east, -north, -1.0])
@@ -290,13 +292,13 @@ def _reported(course: Course) -> np.ndarray:
 
 ERRORS = States(
     _motion,
-    lambda nav, gyro, accel, wind: Fed(nav, jnp.zeros((*wind.shape[:-1], 9))),
+    lambda nav, gyro, accel, wind: CorrectedSins(nav, jnp.zeros((*wind.shape[:-1], 9))),
     _start_sigma,
     _reported,
 )
 
 
-class Surroundings(NamedTuple):
+class EarthRates(NamedTuple):
     """Quantities that depend on position and velocity; ENU."""
 
     omega_in: Array  # rad/s, w_ie + w_en
@@ -305,13 +307,13 @@ class Surroundings(NamedTuple):
     lonlat_rate: Array  # rad/s
 
 
-def surroundings(lat: Array, alt: Array, v: Array) -> Surroundings:
+def surroundings(lat: Array, alt: Array, v: Array) -> EarthRates:
     """Rates, gravity and how the place changes [rad/s], at a place and velocity (ENU)."""
     omega_ie = swap(earth_rate_n(lat))
     omega_en = swap(transport_rate_n(lat, alt, swap(v)))
     meridian, transverse = curvature_radii(lat)
     lonlat_rate = [v[0] / ((transverse + alt) * jnp.cos(lat)), v[1] / (meridian + alt)]
-    return Surroundings(
+    return EarthRates(
         omega_ie + omega_en,
         2.0 * omega_ie + omega_en,
         swap(gravity_n(lat, alt)),

@@ -44,7 +44,7 @@ from robins.sim.star_sensor import observe_euler
 from robins.systems.airship.error_model import error_from_tangent
 from robins.systems.airship.model import WithWind, navigation
 from robins.systems.airship.parameters import AirData, Airship
-from robins.systems.airship.world import AIR, Course, Datum, World, present
+from robins.systems.airship.world import AIR, AirshipCourse, AirshipWorld, Datum, sampled_at
 from robins.systems.study import Instrument, SensorAxes
 
 SAR = "sar_barometer"  # of the paper's first local filter: one vector
@@ -73,17 +73,17 @@ def read_sar(datum: Datum, x: Any, aux: Any) -> tuple[Array, Angle, Array]:
     return level(datum, p), Angle(q_nb.as_euler()[2]), jnp.reshape(p.alt, (1,))
 
 
-def _measure_sar(given: Airship, course: Course, key: Keys, world: World):
+def _measure_sar(given: Airship, course: AirshipCourse, key: Keys, world: AirshipWorld):
     """Measurements as `read_sar`: (E, 2) position, (E,) heading, (E, 1) height."""
     s, b, (q, _, position) = given.sar, given.barometer, world.truth
     errors = SarErrorModel(s.position, s.heading, s.outlier_share, s.outlier_factor)
-    seen, heard = (jnp.asarray(present(course.epoch_s, of)) for of in (s, b))
+    seen, baro_present = (jnp.asarray(sampled_at(course.epoch_s, of)) for of in (s, b))
     fix = observe_sar(errors, key(Component.SAR), position, to_euler(q.wxyz)[2], seen)
-    height = observe_height(key(Component.BAROMETER), position.alt, b.height, heard)
+    height = observe_height(key(Component.BAROMETER), position.alt, b.height, baro_present)
     return level(course.datum, fix.position), Angle(fix.heading_rad), height[:, None]
 
 
-def _believed_sar(given: Airship, course: Course) -> Sensor:
+def _believed_sar(given: Airship, course: AirshipCourse) -> Sensor:
     s = given.sar
     sigma = jnp.array([s.position, s.position, s.heading, given.barometer.height])
     return Sensor(Partial(read_sar, course.datum), sigma, 4, SAR)
@@ -100,7 +100,7 @@ RADAR = Instrument(
 # ------------------------------------------------------------------------------------- stars
 
 
-class Early(NamedTuple):
+class EarlySights(NamedTuple):
     """Inputs of sights before the end of an epoch, besides the state."""
 
     turned_b: ArrayLike  # (S - 1, 3) rad, raw turn of the body from each to the end
@@ -112,7 +112,7 @@ def read_euler(x: Any, aux: Any) -> tuple[Angle, Angle, Angle]:
     return _angles(navigation(x).q_nb)
 
 
-def read_early(x: WithWind, early: Early) -> tuple[Angle, ...]:
+def read_early(x: WithWind, early: EarlySights) -> tuple[Angle, ...]:
     """Pitch, roll, heading at each of the early sights, one after the other.
 
     The body is taken back by what the gyros felt since, and the navigation frame by its turn:
@@ -133,18 +133,18 @@ def _angles(q_nb: Rotation) -> tuple[Angle, Angle, Angle]:
     return Angle(pitch), Angle(roll), Angle(heading)
 
 
-def _measure_star(given: Airship, course: Course, key: Keys, world: World) -> Array:
+def _measure_star(given: Airship, course: AirshipCourse, key: Keys, world: AirshipWorld) -> Array:
     """(E, S, 3) rad, pitch, roll, heading at all sights."""
-    there, sigma = jnp.asarray(present(course.sight_s, given.star)), given.star.attitude
+    there, sigma = jnp.asarray(sampled_at(course.sight_s, given.star)), given.star.attitude
     seen = observe_euler(key(Component.STAR_SENSOR), world.path.q_nb.wxyz, sigma, there)
     return seen.reshape(len(course.epoch_s), course.sights, 3)
 
 
-def _believed_star(given: Airship, course: Course) -> Sensor:
+def _believed_star(given: Airship, course: AirshipCourse) -> Sensor:
     return Sensor(read_euler, jnp.full(3, given.star.attitude), 3, STAR)
 
 
-def _believed_early(given: Airship, course: Course) -> Sensor | None:
+def _believed_early(given: Airship, course: AirshipCourse) -> Sensor | None:
     count = 3 * (course.sights - 1)
     sigma = jnp.full(count, given.star.attitude)
     return Sensor(read_early, sigma, count, STAR_EARLY) if count else None
@@ -154,12 +154,12 @@ def _columns(angles: Array) -> tuple[Angle, ...]:
     return tuple(Angle(angles[:, i]) for i in range(angles.shape[1]))
 
 
-def _taken_early(world: World):
+def _taken_early(world: AirshipWorld):
     early = world.since.shape[1]
     sights = world.readings[STAR][:, :-1].reshape(-1, 3 * early)
     dt = world.whole.dt[:, None] / (early + 1.0)
     age = dt * jnp.arange(early, 0, -1).astype(float)[None]
-    return _columns(sights), Early(world.since, age)
+    return _columns(sights), EarlySights(world.since, age)
 
 
 STARS = Instrument(
@@ -179,35 +179,35 @@ def read_wind(x: Any, v_air_b: ArrayLike) -> Array:
     return thought + x.wind_error if isinstance(x, WithWind) else thought
 
 
-def _measure_air(given: Airship, course: Course, key: Keys, world: World) -> Array:
+def _measure_air(given: Airship, course: AirshipCourse, key: Keys, world: AirshipWorld) -> Array:
     """(E, 3) m/s, velocity through the air, body axes."""
-    there = jnp.asarray(present(course.epoch_s, given.air_data))
+    there = jnp.asarray(sampled_at(course.epoch_s, given.air_data))
     own = jax.random.fold_in(key(Component.AIR_DATA), AIR)
     return observe_air(own, world.air_b, given.air_data.noise, there)
 
 
-def _wind(world: World, wind: Array, air_b: Array) -> tuple[Array, Array]:
+def _wind(world: AirshipWorld, wind: Array, air_b: Array) -> tuple[Array, Array]:
     """Wind, NaN where no air data come, and velocity in the air, as filters take them."""
     there = jnp.isfinite(world.readings[WIND][:, :1])
     return jnp.where(there, wind, jnp.nan), jnp.where(there, air_b, 0.0)
 
 
-def as_measured(world: World) -> tuple[Array, Array]:
+def as_measured(world: AirshipWorld) -> tuple[Array, Array]:
     """Air data and the forecast of the wind."""
     return _wind(world, world.wind + world.wind_error, world.readings[WIND])
 
 
-def as_it_is(world: World) -> tuple[Array, Array]:
+def as_it_is(world: AirshipWorld) -> tuple[Array, Array]:
     """The truth of both."""
     return _wind(world, world.wind, world.air_b)
 
 
-def steady(world: World) -> tuple[Array, Array]:
+def steady(world: AirshipWorld) -> tuple[Array, Array]:
     """Air data, and for the wind what always blows."""
     return _wind(world, jnp.broadcast_to(world.steady_wind, world.wind.shape), world.readings[WIND])
 
 
-def along_the_nose(world: World) -> tuple[Array, Array]:
+def along_the_nose(world: AirshipWorld) -> tuple[Array, Array]:
     """The air speed, forward, as the paper takes it, and the forecast of the wind."""
     speed = jnp.linalg.norm(world.readings[WIND], axis=1)
     air_b = speed[:, None] * jnp.array([[1.0, 0.0, 0.0]])
@@ -217,13 +217,13 @@ def along_the_nose(world: World) -> tuple[Array, Array]:
 def wind_of(
     name: str,
     sigma: Callable[[AirData], float],
-    taken: Callable[[World], tuple[Array, Any]] = as_measured,
+    taken: Callable[[AirshipWorld], tuple[Array, Any]] = as_measured,
     read: Callable[..., Array] = read_wind,
     linear: Callable[..., Any] | None = None,
 ) -> Instrument:
     """The wind as a constraint, believed with a sigma [m/s] on each axis."""
 
-    def believed(given: Airship, course: Course) -> Sensor:
+    def believed(given: Airship, course: AirshipCourse) -> Sensor:
         return Sensor(read, jnp.full(2, sigma(given.air_data)), 2, name, linear)
 
     axes = SensorAxes("m/s", "NED", ("north", "east"))
@@ -235,7 +235,7 @@ SOFT = wind_of(WIND, lambda a: float(np.hypot(a.noise, a.wind_error)))
 """One white noise for air data and wind, where nothing else stands for the error of the wind."""
 
 
-def hard(**given: Any) -> tuple[Instrument, Instrument]:
+def wind_constraints(**given: Any) -> tuple[Instrument, Instrument]:
     """The wind taken for exact, one for each local filter; further arguments as of `wind_of`."""
     one, other = (wind_of(name, lambda a: FLOOR, **given) for name in (WIND, WIND_OF_STAR))
     return one, other
@@ -244,7 +244,7 @@ def hard(**given: Any) -> tuple[Instrument, Instrument]:
 ABOARD = (EARLY_STARS, RADAR, STARS, AIR_DATA)
 """All that the airship carries, in the order of the updates."""
 
-HARD = hard()
+HARD = wind_constraints()
 INSTRUMENTS = (*ABOARD, HARD[1])
 """All that is drawn and shown."""
 
@@ -319,7 +319,7 @@ def printed_wind(x: Any, air: tuple[ArrayLike, Array]):
     return -d, D @ error_from_tangent(x.position.lat, x.position.alt)
 
 
-def _taken_printed(world: World):
+def _taken_printed(world: AirshipWorld):
     wind, air_b = as_measured(world)
     return 0.0 * wind, (air_b, jnp.nan_to_num(wind))
 
@@ -332,7 +332,7 @@ PRINTED_RADAR = RADAR._replace(
 PRINTED_STARS = STARS._replace(
     believed=lambda given, course: replace(_believed_star(given, course), linear=_printed_euler)
 )
-PRINTED_WIND = hard(
+PRINTED_WIND = wind_constraints(
     taken=_taken_printed, read=lambda x, air: printed_wind(x, air)[0], linear=printed_wind
 )
 

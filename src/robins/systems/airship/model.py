@@ -46,7 +46,7 @@ from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav, step
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 from robins.systems.airship.parameters import Airship
-from robins.systems.airship.world import Course, start_sigma
+from robins.systems.airship.world import AirshipCourse, start_sigma
 from robins.systems.parts import noise_of_linear
 
 
@@ -168,12 +168,12 @@ ENU_OF_NED = np.kron(np.eye(3), swap(np.eye(3)))  # (9, 9) of attitude, velocity
 class States(NamedTuple):
     """The states of a filter: how they are believed to move and begin, what they are of a run."""
 
-    motion: Callable[[Airship, Course], Motion]
+    motion: Callable[[Airship, AirshipCourse], Motion]
     # navigation, biases of gyros and accelerometers, error of the wind -> state
     of: Callable[[Nav, Array, Array, Array], Any]
-    sigma: Callable[[Airship, Course], list[Any]]  # at the start, to be put end to end
+    sigma: Callable[[Airship, AirshipCourse], list[Any]]  # at the start, to be put end to end
     # (9, 9) reported = this @ the first nine errors
-    reported: Callable[[Course], np.ndarray] = lambda course: ENU_OF_NED
+    reported: Callable[[AirshipCourse], np.ndarray] = lambda course: ENU_OF_NED
     in_parts: bool = False  # an epoch comes as several increments
 
 
@@ -186,7 +186,7 @@ def _wind(given: Airship) -> WindNoise:
     return WindNoise(jnp.asarray(given.air_data.wind_error), jnp.asarray(given.air_data.wind_time))
 
 
-def _product_motion(given: Airship, course: Course) -> Motion:
+def _product_motion(given: Airship, course: AirshipCourse) -> Motion:
     imu, factor = given.imu, given.believed.accel_noise_factor
     noise = InsNoise(jnp.asarray(imu.gyro_noise), factor * jnp.asarray(imu.accel_noise))
     return with_wind(with_biases(noise), _wind(given))

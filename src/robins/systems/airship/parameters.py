@@ -12,17 +12,17 @@ import pydantic
 
 from robins.scenario import Parameters, Quantity, Share, Span, default
 from robins.systems import quantities as q
-from robins.systems.parts import Draw, Names, Place, Runs, refuse_too_long
+from robins.systems.parts import Draw, Names, Runs, StartPlace, refuse_too_long
 from robins.systems.study import Scenario
 
 
-class Position(Place):
+class Position(StartPlace):
     """Position at the start of the flight."""
 
     height: Annotated[float, Quantity("length", least="0 m", most="100 km")]
 
 
-class Hull(Parameters):
+class AirshipBody(Parameters):
     """Motion of the airship: velocity through the air, and time constant of the drift."""
 
     air_speed: q.SpeedSize = default("10 m/s")
@@ -76,7 +76,7 @@ class Wind(Parameters):
         return self
 
 
-class Imu(Parameters):
+class AirshipImu(Parameters):
     """The inertial unit; biases are constant in a run."""
 
     rate: q.Frequency = default("100 Hz")
@@ -88,14 +88,14 @@ class Imu(Parameters):
     unsensed: Share = 0.0  # share of the acceleration by gusts that the accelerometers do not feel
 
 
-class Readings(Parameters):
+class InstrumentRate(Parameters):
     """Parameters of every instrument but the inertial unit: rate and outages."""
 
     rate: q.Frequency = default("1 Hz")
     lost: tuple[Span, ...] = ()
 
 
-class Sar(Readings):
+class Sar(InstrumentRate):
     """Horizontal position and heading from a radar image matched with a map."""
 
     position: q.Length = default("25 m")  # each axis
@@ -104,20 +104,20 @@ class Sar(Readings):
     outlier_factor: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 5.0
 
 
-class Barometer(Readings):
+class Barometer(InstrumentRate):
     """Height from static pressure."""
 
     height: q.Length = default("20 m")
 
 
-class Star(Readings):
+class AirshipStar(InstrumentRate):
     """Pitch, roll and heading from stars, once an epoch or several times."""
 
     rate: q.Frequency = default("2 Hz")
     attitude: q.Spread = default("20 arcsec")
 
 
-class AirData(Readings):
+class AirData(InstrumentRate):
     """Velocity through the air, and what is thought to be the wind: both err."""
 
     noise: q.Speed = default("0.3 m/s")  # each axis
@@ -125,7 +125,7 @@ class AirData(Readings):
     wind_time: q.Duration = default("50 s")
 
 
-class Start(Parameters):
+class AirshipStart(Parameters):
     """Uncertainty at the start, in north, east, down; one standard deviation."""
 
     attitude: q.AngleSizes
@@ -162,14 +162,14 @@ class Airship(Scenario):
     epoch: q.Duration = default("1 s")  # step of the filters
     counted: Span = Span(begin=200.0, end=800.0)  # figures pooled over time are of this span
     place: Position
-    hull: Hull = pydantic.Field(default_factory=Hull)
+    hull: AirshipBody = pydantic.Field(default_factory=AirshipBody)
     wind: Wind = pydantic.Field(default_factory=Wind)
-    imu: Imu = pydantic.Field(default_factory=Imu)
+    imu: AirshipImu = pydantic.Field(default_factory=AirshipImu)
     sar: Sar = pydantic.Field(default_factory=Sar)
     barometer: Barometer = pydantic.Field(default_factory=Barometer)
-    star: Star = pydantic.Field(default_factory=Star)
+    star: AirshipStar = pydantic.Field(default_factory=AirshipStar)
     air_data: AirData = pydantic.Field(default_factory=AirData)
-    start: Start
+    start: AirshipStart
     believed: BelievedNoise = pydantic.Field(default_factory=BelievedNoise)
 
     @pydantic.model_validator(mode="after")
@@ -183,7 +183,7 @@ class Airship(Scenario):
             if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
                 of = "star.rate" if name == "imu" else "that of the epochs"
                 raise ValueError(f"{name}.rate must be a multiple of {of}, {among:g} Hz")
-        others = (name for name, of in self if isinstance(of, Readings) and name != "star")
+        others = (name for name, of in self if isinstance(of, InstrumentRate) and name != "star")
         for name in others:  # read at the end of an epoch
             ratio = 1.0 / (self.epoch * getattr(self, name).rate)
             if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:

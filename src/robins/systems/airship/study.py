@@ -20,13 +20,13 @@ from jaxtyping import Array
 from robins import filters
 from robins.filters import Belief, Filter, Model, Rule, kalman, rules, taylor
 from robins.manifold import retract
-from robins.systems.aboard import Taken, aboard, taken
+from robins.systems.aboard import Taken, filter_instruments, taken
 from robins.systems.airship import instruments
 from robins.systems.airship.error_model import ERRORS, feedback
 from robins.systems.airship.instruments import SAR, STAR, WIND, WIND_OF_STAR
 from robins.systems.airship.model import NINE, PRODUCT, WIND_STATES, States
 from robins.systems.airship.parameters import Airship
-from robins.systems.airship.world import Course, World, lay_out, simulate
+from robins.systems.airship.world import AirshipCourse, AirshipWorld, lay_out, simulate
 from robins.systems.judgement import Claim, Metric, ratio_claims
 from robins.systems.parts import ENU
 from robins.systems.study import Case, Contender, Instrument, Norm, Recipe, StateBlock, Study, View
@@ -110,10 +110,10 @@ PLAIN = (instruments.RADAR, instruments.STARS)
 HARD = (*PLAIN, *instruments.HARD)
 SOFT = (*PLAIN, instruments.SOFT)
 WINDY = (*PLAIN, instruments.AIR_DATA)
-KNOWN = (*PLAIN, *instruments.hard(taken=instruments.steady))
-EXACT = (*PLAIN, *instruments.hard(taken=instruments.as_it_is))
+KNOWN = (*PLAIN, *instruments.wind_constraints(taken=instruments.steady))
+EXACT = (*PLAIN, *instruments.wind_constraints(taken=instruments.as_it_is))
 PRINTED = (instruments.PRINTED_RADAR, instruments.PRINTED_STARS)
-SIDESLIP = (*PLAIN, *instruments.hard(taken=instruments.along_the_nose))
+SIDESLIP = (*PLAIN, *instruments.wind_constraints(taken=instruments.along_the_nose))
 
 CANDIDATES: dict[str, Candidate] = {
     "ekf": Candidate(lambda: _two(ekf), PLAIN),
@@ -152,7 +152,7 @@ CANDIDATES: dict[str, Candidate] = {
 """Every filter of the study."""
 
 
-def as_case(states: States, of: Taken, sigma: Array, world: World) -> Case:
+def as_case(states: States, of: Taken, sigma: Array, world: AirshipWorld) -> Case:
     """Case of a filter with these sensors, errors at the start of sigma (n,); pure."""
     estimate, zero = retract(world.start, -world.initial_error), jnp.zeros(3)
     count = world.wind.shape[0]
@@ -165,10 +165,10 @@ def as_case(states: States, of: Taken, sigma: Array, world: World) -> Case:
     )
 
 
-def contender(given: Airship, course: Course, name: str) -> Contender:
+def contender(given: Airship, course: AirshipCourse, name: str) -> Contender:
     """A filter with its model, its data, and what it reports."""
     make, taking, states = CANDIDATES[name]
-    sensors, of = aboard(taking, given, course)
+    sensors, of = filter_instruments(taking, given, course)
     sigma = jnp.concatenate([jnp.asarray(s) for s in states.sigma(given, course)])
     return Contender(
         filter=make(),
@@ -191,7 +191,7 @@ BLOCKS = (
 _AROUND_LOSS_S = (-1.0, 100.0, 200.0, 299.0, 350.0, 500.0)  # of which figures are stated
 
 
-def view(given: Airship, course: Course) -> View:
+def view(given: Airship, course: AirshipCourse) -> View:
     """Report of every filter."""
     # an epoch that ends a span belongs to it: 200 s to 800 s are the epochs 200.0 to 800.0
     first, last = (

@@ -33,8 +33,16 @@ from robins.sim.air_data import wind_estimate_error
 from robins.sim.ideal_imu import increments_between
 from robins.sim.imu_sensor import corrupt
 from robins.sim.random import Component, stream
-from robins.sim.wind import Carried, carried_at, carry, dryden, gusts, von_karman, wind_at
-from robins.systems.airship.parameters import Airship, Readings
+from robins.sim.wind import (
+    WindMotion,
+    dryden,
+    gusts,
+    move_in_wind,
+    von_karman,
+    wind_at,
+    wind_motion_at,
+)
+from robins.systems.airship.parameters import Airship, InstrumentRate
 from robins.systems.parts import as_array, outside, signed
 from robins.systems.study import Instrument
 
@@ -55,7 +63,7 @@ class Datum(NamedTuple):
     metres: Array  # (2,) of latitude, longitude
 
 
-class Course(NamedTuple):
+class AirshipCourse(NamedTuple):
     """Data that all runs share."""
 
     epoch_s: np.ndarray  # (E,)
@@ -71,7 +79,7 @@ class Course(NamedTuple):
         return len(self.sight_s) // len(self.epoch_s)
 
 
-class World(NamedTuple):
+class AirshipWorld(NamedTuple):
     """One run; E epochs, NED/FRD."""
 
     whole: Increments  # (E,), (E, 3) as reported, one for an epoch
@@ -90,7 +98,7 @@ class World(NamedTuple):
     readings: dict[str, Any]  # of each instrument, leading axis E; NaN where there is none
 
 
-def lay_out(given: Airship) -> Course:
+def lay_out(given: Airship) -> AirshipCourse:
     """Epochs, sights of the stars and the start, in NumPy.
 
     Raises:
@@ -116,7 +124,7 @@ def lay_out(given: Airship) -> Course:
     samples = round(given.imu.rate / given.star.rate)
     north, east = meridian + place.height, transverse + place.height
     metres = jnp.array([north, east * math.cos(place.latitude)])
-    return Course(
+    return AirshipCourse(
         epoch_s=given.epoch * np.arange(1, count + 1),
         sight_s=np.arange(1, sights + 1) / given.star.rate,
         samples=samples,
@@ -130,7 +138,7 @@ def _towards(direction: float) -> np.ndarray:
     return np.array([math.cos(direction), math.sin(direction)])
 
 
-def present(time_s: np.ndarray, instrument: Readings) -> np.ndarray:
+def sampled_at(time_s: np.ndarray, instrument: InstrumentRate) -> np.ndarray:
     """Mask of the times at which an instrument reads: at its own rate, and not where it is lost."""
     every = round(1.0 / (time_s[0] * instrument.rate))  # the first step is as long as all
     return (np.arange(1, len(time_s) + 1) % every == 0) & outside(instrument.lost, time_s)
@@ -153,7 +161,7 @@ def _attitude(given: Airship, time_s: Numbers):
     return out
 
 
-def blow(given: Airship, key: Array) -> tuple[Array, float]:
+def draw_wind(given: Airship, key: Array) -> tuple[Array, float]:
     """Wind held over steps: (M, 2) m/s north east, and the length of a step [s]."""
     wind, g, t = given.wind, given.wind.gusts, given.wind.turbulence
     step = t.step if t is not None else g.every if g is not None else given.duration
@@ -179,9 +187,11 @@ def _steps(given: Airship, step_s: float) -> int:
     return math.ceil(given.duration / step_s - 1e-9)
 
 
-def _desired(given: Airship, course: Course, carried: Carried, time_s: Float[Array, "n"]) -> Nav:
+def _desired(
+    given: Airship, course: AirshipCourse, carried: WindMotion, time_s: Float[Array, "n"]
+) -> Nav:
     """The motion at times; position only as exactly as gravity and rates need it."""
-    velocity, moved, _ = carried_at(carried, time_s)
+    velocity, moved, _ = wind_motion_at(carried, time_s)
     zero = jnp.zeros_like(time_s)
     start = course.start.position
     north, east = (moved[:, i] / course.datum.metres[i] for i in range(2))
@@ -193,13 +203,17 @@ def _desired(given: Airship, course: Course, carried: Carried, time_s: Float[Arr
 
 
 def simulate(
-    instruments: Sequence[Instrument], given: Airship, course: Course, seed: int, index: Array
-) -> World:
+    instruments: Sequence[Instrument],
+    given: Airship,
+    course: AirshipCourse,
+    seed: int,
+    index: Array,
+) -> AirshipWorld:
     """One run of all instruments, from its number, which may be traced; pure."""
     key = partial(stream, seed, index)
-    wind, step = blow(given, key(Component.WIND))
+    wind, step = draw_wind(given, key(Component.WIND))
     commanded = jnp.asarray(given.hull.air_speed * _towards(given.hull.course))
-    carried = carry(wind, step, commanded, given.hull.response, course.start.v_n[:2])
+    carried = move_in_wind(wind, step, commanded, given.hull.response, course.start.v_n[:2])
     imu, n = given.imu, course.samples
     unit = key(Component.IMU)
     bias = jax.random.split(jax.random.fold_in(unit, _BIASES))
@@ -241,7 +255,7 @@ def simulate(
     blown = wind_at(wind, step, jnp.asarray(course.epoch_s) - 1e-6)  # as the epoch ends
     through = jnp.concatenate([truth.v_n[:, :2] - blown, truth.v_n[:, 2:]], 1)
     a, of_wind = given.air_data, jax.random.fold_in(key(Component.AIR_DATA), WIND_ERROR)
-    world = World(
+    world = AirshipWorld(
         whole=jax.vmap(joined)(single),
         parts=parts,
         since=_turned_since(single),

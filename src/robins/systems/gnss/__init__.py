@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
+from robins.errors import moved
 from robins.systems.gnss.filters import NAMES
 from robins.systems.gnss.log import recorded, replay
 from robins.systems.gnss.model import gnss_model
-from robins.systems.gnss.parameters import City, Replay
+from robins.systems.gnss.parameters import City, GnssReplay
 from robins.systems.gnss.study import CITY
 from robins.systems.study import System
 
@@ -14,7 +15,7 @@ SYSTEM = System(
     studies={"city": CITY},
     default="delays",
     replay_filters=NAMES,
-    replay_parameters=Replay,
+    replay_parameters=GnssReplay,
     replay_default=Path(__file__).parent / "scenarios" / "replay.toml",
     replay=replay,
     recorded=recorded,
@@ -22,4 +23,6 @@ SYSTEM = System(
     replay_finds=("track",),
 )
 
-__all__ = ["SYSTEM", "City", "Replay", "gnss_model", "replay"]
+__all__ = ["SYSTEM", "City", "GnssReplay", "gnss_model", "replay"]
+
+__getattr__ = moved(__name__)

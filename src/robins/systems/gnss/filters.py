@@ -12,24 +12,24 @@ from robins.filters.rule import Rule
 from robins.filters.values import Numbers
 from robins.systems.gnss.model import (
     RANGES,
+    GnssModelKind,
     GnssState,
-    Kind,
-    Place,
-    Travel,
+    LocalFrame,
+    MotionStep,
     gnss_model,
     start_belief,
 )
-from robins.systems.gnss.parameters import Believed, Weights
+from robins.systems.gnss.parameters import GnssAssumptions, RobustWeights
 from robins.systems.gnss.weights import by_component, huber_weight, student_weight, switch_weight
 from robins.systems.study import Case, Contender, Recipe
 
 KINDS = {
-    "ls": Kind(memory=False),
-    "ekf": Kind(),
-    "huber": Kind(),
-    "student-t": Kind(),
-    "switchable": Kind(),
-    "delays": Kind(delays=True),
+    "ls": GnssModelKind(memory=False),
+    "ekf": GnssModelKind(),
+    "huber": GnssModelKind(),
+    "student-t": GnssModelKind(),
+    "switchable": GnssModelKind(),
+    "delays": GnssModelKind(delays=True),
 }
 """Model of the pseudoranges of each filter; "delays" is the default of a replay."""
 
@@ -39,17 +39,17 @@ SMOOTHERS = {f"{name}+rts": name for name, kind in KINDS.items() if kind.memory}
 NAMES = (*KINDS, *SMOOTHERS)
 
 
-class World(NamedTuple):
+class GnssWorld(NamedTuple):
     """A drive as a filter is given it; leading axis E but for the fix."""
 
     fix: Any  # (4 + K,) of `first_fix`, of the first epoch
-    u: Travel
+    u: MotionStep
     y: Any  # measurements by sensor
     sky: Any  # `Sky`
     truth: GnssState | None = None
 
 
-def weighing(name: str, weights: Weights) -> tuple[Rule, ...]:
+def weighing(name: str, weights: RobustWeights) -> tuple[Rule, ...]:
     """The rules of a filter."""
     chosen = {
         "huber": huber_weight(weights.huber),
@@ -62,10 +62,15 @@ def weighing(name: str, weights: Weights) -> tuple[Rule, ...]:
     return (rules.only(RANGES, by_component(chosen[name], name.replace("-", "_"))),)
 
 
-def _case(kind: Kind, believed: Believed, numbers: tuple[Place, Numbers], world: World) -> Case:
+def _case(
+    kind: GnssModelKind,
+    believed: GnssAssumptions,
+    numbers: tuple[LocalFrame, Numbers],
+    world: GnssWorld,
+) -> Case:
     place, member = numbers
     systems = np.shape(member)[1]
-    first = Travel(*(a[0] for a in world.u))
+    first = MotionStep(*(a[0] for a in world.u))
     start = start_belief(believed, kind, world.fix, place, systems, first)
     truth = world.truth
     if truth is not None and not kind.delays:
@@ -73,7 +78,9 @@ def _case(kind: Kind, believed: Believed, numbers: tuple[Place, Numbers], world:
     return Case(start, world.u, world.y, {RANGES: world.sky}, truth)
 
 
-def contender(believed: Believed, place: Place, member: np.ndarray, name: str) -> Contender:
+def contender(
+    believed: GnssAssumptions, place: LocalFrame, member: np.ndarray, name: str
+) -> Contender:
     """A filter with the model it believes in.
 
     Args:

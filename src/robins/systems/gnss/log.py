@@ -9,25 +9,25 @@ from typing import NamedTuple
 import numpy as np
 
 from robins.dataset import OdometryTable, PlaceTable, RangeLog, RangeTable
-from robins.results import Outcome, Progress, silent
+from robins.results import Outcome, Progress, ignore_progress
 from robins.systems import replaying
-from robins.systems.gnss.filters import SMOOTHERS, World, contender
+from robins.systems.gnss.filters import SMOOTHERS, GnssWorld, contender
 from robins.systems.gnss.model import (
     LENGTH,
     POSITION,
     RANGES,
     GnssState,
-    Place,
+    LocalFrame,
+    MotionStep,
     Sky,
-    Travel,
     delay_law,
     first_fix,
     heading_rad,
     sensor_axes,
 )
-from robins.systems.gnss.parameters import Believed, Replay
+from robins.systems.gnss.parameters import GnssAssumptions, GnssReplay
 from robins.systems.gnss.world import length_once
-from robins.systems.replaying import Answer, Piece, Recorded, Reported
+from robins.systems.replaying import FilterEstimates, LogPiece, PreparedLog, ReportedItems
 from robins.systems.study import StateBlock
 from robins.systems.tables import block_array, place_arrays, track_arrays
 
@@ -42,19 +42,19 @@ CAUSES = (
 )
 
 
-class Arranged(NamedTuple):
+class PreparedRangeLog(NamedTuple):
     """A log by epoch, and where its state has its origin."""
 
     epoch_s: np.ndarray  # (E,) since the first epoch
     time_ns: np.ndarray  # (E,)
-    place: Place
+    place: LocalFrame
     member: np.ndarray  # (N, K)
     satellites: tuple[str, ...]
     way_m: np.ndarray  # (E,)
-    world: World
+    world: GnssWorld
 
 
-def arrange(log: RangeLog, believed: Believed) -> Arranged:
+def arrange(log: RangeLog, believed: GnssAssumptions) -> PreparedRangeLog:
     """Every satellite in a column of its own, every time of the receiver an epoch.
 
     The first epoch is the first with pseudoranges of four satellites and odometry; the filter
@@ -87,16 +87,16 @@ def arrange(log: RangeLog, believed: Believed) -> Arranged:
     sky = Sky(sky.satellite_e[epochs], sky.sigma[epochs])
     first = Sky(sky.satellite_e[0], sky.sigma[0])
     fix = first_fix(y[epochs][0], first, member, believed.clock.system_bias)
-    return Arranged(
+    return PreparedRangeLog(
         epoch_s=(time_ns - time_ns[0]) * 1e-9,
         time_ns=time_ns,
-        place=Place.at(fix[:3]),
+        place=LocalFrame.at(fix[:3]),
         member=member,
         satellites=tuple(
             f"{LETTERS.get(s, 'X')}{n}" for s, n in zip(system, numbers.tolist(), strict=True)
         ),
         way_m=way,
-        world=World(
+        world=GnssWorld(
             fix=fix,
             u=u._replace(delay_mean=np.asarray(mean), delay_sigma=np.asarray(spread)),
             y={RANGES: y[epochs], LENGTH: length_once(believed, way)},
@@ -133,7 +133,7 @@ def _filled(x: np.ndarray) -> np.ndarray:
     return np.nan_to_num(np.take_along_axis(x, at, axis=0))
 
 
-def _travel(odometry: OdometryTable, time_ns: np.ndarray) -> tuple[Travel, np.ndarray]:
+def _travel(odometry: OdometryTable, time_ns: np.ndarray) -> tuple[MotionStep, np.ndarray]:
     """The steps between epochs, without delays, and the way (E,) [m] from the first on.
 
     Speed and yaw rate are straight lines between their samples; a step has their means.
@@ -154,13 +154,13 @@ def _travel(odometry: OdometryTable, time_ns: np.ndarray) -> tuple[Travel, np.nd
     speed, rate = (np.diff(x, prepend=x[:1]) / step for x in (way, turn))
     slip, sway = (np.interp(epoch_s, t, x) for x in (odometry.sigma_speed, odometry.sigma_yaw))
     none = np.zeros((len(dt), 0))
-    return Travel(dt, np.abs(speed), rate, slip, sway, none, none), way - way[0]
+    return MotionStep(dt, np.abs(speed), rate, slip, sway, none, none), way - way[0]
 
 
 # ---------------------------------------------------------------------------------------- replay
 
 
-def recorded(log: RangeLog, parameters: Replay) -> Recorded:
+def recorded(log: RangeLog, parameters: GnssReplay) -> PreparedLog:
     """The log as its filters take it, see `System.recorded`.
 
     Raises:
@@ -169,16 +169,16 @@ def recorded(log: RangeLog, parameters: Replay) -> Recorded:
     return _recorded(arrange(log, parameters), parameters)
 
 
-def _recorded(given: Arranged, parameters: Replay) -> Recorded:
-    piece = Piece(world=given.world, begin_s=0.0, epoch_s=given.epoch_s)
-    return Recorded([piece], partial(contender, parameters, given.place, given.member))
+def _recorded(given: PreparedRangeLog, parameters: GnssReplay) -> PreparedLog:
+    piece = LogPiece(world=given.world, begin_s=0.0, epoch_s=given.epoch_s)
+    return PreparedLog([piece], partial(contender, parameters, given.place, given.member))
 
 
 def replay(
     log: RangeLog,
-    parameters: Replay,
+    parameters: GnssReplay,
     filters: tuple[str, ...] = (),
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> Outcome:
     """Navigate a log with the named filters, and report their quality.
 
@@ -194,7 +194,7 @@ def replay(
     given = arrange(log, parameters)
     pieces, make = _recorded(given, parameters)
     wanted = filters or parameters.filters
-    answers = replaying.navigated(pieces, wanted, make, SMOOTHERS, progress)
+    answers = replaying.run_filters(pieces, wanted, make, SMOOTHERS, progress)
     places = {name: given.place.geodetic(a.mean.position) for name, a in answers.items()}
     variables = track_arrays(places.values())
     true = None if log.truth is None else truth_at(log.truth, given)
@@ -208,7 +208,7 @@ def replay(
     return replaying.outcome(
         given.epoch_s,
         answers,
-        Reported(
+        ReportedItems(
             blocks=(POSITION,),
             sensors=sensor_axes(given.satellites),
             estimates=_estimates,
@@ -228,7 +228,7 @@ def replay(
     )
 
 
-def truth_at(truth: PlaceTable, given: Arranged) -> np.ndarray:
+def truth_at(truth: PlaceTable, given: PreparedRangeLog) -> np.ndarray:
     """(E, 3) true places [m, NED] at the epochs, by straight lines; NaN beyond the truth."""
     local = np.asarray(given.place.local(truth.r_e))
     t, epochs = (x - given.time_ns[0] for x in (truth.time_ns, given.time_ns))
@@ -236,7 +236,7 @@ def truth_at(truth: PlaceTable, given: Arranged) -> np.ndarray:
     return np.where(((epochs < t[0]) | (epochs > t[-1]))[:, None], np.nan, out)
 
 
-def accuracy(answer: Answer, true: np.ndarray) -> dict[str, float | int]:
+def accuracy(answer: FilterEstimates, true: np.ndarray) -> dict[str, float | int]:
     """Horizontal and vertical errors, and the NEES of the horizontal place over its two axes."""
     error = true - np.asarray(answer.mean.position)
     known = np.all(np.isfinite(error), axis=1)

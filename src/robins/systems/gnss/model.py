@@ -44,7 +44,7 @@ from robins.earth import OMEGA_E, Geodetic, dcm_en, geodetic_from_ecef
 from robins.filters import Belief, Model, Motion, Sensor
 from robins.filters.belief import Number
 from robins.filters.values import Numbers
-from robins.systems.gnss.parameters import Believed, Clock, Delays
+from robins.systems.gnss.parameters import Delays, GnssAssumptions, ReceiverClock
 from robins.systems.parts import NED
 from robins.systems.study import SensorAxes, StateBlock
 
@@ -66,7 +66,7 @@ class GnssState(NamedTuple):
     delay: Any  # (N,) m, or (0,)
 
 
-class Travel(NamedTuple):
+class MotionStep(NamedTuple):
     """A step of the motion."""
 
     dt: Any  # () s
@@ -85,14 +85,14 @@ class Sky(NamedTuple):
     sigma: Any  # (N,) m
 
 
-class Place(NamedTuple):
+class LocalFrame(NamedTuple):
     """Origin of the frame of the state."""
 
     origin_e: Array  # (3,) m
     C_en: Array  # (3, 3)
 
     @classmethod
-    def at(cls, origin_e: ArrayLike) -> Place:
+    def at(cls, origin_e: ArrayLike) -> LocalFrame:
         """The frame at an Earth-fixed position."""
         lat, lon, _ = geodetic_from_ecef(jnp.asarray(origin_e, float))
         return cls(jnp.asarray(origin_e, float), dcm_en(lat, lon))
@@ -112,7 +112,7 @@ class Place(NamedTuple):
         return Geodetic.from_ecef(self.ecef(position))
 
 
-class Kind(NamedTuple):
+class GnssModelKind(NamedTuple):
     """Model that a filter believes in."""
 
     delays: bool = False  # a state for the delay of each satellite
@@ -125,7 +125,7 @@ def sagnac_m(satellite_e: Numbers, receiver_e: Numbers) -> Numbers:
     return OMEGA_E / LIGHT * (x * receiver_e[..., 1] - y * receiver_e[..., 0])
 
 
-def clock_density(clock: Clock) -> tuple[float, float]:
+def clock_density(clock: ReceiverClock) -> tuple[float, float]:
     """Densities of the noise of clock [m/sqrt(s)] and drift [m/s/sqrt(s)]."""
     return LIGHT * math.sqrt(clock.h0 / 2.0), LIGHT * math.pi * math.sqrt(2.0 * clock.h2)
 
@@ -148,11 +148,11 @@ def _turned(angle: Array, c: Array) -> Array:
     return jnp.stack([k * c[0] - s * c[1], s * c[0] + k * c[1]])
 
 
-def _kept(scales: Array, u: Travel) -> Array:
+def _kept(scales: Array, u: MotionStep) -> Array:
     return jnp.exp(-u.dt / scales[0] - u.speed * u.dt / scales[1])
 
 
-def _step(scales: Array, x: GnssState, u: Travel) -> GnssState:
+def _step(scales: Array, x: GnssState, u: MotionStep) -> GnssState:
     turn = (u.yaw_rate - x.yaw_bias) * u.dt
     way = u.speed * u.dt * _turned(0.5 * turn, x.direction)
     delay = x.delay
@@ -166,7 +166,7 @@ def _step(scales: Array, x: GnssState, u: Travel) -> GnssState:
     )
 
 
-def _noise(memory: bool, numbers: tuple[Array, Array], x: GnssState, u: Travel) -> Array:
+def _noise(memory: bool, numbers: tuple[Array, Array], x: GnssState, u: MotionStep) -> Array:
     (rise, clock, drift), scales = numbers
     root = jnp.sqrt(u.dt)
     slip, sway = u.speed_sigma * u.dt, u.yaw_sigma * u.dt
@@ -180,15 +180,15 @@ def _noise(memory: bool, numbers: tuple[Array, Array], x: GnssState, u: Travel) 
     return jnp.concatenate([place, *rest])
 
 
-def _noise_kept(numbers: tuple[Array, Array], x: GnssState, u: Travel) -> Array:
+def _noise_kept(numbers: tuple[Array, Array], x: GnssState, u: MotionStep) -> Array:
     return _noise(True, numbers, x, u)
 
 
-def _noise_free(numbers: tuple[Array, Array], x: GnssState, u: Travel) -> Array:
+def _noise_free(numbers: tuple[Array, Array], x: GnssState, u: MotionStep) -> Array:
     return _noise(False, numbers, x, u)
 
 
-def pseudoranges(place: Place, member: Array, x: GnssState, sky: Sky) -> Array:
+def pseudoranges(place: LocalFrame, member: Array, x: GnssState, sky: Sky) -> Array:
     """(N,) what the receiver reads [m]."""
     q = place.ecef(x.position)
     r = jnp.sqrt(jnp.sum((sky.satellite_e - q[None, :]) ** 2, axis=-1))
@@ -196,7 +196,7 @@ def pseudoranges(place: Place, member: Array, x: GnssState, sky: Sky) -> Array:
     return rho + x.delay if x.delay.shape[0] else rho
 
 
-def _read(numbers: tuple[Place, Array], x: GnssState, sky: Sky) -> Array:
+def _read(numbers: tuple[LocalFrame, Array], x: GnssState, sky: Sky) -> Array:
     return pseudoranges(*numbers, x, sky)
 
 
@@ -209,7 +209,9 @@ def _length(x: GnssState, aux: Array | None) -> Array:
     return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)[None]
 
 
-def gnss_model(believed: Believed, kind: Kind, place: Place, member: np.ndarray) -> Model:
+def gnss_model(
+    believed: GnssAssumptions, kind: GnssModelKind, place: LocalFrame, member: np.ndarray
+) -> Model:
     """The motion and the sensors.
 
     Args:
@@ -232,7 +234,12 @@ def gnss_model(believed: Believed, kind: Kind, place: Place, member: np.ndarray)
 
 
 def start_belief(
-    believed: Believed, kind: Kind, fix: Numbers, place: Place, systems: int, u: Travel
+    believed: GnssAssumptions,
+    kind: GnssModelKind,
+    fix: Numbers,
+    place: LocalFrame,
+    systems: int,
+    u: MotionStep,
 ) -> Belief:
     """Belief about the first fix; nothing is known of the heading.
 

@@ -19,7 +19,7 @@ from robins.systems.study import Scenario
 Decibels = Annotated[float, pydantic.Field(ge=0.0, le=70.0)]
 
 
-class Clock(Parameters):
+class ReceiverClock(Parameters):
     """The receiver's oscillator, by the coefficients h0 [s] and h_-2 [Hz] of its Allan variance."""
 
     h0: Positive = 2e-19
@@ -28,7 +28,7 @@ class Clock(Parameters):
     system_bias: q.Length = default("10 m")  # of a system's clock against the first
 
 
-class Wheels(Parameters):
+class GnssWheels(Parameters):
     """Odometer and yaw gyro; the log states the white noise of each sample."""
 
     scale: Annotated[float, Quantity("ratio", above="0 ppm")] = default("2 %")
@@ -62,7 +62,7 @@ class Delays(Parameters):
         return self
 
 
-class Weights(Parameters):
+class RobustWeights(Parameters):
     """Robust weights by satellite; the usual constants of their authors."""
 
     huber: Positive = 1.345
@@ -70,16 +70,16 @@ class Weights(Parameters):
     switch: Positive = 1.0
 
 
-class Believed(Parameters):
+class GnssAssumptions(Parameters):
     """Assumptions of every filter."""
 
-    clock: Clock = pydantic.Field(default_factory=Clock)
-    wheels: Wheels = pydantic.Field(default_factory=Wheels)
+    clock: ReceiverClock = pydantic.Field(default_factory=ReceiverClock)
+    wheels: GnssWheels = pydantic.Field(default_factory=GnssWheels)
     delays: Delays = pydantic.Field(default_factory=Delays)
-    weights: Weights = pydantic.Field(default_factory=Weights)
+    weights: RobustWeights = pydantic.Field(default_factory=RobustWeights)
 
 
-class Replay(Believed):
+class GnssReplay(GnssAssumptions):
     """Parameters of a recorded log that its file does not contain."""
 
     system: Literal["gnss"] = "gnss"
@@ -108,7 +108,7 @@ class Streets(Parameters):
     loss_db: Positive = 12.0  # of a reflected signal
 
 
-class City(Scenario, Believed):
+class City(Scenario, GnssAssumptions):
     """A simulated drive through streets that block and reflect."""
 
     system: str = "gnss"

@@ -10,7 +10,7 @@ import xarray as xr
 from robins.systems.gnss import filters, world
 from robins.systems.gnss.model import POSITION, sensor_axes
 from robins.systems.gnss.parameters import City
-from robins.systems.gnss.world import Course
+from robins.systems.gnss.world import GnssCourse
 from robins.systems.judgement import Claim, Metric, Metrics, consistency, nees_claim, ratio
 from robins.systems.study import Contender, Norm, Study, View
 from robins.systems.tables import place_arrays, track_arrays
@@ -18,12 +18,12 @@ from robins.systems.tables import place_arrays, track_arrays
 HORIZONTAL = "horizontal"
 
 
-def contender(city: City, course: Course, name: str) -> Contender:
+def contender(city: City, course: GnssCourse, name: str) -> Contender:
     """A filter with the model it believes in."""
     return filters.contender(city, course.place, course.member, name)
 
 
-def view(city: City, course: Course) -> View:
+def view(city: City, course: GnssCourse) -> View:
     """Report: the position, the true path, the track of each filter in the first run."""
     place = course.place
     p = place.geodetic(course.position)

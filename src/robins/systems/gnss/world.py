@@ -22,32 +22,32 @@ from robins import rotation
 from robins.earth import Geodetic
 from robins.sim.commands import from_commands
 from robins.sim.random import Component, gauss_markov, stream
-from robins.sim.trajectory import Motion
-from robins.systems.gnss.filters import World
+from robins.sim.trajectory import MotionProfile
+from robins.systems.gnss.filters import GnssWorld
 from robins.systems.gnss.model import (
     LENGTH,
     RANGES,
     GnssState,
-    Place,
+    LocalFrame,
+    MotionStep,
     Sky,
-    Travel,
     clock_density,
     delay_law,
     first_fix,
     pseudoranges,
 )
-from robins.systems.gnss.parameters import Believed, City
+from robins.systems.gnss.parameters import City, GnssAssumptions
 
 _ORBIT_M = 26.56e6  # radius of a GPS orbit
 _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 _MULTIPATH_S = 10.0  # correlation time of the multipath of a signal in direct sight
 
 
-class Course(NamedTuple):
+class GnssCourse(NamedTuple):
     """Data that all runs share; E epochs, N satellites."""
 
     epoch_s: np.ndarray  # (E,)
-    place: Place
+    place: LocalFrame
     member: np.ndarray  # (N, 1)
     satellites: tuple[str, ...]
     satellite_e: np.ndarray  # (N, 3) m; they stand still: 0.5 deg in a minute counts for nothing
@@ -61,7 +61,7 @@ class Course(NamedTuple):
     way_m: np.ndarray  # (E,) along the road
 
 
-def motion_of(city: City) -> Motion:
+def motion_of(city: City) -> MotionProfile:
     """The motion that the legs describe, from rest.
 
     Raises:
@@ -72,7 +72,7 @@ def motion_of(city: City) -> Motion:
     return from_commands(start, [leg.command() for leg in city.legs], heading_rad=p.heading)
 
 
-def lay_out(city: City) -> Course:
+def lay_out(city: City) -> GnssCourse:
     """Everything that does not depend on a run.
 
     Raises:
@@ -81,13 +81,13 @@ def lay_out(city: City) -> Course:
     motion = motion_of(city)
     time_s = motion.times_ns(city.rate) * 1e-9
     k = motion.at(time_s)
-    place = Place.at(motion.start.as_ecef())
+    place = LocalFrame.at(motion.start.as_ecef())
     position = np.asarray(place.local(Geodetic(k.lat, k.lon, k.alt).as_ecef()))
     heading = np.unwrap(np.asarray(rotation.to_euler(jnp.asarray(k.q_nb))[2]))
     dt = np.diff(time_s)
     way = np.hypot(*np.diff(position[:, :2], axis=0).T)
     azimuth, elevation, r_e = _constellation(city, place)
-    return Course(
+    return GnssCourse(
         epoch_s=time_s[1:],
         place=place,
         member=(np.arange(len(azimuth)) % 2)[:, None].astype(float),
@@ -104,7 +104,7 @@ def lay_out(city: City) -> Course:
     )
 
 
-def _constellation(city: City, place: Place) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _constellation(city: City, place: LocalFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Azimuth, elevation (N,) [rad] and place (N, 3) [m, ECEF], equal areas of the sky."""
     n, least = city.satellites.count, np.sin(city.satellites.lowest)
     up = least + (1.0 - least) * (np.arange(n) + 0.5) / n
@@ -125,7 +125,7 @@ class Signals(NamedTuple):
     cn0_dbhz: Any
 
 
-def signals(city: City, course: Course, key: Array) -> Signals:
+def signals(city: City, course: GnssCourse, key: Array) -> Signals:
     """Draw the walls, and find what they do to every signal."""
     s = city.streets
     count = int(course.way_m[-1] / s.block) + 1
@@ -159,7 +159,7 @@ def signals(city: City, course: Course, key: Array) -> Signals:
     return Signals(jnp.where(blocked, late, 0.0) + rough, cn0)
 
 
-def simulate(city: City, course: Course, seed: int, index: Array) -> World:
+def simulate(city: City, course: GnssCourse, seed: int, index: Array) -> GnssWorld:
     """One run, from its number; pure."""
     key = partial(stream, seed, index)
     arriving = signals(city, course, key(Component.GNSS))
@@ -204,7 +204,7 @@ def simulate(city: City, course: Course, seed: int, index: Array) -> World:
     exact = jax.vmap(partial(pseudoranges, course.place, jnp.asarray(course.member)))(truth, sky)
     y = jnp.where(present, exact + sigma * draw(white, (e, n)), jnp.nan)
     wanted: dict[str, Any] = {RANGES: y, LENGTH: length_once(city, course.way_m)}
-    u = Travel(
+    u = MotionStep(
         dt,
         speed,
         rate,
@@ -215,10 +215,10 @@ def simulate(city: City, course: Course, seed: int, index: Array) -> World:
     )
     here = Sky(sky.satellite_e[0], sky.sigma[0])
     fix = first_fix(y[0], here, course.member, b.clock.system_bias)
-    return World(fix, u, wanted, sky, truth)
+    return GnssWorld(fix, u, wanted, sky, truth)
 
 
-def length_once(believed: Believed, way_m: np.ndarray) -> np.ndarray:
+def length_once(believed: GnssAssumptions, way_m: np.ndarray) -> np.ndarray:
     """(E, 1) one at the epoch where the way is long enough to know the heading, NaN elsewhere."""
     out = np.full((len(way_m), 1), np.nan)
     far = np.flatnonzero(way_m >= believed.wheels.aligned_after)

@@ -21,9 +21,9 @@ from robins.ins.blocks import reach_of_rate, usual_width
 from robins.ins.increments import Increments
 from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.log import recorded
-from robins.systems.ins_gnss.parameters import Replay
+from robins.systems.ins_gnss.parameters import InsGnssReplay
 from robins.systems.ins_gnss.recording import axes_of
-from robins.systems.parts import Block
+from robins.systems.parts import ImuBlock
 from robins.systems.study import Case, Problem
 
 _EPOCHS = 64  # of the drive or log, by which the filter is traced and tried
@@ -41,8 +41,8 @@ _FIELDS = {
 }
 
 
-def aboard(
-    given: Replay,
+def export_sources(
+    given: InsGnssReplay,
     dataset: Dataset,
     rates_hz: tuple[float, float],
     name: str,
@@ -72,7 +72,7 @@ def aboard(
         raise RobinsError(f"it cannot be navigated: {error}", label) from error
     piece = pieces[0]
     usual = usual_width(given.update.longest_block, 1.0 / rates_hz[0]) + 8
-    world = _begun(piece.world, usual)
+    world = _first_epochs(piece.world, usual)
     chosen = contender(name)
     problem = Problem(
         epoch_s=piece.epoch_s[:_EPOCHS],
@@ -86,12 +86,12 @@ def aboard(
     wide = not hasattr(chosen.case(world).start.mean, "q_nb")
     macros = {
         "MEAN(field)": f"mean_{'ins_' if wide else ''}##field",
-        "TELL_WRONG(result, to)": _told_wrong(chosen.filter.suspects, suspects),
+        "TELL_WRONG(result, to)": _wrong_to_wire(chosen.filter.suspects, suspects),
     }
     return problem, _given_h(given, rates_hz, world, macros)
 
 
-def _refuse_what_c_lacks(given: Replay, dataset: Dataset) -> None:
+def _refuse_what_c_lacks(given: InsGnssReplay, dataset: Dataset) -> None:
     """Refuse parameters and logs that the loop in C cannot follow.
 
     Raises:
@@ -133,7 +133,7 @@ def _refuse_what_c_lacks(given: Replay, dataset: Dataset) -> None:
 _SENSORS = (model.POSITION, model.VELOCITY, model.STANDSTILL, model.STILL_RATE)
 
 
-def _begun(world: Case, width: int) -> Case:
+def _first_epochs(world: Case, width: int) -> Case:
     """The first epochs of a piece, in blocks of so many pieces, with what is on the wire."""
     heard = {name: world.y[name] for name in _SENSORS if name in world.y}
     about = {name: world.aux[name] for name in heard if name in world.aux}
@@ -145,17 +145,17 @@ def _begun(world: Case, width: int) -> Case:
         raise RobinsError(what, "--board", "give a log whose samples come evenly at its beginning")
     more = max(0, width - inc.dt.shape[1])
     padded = (np.pad(a, [(0, 0), (0, more), (0, 0)][: a.ndim])[:, :width] for a in inc[:3])
-    return first._replace(start=world.start, u=Block(Increments(*padded), first.u.noise_scale))
+    return first._replace(start=world.start, u=ImuBlock(Increments(*padded), first.u.noise_scale))
 
 
-def _told_wrong(suspects: tuple[str, ...], wire: tuple[str, ...]) -> str:
+def _wrong_to_wire(suspects: tuple[str, ...], wire: tuple[str, ...]) -> str:
     """C that copies the probabilities of a result in the order of the wire."""
     where = {name: f"(result).wrong[{i}]" for i, name in enumerate(suspects)}
     return ", ".join(f"(to)[{k}] = {where.get(one, 'NAN')}" for k, one in enumerate(wire))
 
 
 def _given_h(
-    given: Replay, rates_hz: tuple[float, float], world: Case, macros: Mapping[str, str]
+    given: InsGnssReplay, rates_hz: tuple[float, float], world: Case, macros: Mapping[str, str]
 ) -> str:
     """`navigation_given.h`: the constants of the part, and room for its memory."""
     g, aids, longest_s = given.gnss, given.aids, given.update.longest_block

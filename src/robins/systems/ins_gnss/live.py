@@ -51,21 +51,21 @@ from robins.systems.ins_gnss.log import (
     first_belief,
     steps_of,
 )
-from robins.systems.ins_gnss.parameters import Replay
+from robins.systems.ins_gnss.parameters import InsGnssReplay
 from robins.systems.ins_gnss.positions import attitudes
 from robins.systems.ins_gnss.recording import Log, axes_of, believed_sigmas
-from robins.systems.ins_gnss.rest import WAYS_S, Usual, known_until
+from robins.systems.ins_gnss.rest import WAYS_S, UsualIntervals, known_until
 from robins.systems.ins_gnss.start import REST_S, fast_fix, find_start
-from robins.systems.parts import Block
+from robins.systems.parts import ImuBlock
 from robins.systems.streaming import (
-    Door,
     Flag,
     Live,
     LiveError,
-    as_before,
+    TimestampGate,
     numbers,
     online,
     refuse_units,
+    restored,
     stamp,
 )
 from robins.systems.study import Case
@@ -95,7 +95,7 @@ class LiveInsGnss(Live):
         passed: the same of each epoch that the last sample or fix brought, in order.
     """
 
-    _parameters: ClassVar[type[Any]] = Replay
+    _parameters: ClassVar[type[Any]] = InsGnssReplay
     _kept: ClassVar[tuple[str, ...]] = (
         "_origin_ns", "_raw_ns", "_raw", "_steps", "_first", "_newest", "_fixes", "_field", "_past",
         "_counted", "_last_step", "_known", "_velocities", "start", "_first_fix_s",
@@ -104,7 +104,7 @@ class LiveInsGnss(Live):
 
     def __init__(
         self,
-        parameters: Replay,
+        parameters: InsGnssReplay,
         rate_hz: float,
         fix_rate_hz: float = 1.0,
         filter: str = "robust",
@@ -137,7 +137,7 @@ class LiveInsGnss(Live):
         made_with |= {"longest_delay_s": longest_delay_s, "machine": machine or usual()}
         super().__init__(parameters, **made_with)
         p = parameters
-        self._usual = Usual(1.0 / rate_hz, 1.0 / fix_rate_hz)
+        self._usual = UsualIntervals(1.0 / rate_hz, 1.0 / fix_rate_hz)
         self._reach_s = reach_of_rate(self._usual.sample_s)
         self._delay_s = longest_delay_s
         self._width = usual_width(p.update.longest_block, self._usual.sample_s)
@@ -156,11 +156,11 @@ class LiveInsGnss(Live):
 
     def start_over(self) -> None:
         """Be as new: without samples, fixes and counts."""
-        self._door = Door(self.parameters.update.longest_gap, self._patience)
+        self._door = TimestampGate(self.parameters.update.longest_gap, self._patience)
         self.counts.clear()
-        self._begin_anew()
+        self._restart()
 
-    def _begin_anew(self) -> None:
+    def _restart(self) -> None:
         """Forget all but the counts and the stamps."""
         self._origin_ns: int | None = None
         self._raw_ns: list[int] = []  # the last four samples
@@ -198,11 +198,11 @@ class LiveInsGnss(Live):
         self.passed, time = [], stamp(time_ns)
         values = np.stack([numbers("gyro", gyro_rad_s, 3), numbers("accel", accel_m_s2, 3)])
         field = None if field_t is None else numbers("field", field_t, 3)
-        why = self._door.ask(time, values.ravel())
+        why = self._door.check(time, values.ravel())
         if why == "anew":
             kind = "imu_gaps_declared" if self._raw_ns and time > self._raw_ns[-1] else "begun_anew"
             self.counts[kind] += 1
-            self._begin_anew()
+            self._restart()
         elif why:
             self.counts[f"imu_{why}"] += 1
             return self._answer(time, Flag.REFUSED)
@@ -313,8 +313,8 @@ class LiveInsGnss(Live):
         )
         log = log._replace(first=self._first)
         if gnss.use_velocity:  # there or not, so that nothing is compiled when the first one comes
-            told = table_of(f, self._origin_ns or 0, velocities=True)
-            log = log._replace(v_n=f[:, 7:10], sigma_v=believed_sigmas(told, gnss)[1])
+            fix_table = table_of(f, self._origin_ns or 0, velocities=True)
+            log = log._replace(v_n=f[:, 7:10], sigma_v=believed_sigmas(fix_table, gnss)[1])
         if len(self._field):
             return log._replace(field_s=self._field[:, 0], field_b=self._field[:, 1:])
         return log
@@ -371,7 +371,7 @@ class LiveInsGnss(Live):
         try:
             refuse_units(*(raw[:, k : k + 3] / raw[:, 1:2] for k in (2, 5)))
         except LiveError:
-            self._begin_anew()
+            self._restart()
             raise
         belief = self._case(Case(first_belief(log, found, p), None, {}, {}, None)).start
         self._online = self._on(belief)
@@ -384,7 +384,7 @@ class LiveInsGnss(Live):
         assert self._online is not None
         at, log = Epoch(*self._past[-1]), self._log()
         used = np.abs(log.gnss_s - to.time_s) < 1e-9
-        usual = Usual(*self._known)
+        usual = UsualIntervals(*self._known)
         steps = steps_of(log, used, at.time_s, np.array([to.time_s]), self.parameters, usual)
         u, y, aux = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], tuple(steps[:3]))
         found = np.asarray(self._online.step(y, u, aux, keep=kept))
@@ -417,7 +417,7 @@ class LiveInsGnss(Live):
         if self._steps[0, 0] < begin - self._back_s:
             first = int(np.searchsorted(self._steps[:, 0], begin, side="right"))
             settled = min(first + self._settled, len(self._steps) - 1)
-            since_s, usual = float(self._steps[settled, 0]), Usual(*self._known)
+            since_s, usual = float(self._steps[settled, 0]), UsualIntervals(*self._known)
             self._known = tuple(known_until(self._log(), self.parameters.aids, usual, since_s))
             # a way over an outage begins at the last place before it
             far = self._fixes[:, 0] <= begin - WAYS_S[-1] - 2.0 * max(1.0, self._usual.fix_s)
@@ -459,7 +459,7 @@ class LiveInsGnss(Live):
         scale = replaying.noise_scale(
             blocks, rows[:, 1], self.parameters.update.gap_noise, self._usual.sample_s
         )
-        u = jax.tree_util.tree_map(lambda a: a[0], Block(blocks.increments, scale))
+        u = jax.tree_util.tree_map(lambda a: a[0], ImuBlock(blocks.increments, scale))
         found = self._online.look(predicted, u)
         answer = answer_of(time_ns, np.asarray(found), mark)
         if self.epoch is None:
@@ -472,7 +472,7 @@ class LiveInsGnss(Live):
         step = round(1e9 * self._usual.sample_s)
         attitudes(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros((0, 3)))
         second, ones = max(1, round(1e9 / step)), np.ones(3)
-        place = Replay.model_validate({"start": {"known_heading": 0.0}}).start
+        place = InsGnssReplay.model_validate({"start": {"known_heading": 0.0}}).start
         p, self.parameters = self.parameters, self.parameters.model_copy(update={"start": place})
         C, self._C_bs = self._C_bs, None
         last = math.ceil((3.0 + 2.0 * p.aids.window + p.update.longest_block) * 1e9 / step)
@@ -495,6 +495,6 @@ class LiveInsGnss(Live):
         count = len(self._past)
         each = len(state) // count
         like = self._compiled_state
-        self._states = [as_before(like, state[k * each : (k + 1) * each]) for k in range(count)]
+        self._states = [restored(like, state[k * each : (k + 1) * each]) for k in range(count)]
         self._online = self._on(self._states[-1])
         self.epoch = None if self._last_step is None else self._epoch()

@@ -13,13 +13,13 @@ from robins.filters import Belief, Code, Filter, FilterState, Model
 from robins.filters.kalman import WRONG
 from robins.filters.run import Step
 from robins.systems.ins_gnss.robust import navigation
-from robins.systems.parts import Block
+from robins.systems.parts import ImuBlock
 from robins.systems.streaming import Flag
 
 _WIDTH = 19  # of the vector: attitude, velocity, place and nine sigmas
 
 
-class Seen(NamedTuple):
+class MeasurementOutcome(NamedTuple):
     """Outcome of a measurement in the filter."""
 
     code: Code
@@ -40,10 +40,10 @@ class Navigation(NamedTuple):
     flags: Flag
     # probability that each suspect of a bank is wrong, after the last fix or standstill
     wrong: Mapping[str, float] = {}
-    seen: Mapping[str, Seen] = {}  # by sensor, in the last step of the filter
+    seen: Mapping[str, MeasurementOutcome] = {}  # by sensor, in the last step of the filter
 
 
-def predicted(filter_: Filter, model: Model, state: FilterState, u: Block) -> jax.Array:
+def predicted(filter_: Filter, model: Model, state: FilterState, u: ImuBlock) -> jax.Array:
     """Mean and standard deviations after a block, in one vector."""
     return _vector(filter_.predict(state, model.motion, u)[1].belief)
 
@@ -84,7 +84,7 @@ def answer_of(
     lat, lon, alt = x[7:10].tolist()
     rows, rest = np.split(x[_WIDTH:], [3 * len(sensors)])
     seen = {
-        name: Seen(Code(int(code)), nis, int(dof))
+        name: MeasurementOutcome(Code(int(code)), nis, int(dof))
         for name, (code, nis, dof) in zip(sensors, rows.reshape(-1, 3).tolist(), strict=True)
     }
     wrong = dict(zip(suspects, rest.tolist(), strict=False))

@@ -26,12 +26,12 @@ from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsState
 from robins.program.evaluated import evaluated
-from robins.results import Outcome, Progress, array, silent
+from robins.results import Outcome, Progress, array, ignore_progress
 from robins.rotation import Rotation
 from robins.systems import replaying
 from robins.systems.ins_gnss import model
-from robins.systems.ins_gnss.lasting import with_lasting
-from robins.systems.ins_gnss.parameters import Aids, Replay
+from robins.systems.ins_gnss.correlated_errors import with_correlated_share
+from robins.systems.ins_gnss.parameters import Aids, InsGnssReplay
 from robins.systems.ins_gnss.recording import Log, in_body_axes, on_one_clock, with_lever_arm
 from robins.systems.ins_gnss.reported import (
     DIVERGED,
@@ -41,26 +41,32 @@ from robins.systems.ins_gnss.reported import (
     sigma_notes,
     verdict,
 )
-from robins.systems.ins_gnss.rest import Usual, at_rest, usual_of
+from robins.systems.ins_gnss.rest import UsualIntervals, at_rest, usual_of
 from robins.systems.ins_gnss.robust import (
     AS_TOLD,
     HYPOTHESES,
-    Verdict,
-    case,
-    changes,
+    HindsightVerdict,
+    augmented_case,
     fresh,
-    in_hindsight,
+    hypothesis_model,
+    mode_changes,
     navigation,
     robust,
-    supposed,
-    weighed,
+    single_hypothesis,
+    smoothed_probabilities,
 )
 from robins.systems.ins_gnss.samples import as_files
 from robins.systems.ins_gnss.start import StartPoint, find_start
 from robins.systems.ins_gnss.study import NAMES as STUDIED
 from robins.systems.ins_gnss.study import SMOOTHERS, make_filter
-from robins.systems.parts import Block
-from robins.systems.replaying import PROBABILITY, Answer, Piece, Recorded, Reported
+from robins.systems.parts import ImuBlock
+from robins.systems.replaying import (
+    PROBABILITY,
+    FilterEstimates,
+    LogPiece,
+    PreparedLog,
+    ReportedItems,
+)
 from robins.systems.study import Case, Contender
 from robins.systems.suspects import spans
 from robins.systems.tables import track_arrays
@@ -80,7 +86,7 @@ NAMES = (ROBUST, f"{ROBUST}+rts", *STUDIED)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stretch(Piece):
+class LogSegment(LogPiece):
     """A piece of a log that is navigated; its world is a `Case`."""
 
     start: StartPoint
@@ -89,7 +95,7 @@ class Stretch(Piece):
     withheld: np.ndarray  # (E,) bool
 
 
-def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
+def prepare(whole: Log, parameters: InsGnssReplay, rows: slice) -> LogSegment:
     """Align on a piece of a log, place the epochs and sort the measurements to them.
 
     Raises:
@@ -107,7 +113,7 @@ def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
     longest_s = parameters.update.longest_block
     epochs = epochs_between(begin_s, end_s, log.gnss_s[used], longest_s, even=False)
     steps = steps_of(log, used, begin_s, epochs, parameters, usual)
-    return Stretch(
+    return LogSegment(
         world=Case(first_belief(log, start, parameters), steps.u, steps.y, steps.aux, None),
         begin_s=begin_s,
         epoch_s=epochs,
@@ -119,10 +125,10 @@ def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
     )
 
 
-class Steps(NamedTuple):
+class InsGnssSteps(NamedTuple):
     """Steps of a filter; leading axis E epochs."""
 
-    u: Block
+    u: ImuBlock
     y: dict[str, Any]
     aux: dict[str, Any]
     rate_b: np.ndarray  # (E, 3) rad/s, mean raw gyro rate about each epoch
@@ -133,9 +139,9 @@ def steps_of(
     used: np.ndarray,
     begin_s: float,
     epochs: np.ndarray,
-    parameters: Replay,
-    usual: Usual,
-) -> Steps:
+    parameters: InsGnssReplay,
+    usual: UsualIntervals,
+) -> InsGnssSteps:
     """Steps from epoch to epoch, with what was measured at their ends.
 
     A piece of a log that reaches back far enough has the bits of the whole log.
@@ -156,10 +162,10 @@ def steps_of(
     window_s = p.gnss.velocity_window
     y, aux = measured_fixes(log, used, epochs, rate, usual.fix_s if window_s is None else window_s)
     known, about = measured_rest(log, epochs, rate, p.aids, usual)
-    return Steps(Block(blocks.increments, scale), y | known, aux | about, rate)
+    return InsGnssSteps(ImuBlock(blocks.increments, scale), y | known, aux | about, rate)
 
 
-def first_belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
+def first_belief(log: Log, start: StartPoint, parameters: InsGnssReplay) -> Belief:
     """Belief at the first fix, moved from the antenna to the IMU."""
     g, row = log.gnss, start.fix
     antenna = Geodetic(*(np.asarray(a[row]) for a in (g.lat_rad, g.lon_rad, g.alt_m)))
@@ -217,7 +223,7 @@ def measured_fixes(
 
 
 def measured_rest(
-    log: Log, epochs: np.ndarray, rate: np.ndarray, aids: Aids, usual: Usual
+    log: Log, epochs: np.ndarray, rate: np.ndarray, aids: Aids, usual: UsualIntervals
 ) -> tuple[dict[str, PyTree], dict[str, PyTree]]:
     """Measurements of what is known without a receiver: standing still, or not slipping."""
     still, mean_rate = at_rest(log, aids, usual, epochs)
@@ -232,13 +238,13 @@ def measured_rest(
     if log.wheels is not None and len(log.wheels.time_s) > 1:
         t, speed, sigma = log.wheels
         near = np.clip(np.searchsorted(t, epochs), 1, len(t) - 1)
-        heard = (t[near] - t[near - 1] < WHEELS_S) & (epochs >= t[0]) & (epochs <= t[-1])
-        y[model.ODOMETER] = np.where(heard, np.interp(epochs, t, speed), np.nan)[:, None]
+        received = (t[near] - t[near - 1] < WHEELS_S) & (epochs >= t[0]) & (epochs <= t[-1])
+        y[model.ODOMETER] = np.where(received, np.interp(epochs, t, speed), np.nan)[:, None]
         about[model.ODOMETER] = model.Wheel(np.interp(epochs, t, sigma)[:, None], rate)
     return y, about
 
 
-def bank_step_s(parameters: Replay, fix_step_s: float) -> float:
+def bank_step_s(parameters: InsGnssReplay, fix_step_s: float) -> float:
     """Length of most steps."""
     return min(fix_step_s, parameters.update.longest_block)
 
@@ -246,7 +252,7 @@ def bank_step_s(parameters: Replay, fix_step_s: float) -> float:
 _case = cache(partial)
 
 
-def contender(parameters: Replay, fix_step_s: float, name: str) -> Contender:
+def contender(parameters: InsGnssReplay, fix_step_s: float, name: str) -> Contender:
     """A filter with the model it believes in.
 
     Args:
@@ -255,48 +261,54 @@ def contender(parameters: Replay, fix_step_s: float, name: str) -> Contender:
         name: of a filter, or `WEIGHED`.
     """
     believed = model.ins_gnss_model(parameters.imu, parameters.gnss, parameters.aids)
-    asked = parameters.gnss.velocity_window is None
+    fits_share = parameters.gnss.velocity_window is None
     if name in (ROBUST, WEIGHED):
         share, time_s = parameters.gnss.lasting_share, parameters.gnss.lasting_time
         lasting = jnp.array([share, time_s]) if share else None
         own = ((share, time_s), parameters.start.position) if share else (None, 0.0)
-        start = _case(case, asked, *own)
+        start = _case(augmented_case, fits_share, *own)
         step_s, patience_s = bank_step_s(parameters, fix_step_s), parameters.update.patience
-        bank = weighed() if name == WEIGHED else robust(believed, step_s, patience_s, lasting)
-        return Contender(bank, supposed(believed, AS_TOLD, lasting), start)
-    told = fresh(believed) if asked else believed
-    return Contender(make_filter(name, parameters.update.gate), told)
+        bank = (
+            single_hypothesis()
+            if name == WEIGHED
+            else robust(believed, step_s, patience_s, lasting)
+        )
+        return Contender(bank, hypothesis_model(believed, AS_TOLD, lasting), start)
+    fix_model = fresh(believed) if fits_share else believed
+    return Contender(make_filter(name, parameters.update.gate), fix_model)
 
 
 def _answers(
-    pieces: Sequence[Stretch],
-    parameters: Replay,
+    pieces: Sequence[LogSegment],
+    parameters: InsGnssReplay,
     fix_step_s: float,
     wanted: Sequence[str],
     progress: Progress,
-) -> tuple[dict[str, Answer], list[str], list[str]]:
+) -> tuple[dict[str, FilterEstimates], list[str], list[str]]:
     """Answers of each filter and smoother, notes and warnings of the bank.
 
     The smoother of one hypothesis takes that which the bank thinks likely in hindsight: it does not
     see positions that were off, and has the bank's process noise.
     """
 
-    def navigated(pieces: Sequence[Stretch], wanted: Sequence[str]) -> dict[str, Answer]:
+    def navigated(
+        pieces: Sequence[LogSegment], wanted: Sequence[str]
+    ) -> dict[str, FilterEstimates]:
         made = partial(contender, parameters, fix_step_s)
-        return replaying.navigated(pieces, wanted, made, SMOOTHED, progress)
+        return replaying.run_filters(pieces, wanted, made, SMOOTHED, progress)
 
     smooths = [name for name in wanted if SMOOTHED.get(name) == WEIGHED]
     causal = [name for name in wanted if name not in smooths]
-    asks = bool(smooths) and ROBUST not in causal
-    found = navigated(pieces, [*causal, ROBUST] if asks else causal)
+    wants_robust = bool(smooths) and ROBUST not in causal
+    found = navigated(pieces, [*causal, ROBUST] if wants_robust else causal)
     notes, doubts = [], []
     if ROBUST in found:
-        change = changes(bank_step_s(parameters, fix_step_s), parameters.update.patience)
+        change = mode_changes(bank_step_s(parameters, fix_step_s), parameters.update.patience)
         probability = np.asarray(list(found[ROBUST].updates.values())[-1].notes[PROBABILITY])
         verdicts, first = [], 0
         for piece in pieces:
             last = first + len(piece.epoch_s)
-            verdicts.append(in_hindsight(probability[first:last], change))
+            verdicts.append(smoothed_probabilities(probability[first:last], change))
             doubts += _doubts(piece, probability[first:last], verdicts[-1])
             first = last + 1
         notes += _share_note(found[ROBUST], parameters, fix_step_s)
@@ -307,7 +319,7 @@ def _answers(
     return kept, notes, doubts
 
 
-def _settled(piece: Stretch, verdict: Verdict) -> Stretch:
+def _settled(piece: LogSegment, verdict: HindsightVerdict) -> LogSegment:
     """The piece without the positions that were off, with the process noise that it had."""
     world: Case = piece.world
     off = verdict.off > 0.5
@@ -316,14 +328,14 @@ def _settled(piece: Stretch, verdict: Verdict) -> Stretch:
     return replace(piece, world=world._replace(u=u, y={**world.y, model.POSITION: position}))
 
 
-def _doubts(piece: Stretch, probability: np.ndarray, verdict: Verdict) -> list[str]:
+def _doubts(piece: LogSegment, probability: np.ndarray, verdict: HindsightVerdict) -> list[str]:
     """Sentences on where positions were off, and on where that could not be told in time."""
     seen = np.isfinite(np.asarray(piece.world.y[model.POSITION].lat))
-    said = []
+    sentences = []
     if off := spans(piece.epoch_s[seen], verdict.off[seen] > 0.5):
         shown = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in off[:6])
         more = "" if len(off) <= 6 else f" and {len(off) - 6} more"
-        said.append(
+        sentences.append(
             f"{ROBUST}: positions were off, all to one side, against velocities and the IMU: "
             f"{shown}{more}. They were not followed."
         )
@@ -331,18 +343,18 @@ def _doubts(piece: Stretch, probability: np.ndarray, verdict: Verdict) -> list[s
     open_ = [(a, b) for a, b in spans(piece.epoch_s, (now > 0.05) & (now < 0.95) & seen)]
     if long := [(a, b) for a, b in open_ if b - a >= UNSURE_S]:
         shown = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in long[:6])
-        said.append(
+        sentences.append(
             f"{ROBUST}: for a while it could not be told whether positions were off or the "
             f"estimate, and its sigma says so: {shown}."
         )
-    if np.any(verdict.strayed > 0.5):
-        at = piece.epoch_s[np.flatnonzero(verdict.strayed > 0.5)]
+    if np.any(verdict.diverged > 0.5):
+        at = piece.epoch_s[np.flatnonzero(verdict.diverged > 0.5)]
         shown = ", ".join(f"{t:.1f} s" for t in at[:6])
-        said.append(f"{ROBUST}: {DIVERGED}: {shown}. Before, its sigma did not hold.")
-    return said
+        sentences.append(f"{ROBUST}: {DIVERGED}: {shown}. Before, its sigma did not hold.")
+    return sentences
 
 
-def _share_note(answer: Answer, parameters: Replay, fix_step_s: float) -> list[str]:
+def _share_note(answer: FilterEstimates, parameters: InsGnssReplay, fix_step_s: float) -> list[str]:
     """A sentence on what the velocities are, where the configuration does not say."""
     wide = answer.mean
     if wide.share is None or model.VELOCITY not in answer.updates:
@@ -364,14 +376,14 @@ def _share_note(answer: Answer, parameters: Replay, fix_step_s: float) -> list[s
 
 # parameters, the log on one clock, pieces to navigate, sentences on others, interval of fixes [s],
 # notes
-_Opened = tuple[Replay, Log, list[Stretch], list[str], float, list[str]]
+_Opened = tuple[InsGnssReplay, Log, list[LogSegment], list[str], float, list[str]]
 
 
-def _opened(dataset: Dataset, parameters: Replay) -> _Opened:
+def _opened(dataset: Dataset, parameters: InsGnssReplay) -> _Opened:
     parameters = with_lever_arm(parameters, dataset.lever_arm_b_m)
     log = on_one_clock(in_body_axes(dataset, parameters.imu.orientation), parameters)
-    parameters, notes = with_lasting(parameters, log)
-    pieces, problems = replaying.prepared(
+    parameters, notes = with_correlated_share(parameters, log)
+    pieces, problems = replaying.prepare_pieces(
         log.time_s,
         log.increments.dt,
         parameters.update.longest_gap,
@@ -380,26 +392,26 @@ def _opened(dataset: Dataset, parameters: Replay) -> _Opened:
     return parameters, log, pieces, problems, usual_of(log).fix_s, notes
 
 
-def recorded(dataset: Dataset, parameters: Replay) -> Recorded:
+def recorded(dataset: Dataset, parameters: InsGnssReplay) -> PreparedLog:
     """The log as its filters take it, as `System.recorded` says.
 
     Raises:
         ValueError: the log cannot be navigated; the sentence says why and what to do.
     """
     parameters, _, pieces, _, interval_s, _ = _opened(dataset, parameters)
-    return Recorded(pieces, partial(contender, parameters, interval_s))
+    return PreparedLog(pieces, partial(contender, parameters, interval_s))
 
 
 def replay(
     dataset: Dataset,
-    parameters: Replay,
+    parameters: InsGnssReplay,
     filters: tuple[str, ...] = (),
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> Outcome:
     """Navigate a log of IMU and GNSS, examined and cleaned, as `System.replay` says.
 
-    Samples that were loaded without a mounting are turned as the parameters say; `Replay()` is what
-    the command takes without a file.
+    Samples that were loaded without a mounting are turned as the parameters say; `InsGnssReplay()`
+    is what the command takes without a file.
 
     Raises:
         ValueError: the log cannot be navigated; the sentence says why and what to do.
@@ -420,7 +432,7 @@ def replay(
     outcome = replaying.outcome(
         epoch_s,
         answers,
-        Reported(
+        ReportedItems(
             blocks=model.state_blocks(parameters.imu.scale_states),
             sensors=model.SENSORS,
             estimates=_estimates,

@@ -35,8 +35,8 @@ from robins.filters import Belief, Model, Sensor
 from robins.filters.belief import Number
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
-from robins.systems.ins_gnss.parameters import Aids, Gnss, Imu, Start
-from robins.systems.parts import FRD, NED, Block, as_array, moved_by
+from robins.systems.ins_gnss.parameters import Aids, Gnss, InsGnssImu, InsGnssStart
+from robins.systems.parts import FRD, NED, ImuBlock, as_array, moved_by
 from robins.systems.study import SensorAxes, StateBlock
 
 POSITION, VELOCITY, STANDSTILL, STILL_RATE, ROAD = (
@@ -107,11 +107,11 @@ class Mount(NamedTuple):
     axle_b: Array  # (3,) m, IMU to the point that cannot slip sideways
 
 
-def _step(noise: InsNoise, x: InsState, block: Block) -> InsState:
+def _step(noise: InsNoise, x: InsState, block: ImuBlock) -> InsState:
     return propagate(x, block.increments, noise)
 
 
-def _step_linear(noise: InsNoise, x: InsState, block: Block):
+def _step_linear(noise: InsNoise, x: InsState, block: ImuBlock):
     new, Phi, factor = propagate_linear(x, block.increments, noise)
     return new, Phi, factor * block.noise_scale
 
@@ -166,7 +166,7 @@ def _read_wheel(mount: Mount, x: InsState, wheel: Wheel):
     return _axle_velocity_b(mount, x, jnp.asarray(wheel.omega_b))[:1]
 
 
-def noise_of(imu: Imu) -> InsNoise:
+def noise_of(imu: InsGnssImu) -> InsNoise:
     """Noise of the inertial sensors, SI.
 
     A Gauss-Markov bias of spread s and time tau is driven by noise of density s sqrt(2 / tau).
@@ -194,7 +194,7 @@ def mount_of(gnss: Gnss, aids: Aids) -> Mount:
     return Mount(jnp.asarray(gnss.lever_arm), jnp.asarray(gnss.latency), jnp.asarray(aids.axle))
 
 
-def ins_gnss_model(imu: Imu, gnss: Gnss, aids: Aids) -> Model:
+def ins_gnss_model(imu: InsGnssImu, gnss: Gnss, aids: Aids) -> Model:
     """Loosely coupled INS/GNSS with zero-velocity, zero-rate and non-holonomic updates.
 
     Args:
@@ -227,8 +227,8 @@ def ins_gnss_model(imu: Imu, gnss: Gnss, aids: Aids) -> Model:
 
 def start_belief(
     nav: Nav,
-    imu: Imu,
-    start: Start,
+    imu: InsGnssImu,
+    start: InsGnssStart,
     tilt_rad: Number,
     heading_rad: Number,
     gyro_bias: ArrayLike | None = None,

@@ -9,11 +9,18 @@ import pydantic
 
 from robins.scenario import Parameters, Positive, Quantity, default
 from robins.systems import quantities as q
-from robins.systems.parts import Cutting, Departure, Leg, Names, refuse_too_long, refuse_unsettled
+from robins.systems.parts import (
+    Departure,
+    Leg,
+    LogPartition,
+    Names,
+    refuse_too_long,
+    refuse_unsettled,
+)
 from robins.systems.study import Scenario
 
 
-class Imu(Parameters):
+class InsGnssImu(Parameters):
     """The inertial sensors as the filter models them, and how they are mounted.
 
     The biases are random walks that begin with the stated spread, or first-order Gauss-Markov
@@ -53,7 +60,7 @@ class Gnss(Parameters):
     lasting_time: q.Duration = default("100 s")
 
 
-class Start(Parameters):
+class InsGnssStart(Parameters):
     """Uncertainty of the start, and the source of the heading."""
 
     tilt: q.Spread = default("2 deg")
@@ -109,7 +116,7 @@ class Outages(Parameters):
         return inside & (first_s + self.first + begin < last_s - self.last)
 
 
-class Update(Cutting):
+class InsGnssUpdate(LogPartition):
     """Steps of the filter."""
 
     longest_gap: q.Duration = default("1 s")
@@ -119,7 +126,7 @@ class Update(Cutting):
     patience: q.Duration = default("10 s")
 
 
-class Unit(Imu):
+class UnknownImu(InsGnssImu):
     """A unit of which nothing is told: a consumer-grade MEMS."""
 
     gyro_noise: Annotated[q.Three, Quantity("angle random walk", above="0 deg/sqrt(h)")] = default(
@@ -134,7 +141,7 @@ class Unit(Imu):
     accel_bias_walk: q.AccelRateWalkSizes = default("20 ug/sqrt(s)")
 
 
-class Rover(Gnss):
+class UnknownReceiver(Gnss):
     """A receiver of which nothing is told."""
 
     # of every fix, in the place of what the log states; north, east, down, or one for all
@@ -143,22 +150,22 @@ class Rover(Gnss):
     sigma_factor: dict[str, Positive] = pydantic.Field(default_factory=lambda: {"2": 3.0, "5": 3.0})
 
 
-class FirstLook(Start):
+class UnknownStart(InsGnssStart):
     """A start of which nothing is told."""
 
     tilt: q.Spread = default("3 deg")
 
 
-class Replay(Parameters):
+class InsGnssReplay(Parameters):
     """A recorded log: what cannot be read from the files themselves; each part may be left out."""
 
     system: Literal["ins-gnss"] = "ins-gnss"
     title: str = "INS/GNSS replay, consumer MEMS"
-    imu: Unit = pydantic.Field(default_factory=Unit)
-    gnss: Rover = pydantic.Field(default_factory=Rover)
-    start: FirstLook = pydantic.Field(default_factory=FirstLook)
+    imu: UnknownImu = pydantic.Field(default_factory=UnknownImu)
+    gnss: UnknownReceiver = pydantic.Field(default_factory=UnknownReceiver)
+    start: UnknownStart = pydantic.Field(default_factory=UnknownStart)
     aids: Aids = pydantic.Field(default_factory=Aids)
-    update: Update = pydantic.Field(default_factory=Update)
+    update: InsGnssUpdate = pydantic.Field(default_factory=InsGnssUpdate)
     outages: Outages | None = None
     filters: Names = ("robust", "robust+rts")
     every_sample: bool = False  # write positions and attitudes at every inertial sample as well
@@ -170,7 +177,7 @@ class Replay(Parameters):
         return self.outages.mask(time_s, fix_s[0], fix_s[-1])
 
 
-class Receiver(Gnss):
+class SimulatedReceiver(Gnss):
     """A simulated receiver; its sigmas are true, and what it states."""
 
     rate: Annotated[float, Quantity("frequency", above="0 Hz", most="1 kHz")] = default("1 Hz")
@@ -178,7 +185,7 @@ class Receiver(Gnss):
     velocity_sigma: Annotated[q.Three, Quantity("speed", above="0 m/s")]
 
 
-class Believed(Parameters):
+class InsGnssAssumptions(Parameters):
     """Ratios of what the filters assume to what is true; 1 is right, anything else is a test."""
 
     q_factor: Positive = 1.0  # of the process noise covariance
@@ -194,13 +201,13 @@ class Drive(Scenario):
     imu_rate: q.Frequency = default("100 Hz")
     place: Departure
     legs: Annotated[tuple[Leg, ...], pydantic.Field(min_length=1)]
-    imu: Imu
-    gnss: Receiver
-    start: Start = pydantic.Field(default_factory=Start)
+    imu: InsGnssImu
+    gnss: SimulatedReceiver
+    start: InsGnssStart = pydantic.Field(default_factory=InsGnssStart)
     aids: Aids = pydantic.Field(default_factory=lambda: Aids(zero_velocity=False))
-    update: Update = pydantic.Field(default_factory=Update)
+    update: InsGnssUpdate = pydantic.Field(default_factory=InsGnssUpdate)
     outages: Outages | None = None
-    believed: Believed = pydantic.Field(default_factory=Believed)
+    believed: InsGnssAssumptions = pydantic.Field(default_factory=InsGnssAssumptions)
     # figures pooled over time leave out what comes before, while heading errors are large
     settle: q.Time = default("0 s")
     filters: Names = ("ekf",)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation as SciRotation
 from robins import rotation
 from robins.program.evaluated import evaluated
 from robins.program.scanned import named_scan
-from robins.systems.ins_gnss.parameters import Gnss, Start
+from robins.systems.ins_gnss.parameters import Gnss, InsGnssStart
 from robins.systems.ins_gnss.recording import Log
 from robins.systems.ins_gnss.rest import WAYS_S, ways
 
@@ -54,7 +54,7 @@ def heading_of(q_nb: np.ndarray) -> float:
     return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
 
-def course_fix(log: Log, start: Start) -> int | None:
+def course_fix(log: Log, start: InsGnssStart) -> int | None:
     """Row of the first fix without a velocity whose positions give a course; None: there is none.
 
     The speed is `start.course_speed` or more, and `SURE` times its sigma.

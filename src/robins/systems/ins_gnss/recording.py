@@ -12,12 +12,12 @@ from robins import rotation
 from robins.dataset import Dataset, GnssTable
 from robins.ins.frames import to_ned_frd
 from robins.ins.increments import Increments, from_imu, own_intervals
-from robins.systems.ins_gnss.parameters import Replay, Rover
+from robins.systems.ins_gnss.parameters import InsGnssReplay, UnknownReceiver
 
 TYRES = 0.02  # share of the speed by which wheels may read wrong: tyres, pressure, slip
 
 
-class Wheels(NamedTuple):
+class WheelSpeed(NamedTuple):
     """Forward speed by the wheels."""
 
     time_s: np.ndarray  # (W,)
@@ -38,7 +38,7 @@ class Log(NamedTuple):
     withheld: np.ndarray  # (M,) bool
     field_s: np.ndarray | None = None  # (K,) of a magnetometer, where there is one
     field_b: np.ndarray | None = None  # (K, 3) T, body axes
-    wheels: Wheels | None = None
+    wheels: WheelSpeed | None = None
     first: int = 0  # number of increments of the record before these
 
 
@@ -79,7 +79,7 @@ def axes_of(orientation: Sequence[float]) -> np.ndarray:
 
 
 def believed_sigmas(
-    gnss: GnssTable, parameters: Rover, assumed: Collection[str] = ()
+    gnss: GnssTable, parameters: UnknownReceiver, assumed: Collection[str] = ()
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """(M, 3) m and m/s, sigmas of fixes as the filter shall believe them; None where not used.
 
@@ -107,7 +107,7 @@ def believed_sigmas(
     return of("place", gnss.sigma_m, g.sigma, g.least_sigma), sigma_v
 
 
-def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
+def on_one_clock(dataset: Dataset, parameters: InsGnssReplay) -> Log:
     """Both tables on the IMU's clock, sigmas as the filter shall believe them.
 
     Raises:
@@ -143,7 +143,7 @@ def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
     )
 
 
-def _wheels(dataset: Dataset, origin_ns: int) -> Wheels | None:
+def _wheels(dataset: Dataset, origin_ns: int) -> WheelSpeed | None:
     """Whole rows of the odometry, in the order of time; None without one."""
     rows = dataset.odometry
     if rows is None:
@@ -152,7 +152,7 @@ def _wheels(dataset: Dataset, origin_ns: int) -> Wheels | None:
     order = order[np.isfinite(rows.speed_mps[order]) & (rows.sigma_speed[order] > 0.0)]
     speed = rows.speed_mps[order]
     sigma = np.hypot(rows.sigma_speed[order], TYRES * speed)
-    return Wheels((rows.time_ns[order] - origin_ns) * 1e-9, speed, sigma)
+    return WheelSpeed((rows.time_ns[order] - origin_ns) * 1e-9, speed, sigma)
 
 
 def _field(dataset: Dataset, origin_ns: int) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -164,7 +164,9 @@ def _field(dataset: Dataset, origin_ns: int) -> tuple[np.ndarray | None, np.ndar
     return (mag.time_ns[whole] - origin_ns) * 1e-9, mag.field_t[whole]
 
 
-def with_lever_arm(parameters: Replay, arm: tuple[float, float, float] | None) -> Replay:
+def with_lever_arm(
+    parameters: InsGnssReplay, arm: tuple[float, float, float] | None
+) -> InsGnssReplay:
     """The parameters with the lever arm that the log was loaded with, if it was with one.
 
     Raises:

@@ -15,13 +15,13 @@ from robins.filters import Code
 from robins.filters.chi_square import chi2_band
 from robins.filters.tally import CORRELATED
 from robins.ins.state import InsState
-from robins.program.scanned import named_scan, on_each
+from robins.program.scanned import mapped_rows, named_scan
 from robins.results import Variables, array, variable
 from robins.systems.ins_gnss import model
-from robins.systems.ins_gnss.parameters import Replay
+from robins.systems.ins_gnss.parameters import InsGnssReplay
 from robins.systems.ins_gnss.recording import Log
 from robins.systems.judgement import Metrics
-from robins.systems.replaying import Answer
+from robins.systems.replaying import FilterEstimates
 from robins.systems.tables import place_arrays
 
 DIVERGED = "the estimate was off and took the word of positions that stayed away"
@@ -34,7 +34,7 @@ _RANK = {1: 0, 6: 1, 2: 2, 3: 3, 4: 3, 5: 4}  # of a quality, by its usual sigma
 RTK_QUALITY = {1: "fix", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp"}
 
 
-def sigma_notes(dataset: Dataset, parameters: Replay) -> list[str]:
+def sigma_notes(dataset: Dataset, parameters: InsGnssReplay) -> list[str]:
     """Sentences on sigmas of positions that the log does not state."""
     if parameters.gnss.sigma is not None:
         shown = " ".join(f"{x:g}" for x in parameters.gnss.sigma)
@@ -73,7 +73,7 @@ def distances(
     epoch = np.searchsorted(epoch_s, log.gnss_s[use] - 1e-9)
     at = jax.tree_util.tree_map(lambda x: np.asarray(x)[epoch], antenna)
     fix = Geodetic(*(v[use] for v in (g.lat_rad, g.lon_rad, g.alt_m)))
-    error, withheld = on_each(_between, (fix, at)), log.withheld[use]
+    error, withheld = mapped_rows(_between, (fix, at)), log.withheld[use]
     across = np.hypot(error[:, 0], error[:, 1])
     out: dict[str, Any] = {
         "aided_horizontal_rms_m": _rms(across[~withheld]),
@@ -112,7 +112,7 @@ def fix_arrays(log: Log) -> Variables:
     return out
 
 
-def verdict(answers: Mapping[str, Answer], metrics: Metrics, doubts: list[str]) -> str:
+def verdict(answers: Mapping[str, FilterEstimates], metrics: Metrics, doubts: list[str]) -> str:
     """One sentence on whether a replay is good, by its first causal filter; "" without one.
 
     "Do not trust" where sigmas are too small by a factor of two (NIS above `NIS_MOST`) or a third
@@ -139,7 +139,7 @@ def verdict(answers: Mapping[str, Answer], metrics: Metrics, doubts: list[str]) 
     parts.append(f"{refused} of {count} fixes refused")
     far = 0.0
     if (smooth := answers.get(f"{name}+rts")) is not None:
-        apart = on_each(_between, (answers[name].mean.position, smooth.mean.position))
+        apart = mapped_rows(_between, (answers[name].mean.position, smooth.mean.position))
         far = float(np.nanmax(np.abs(apart) / np.asarray(answers[name].sigma)[:, 6:9]))
         parts.append(f"at most {far:.1f} sigmas from its smoother")
     own = [one for one in doubts if one.startswith(f"{name}: ")]

@@ -25,7 +25,7 @@ _SEEN = 5.0  # times the speed of motion: what moves faster would have been seen
 _CALMER = 0.5  # at rest without fixes: this share of the least unrest seen in motion, or less
 
 
-class Usual(NamedTuple):
+class UsualIntervals(NamedTuple):
     """Numbers of a whole log that a piece of it does not show."""
 
     sample_s: float  # interval between samples
@@ -35,10 +35,10 @@ class Usual(NamedTuple):
     since_s: float = -np.inf  # before it statistics over windows lack samples
 
 
-def usual_of(log: Log) -> Usual:
+def usual_of(log: Log) -> UsualIntervals:
     """Intervals of samples and of fixes in a log."""
     fix_s = float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 1.0
-    return Usual(usual_interval(log.increments.dt), fix_s)
+    return UsualIntervals(usual_interval(log.increments.dt), fix_s)
 
 
 class Evidence(NamedTuple):
@@ -55,7 +55,7 @@ _Observed = tuple[np.ndarray, np.ndarray, np.ndarray, list[Evidence], float]
 
 
 def at_rest(
-    log: Log, aids: Aids, usual: Usual, at_s: np.ndarray | None = None
+    log: Log, aids: Aids, usual: UsualIntervals, at_s: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Tell whether the vehicle certainly stands still (E,), and its mean rate (E, 3) [rad/s].
 
@@ -70,7 +70,7 @@ def at_rest(
     return confirmed(still, unrest_, log.time_s, evidence, wait_s, usual, at_s), mean_rate[rows]
 
 
-def looks_still(log: Log, aids: Aids, usual: Usual) -> tuple[np.ndarray, np.ndarray]:
+def seems_at_rest(log: Log, aids: Aids, usual: UsualIntervals) -> tuple[np.ndarray, np.ndarray]:
     """As `at_rest`, but where fixes that come say nothing, the spread of the samples decides."""
     still, mean_rate, unrest_, evidence, wait_s = _observed(log, aids, usual)
 
@@ -82,7 +82,7 @@ def looks_still(log: Log, aids: Aids, usual: Usual) -> tuple[np.ndarray, np.ndar
     return confirmed(still, unrest_, log.time_s, evidence, wait_s, usual), mean_rate
 
 
-def known_until(log: Log, aids: Aids, usual: Usual, since_s: float) -> Usual:
+def known_until(log: Log, aids: Aids, usual: UsualIntervals, since_s: float) -> UsualIntervals:
     """Numbers of a log of which only the part after a time is kept."""
     still, _, unrest_, evidence, wait_s = _observed(log, aids, usual)
     least = usual.calmest
@@ -103,7 +103,7 @@ def rows_at(time_s: np.ndarray, at_s: np.ndarray | None) -> np.ndarray:
     return np.minimum(np.searchsorted(time_s, at_s - 1e-9), len(time_s) - 1)
 
 
-def _observed(log: Log, aids: Aids, usual: Usual) -> _Observed:
+def _observed(log: Log, aids: Aids, usual: UsualIntervals) -> _Observed:
     args, wait_s = (*aids.quiet, usual.sample_s, log.first), 1.5 * max(1.0, usual.fix_s)
     evidence = evidence_of(log, aids.moving_speed, wait_s)
     return *standstill(log.increments, *args), unrest(log.increments, *args), evidence, wait_s
@@ -115,7 +115,7 @@ def confirmed(
     time_s: np.ndarray,
     evidence: Sequence[Evidence],
     wait_s: float,
-    usual: Usual,
+    usual: UsualIntervals,
     at_s: np.ndarray | None = None,
 ) -> np.ndarray:
     """Find the times at which what looks still is: a smooth road looks like rest.
@@ -157,7 +157,7 @@ def confirmed(
     return still[rows] & ~moving & (rests | calm)
 
 
-def quiet_since(still: np.ndarray, time_s: np.ndarray, usual: Usual) -> np.ndarray:
+def quiet_since(still: np.ndarray, time_s: np.ndarray, usual: UsualIntervals) -> np.ndarray:
     """(N,) last time up to each sample at which the samples were not quiet; arguments as above."""
     quiet = still | (time_s < usual.since_s)
     return np.maximum(np.maximum.accumulate(np.where(quiet, -np.inf, time_s)), usual.quiet_s)
@@ -168,7 +168,7 @@ def calmest_in_motion(
     time_s: np.ndarray,
     evidence: Evidence,
     wait_s: float,
-    usual: Usual,
+    usual: UsualIntervals,
     until_s: float = np.inf,
 ) -> np.ndarray:
     """(M + 1,) least unrest in motion as it is known after so many fixes; infinite: not known.

@@ -7,7 +7,8 @@ hypotheses of an interacting multiple model (`robins.filters.composite.imm`):
     x = (ins, z, share, o)   ins: the navigation state; tangent components behind its 15 or 21
 
     z       (3,) NED: the part of the error of positions that lasts, over its sigma: first-order
-            Gauss-Markov (`robins.systems.ins_gnss.lasting`); where the log shows such a part
+            Gauss-Markov (`robins.systems.ins_gnss.correlated_errors`); where the log shows such a
+            part
     share   what a velocity is: that of the fix (0), or the mean since the last one (1); constant
     o       (3,) m, NED: by how much positions are off, as multipath makes them
 
@@ -39,7 +40,14 @@ from jaxtyping import Array, ArrayLike, PyTree
 
 from robins.earth import Geodetic
 from robins.filters import Belief, Filter, Model, Motion, Rule, Sensor, kalman, taylor
-from robins.filters.composite.bank import EVERY, Row, bank, louder, stacked, transitions
+from robins.filters.composite.bank import (
+    EVERY,
+    HypothesisRow,
+    bank,
+    scale_transitions,
+    stacked,
+    transitions,
+)
 from robins.filters.composite.imm import Mode
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory
@@ -49,7 +57,7 @@ from robins.ins.state import InsState
 from robins.linalg import block_diagonal
 from robins.program.evaluated import evaluated
 from robins.systems.ins_gnss.model import IMU, POSITION, VELOCITY, Fix, Velocity
-from robins.systems.parts import Block, moved_by
+from robins.systems.parts import ImuBlock, moved_by
 from robins.systems.study import Case
 
 SCALES = (1.0, 8.0, 64.0)
@@ -59,13 +67,13 @@ WILD_M = 1e6  # m, the same of one that says nothing
 WILD_S = 1000.0  # s from one such position to the next, in the mean
 WALK = 0.005  # m/sqrt(s), by which that wanders; more makes `lasts` less likely than `right`
 SELDOM_S = 100.0  # s from one time that positions are off to the next, in the mean
-LATER = math.exp(4.0) - 1.0  # `strayed` is so much rarer than `ends`: as likely after 4 patiences
+LATER = math.exp(4.0) - 1.0  # `diverged` is so much rarer than `ends`: as likely after 4 patiences
 _SHARE = 0.5, 0.5  # mean and sigma before anything is seen
 _TAILS = 4.0  # degrees of freedom of Student's t
 HEAVIEST = 16.0  # times the covariance of a position, by its weight in a mode
 
 
-class Wide(NamedTuple):
+class AugmentedInsState(NamedTuple):
     """The navigation state and what is not known of its receiver."""
 
     ins: InsState
@@ -74,7 +82,7 @@ class Wide(NamedTuple):
     offset: Array  # (3,) m, NED
 
 
-class Hypothesis(NamedTuple):
+class FixHypothesis(NamedTuple):
     """Numbers of a mode; of the bank with a leading axis."""
 
     scale: Any  # of the covariance of the process noise
@@ -91,21 +99,21 @@ BEGINS, ENDS, STRAYED, WILD = range(2 * COUNT, 2 * COUNT + 4)
 
 _IMU, _POSITION = (IMU,), (POSITION,)  # what is wrong
 _ROWS = [
-    Row(Hypothesis(s, off, off, 0.0, 0.0), _POSITION * int(off) + _IMU * (s > 1.0))
+    HypothesisRow(FixHypothesis(s, off, off, 0.0, 0.0), _POSITION * int(off) + _IMU * (s > 1.0))
     for off in (0.0, 1.0)
     for s in SCALES
 ] + [
-    Row(Hypothesis(SCALES[1], 1.0, 0.0, OFF_M, 0.0), _POSITION),
-    Row(Hypothesis(SCALES[1], 0.0, 0.0, 0.0, 0.0)),
-    Row(Hypothesis(SCALES[1], 0.0, 0.0, 0.0, 1.0), _IMU),
+    HypothesisRow(FixHypothesis(SCALES[1], 1.0, 0.0, OFF_M, 0.0), _POSITION),
+    HypothesisRow(FixHypothesis(SCALES[1], 0.0, 0.0, 0.0, 0.0)),
+    HypothesisRow(FixHypothesis(SCALES[1], 0.0, 0.0, 0.0, 1.0), _IMU),
     # it leads to no mode that keeps its o: so wide a spread would be mixed into what `lasts` knows
-    Row(Hypothesis(SCALES[0], 1.0, 0.0, WILD_M, 0.0), _POSITION),
+    HypothesisRow(FixHypothesis(SCALES[0], 1.0, 0.0, WILD_M, 0.0), _POSITION),
 ]
 HYPOTHESES = stacked(_ROWS)
-AS_TOLD = Hypothesis(*np.array(_ROWS[0].numbers))
+AS_TOLD = FixHypothesis(*np.array(_ROWS[0].numbers))
 
 
-def changes(step_s: float, patience_s: float) -> np.ndarray:
+def mode_changes(step_s: float, patience_s: float) -> np.ndarray:
     """(modes, modes) probabilities to change in a step.
 
     Args:
@@ -115,7 +123,9 @@ def changes(step_s: float, patience_s: float) -> np.ndarray:
     step_s = min(step_s, 0.5 * patience_s)
     lengths = SELDOM_S, WILD_S, patience_s
     begin, wild, over = (-math.expm1(-step_s / length) for length in lengths)
-    edges: list[Any] = [(same, same, louder(SCALES, RISE, FALL)) for same in (RIGHT, LASTS)]
+    edges: list[Any] = [
+        (same, same, scale_transitions(SCALES, RISE, FALL)) for same in (RIGHT, LASTS)
+    ]
     edges += [(EVERY, BEGINS, begin), (EVERY, WILD, wild)]
     for off in (LASTS, BEGINS):
         edges += [(off, ENDS, over), (off, STRAYED, over / LATER)]
@@ -125,22 +135,22 @@ def changes(step_s: float, patience_s: float) -> np.ndarray:
 # ------------------------------------------------------------------------------------ the model
 
 
-def widened(
-    start: Belief, asked: bool, lasting: Array | None = None, start_m: float | Array = 0.0
+def augmented_belief(
+    start: Belief, with_share: bool, lasting: Array | None = None, start_m: float | Array = 0.0
 ) -> Belief:
     """A belief about the navigation state with what the bank adds to it.
 
     Args:
         start: at the place of the first fix; sigmas of position S, uncorrelated with the rest.
-        asked: with a state for what velocities are.
+        with_share: with a state for what velocities are.
         lasting: (2,) share of the variance of positions that lasts, and its time constant [s].
         start_m: the part of S that is not the first fix's. The rest is: where the fix is off by
             s z, so is the start, by cov(p, z) = -s with s^2 = share (S^2 - start_m^2).
     """
     mean, sigma = _SHARE
-    share = jnp.full(1, mean) if asked else None
-    spread = np.zeros((3 + asked, 3 + asked))
-    if asked:
+    share = jnp.full(1, mean) if with_share else None
+    spread = np.zeros((3 + with_share, 3 + with_share))
+    if with_share:
         spread[0, 0] = sigma
     factor = jnp.asarray(start.factor, float)
     z = None
@@ -150,20 +160,22 @@ def widened(
         factor = block_diagonal(factor, jnp.diag(jnp.sqrt(1.0 - tied**2)))
         factor = factor.at[n + jnp.arange(3), 6 + jnp.arange(3)].set(-tied)
     factor = block_diagonal(factor, jnp.asarray(spread))
-    return Belief(Wide(start.mean, z, share, jnp.zeros(3)), factor)
+    return Belief(AugmentedInsState(start.mean, z, share, jnp.zeros(3)), factor)
 
 
-def navigation(x: InsState | Wide) -> InsState:
+def navigation(x: InsState | AugmentedInsState) -> InsState:
     """The navigation state of a wide one; another as it is."""
-    return x.ins if isinstance(x, Wide) else x
+    return x.ins if isinstance(x, AugmentedInsState) else x
 
 
-def _moved(of: Hypothesis, x: Wide) -> Wide:
+def _moved(of: FixHypothesis, x: AugmentedInsState) -> AugmentedInsState:
     place = x.ins.position.retract(of.taken * x.offset)
     return x._replace(ins=x.ins._replace(position=place), offset=of.kept * x.offset)
 
 
-def _faded(lasting: Array | None, x: Wide, u: Block) -> tuple[Wide, Array | None]:
+def _faded(
+    lasting: Array | None, x: AugmentedInsState, u: ImuBlock
+) -> tuple[AugmentedInsState, Array | None]:
     """The state with what a step leaves of z, and the share that it leaves."""
     if lasting is None or x.lasting is None:
         return x, None
@@ -171,12 +183,16 @@ def _faded(lasting: Array | None, x: Wide, u: Block) -> tuple[Wide, Array | None
     return x._replace(lasting=left * x.lasting), left
 
 
-def _step(motion: Motion, of: Hypothesis, lasting: Array | None, x: Wide, u: Block) -> Wide:
+def _step(
+    motion: Motion, of: FixHypothesis, lasting: Array | None, x: AugmentedInsState, u: ImuBlock
+) -> AugmentedInsState:
     x, _ = _faded(lasting, _moved(of, x), u)
     return x._replace(ins=motion.step(x.ins, u))
 
 
-def _step_linear(motion: Motion, of: Hypothesis, lasting: Array | None, x: Wide, u: Block):
+def _step_linear(
+    motion: Motion, of: FixHypothesis, lasting: Array | None, x: AugmentedInsState, u: ImuBlock
+):
     assert motion.linear is not None
     x, left = _faded(lasting, _moved(of, x), u)
     ins, Phi, factor = motion.linear(x.ins, u)
@@ -194,21 +210,23 @@ def _step_linear(motion: Motion, of: Hypothesis, lasting: Array | None, x: Wide,
     return x._replace(ins=ins), Phi @ takes, noise
 
 
-def _read(read: Callable, x: Wide, aux: PyTree):
+def _read(read: Callable, x: AugmentedInsState, aux: PyTree):
     return read(x.ins, aux)
 
 
-def _read_off(read: Callable[..., Geodetic], off: ArrayLike, x: Wide, aux: Fix):
+def _read_off(read: Callable[..., Geodetic], off: ArrayLike, x: AugmentedInsState, aux: Fix):
     return read(x.ins, aux).retract(jnp.asarray(off) * x.offset)
 
 
-def _read_lasting(read: Callable[..., Geodetic], off: ArrayLike, lasting: Array, x: Wide, fix: Fix):
+def _read_correlated(
+    read: Callable[..., Geodetic], off: ArrayLike, lasting: Array, x: AugmentedInsState, fix: Fix
+):
     assert x.lasting is not None
     error = jnp.sqrt(lasting[0]) * jnp.asarray(fix.sigma) * x.lasting
     return read(x.ins, fix).retract(jnp.asarray(off) * x.offset + error)
 
 
-def _white(sigma: Callable[..., Array], lasting: Array, x: Wide, fix: Fix):
+def _white(sigma: Callable[..., Array], lasting: Array, x: AugmentedInsState, fix: Fix):
     return jnp.sqrt(1.0 - lasting[0]) * sigma(x.ins, fix)
 
 
@@ -217,7 +235,7 @@ def _aged(fix: Velocity, share: ArrayLike) -> Velocity:
     return fix._replace(gained_b=gained, age_s=age)
 
 
-def _read_share(read: Callable, x: Wide, fix: Velocity):
+def _read_share(read: Callable, x: AugmentedInsState, fix: Velocity):
     return read(x.ins, fix if x.share is None else _aged(fix, x.share[0]))
 
 
@@ -235,20 +253,20 @@ def fresh(model: Model) -> Model:
     return Model(model.motion, tuple(map(sensor, model.sensors)))
 
 
-def supposed(model: Model, of: Hypothesis, lasting: Array | None = None) -> Model:
+def hypothesis_model(model: Model, of: FixHypothesis, lasting: Array | None = None) -> Model:
     """The model of the wide state under a hypothesis.
 
     Args:
         model: from `ins_gnss_model`.
         of: its numbers.
-        lasting: as in `widened`.
+        lasting: as in `augmented_belief`.
     """
 
     def sensor(s: Sensor) -> Sensor:
         own = as_data(s.read)
         if s.name == POSITION and lasting is not None:
             white = Partial(_white, as_data(s.noise), lasting)
-            return Sensor(Partial(_read_lasting, own, of.read, lasting), white, s.dim, s.name)
+            return Sensor(Partial(_read_correlated, own, of.read, lasting), white, s.dim, s.name)
         if s.name == POSITION:
             read = Partial(_read_off, own, of.read)
         else:
@@ -260,13 +278,17 @@ def supposed(model: Model, of: Hypothesis, lasting: Array | None = None) -> Mode
     return Model(moved_by(_step, _step_linear, model.motion, of, lasting), sensors)
 
 
-def case(asked: bool, lasting: tuple[float, float] | None, start_m: float, world: Case) -> Case:
-    """The case of a world whose start is about the navigation state alone, as in `widened`."""
+def augmented_case(
+    with_share: bool, lasting: tuple[float, float] | None, start_m: float, world: Case
+) -> Case:
+    """Case of a world whose start is about the navigation state alone, as in `augmented_belief`."""
     if lasting is None:
-        return world._replace(start=evaluated(partial(widened, asked=asked), world.start))
+        return world._replace(
+            start=evaluated(partial(augmented_belief, with_share=with_share), world.start)
+        )
 
     def wide(start: Belief, lasting: Array, start_m: Array) -> Belief:
-        return widened(start, asked, lasting, start_m)
+        return augmented_belief(start, with_share, lasting, start_m)
 
     numbers = jnp.asarray(lasting), jnp.asarray(start_m)
     return world._replace(start=evaluated(wide, world.start, *numbers))
@@ -275,15 +297,15 @@ def case(asked: bool, lasting: tuple[float, float] | None, start_m: float, world
 # ----------------------------------------------------------------------------- in hindsight
 
 
-class Verdict(NamedTuple):
+class HindsightVerdict(NamedTuple):
     """Verdict of a bank on each step, once the whole log is known."""
 
     off: np.ndarray  # (E,) probability that positions are off
     scale: np.ndarray  # (E,) of the covariance of the process noise, geometric mean
-    strayed: np.ndarray  # (E,) probability that the estimate was off and took the fixes' word
+    diverged: np.ndarray  # (E,) probability that the estimate was off and took the fixes' word
 
 
-def in_hindsight(probability: np.ndarray, change: np.ndarray) -> Verdict:
+def smoothed_probabilities(probability: np.ndarray, change: np.ndarray) -> HindsightVerdict:
     """Probabilities of the modes given all of a log (Kim 1994, *Dynamic linear models with
     Markov-switching*, J. Econometrics 60, eq. 2.20), backwards from the filtered ones.
 
@@ -291,7 +313,7 @@ def in_hindsight(probability: np.ndarray, change: np.ndarray) -> Verdict:
 
     Args:
         probability: (E, modes) after each step.
-        change: (modes, modes), from `changes`.
+        change: (modes, modes), from `mode_changes`.
     """
     known = np.array(probability, float)
     for k in range(len(known) - 2, -1, -1):
@@ -299,7 +321,7 @@ def in_hindsight(probability: np.ndarray, change: np.ndarray) -> Verdict:
         known[k] *= change @ np.divide(known[k + 1], ahead, np.zeros_like(ahead), where=ahead > 0.0)
         known[k] /= known[k].sum()
     off = known[:, HYPOTHESES.read > 0.0].sum(axis=1)
-    return Verdict(off, np.exp(known @ np.log(HYPOTHESES.scale)), known[:, STRAYED])
+    return HindsightVerdict(off, np.exp(known @ np.log(HYPOTHESES.scale)), known[:, STRAYED])
 
 
 # ----------------------------------------------------------------------------------- the filters
@@ -307,7 +329,7 @@ def in_hindsight(probability: np.ndarray, change: np.ndarray) -> Verdict:
 
 @value
 class Tails(Rule):
-    """The rule of `tails`: of a position s R with s = min(1 / weight, heaviest)."""
+    """The rule of `bounded_student_t`: of a position s R with s = min(1 / weight, heaviest)."""
 
     inner: Rule
     heaviest: Numbers  # ()
@@ -323,7 +345,7 @@ class Tails(Rule):
         return memory, prior, seen
 
 
-def tails() -> Rule:
+def bounded_student_t() -> Rule:
     """Student's t on every measurement; of a position no more than `HEAVIEST`.
 
     A position far away is a matter of the hypotheses. A mode that explains it by a weight, again at
@@ -333,13 +355,13 @@ def tails() -> Rule:
     return Tails(student_t(_TAILS, patience=None), np.asarray(HEAVIEST))
 
 
-def weighed() -> Filter:
+def single_hypothesis() -> Filter:
     """A filter of one hypothesis; it can be smoothed."""
     return kalman(taylor(), [student_t(_TAILS)])
 
 
-def _mode(model: Model, rule: Rule, lasting: Array | None, row: Hypothesis) -> Mode:
-    own = supposed(model, row, lasting)
+def _mode(model: Model, rule: Rule, lasting: Array | None, row: FixHypothesis) -> Mode:
+    own = hypothesis_model(model, row, lasting)
     mine = tuple(s for s in own.sensors if s.name == POSITION)
     return Mode(kalman(taylor(), [rule]), own.motion, mine)
 
@@ -348,13 +370,14 @@ def robust(model: Model, step_s: float, patience_s: float, lasting: Array | None
     """The bank over the hypotheses, for a model.
 
     Args:
-        model: from `ins_gnss_model`; the filter runs on `supposed` of it, from `widened`.
+        model: from `ins_gnss_model`; the filter runs on `hypothesis_model` of it, from
+            `augmented_belief`.
         step_s: between fixes, or of the longest block where that is shorter.
         patience_s: how long positions are off where they are, in the mean.
-        lasting: as in `widened`.
+        lasting: as in `augmented_belief`.
     """
     start = np.zeros(len(_ROWS))
     start[RIGHT] = 1.0 / COUNT
     # a position that may be off by `OFF_M` is seldom expected, and would hide what is
-    make = Partial(_mode, model, tails(), lasting)
-    return bank(make, _ROWS, changes(step_s, patience_s), start, likeliest=True)
+    make = Partial(_mode, model, bounded_student_t(), lasting)
+    return bank(make, _ROWS, mode_changes(step_s, patience_s), start, likeliest=True)

@@ -18,11 +18,11 @@ from robins.ins.increments import Increments
 from robins.ins.mechanise import vector
 from robins.ins.state import InsState, path
 from robins.program.scanned import named_scan
-from robins.systems.replaying import Answer, Piece
+from robins.systems.replaying import FilterEstimates, LogPiece
 
 
 def at_samples(
-    time_s: np.ndarray, pieces: Sequence[Piece], mean: InsState
+    time_s: np.ndarray, pieces: Sequence[LogPiece], mean: InsState
 ) -> tuple[np.ndarray, np.ndarray]:
     """Times (K,) and rows (K, 10), as `mechanise.vector` has them, at the samples of all pieces.
 
@@ -60,7 +60,10 @@ def _through(carry: Array, row: tuple[InsState, Increments]) -> tuple[Array, Arr
 
 
 def as_files(
-    time_s: np.ndarray, origin_ns: int, pieces: Sequence[Piece], answers: Mapping[str, Answer]
+    time_s: np.ndarray,
+    origin_ns: int,
+    pieces: Sequence[LogPiece],
+    answers: Mapping[str, FilterEstimates],
 ) -> dict[str, bytes]:
     """A file NAME-sample.npz for each filter, by its path in the result.
 

@@ -12,7 +12,7 @@ from robins.earth import gravity_n
 from robins.earth.magnetic import decimal_year, elements, field_n, wmm_for
 from robins.ins.alignment import level
 from robins.ins.rest import moving_statistics
-from robins.systems.ins_gnss.parameters import Aids, Gnss, Start
+from robins.systems.ins_gnss.parameters import Aids, Gnss, InsGnssStart
 from robins.systems.ins_gnss.positions import (
     attitudes,
     best_lines,
@@ -21,7 +21,7 @@ from robins.systems.ins_gnss.positions import (
     with_heading,
 )
 from robins.systems.ins_gnss.recording import Log
-from robins.systems.ins_gnss.rest import WAYS_S, Usual, at_rest, looks_still, usual_of
+from robins.systems.ins_gnss.rest import WAYS_S, UsualIntervals, at_rest, seems_at_rest, usual_of
 
 REST_S = 10.0  # after the first whole fix, within which a filter with a given heading levels
 UNKNOWN_SPEED = 10.0  # m/s, sigma of a velocity of which nothing is known
@@ -37,12 +37,12 @@ class StartPoint(NamedTuple):
     sentence: str  # how it was found, for the reader
     heading_sigma_rad: float
     v_n: np.ndarray  # (3,) m/s, of the antenna where the receiver states it
-    # (3, 2, 2) of velocity and position on each axis; None: as `Start` has them
+    # (3, 2, 2) of velocity and position on each axis; None: as `InsGnssStart` has them
     spread: np.ndarray | None = None
     offset_n: np.ndarray | None = None  # (3,) m, IMU from the fix; None: by lever arm and attitude
 
 
-def fast_fix(log: Log, start: Start) -> tuple[int | None, bool, str]:
+def fast_fix(log: Log, start: InsGnssStart) -> tuple[int | None, bool, str]:
     """First fix that a course can be taken from, and whether by positions; None and why, else."""
     v_n = log.gnss.v_n
     speed = np.zeros(len(log.gnss_s)) if v_n is None else np.hypot(v_n[:, 0], v_n[:, 1])
@@ -112,7 +112,11 @@ def _compass(
 
 
 def find_start(
-    log: Log, start: Start, aids: Aids, usual: Usual | None = None, gnss: Gnss | None = None
+    log: Log,
+    start: InsGnssStart,
+    aids: Aids,
+    usual: UsualIntervals | None = None,
+    gnss: Gnss | None = None,
 ) -> StartPoint:
     """Level on the quietest early window; take the heading as given or from the course.
 
@@ -148,9 +152,9 @@ def find_start(
         at, begin_s = 0, begin_s if tilt == start.tilt else float(log.gnss_s[some])
     elif fast is None:
         place = float(g.lat_rad[some]), float(g.lon_rad[some]), float(g.alt_m[some])
-        heading, told = _compass(log, q_nb, begin_s, place, int(g.time_ns[some]), unknown)
+        heading, source = _compass(log, q_nb, begin_s, place, int(g.time_ns[some]), unknown)
         q_nb = with_heading(q_nb, heading)
-        sentence += f", {told}"
+        sentence += f", {source}"
     else:
         q_nb, at, begin_s = _carried(log, q_nb, at, last, bias), last, float(log.gnss_s[fast])
     if fast is not None and not by_way and g.v_n is not None:
@@ -188,7 +192,12 @@ def _whole_fixes(log: Log) -> np.ndarray:
 
 
 def _levelled(
-    log: Log, start: Start, aids: Aids, usual: Usual, fast: int | None, until_s: float
+    log: Log,
+    start: InsGnssStart,
+    aids: Aids,
+    usual: UsualIntervals,
+    fast: int | None,
+    until_s: float,
 ) -> tuple[int, int, np.ndarray, float, np.ndarray, str]:
     """Level on rest, or on the quietest second, of the samples up to a time or a fast fix.
 
@@ -200,7 +209,7 @@ def _levelled(
         ValueError: the mean specific force is not gravity's.
     """
     dt, _, dv = log.increments[:3]
-    still, mean_rate = looks_still(log, aids, usual)
+    still, mean_rate = seems_at_rest(log, aids, usual)
     width = max(2, round(2.0 * aids.window / usual.sample_s))
     mean_force, spread = moving_statistics(dv / dt[:, None], width, log.first)
     # without a course nothing is taken from after the rest that it begins at
@@ -249,7 +258,7 @@ def _by_positions(
     at: int,
     later: np.ndarray,
     stands: np.ndarray,
-    start: Start,
+    start: InsGnssStart,
     gnss: Gnss,
     by_way: bool,
 ) -> StartPoint:

@@ -16,8 +16,8 @@ from robins.filters import Filter, adaptive, cubature, kalman, taylor, unscented
 from robins.filters.rules import gate
 from robins.results import array
 from robins.systems.ins_gnss.model import IMU, SENSORS, ins_gnss_model, state_blocks
-from robins.systems.ins_gnss.parameters import Drive, Imu
-from robins.systems.ins_gnss.world import Course, as_believed, belief_of, lay_out, simulate
+from robins.systems.ins_gnss.parameters import Drive, InsGnssImu
+from robins.systems.ins_gnss.world import InsGnssCourse, as_believed, belief_of, lay_out, simulate
 from robins.systems.judgement import Metric, consistency, consistency_claims
 from robins.systems.parts import refuse_unsettled
 from robins.systems.study import Contender, StateBlock, Study, View
@@ -60,7 +60,7 @@ def make_filter(name: str, gate_probability: float = 0.0) -> Filter:
     return FILTERS[name]((gate(gate_probability),) if gate_probability > 0.0 else ())
 
 
-def believed_imu(drive: Drive) -> Imu:
+def believed_imu(drive: Drive) -> InsGnssImu:
     """The inertial sensors as the filters believe in them: their noise by `believed.q_factor`."""
     factor = float(np.sqrt(drive.believed.q_factor))
     scaled = ("gyro_noise", "accel_noise", "gyro_bias_walk", "accel_bias_walk")
@@ -69,7 +69,7 @@ def believed_imu(drive: Drive) -> Imu:
     )
 
 
-def contender(drive: Drive, course: Course, name: str) -> Contender:
+def contender(drive: Drive, course: InsGnssCourse, name: str) -> Contender:
     """A filter with the model it believes in.
 
     Raises:
@@ -82,7 +82,7 @@ def contender(drive: Drive, course: Course, name: str) -> Contender:
     return Contender(make_filter(name, drive.update.gate), model, case)
 
 
-def view(drive: Drive, course: Course) -> View:
+def view(drive: Drive, course: InsGnssCourse) -> View:
     """Arrays of the report: all states, the true path, the track of each filter in the first run.
 
     Raises:

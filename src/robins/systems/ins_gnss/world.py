@@ -29,17 +29,17 @@ from robins.sim.gnss_sensor import GnssErrorModel, as_table, fix_times, observe
 from robins.sim.ideal_imu import ideal_increments
 from robins.sim.imu_sensor import corrupt
 from robins.sim.random import Component, stream
-from robins.sim.trajectory import Motion
+from robins.sim.trajectory import MotionProfile
 from robins.systems.ins_gnss.model import POSITION, VELOCITY, Fix, Velocity, start_belief
-from robins.systems.ins_gnss.parameters import Drive, Imu
-from robins.systems.parts import Block, any_there, as_array
+from robins.systems.ins_gnss.parameters import Drive, InsGnssImu
+from robins.systems.parts import ImuBlock, any_there, as_array
 from robins.systems.study import Case
 
 
-class Course(NamedTuple):
+class InsGnssCourse(NamedTuple):
     """Data that all runs share."""
 
-    motion: Motion
+    motion: MotionProfile
     ideal: Increments  # (N,), (N, 3), (N, 3) the samples of an ideal unit
     blocks: Blocks  # of the same with coning and sculling in them
     start: Nav
@@ -51,7 +51,7 @@ class Course(NamedTuple):
     outage: np.ndarray  # (E,) bool
 
 
-def motion_of(drive: Drive) -> Motion:
+def motion_of(drive: Drive) -> MotionProfile:
     """The motion that the legs describe, from rest.
 
     Raises:
@@ -62,7 +62,7 @@ def motion_of(drive: Drive) -> Motion:
     return from_commands(start, [leg.command() for leg in drive.legs], heading_rad=p.heading)
 
 
-def error_model(imu: Imu) -> ImuErrorModel:
+def error_model(imu: InsGnssImu) -> ImuErrorModel:
     """The sensors whose errors the filter's parameters describe."""
 
     def triad(bias, noise, walk, time, scale) -> TriadErrors:
@@ -94,7 +94,7 @@ def receiver_model(drive: Drive) -> GnssErrorModel:
     )
 
 
-def lay_out(drive: Drive) -> Course:
+def lay_out(drive: Drive) -> InsGnssCourse:
     """Everything that does not depend on a run, in NumPy.
 
     Raises:
@@ -129,7 +129,7 @@ def lay_out(drive: Drive) -> Course:
     outage = np.zeros(len(epochs), dtype=bool)
     if drive.outages is not None:
         outage = drive.outages.mask(epochs, 0.0, float(epochs[-1]))
-    return Course(
+    return InsGnssCourse(
         motion=motion,
         ideal=Increments(dt, table.gyro[1:], table.accel[1:]),
         blocks=blocks,
@@ -143,13 +143,13 @@ def lay_out(drive: Drive) -> Course:
     )
 
 
-def _at_fixes(motion: Motion, valid_s: np.ndarray) -> tuple[np.ndarray, ...]:
+def _at_fixes(motion: MotionProfile, valid_s: np.ndarray) -> tuple[np.ndarray, ...]:
     """The truth at some times, as `observe` takes it."""
     k = motion.at(valid_s)
     return valid_s, k.lat, k.lon, k.alt, k.v_n, k.q_nb, k.rates()[0]
 
 
-def simulate(drive: Drive, course: Course, seed: int, index: Array) -> Case:
+def simulate(drive: Drive, course: InsGnssCourse, seed: int, index: Array) -> Case:
     """One run, from its number; pure."""
     dt, theta, dv = (jnp.asarray(a) for a in course.ideal[:3])
     key = partial(stream, seed, index)
@@ -159,7 +159,7 @@ def simulate(drive: Drive, course: Course, seed: int, index: Array) -> Case:
     share = course.blocks.increments.dt / np.asarray(course.ideal.dt)[parent]
     share = jnp.asarray(np.where(padded, 0.0, share))[..., None]
     pieces = course.blocks.increments
-    u = Block(
+    u = ImuBlock(
         Increments(
             jnp.asarray(pieces.dt),
             jnp.asarray(pieces.theta) + share * (turned - theta)[parent],
@@ -215,7 +215,7 @@ class DriveBelief(NamedTuple):
     sigma: dict[str, Any]  # by sensor
 
 
-def belief_of(drive: Drive, course: Course) -> DriveBelief:
+def belief_of(drive: Drive, course: InsGnssCourse) -> DriveBelief:
     """Assumptions of the filters, by the parameters."""
     begin = drive.start
     known = start_belief(course.start, drive.imu, begin, begin.tilt, begin.heading)
@@ -224,13 +224,13 @@ def belief_of(drive: Drive, course: Course) -> DriveBelief:
     return DriveBelief(known.factor, {name: r * as_array(each) for name, each in sigma.items()})
 
 
-def as_believed(told: DriveBelief, world: Case) -> Case:
+def as_believed(belief: DriveBelief, world: Case) -> Case:
     """The case of a drive, which may have been drawn with other numbers than filters are told."""
     aux = {
-        name: fix._replace(sigma=jnp.broadcast_to(told.sigma[name], fix.sigma.shape))
+        name: fix._replace(sigma=jnp.broadcast_to(belief.sigma[name], fix.sigma.shape))
         for name, fix in world.aux.items()
     }
-    return world._replace(start=world.start._replace(factor=told.factor), aux=aux)
+    return world._replace(start=world.start._replace(factor=belief.factor), aux=aux)
 
 
 def drive_dataset(drive: Drive, seed: int, run: int = 0) -> Dataset:

@@ -3,14 +3,14 @@
 from pathlib import Path
 
 from robins.errors import moved
-from robins.systems.marg.aboard import aboard
+from robins.systems.marg.aboard import export_problem
 from robins.systems.marg.filters import filter_of, one_prior
 from robins.systems.marg.live import LiveMarg
 from robins.systems.marg.log import prepare
 from robins.systems.marg.model import Block, Samples, integrate, model_of
-from robins.systems.marg.parameters import Replay
+from robins.systems.marg.parameters import MargReplay
 from robins.systems.marg.replay import FILTERS, recorded, replay
-from robins.systems.marg.start import first_belief, first_look
+from robins.systems.marg.start import first_belief, initial_alignment
 from robins.systems.study import System
 
 SYSTEM = System(
@@ -18,14 +18,14 @@ SYSTEM = System(
     studies={},
     default="marg",
     replay_filters=FILTERS,
-    replay_parameters=Replay,
+    replay_parameters=MargReplay,
     replay_default=Path(__file__).parent / "scenarios" / "replay.toml",
     replay=replay,
     recorded=recorded,
     use="attitude",
     replay_finds=("attitude",),
     orientation=lambda parameters: parameters.orientation,
-    aboard=aboard,
+    aboard=export_problem,
 )
 
 __getattr__ = moved(__name__)
@@ -34,11 +34,11 @@ __all__ = [
     "SYSTEM",
     "Block",
     "LiveMarg",
-    "Replay",
+    "MargReplay",
     "Samples",
     "filter_of",
     "first_belief",
-    "first_look",
+    "initial_alignment",
     "integrate",
     "model_of",
     "one_prior",

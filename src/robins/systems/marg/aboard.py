@@ -27,8 +27,8 @@ from robins.filters import Model, Motion
 from robins.rotation import Rotation
 from robins.systems.marg import model
 from robins.systems.marg.filters import one_prior
-from robins.systems.marg.log import Prepared, prepare
-from robins.systems.marg.parameters import Replay
+from robins.systems.marg.log import PreparedMargLog, prepare
+from robins.systems.marg.parameters import MargReplay
 from robins.systems.marg.replay import CAUSAL
 from robins.systems.parts import NED
 from robins.systems.study import Case, Contender, Problem, StateBlock
@@ -73,7 +73,7 @@ FIELDS = {
 """Comments on the fields of the exported library, in addition to those of the model."""
 
 
-class Given(NamedTuple):
+class BoardInput(NamedTuple):
     """Input of a step: n increments, and what is known of them."""
 
     dt_s: Any  # (n,)
@@ -84,19 +84,19 @@ class Given(NamedTuple):
     lost_dv: Any  # () m/s
 
 
-def block_of(u: Given) -> model.Block:
+def block_of(u: BoardInput) -> model.Block:
     """The increments, integrated."""
     field = jnp.full(jnp.shape(u.theta_b), jnp.nan)
     integrals, _ = model.of_block(model.Samples(u.dt_s, u.theta_b, u.dv_b, field))
     return model.Block(integrals, u.still, u.lost_turn, u.lost_dv)
 
 
-def _of_increments(inner: Callable[..., PyTree], x: model.MargState, u: Given) -> PyTree:
+def _of_increments(inner: Callable[..., PyTree], x: model.MargState, u: BoardInput) -> PyTree:
     return inner(x, block_of(u))
 
 
-def model_on_board(parameters: Replay) -> Model:
-    """`model_of`, whose motion takes `Given`."""
+def model_on_board(parameters: MargReplay) -> Model:
+    """`model_of`, whose motion takes `BoardInput`."""
     known = model.model_of(parameters)
     step, noise, linear = (
         Partial(_of_increments, part)
@@ -108,7 +108,7 @@ def model_on_board(parameters: Replay) -> Model:
 # --------------------------------------------------------------------------------------- the hand
 
 
-class Hand(NamedTuple):
+class HandMotion(NamedTuple):
     """A simulated log and its truth; N samples behind the first."""
 
     log: Dataset
@@ -120,7 +120,7 @@ class Hand(NamedTuple):
     accel_bias: np.ndarray  # (3,) m/s^2
 
 
-def hand(parameters: Replay, seed: int, run: int) -> Hand:
+def simulated_hand(parameters: MargReplay, seed: int, run: int) -> HandMotion:
     """A hand that turns and swings the unit; each run in another way, with other errors.
 
     Samples are means over the intervals that they end. What is believed of the unit is the size of
@@ -159,15 +159,15 @@ def hand(parameters: Replay, seed: int, run: int) -> Hand:
 
     imu = ImuTable(time_ns, rows(gyro), rows(accel), "rate")
     log = Dataset(name="hand", imu=imu, mag=MagTable(time_ns, rows(raw)))
-    return Hand(log, q_nb, v_n, p_n, bias, gain, accel_bias)
+    return HandMotion(log, q_nb, v_n, p_n, bias, gain, accel_bias)
 
 
-def case_of(parameters: Replay, of: Hand) -> Case:
+def case_of(parameters: MargReplay, of: HandMotion) -> Case:
     """Inputs and measurements of a filter on a board, and the truth at the ends of its steps."""
-    made: Prepared = prepare(of.log, parameters)
+    made: PreparedMargLog = prepare(of.log, parameters)
     p = parameters.accelerometer
     world, samples, count = made.world, made.samples, len(made.rows)
-    u = Given(samples.dt_s, samples.theta, samples.dv, *world.u[1:])
+    u = BoardInput(samples.dt_s, samples.theta, samples.dv, *world.u[1:])
     truth = model.MargState(
         q_nb=Rotation(jnp.asarray(np.roll(of.q_nb.as_quat()[made.rows], 1, axis=-1))),
         v_n=jnp.asarray(of.v_n[made.rows]),
@@ -183,13 +183,13 @@ def case_of(parameters: Replay, of: Hand) -> Case:
     return Case(world.start, u, world.y, world.aux, truth)
 
 
-def aboard(parameters: Replay, seed: int) -> Problem:
+def export_problem(parameters: MargReplay, seed: int) -> Problem:
     """The filter on some simulated hands, as `robins export` takes it.
 
     Raises:
         ValueError: the parameters allow no log of such a hand.
     """
-    cases = [case_of(parameters, hand(parameters, seed, run)) for run in range(RUNS)]
+    cases = [case_of(parameters, simulated_hand(parameters, seed, run)) for run in range(RUNS)]
     every = jax.tree_util.tree_map(lambda *a: jnp.stack([jnp.asarray(x) for x in a]), *cases)
     known = model_on_board(parameters)
 

@@ -16,7 +16,7 @@ from robins.filters.rule import Memory, Rule
 from robins.filters.trees import select
 from robins.filters.values import Numbers, number, value
 from robins.systems.marg import model
-from robins.systems.marg.parameters import Replay
+from robins.systems.marg.parameters import MargReplay
 
 # of what is learned of travel: forgetting, and least and most of its variances
 _MEMORY, _TRAVEL_VARIANCE = 0.98, (0.3, 10.0)
@@ -115,7 +115,7 @@ def marg_filter(
     return kalman(rules=chain)
 
 
-def one_prior(parameters: Replay) -> Filter:
+def one_prior(parameters: MargReplay) -> Filter:
     """The filter, with its rules, for gyros of the gain `parameters.gyro.gain`."""
     m, sees = parameters.magnetometer, parameters.use_magnetometer
     return marg_filter(
@@ -126,7 +126,7 @@ def one_prior(parameters: Replay) -> Filter:
     )
 
 
-def filter_of(parameters: Replay) -> Filter:
+def filter_of(parameters: MargReplay) -> Filter:
     """The filter of a log, which takes gyros for those of a bare chip once that is likelier."""
     gyro, spread = parameters.gyro, np.zeros(model.DIM)
     spread[model.GAINS] = gyro.bare_gain

@@ -38,24 +38,24 @@ from robins.ins.increments import Increments
 from robins.linalg.scalars import product
 from robins.systems.marg import model, monitor
 from robins.systems.marg.filters import filter_of
-from robins.systems.marg.parameters import Replay
-from robins.systems.marg.path import SamplePath, Steps
+from robins.systems.marg.parameters import MargReplay
+from robins.systems.marg.path import MargSteps, SamplePath
 from robins.systems.marg.replay import stated_sigma
-from robins.systems.marg.start import first_belief, first_look
+from robins.systems.marg.start import first_belief, initial_alignment
 from robins.systems.replaying import kept
 from robins.systems.streaming import (
-    Door,
     Flag,
     Live,
     LiveError,
-    as_before,
+    TimestampGate,
     numbers,
     online,
     refuse_field_unit,
     refuse_units,
+    restored,
     stamp,
 )
-from robins.systems.tables import Update
+from robins.systems.tables import SensorUpdates
 
 _STEPS = 2  # of the filter in a sample, where it has to catch up
 _LONGEST_GAP_S, _PATIENCE_S = 10.0, 0.1
@@ -112,7 +112,7 @@ class LiveMarg(Live):
             `imu_bridged`, `imu_frozen`, `imu_gaps`, `blocks_in_free_fall`, `steps_not_taken`.
     """
 
-    _parameters: ClassVar[type[Replay]] = Replay
+    _parameters: ClassVar[type[MargReplay]] = MargReplay
     _kept: ClassVar[tuple[str, ...]] = (
         "_field", "_far", "_pending", "_looks", "_since", "_q", "_sigma", "_bias", "_gain",
         "_marks", "_starting", "_open",
@@ -121,7 +121,7 @@ class LiveMarg(Live):
 
     def __init__(
         self,
-        parameters: Replay,
+        parameters: MargReplay,
         rate_hz: float,
         declination_rad: float = 0.0,
         machine: str | None = None,
@@ -150,11 +150,11 @@ class LiveMarg(Live):
         self._turn_north = (math.cos(half), 0.0, 0.0, math.sin(half))
         self._on = partial(online, filter_of(p), model.model_of(p), machine=machine or usual())
         self._online: OnlineFilter | None = None
-        self._door = Door(_LONGEST_GAP_S, max(3, round(_PATIENCE_S * rate_hz)))
-        self._begin_anew()
+        self._door = TimestampGate(_LONGEST_GAP_S, max(3, round(_PATIENCE_S * rate_hz)))
+        self._restart()
         self._compile()
 
-    def _begin_anew(self) -> None:
+    def _restart(self) -> None:
         """Forget all but the counts and the stamps."""
         self._field = np.full(3, np.nan)  # of a sample that was refused
         self._far: list[float] = []  # sizes of implausible readings in a row
@@ -182,7 +182,7 @@ class LiveMarg(Live):
         self._online = self._on(found[1])
         self._step()
         self.counts.clear()
-        self._begin_anew()
+        self._restart()
 
     # ------------------------------------------------------------------------------ a sample
 
@@ -203,10 +203,10 @@ class LiveMarg(Live):
         gyro, accel = numbers("gyro", gyro_rad_s, 3), numbers("accel", accel_m_s2, 3)
         self._read_field(field_t)
         values = np.concatenate([gyro, accel])
-        why = self._door.ask(time, values)
+        why = self._door.check(time, values)
         if why == "anew":
             self.counts["begun_anew"] += 1
-            self._begin_anew()
+            self._restart()
         elif why:
             self.counts[f"imu_{why}"] += 1
             return self._answer(time, Flag.REFUSED)
@@ -275,7 +275,7 @@ class LiveMarg(Live):
         q = np.array(product(self._turn_north, self._q))
         return Attitude(time_ns, q / np.linalg.norm(q), self._sigma, flags)
 
-    def _wait(self, made: list[Steps]) -> None:
+    def _wait(self, made: list[MargSteps]) -> None:
         """Add steps to those that wait."""
         for steps in made:
             rows = steps.u, steps.y, steps.aux
@@ -299,7 +299,7 @@ class LiveMarg(Live):
         """Begin the filter as soon as the start is known."""
         if not self._pending:
             return
-        increments, _ = self._path.begun
+        increments, _ = self._path.until_start
         found = self._path.start()
         if found is None:
             return
@@ -307,7 +307,7 @@ class LiveMarg(Live):
         try:
             refuse_units(rate, force)
         except LiveError:
-            self._begin_anew()
+            self._restart()
             raise
         self._online = self._on(found[1])
 
@@ -337,17 +337,17 @@ class LiveMarg(Live):
         self._looks = np.concatenate([self._looks, np.concatenate(row)[None]])[-most:]
         looks, none = self._looks, np.zeros(len(self._looks))
         updates = {
-            name: Update(none, none, looks[:, 2], looks[:, k], looks[:, k + 1])
+            name: SensorUpdates(none, none, looks[:, 2], looks[:, k], looks[:, k + 1])
             for name, k in ((model.TRAVEL, 3), (model.MAGNETOMETER, 5))
         }
         bare = looks[:, 7] > 0.0
         doubt = monitor.doubts_of(looks[:, 0], looks[:, 1], updates, self.parameters, bare)
-        told = bool(doubt.declination[-1] or doubt.gain[-1])
+        doubtful = bool(doubt.declination[-1] or doubt.gain[-1])
         for column, k in ((doubt.tilt, 3), (doubt.refused, 5)):
             refused = looks[:, k + 1] == Code.REFUSED
             asked = np.flatnonzero((looks[:, k] == np.max(looks[:, k])) | refused)
-            told |= bool(len(asked)) and bool(column[asked[-1]])
-        flags = Flag.DOUBTFUL if told else Flag(0)
+            doubtful |= bool(len(asked)) and bool(column[asked[-1]])
+        flags = Flag.DOUBTFUL if doubtful else Flag(0)
         asked = np.flatnonzero((looks[:, 5] > 0) | (looks[:, 6] == Code.REFUSED))
         disturbed = len(asked) > 0 and looks[asked[-1], 6] == Code.REFUSED
         return flags | (Flag.DISTURBED if disturbed else Flag(0))
@@ -359,7 +359,8 @@ class LiveMarg(Live):
 
     def _go_on_from(self, state: list[Array]) -> None:
         increments = Increments(np.ones(1), np.zeros((1, 3)), np.array([[0.0, 0.0, -9.81]]))
-        belief = first_belief(first_look(increments, np.full((1, 3), np.nan), self.parameters),
-                              self.parameters)  # fmt: skip
+        belief = first_belief(
+            initial_alignment(increments, np.full((1, 3), np.nan), self.parameters), self.parameters
+        )
         self._online = self._on(belief)
-        self._online.state = as_before(self._online.state, state)
+        self._online.state = restored(self._online.state, state)

@@ -10,28 +10,28 @@ from robins.dataset import Dataset, ImuTable, MagTable
 from robins.ins.frames import to_ned_frd
 from robins.ins.increments import usual_interval
 from robins.systems.marg import model
-from robins.systems.marg.parameters import Magnetometer, Replay
+from robins.systems.marg.parameters import MargMagnetometer, MargReplay
 from robins.systems.marg.path import SamplePath, joined
 from robins.systems.marg.saturation import levels
-from robins.systems.marg.start import FirstLook
-from robins.systems.replaying import Piece
+from robins.systems.marg.start import FilterStart
+from robins.systems.replaying import LogPiece
 from robins.systems.study import Case
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prepared(Piece):
+class PreparedMargLog(LogPiece):
     """A log as the filter takes it; K blocks of n samples, N samples. The world is a `Case`."""
 
     time_ns: np.ndarray  # (N,) int64, of each sample, from the first one on
     samples: model.Samples
     rows: np.ndarray  # (K,) the sample that each block ends with
-    look: FirstLook
+    look: FilterStart
     still: np.ndarray  # (K,) bool
     counts: dict[str, int]
 
 
 def calibrated(
-    mag: MagTable, magnetometer: Magnetometer
+    mag: MagTable, magnetometer: MargMagnetometer
 ) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
     """Time [ns] and field [T, FRD] of the readings that can be the field of the Earth; counts."""
     table = to_ned_frd(mag)
@@ -58,7 +58,7 @@ def at_samples(time_ns: np.ndarray, field_ns: np.ndarray, field: np.ndarray) -> 
     return out
 
 
-def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
+def prepare(dataset: Dataset, parameters: MargReplay) -> PreparedMargLog:
     """Take a log through the path of its samples, as one chunk.
 
     Raises:
@@ -84,7 +84,7 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
     look, belief = found_start
     rows = np.minimum((np.arange(len(steps.still)) + 1) * path.n, len(dt))
     counts = ("imu_saturated", "imu_bridged", "imu_frozen", "imu_gaps", "blocks_in_free_fall")
-    return Prepared(
+    return PreparedMargLog(
         world=Case(belief, steps.u, steps.y, steps.aux, None),
         begin_s=0.0,
         epoch_s=(time_ns[rows] - time_ns[0]) * 1e-9,

@@ -36,9 +36,9 @@ from jaxtyping import Array, ArrayLike, Float
 from robins import rotation
 from robins.filters import Model, Motion, Sensor
 from robins.manifold import Angle
-from robins.program.scanned import on_each
+from robins.program.scanned import mapped_rows
 from robins.rotation import Rotation, left_jacobian, skew
-from robins.systems.marg.parameters import Replay
+from robins.systems.marg.parameters import MargReplay
 from robins.systems.parts import NED
 from robins.systems.study import SensorAxes, StateBlock
 
@@ -109,7 +109,7 @@ class Block(NamedTuple):
     lost_dv: ArrayLike  # () m/s, the same of the velocity
 
 
-class Noise(NamedTuple):
+class MargNoise(NamedTuple):
     """Process noise of a second, and how sure what is known of the motion and the field is."""
 
     gyro: ArrayLike  # rad/sqrt(s)
@@ -133,7 +133,7 @@ def correction(x: MargState, block: Block) -> Array:
     return gain - jnp.asarray(block.samples.turn_time) @ x.gyro_bias
 
 
-def persistence(noise: Noise, block: Block) -> Array:
+def persistence(noise: MargNoise, block: Block) -> Array:
     """Share of the declination that a block leaves: all of it while the unit lies still."""
     moving_s = jnp.asarray(block.samples.dt_s) * (1.0 - jnp.asarray(block.still))
     return jnp.exp(-moving_s / noise.declination_time)
@@ -146,7 +146,7 @@ def _velocity_gain(x: MargState, block: Block) -> Array:
     return x.q_nb.apply(dv - jnp.asarray(block.samples.turn_time) @ x.accel_bias)
 
 
-def advance(noise: Noise, x: MargState, block: Block) -> MargState:
+def advance(noise: MargNoise, x: MargState, block: Block) -> MargState:
     """The state after a block."""
     dt = jnp.asarray(block.samples.dt_s)
     gained = _velocity_gain(x, block) + jnp.array([0.0, 0.0, 1.0]) * x.gravity * dt
@@ -161,7 +161,7 @@ def advance(noise: Noise, x: MargState, block: Block) -> MargState:
     )
 
 
-def _factor(noise: Noise, x: MargState, block: Block) -> Array:
+def _factor(noise: MargNoise, x: MargState, block: Block) -> Array:
     """(32, 32) of the process noise: diagonal, but that a turn is lost about body axes."""
     dt, moving = jnp.asarray(block.samples.dt_s), 1.0 - jnp.asarray(block.still)
     root = jnp.sqrt(dt)
@@ -188,7 +188,7 @@ def _factor(noise: Noise, x: MargState, block: Block) -> Array:
     return jnp.diag(jnp.concatenate(parts)).at[0:3, 0:3].set(x.q_nb.as_dcm() * turn[None, :])
 
 
-def advance_linear(noise: Noise, x: MargState, block: Block):
+def advance_linear(noise: MargNoise, x: MargState, block: Block):
     """`advance`, its Jacobian (32, 32) between tangent spaces, and the noise factor."""
     dt, dv = jnp.asarray(block.samples.dt_s), jnp.asarray(block.samples.dv)
     rate_map = jnp.concatenate(
@@ -219,7 +219,7 @@ def _travel_linear(x: MargState, _: Array | None):
     return _read_travel(x, None), jnp.eye(6, DIM, 3)
 
 
-def _travel_sigma(noise: Noise) -> Array:
+def _travel_sigma(noise: MargNoise) -> Array:
     sigma = jnp.stack([jnp.asarray(noise.velocity), jnp.asarray(noise.place)])
     return jnp.repeat(sigma, 3)
 
@@ -237,7 +237,7 @@ def _rest_linear(x: MargState, seen_b: Array):
     return _read_rest(x, seen_b), H
 
 
-def _rest_sigma(noise: Noise, x: MargState, seen_b: Array):
+def _rest_sigma(noise: MargNoise, x: MargState, seen_b: Array):
     velocity, rate = jnp.asarray(noise.velocity_still), jnp.asarray(seen_b)[3]
     return jnp.repeat(jnp.stack([velocity, rate]), 3)
 
@@ -261,7 +261,7 @@ def _magnetometer_linear(x: MargState, field_b: Array):
     return _read_magnetometer(x, field_b), H.at[1:, FIELD].set(-jnp.eye(2))
 
 
-def _magnetometer_sigma(noise: Noise, x: MargState, field_b: Array):
+def _magnetometer_sigma(noise: MargNoise, x: MargState, field_b: Array):
     strength, _ = _level(x, field_b)
     # A field that points down has no azimuth: half a turn is as little as can be known.
     azimuth = jnp.pi * jnp.tanh(noise.field / jnp.maximum(strength, 1e-3 * noise.field) / jnp.pi)
@@ -283,7 +283,7 @@ def _site_sigma(x: MargState, seen_b: Array):
     return jnp.asarray(seen_b)[3:4]
 
 
-def model_of(parameters: Replay) -> Model:
+def model_of(parameters: MargReplay) -> Model:
     """Gyro and accelerometer carry the state; travel, rest and the magnetometer hold it.
 
     The Jacobian of the magnetometer has no columns of tilt: a disturbed field cannot tilt the
@@ -299,7 +299,7 @@ def model_of(parameters: Replay) -> Model:
     """
     gyro, accelerometer = parameters.gyro, parameters.accelerometer
     magnetometer, travel, rest = parameters.magnetometer, parameters.travel, parameters.rest
-    noise = Noise(
+    noise = MargNoise(
         gyro=gyro.noise,
         turn_error=gyro.turn_error,
         accel=accelerometer.noise,
@@ -371,7 +371,7 @@ def integrate(samples: Samples) -> tuple[Integrals, np.ndarray]:
 
     The field is in body axes at the end of the block, (K, 3) T; NaN where there is none.
     """
-    return on_each(of_block, samples)
+    return mapped_rows(of_block, samples)
 
 
 def _turns(bias: Array, gain: Array, dt: Array, theta: Array) -> Array:
@@ -398,7 +398,7 @@ def causal_attitudes(
         lambda a, b: np.concatenate([np.asarray(a)[None], np.asarray(b)[:-1]]), start, posterior
     )
     given = before.q_nb.wxyz, before.gyro_bias, before.gyro_gain
-    q = on_each(_carried, (*given, samples.dt_s, samples.theta))
+    q = mapped_rows(_carried, (*given, samples.dt_s, samples.theta))
     q[:, -1] = posterior.q_nb.wxyz
     return q
 
@@ -418,18 +418,18 @@ def smoothed_attitudes(
     """
     given = smoothed.gyro_bias, smoothed.gyro_gain, samples.dt_s, samples.theta
     q_end = np.asarray(smoothed.q_nb.wxyz)
-    first = on_each(_begun, (q_end[:1], *(x[:1] for x in given)))
+    first = mapped_rows(_attitude_before, (q_end[:1], *(x[:1] for x in given)))
     start = np.concatenate([first, q_end[:-1]])
-    return on_each(_mended, (start, q_end, *given)), first[0]
+    return mapped_rows(_joined_attitudes, (start, q_end, *given)), first[0]
 
 
-def _begun(block: tuple[Array, Array, Array, Array, Array]) -> Array:
+def _attitude_before(block: tuple[Array, Array, Array, Array, Array]) -> Array:
     """(4,) attitude before a block, from that at its end."""
     q_end, *given = block
     return rotation.normalise(rotation.multiply(q_end, rotation.conjugate(_turns(*given)[-1])))
 
 
-def _mended(block: tuple[Array, Array, Array, Array, Array, Array]) -> Array:
+def _joined_attitudes(block: tuple[Array, Array, Array, Array, Array, Array]) -> Array:
     """(n, 4) attitudes of a block between two that are known."""
     start, q_end, *given = block
     q = rotation.multiply(start[None], _turns(*given))

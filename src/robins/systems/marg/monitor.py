@@ -14,8 +14,8 @@ import numpy as np
 
 from robins.filters import Code
 from robins.systems.marg.model import MAGNETOMETER, TRAVEL, MargState
-from robins.systems.marg.parameters import Replay
-from robins.systems.tables import Update
+from robins.systems.marg.parameters import MargReplay
+from robins.systems.tables import SensorUpdates
 
 _SIGMAS = 3.0
 _LOOKS = 20  # of travel, in the mean of its squares
@@ -25,7 +25,7 @@ _LASTING_S = 5.0
 _GAP_SHARE = 0.002  # of samples at the end of their range that nothing could be put back for
 
 
-class Doubt(NamedTuple):
+class Contradictions(NamedTuple):
     """Doubts of B blocks."""
 
     declination: np.ndarray  # (B,) bool
@@ -42,10 +42,10 @@ class Doubt(NamedTuple):
 def doubts_of(
     declination: np.ndarray,
     gain: np.ndarray,
-    updates: Mapping[str, Update],
-    parameters: Replay,
+    updates: Mapping[str, SensorUpdates],
+    parameters: MargReplay,
     bare: np.ndarray | bool = False,
-) -> Doubt:
+) -> Contradictions:
     """Contradictions of states or innovations of a filter or a smoother with the parameters.
 
     - declination: further from zero than three of its standard deviations;
@@ -71,7 +71,7 @@ def doubts_of(
         tilt = _too_large(updates[TRAVEL])
     if MAGNETOMETER in updates:
         refused = _in_a_row(updates[MAGNETOMETER], 10)
-    return Doubt(
+    return Contradictions(
         declination > _SIGMAS * parameters.magnetometer.declination,
         gain > _SIGMAS * usual,
         tilt,
@@ -79,21 +79,23 @@ def doubts_of(
     )
 
 
-def squared(innovation: np.ndarray, parameters: Replay) -> np.ndarray:
+def squared(innovation: np.ndarray, parameters: MargReplay) -> np.ndarray:
     """Sum of squares of innovations of travel (..., 6) in their stated standard deviations."""
     travel = parameters.travel
     ratio = innovation / np.repeat([travel.velocity, travel.place], 3)
     return np.asarray(np.sum(ratio**2, axis=-1))
 
 
-def as_stated(updates: Mapping[str, Update], parameters: Replay) -> dict[str, Update]:
+def as_stated(
+    updates: Mapping[str, SensorUpdates], parameters: MargReplay
+) -> dict[str, SensorUpdates]:
     """Updates with the squares of travel by its stated deviations in the place of its NIS."""
     travel = updates[TRAVEL]
     square = squared(np.asarray(travel.innovation), parameters)
     return {**updates, TRAVEL: travel._replace(nis=square)}
 
 
-def _too_large(update: Update) -> np.ndarray:
+def _too_large(update: SensorUpdates) -> np.ndarray:
     nis, dof = np.asarray(update.nis), np.asarray(update.dof)
     looks = np.flatnonzero(dof == np.max(dof, initial=0))
     out = np.zeros(len(nis), dtype=bool)
@@ -107,7 +109,7 @@ def _too_large(update: Update) -> np.ndarray:
     return out
 
 
-def _in_a_row(update: Update, least: int) -> np.ndarray:
+def _in_a_row(update: SensorUpdates, least: int) -> np.ndarray:
     code, dof = np.asarray(update.code), np.asarray(update.dof)
     refused = code == int(Code.REFUSED)
     out, run = np.zeros(len(code), dtype=bool), []
@@ -118,7 +120,7 @@ def _in_a_row(update: Update, least: int) -> np.ndarray:
     return out
 
 
-def sentences(name: str, doubt: Doubt, mean: MargState, dt_s: np.ndarray) -> list[str]:
+def sentences(name: str, doubt: Contradictions, mean: MargState, dt_s: np.ndarray) -> list[str]:
     """Warnings of a filter: what was doubtful for more than 5 s, and what follows.
 
     Args:

@@ -21,7 +21,7 @@ Field = Annotated[q.Three, Quantity("magnetic field")]
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-class Gyro(Parameters):
+class MargGyro(Parameters):
     """The gyros: true rate = (I + gain) (what is read) - bias."""
 
     noise: q.AngleWalk = default("0.01 deg/s/sqrt(Hz)")
@@ -52,7 +52,7 @@ class Accelerometer(Parameters):
     )
 
 
-class Magnetometer(Parameters):
+class MargMagnetometer(Parameters):
     """The magnetometer and the field about it.
 
     A reading is first calibrated: matrix (reading - offset). The field of a room bends from place
@@ -77,7 +77,7 @@ class Magnetometer(Parameters):
     patience: q.Duration = default("20 s")
 
 
-class Travel(Parameters):
+class BoundedTravel(Parameters):
     """Prior knowledge of the motion: it does not run away.
 
     Seen once in `every` of motion, velocity and place are zero with these spreads. For a vehicle
@@ -107,7 +107,7 @@ class Rest(Parameters):
     velocity: q.Speed = default("0.01 m/s")
 
 
-class Start(Parameters):
+class MargStart(Parameters):
     """Uncertainty of the first attitude, found at rest and in motion."""
 
     still: q.Duration = default("0.5 s")
@@ -121,7 +121,7 @@ class Start(Parameters):
     north: Literal["start", "mean"] = "start"
 
 
-class Stated(Parameters):
+class StatedErrors(Parameters):
     """Errors that no state carries and the stated standard deviations of attitude must hold.
 
     Axes of a housing, gyros that do not respond at once, and stamps that are late cannot be
@@ -134,7 +134,7 @@ class Stated(Parameters):
     delay: q.Time = default("0.002 s")
 
 
-class Update(Parameters):
+class MargUpdate(Parameters):
     """Steps of the filter."""
 
     # a sample is the mean over the interval it ends, or the value at an instant
@@ -146,19 +146,19 @@ class Update(Parameters):
     gap_accel: q.Acceleration = default("3 m/s^2")
 
 
-class Replay(Parameters):
+class MargReplay(Parameters):
     """Parameters of a recorded nine-axis log that its files do not contain."""
 
     system: Literal["marg"] = "marg"
     title: str = "Orientation from gyro, accelerometer and magnetometer"
     use_magnetometer: Literal["always", "undisturbed", "never"] = "undisturbed"
     orientation: q.Angles = default("0 deg")  # roll, pitch, yaw of mount
-    gyro: Gyro = pydantic.Field(default_factory=Gyro)
+    gyro: MargGyro = pydantic.Field(default_factory=MargGyro)
     accelerometer: Accelerometer = pydantic.Field(default_factory=Accelerometer)
-    magnetometer: Magnetometer = pydantic.Field(default_factory=Magnetometer)
-    travel: Travel = pydantic.Field(default_factory=Travel)
+    magnetometer: MargMagnetometer = pydantic.Field(default_factory=MargMagnetometer)
+    travel: BoundedTravel = pydantic.Field(default_factory=BoundedTravel)
     rest: Rest = pydantic.Field(default_factory=Rest)
-    start: Start = pydantic.Field(default_factory=Start)
-    stated: Stated = pydantic.Field(default_factory=Stated)
-    update: Update = pydantic.Field(default_factory=Update)
+    start: MargStart = pydantic.Field(default_factory=MargStart)
+    stated: StatedErrors = pydantic.Field(default_factory=StatedErrors)
+    update: MargUpdate = pydantic.Field(default_factory=MargUpdate)
     filters: Names = ("marg", "marg-smoothed")

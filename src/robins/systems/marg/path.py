@@ -30,16 +30,16 @@ from robins.filters import Belief
 from robins.ins.increments import Increments, after_gap, from_imu, usual_interval
 from robins.manifold import Angle
 from robins.systems.marg import model
-from robins.systems.marg.parameters import Replay
-from robins.systems.marg.rest import Watch
-from robins.systems.marg.saturation import FLANK, LONGEST_S, Range, beyond, bridged
+from robins.systems.marg.parameters import MargReplay
+from robins.systems.marg.rest import RestDetector
+from robins.systems.marg.saturation import FLANK, LONGEST_S, GyroRange, beyond, bridged
 from robins.systems.marg.sites import Look, Sites
-from robins.systems.marg.start import FirstLook, first_belief, first_look
+from robins.systems.marg.start import FilterStart, first_belief, initial_alignment
 
 _FALLING = 0.3  # of gravity: below it nothing holds the unit up, and tilt cannot be seen
 
 
-class Steps(NamedTuple):
+class MargSteps(NamedTuple):
     """Steps of the filter; leading axis K blocks of n samples."""
 
     u: model.Block
@@ -61,7 +61,7 @@ class SamplePath:
 
     def __init__(
         self,
-        parameters: Replay,
+        parameters: MargReplay,
         usual_s: float,
         kind: Literal["rate", "increment"] = "rate",
         levels: np.ndarray | None = None,
@@ -80,8 +80,8 @@ class SamplePath:
         # a peak that ends in a block may have started in those before
         self._most_context = math.ceil(LONGEST_S / usual_s) + 2 * FLANK
         self._by_sample = levels is None and kind == "rate"
-        self.range = Range(levels)
-        self._watch, self._pace = Watch(self.n * usual_s, parameters.rest), Pace()
+        self.range = GyroRange(levels)
+        self._watch, self._pace = RestDetector(self.n * usual_s, parameters.rest), MeasurementPace()
         self._sites = Sites(model.SITES)
         self.counts: Counter[str] = Counter()
         self.time_ns = np.zeros(0, np.int64)  # of the samples kept, and
@@ -96,7 +96,7 @@ class SamplePath:
         """Number of samples that are in no block yet."""
         return len(self.rows) - self._context
 
-    def push(self, time_ns: np.ndarray, rows: np.ndarray) -> list[Steps]:
+    def push(self, time_ns: np.ndarray, rows: np.ndarray) -> list[MargSteps]:
         """Take samples; the steps that they complete.
 
         Args:
@@ -116,11 +116,11 @@ class SamplePath:
                 made.append(self._cut(self._context + blocks * self.n))
         return made
 
-    def finish(self) -> list[Steps]:
+    def finish(self) -> list[MargSteps]:
         """Steps of the samples that are left, of which the last block need not be full."""
         return [self._cut(len(self.rows))] if self.waiting > 0 else []
 
-    def start(self, is_whole: bool = False) -> tuple[FirstLook, Belief] | None:
+    def start(self, is_whole: bool = False) -> tuple[FilterStart, Belief] | None:
         """The start and the belief there, once later samples do not change them; None before.
 
         Args:
@@ -129,21 +129,21 @@ class SamplePath:
         p = self._parameters
         if not self._begun:
             return None
-        increments, field = self.begun
+        increments, field = self.until_start
         lasted = float(np.sum(increments.dt))
         if not is_whole:
             if lasted <= (p.start.moving if self._in_motion else p.start.still):
                 return None
             if not self._watch.settled:
                 return None
-            if not self._in_motion and not first_look(increments, field, p).still:
+            if not self._in_motion and not initial_alignment(increments, field, p).still:
                 self._in_motion = True
                 return None
-        look, self._begun = first_look(increments, field, p), None
+        look, self._begun = initial_alignment(increments, field, p), None
         return look, first_belief(look, p, self._watch)
 
     @property
-    def begun(self) -> tuple[Increments, np.ndarray]:
+    def until_start(self) -> tuple[Increments, np.ndarray]:
         """Increments and field (N, 3) of all blocks until the start is found."""
         dt, theta, dv, field = map(np.concatenate, zip(*(self._begun or ()), strict=True))
         return Increments(dt, theta, dv), field
@@ -200,7 +200,7 @@ class SamplePath:
                 return False
         return True
 
-    def _cut(self, end: int) -> Steps:
+    def _cut(self, end: int) -> MargSteps:
         """Steps of the samples up to a number; what is context of the next block is kept."""
         p, n, context = self._parameters, self.n, self._context
         accel, field = self.rows[:, 3:6], self.rows[:, 6:]
@@ -240,7 +240,9 @@ class SamplePath:
         self.counts["imu_frozen"] += int(np.sum(out > 0.0))
         return out
 
-    def _steps(self, samples: model.Samples, lost_turn: np.ndarray, lost_s: np.ndarray) -> Steps:
+    def _steps(
+        self, samples: model.Samples, lost_turn: np.ndarray, lost_s: np.ndarray
+    ) -> MargSteps:
         """Integrate blocks, and add what is known at their ends."""
         p = self._parameters
         integrals, field_b = model.integrate(samples)
@@ -254,10 +256,10 @@ class SamplePath:
         u, falling = inputs(integrals, still, lost_turn, lost_s, p)
         self.counts["blocks_in_free_fall"] += int(np.sum(falling))
         y, aux = measurements(integrals, field_b, still, sigma, looks, p, self._pace)
-        return Steps(u, y, aux, still, samples)
+        return MargSteps(u, y, aux, still, samples)
 
 
-def joined(steps: Sequence[Steps]) -> Steps:
+def joined(steps: Sequence[MargSteps]) -> MargSteps:
     """Steps of chunks, one after another."""
     return jax.tree_util.tree_map(lambda *rows: np.concatenate(rows), *steps)
 
@@ -294,7 +296,7 @@ def not_sampled(
     doubt: np.ndarray,
     accel_full: np.ndarray,
     usual: float,
-    parameters: Replay,
+    parameters: MargReplay,
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Spread of the turn that intervals did not show (N, 3) [rad], seconds of specific force that
     they did not show (N,), and how many are gaps.
@@ -323,7 +325,7 @@ def inputs(
     still: np.ndarray,
     lost_turn: np.ndarray,
     lost_s: np.ndarray,
-    parameters: Replay,
+    parameters: MargReplay,
 ) -> tuple[model.Block, np.ndarray]:
     """Inputs of the motion for K blocks, and mask of those in free fall (K,) bool.
 
@@ -346,7 +348,7 @@ def inputs(
     return u, falling
 
 
-class Pace:
+class MeasurementPace:
     """Times of the last use of travel and field, so that they are used once in an interval."""
 
     def __init__(self) -> None:
@@ -370,8 +372,8 @@ def measurements(
     still: np.ndarray,
     sigma: np.ndarray,
     looks: Sequence[Look],
-    parameters: Replay,
-    pace: Pace,
+    parameters: MargReplay,
+    pace: MeasurementPace,
 ) -> tuple[dict[str, PyTree], dict[str, PyTree]]:
     """Measurements at the end of each of K blocks, and what they depend on; NaN where nothing is.
 
@@ -412,7 +414,7 @@ def measurements(
     return y, aux
 
 
-def _of_site(look: Look, parameters: Replay) -> np.ndarray:
+def _of_site(look: Look, parameters: MargReplay) -> np.ndarray:
     """(4 + SITES,) field in body axes, sigma of its azimuth and which site it is."""
     site, field_b, dip = look
     leaning = np.tan(min(abs(dip), 1.5)) * parameters.stated.tilt

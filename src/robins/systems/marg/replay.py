@@ -22,15 +22,15 @@ from robins.errors import require_known
 from robins.filters import Code
 from robins.filters.values import Numbers
 from robins.ins.frames import to_ned_frd
-from robins.results import Outcome, Progress, Variables, array, silent, variable
+from robins.results import Outcome, Progress, Variables, array, ignore_progress, variable
 from robins.systems import replaying
 from robins.systems.marg import model, monitor
 from robins.systems.marg.filters import BARE, filter_of, one_prior
-from robins.systems.marg.log import Prepared, prepare
-from robins.systems.marg.parameters import Replay
-from robins.systems.replaying import Answer, Recorded, Reported
+from robins.systems.marg.log import PreparedMargLog, prepare
+from robins.systems.marg.parameters import MargReplay
+from robins.systems.replaying import FilterEstimates, PreparedLog, ReportedItems
 from robins.systems.study import Contender, StateBlock
-from robins.systems.tables import EULER, Update, attitude_array, block_array
+from robins.systems.tables import EULER, SensorUpdates, attitude_array, block_array
 
 CAUSAL, SMOOTHED = FILTERS = ("marg", "marg-smoothed")
 # the azimuth of a site that was never visited is not known, and those of others are in the heading
@@ -101,7 +101,7 @@ class Errors(NamedTuple):
     counts: np.ndarray  # (B,) bool
 
 
-def contender(parameters: Replay, name: str) -> Contender:
+def contender(parameters: MargReplay, name: str) -> Contender:
     """The filter with the model it believes in.
 
     Raises:
@@ -111,20 +111,20 @@ def contender(parameters: Replay, name: str) -> Contender:
     return Contender(filter_of(parameters), model.model_of(parameters))
 
 
-def recorded(dataset: Dataset, parameters: Replay) -> Recorded:
+def recorded(dataset: Dataset, parameters: MargReplay) -> PreparedLog:
     """The log as its filter takes it, see `System.recorded`.
 
     Raises:
         ValueError: the log cannot be used; the message gives the reason.
     """
-    return Recorded([prepare(dataset, parameters)], partial(contender, parameters))
+    return PreparedLog([prepare(dataset, parameters)], partial(contender, parameters))
 
 
 def replay(
     dataset: Dataset,
-    parameters: Replay,
+    parameters: MargReplay,
     filters: tuple[str, ...] = (),
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> Outcome:
     """Find the orientation over a log, with and without a true attitude; see `System.replay`.
 
@@ -147,7 +147,7 @@ def replay(
         errors = {name: _errors(dataset.attitude, log, q) for name, q in q_nb.items()}
         variables |= _error_arrays(answers, errors)
 
-    def metrics(answer: Answer) -> dict[str, float | int]:
+    def metrics(answer: FilterEstimates) -> dict[str, float | int]:
         share = {"rest_share": float(np.mean(log.still))}
         if dataset.attitude is None:
             return share
@@ -186,14 +186,14 @@ def replay(
 
 
 def _answers(
-    log: Prepared, parameters: Replay, wanted: Sequence[str], progress: Progress
-) -> tuple[dict[str, Answer], dict[str, Mapping[str, Update]]]:
+    log: PreparedMargLog, parameters: MargReplay, wanted: Sequence[str], progress: Progress
+) -> tuple[dict[str, FilterEstimates], dict[str, Mapping[str, SensorUpdates]]]:
     """Estimates of filters and smoother by name, and the updates that each can be doubted by."""
     # the causal run is needed too: it finds out what gyros these are
     causal = dict.fromkeys([*wanted, CAUSAL])
     causal.pop(SMOOTHED, None)
     make = partial(contender, parameters)
-    answers = replaying.navigated([log], tuple(causal), make, None, progress)
+    answers = replaying.run_filters([log], tuple(causal), make, None, progress)
     seen = {CAUSAL: answers[CAUSAL].updates}
     if SMOOTHED in wanted:
         smoothed = _smoothed(log, answers[CAUSAL], parameters, progress)
@@ -201,7 +201,9 @@ def _answers(
     return {name: answers[name] for name in wanted}, seen
 
 
-def _doubt(answer: Answer, seen: Mapping[str, Update], parameters: Replay) -> monitor.Doubt:
+def _doubt(
+    answer: FilterEstimates, seen: Mapping[str, SensorUpdates], parameters: MargReplay
+) -> monitor.Contradictions:
     """Contradictions of an answer with the parameters."""
     return monitor.doubts_of(
         np.asarray(answer.mean.declination),
@@ -213,8 +215,8 @@ def _doubt(answer: Answer, seen: Mapping[str, Update], parameters: Replay) -> mo
 
 
 def _smoothed(
-    log: Prepared, causal: Answer, parameters: Replay, progress: Progress
-) -> tuple[Answer, Mapping[str, Update]]:
+    log: PreparedMargLog, causal: FilterEstimates, parameters: MargReplay, progress: Progress
+) -> tuple[FilterEstimates, Mapping[str, SensorUpdates]]:
     """The smoother, for the gyros the causal run ended with, and the updates of what it smooths."""
     start, bare = log.world.start, bool(np.asarray(causal.wrong[BARE])[-1] > 0.5)
     if bare:
@@ -224,7 +226,7 @@ def _smoothed(
     piece = replace(log, world=log.world._replace(start=start))
     one = Contender(one_prior(parameters), model.model_of(parameters))
     names, smoothers = (SMOOTHED, CAUSAL), {SMOOTHED: CAUSAL}
-    found = replaying.navigated([piece], names, lambda _: one, smoothers, progress)
+    found = replaying.run_filters([piece], names, lambda _: one, smoothers, progress)
     wrong = {BARE: np.full(len(log.epoch_s), float(bare))}
     return found[SMOOTHED]._replace(wrong=wrong), found[CAUSAL].updates
 
@@ -257,7 +259,7 @@ def _turned_north(q_nb: np.ndarray, declination: float) -> np.ndarray:
     return np.asarray(rotation.multiply(turn, q_nb))
 
 
-def _turned_answer(answer: Answer, declination: float) -> Answer:
+def _turned_answer(answer: FilterEstimates, declination: float) -> FilterEstimates:
     turn = rotation.from_rotvec(jnp.array([0.0, 0.0, declination]))
     mean = answer.mean
     q_nb = mean.q_nb.__class__(jnp.asarray(_turned_north(mean.q_nb.wxyz, declination)))
@@ -265,7 +267,7 @@ def _turned_answer(answer: Answer, declination: float) -> Answer:
     return answer._replace(mean=mean._replace(q_nb=q_nb, v_n=turned[0], p_n=turned[1]))
 
 
-def _by_sample(log: Prepared, answer: Answer) -> np.ndarray:
+def _by_sample(log: PreparedMargLog, answer: FilterEstimates) -> np.ndarray:
     """(N, 4) attitude at every sample."""
     if answer.name == SMOOTHED:
         q, first = model.smoothed_attitudes(answer.mean, log.samples)
@@ -278,7 +280,9 @@ def _by_sample(log: Prepared, answer: Answer) -> np.ndarray:
     return np.concatenate([np.asarray(first)[None], rows])
 
 
-def _as_stated(log: Prepared, answer: Answer, parameters: Replay) -> Answer:
+def _as_stated(
+    log: PreparedMargLog, answer: FilterEstimates, parameters: MargReplay
+) -> FilterEstimates:
     """The answer as NumPy arrays, its attitude as sure as is stated."""
     kept = answer.mean, answer.sigma, answer.updates
     mean, sigma, seen = jax.tree_util.tree_map(np.asarray, kept)
@@ -288,7 +292,7 @@ def _as_stated(log: Prepared, answer: Answer, parameters: Replay) -> Answer:
 
 
 def stated_sigma(
-    sigma: np.ndarray, turned: np.ndarray, lasted: np.ndarray, parameters: Replay
+    sigma: np.ndarray, turned: np.ndarray, lasted: np.ndarray, parameters: MargReplay
 ) -> np.ndarray:
     """(B, n) standard deviations, those of attitude with what no state carries.
 
@@ -309,7 +313,7 @@ def _estimates(mean: model.MargState) -> Mapping[str, Numbers]:
     return {name: x.reshape(len(x), -1) for name, x in values.items()} | {"q_nb": mean.q_nb.wxyz}
 
 
-REPORTED = Reported(
+REPORTED = ReportedItems(
     blocks=_BLOCKS,
     sensors=model.SENSORS,
     estimates=_estimates,
@@ -321,7 +325,9 @@ REPORTED = Reported(
 )
 
 
-def _accuracy(attitude: AttitudeTable, log: Prepared, q_nb: np.ndarray) -> dict[str, float | int]:
+def _accuracy(
+    attitude: AttitudeTable, log: PreparedMargLog, q_nb: np.ndarray
+) -> dict[str, float | int]:
     q_true, counts = truth_at(attitude, log.time_ns)
     e = orientation_errors(q_nb[counts], q_true[counts])
     return {
@@ -333,7 +339,7 @@ def _accuracy(attitude: AttitudeTable, log: Prepared, q_nb: np.ndarray) -> dict[
     }
 
 
-def _errors(attitude: AttitudeTable, log: Prepared, q_nb: np.ndarray) -> Errors:
+def _errors(attitude: AttitudeTable, log: PreparedMargLog, q_nb: np.ndarray) -> Errors:
     q_true, counts = truth_at(attitude, log.time_ns[log.rows])
     q = q_nb[log.rows]
     # how the true vertical leans against the estimated one, along estimated north and east
@@ -343,7 +349,9 @@ def _errors(attitude: AttitudeTable, log: Prepared, q_nb: np.ndarray) -> Errors:
     return Errors(-orientation_errors(q, q_true).heading, tilt, counts)
 
 
-def _error_arrays(answers: Mapping[str, Answer], errors: Mapping[str, Errors]) -> Variables:
+def _error_arrays(
+    answers: Mapping[str, FilterEstimates], errors: Mapping[str, Errors]
+) -> Variables:
     out: dict[str, Any] = {}
     for block, values, words in (
         (_HEADING, [e.heading[:, None] for e in errors.values()], "true minus estimated heading"),
@@ -355,7 +363,7 @@ def _error_arrays(answers: Mapping[str, Answer], errors: Mapping[str, Errors]) -
     return out
 
 
-def _refused(log: Prepared, answer: Answer) -> np.ndarray:
+def _refused(log: PreparedMargLog, answer: FilterEstimates) -> np.ndarray:
     """(B,) bool: the magnetometer was refused."""
     update = answer.updates.get(model.MAGNETOMETER)
     none = np.zeros(len(log.rows), dtype=bool)
@@ -363,7 +371,9 @@ def _refused(log: Prepared, answer: Answer) -> np.ndarray:
 
 
 def _variables(
-    log: Prepared, answers: Mapping[str, Answer], doubt: Mapping[str, monitor.Doubt]
+    log: PreparedMargLog,
+    answers: Mapping[str, FilterEstimates],
+    doubt: Mapping[str, monitor.Contradictions],
 ) -> Variables:
     still = log.still.astype(np.int8)
     data = array("context", still, "rest", unit="1", long_name="unit lies still")
@@ -385,7 +395,7 @@ def _variables(
     )
 
 
-def _attitudes(log: Prepared, q_nb: Mapping[str, np.ndarray]) -> Variables:
+def _attitudes(log: PreparedMargLog, q_nb: Mapping[str, np.ndarray]) -> Variables:
     """Attitude at every sample, on a clock of its own."""
     since_s = (log.time_ns - log.time_ns[0]) * 1e-9
     clock = variable("sample_time", since_s, "s", "time of the inertial samples")
@@ -394,7 +404,7 @@ def _attitudes(log: Prepared, q_nb: Mapping[str, np.ndarray]) -> Variables:
     return {"sample_time": clock} | attitude_array(q, "body to NED", "sample_time", words)
 
 
-def _sentences(log: Prepared, answers: Mapping[str, Answer]) -> list[str]:
+def _sentences(log: PreparedMargLog, answers: Mapping[str, FilterEstimates]) -> list[str]:
     """Remarks for the reader of the report."""
     c = log.counts
     out = [
@@ -410,10 +420,10 @@ def _sentences(log: Prepared, answers: Mapping[str, Answer]) -> list[str]:
     for name, answer in answers.items():
         refused = _refused(log, answer)
         update = answer.updates.get(model.MAGNETOMETER)
-        asked = 0 if update is None else int(np.sum((update.dof > 0) | refused))
-        if asked:
+        looked = 0 if update is None else int(np.sum((update.dof > 0) | refused))
+        if looked:
             out.append(
-                f"{name}: the field was disturbed at {np.sum(refused)} of {asked} looks; heading "
+                f"{name}: the field was disturbed at {np.sum(refused)} of {looked} looks; heading "
                 "then came from the gyros."
             )
     return out

@@ -15,7 +15,7 @@ from robins.systems.marg.parameters import Rest
 _SHORT = 3  # blocks, below which there is no decision
 
 
-class Watch:
+class RestDetector:
     """Detector of rest, block by block.
 
     A quiet spell is one in which rate and specific force stay near their means over the last

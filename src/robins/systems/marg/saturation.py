@@ -11,7 +11,7 @@ cut off. It has to last 0.08 s, since the peak of a hand's motion can be flatter
 0.4 s at most: a machine that turns at one rate does so for longer.
 
 A replay finds levels over the whole log: a peak before the first that shows the range is put back
-too. A live object finds them sample by sample (`Range`).
+too. A live object finds them sample by sample (`GyroRange`).
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def _has_plateau(x: np.ndarray, top: float, step_s: float) -> bool:
     return False
 
 
-class Range:
+class GyroRange:
     """The end of each gyro's range and its least step, as the samples so far show them.
 
     Attributes:

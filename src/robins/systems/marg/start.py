@@ -14,8 +14,8 @@ from robins.ins.increments import Increments
 from robins.program.evaluated import evaluated
 from robins.rotation import Rotation
 from robins.systems.marg import model
-from robins.systems.marg.parameters import Replay
-from robins.systems.marg.rest import Watch
+from robins.systems.marg.parameters import MargReplay
+from robins.systems.marg.rest import RestDetector
 
 # a unit at rest, by its first samples
 _STILL_RATE = np.radians(8.0)  # rad/s, mean length of the rate
@@ -25,7 +25,7 @@ _BIASES = 3.0  # standard deviations of the bias, beyond which a scale is off
 _SCALE = 0.1  # share of gravity that it may be off by
 
 
-class FirstLook(NamedTuple):
+class FilterStart(NamedTuple):
     """Start of the filter."""
 
     q_nb: np.ndarray  # (4,)
@@ -49,7 +49,9 @@ def attitude_of(force_b: np.ndarray, field_b: np.ndarray | None) -> np.ndarray:
     return np.asarray(evaluated(Rotation.from_dcm, C_nb).wxyz)
 
 
-def first_look(increments: Increments, field_b: np.ndarray, parameters: Replay) -> FirstLook:
+def initial_alignment(
+    increments: Increments, field_b: np.ndarray, parameters: MargReplay
+) -> FilterStart:
     """Align on the first samples: a short while of rest, or a longer one of motion.
 
     In motion the gyros carry specific force and field back to the first sample, so that a swing
@@ -88,7 +90,7 @@ def first_look(increments: Increments, field_b: np.ndarray, parameters: Replay) 
     if not np.any(there):
         q_nb = attitude_of(force, None)
         sentence = f"Levelled {how}; there is no field, so the heading is counted from the start."
-        return FirstLook(q_nb, np.zeros(2), tilt, np.pi, gravity, still, sentence)
+        return FilterStart(q_nb, np.zeros(2), tilt, np.pi, gravity, still, sentence)
     field = np.mean(turned[1:].apply(np.where(there[:, None], field_b[:window], 0.0)), axis=0)
     field = field * window / np.sum(there)
     q_nb = attitude_of(force, field)
@@ -99,7 +101,7 @@ def first_look(increments: Increments, field_b: np.ndarray, parameters: Replay) 
         f"{dip:.1f} deg, is north."
     )
     heading = start.heading if still else start.heading_moving
-    return FirstLook(q_nb, np.array([north, down]), tilt, heading, gravity, still, sentence)
+    return FilterStart(q_nb, np.array([north, down]), tilt, heading, gravity, still, sentence)
 
 
 def _turned(theta: np.ndarray) -> SciRotation:
@@ -110,7 +112,9 @@ def _turned(theta: np.ndarray) -> SciRotation:
     return SciRotation.concatenate(out)
 
 
-def first_belief(look: FirstLook, parameters: Replay, rest: Watch | None = None) -> Belief:
+def first_belief(
+    look: FilterStart, parameters: MargReplay, rest: RestDetector | None = None
+) -> Belief:
     """The belief at the first sample.
 
     Only heading and declination are correlated: what the field of the start is turned by against

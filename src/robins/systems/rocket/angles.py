@@ -41,7 +41,7 @@ class AngleState(NamedTuple):
     omega_b: Any  # (3,)
 
 
-class Coefficients(NamedTuple):
+class AngleCoefficients(NamedTuple):
     """Coefficients of the motion: e1 (no unit), e2, e3 [1/s], kinematic k, the step T [s]."""
 
     e1: Any
@@ -58,7 +58,7 @@ def angle_state(q_nb: Array, omega_b: Array) -> AngleState:
 
 
 # (A1) to (A4)
-def slope(c: Coefficients, x: Array) -> Array:
+def slope(c: AngleCoefficients, x: Array) -> Array:
     """(6,) time derivative of (roll, pitch, yaw, p, q, r)."""
     roll, pitch, _, p, q, r = x
     sin, cos = jnp.sin(roll), jnp.cos(roll)
@@ -68,7 +68,7 @@ def slope(c: Coefficients, x: Array) -> Array:
     return jnp.concatenate([c.kinematic * angles, rates])
 
 
-def step(c: Coefficients, state: AngleState, u: Array | None) -> AngleState:
+def step(c: AngleCoefficients, state: AngleState, u: Array | None) -> AngleState:
     """One step of the motion by Runge and Kutta's classic rule."""
     x = jnp.concatenate([jnp.stack([a.rad for a in state[:3]]), state.omega_b])
     h = c.step_s
@@ -81,12 +81,12 @@ def step(c: Coefficients, state: AngleState, u: Array | None) -> AngleState:
     return AngleState(roll, pitch, yaw, state.omega_b + moved[3:])
 
 
-def stand_still(state: AngleState, u: Array | None) -> AngleState:
+def no_motion(state: AngleState, u: Array | None) -> AngleState:
     """No motion; with much noise, what is believed next is only what is measured next."""
     return state
 
 
-def reckon(step_s: Number, state: AngleState, theta_b: Array) -> AngleState:
+def dead_reckoned(step_s: Number, state: AngleState, theta_b: Array) -> AngleState:
     """Turn by the angles [rad] that the gyro reports of a step; its mean rate is that believed."""
     q = multiply(from_euler(*(a.rad for a in state[:3])), from_rotvec(theta_b))
     return angle_state(q, theta_b / step_s)

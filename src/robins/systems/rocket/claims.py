@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from robins.systems.judgement import Band, Metric, ratio_claims, rms_by_component
-from robins.systems.rocket.world import BODY, EULER, Course
+from robins.systems.rocket.world import BODY, EULER, RocketCourse
 
 PAPER, SCALAR, UKF = "federated-vector-stukf", "federated-scalar-ukf", "ukf"
 RMS, QUIET, PEAK = "attitude_rms_deg", "quiet_rms_deg", "burst_peak_deg"
@@ -18,7 +18,7 @@ def _pooled_deg(rms: np.ndarray) -> float:
     return float(np.degrees(np.sqrt(np.mean(rms**2))))
 
 
-def _common_metrics(course: Course, statistics: Any) -> dict[str, Metric]:
+def _common_metrics(course: RocketCourse, statistics: Any) -> dict[str, Metric]:
     """Metrics of both studies: components 0 to 2 are the attitude's.
 
     ``attitude_rms_deg`` is the RMS error of an axis, pooled over the three, ``quiet_rms_deg`` the
@@ -42,7 +42,7 @@ def _each(axes: tuple[str, ...], unit: str, rms: np.ndarray) -> dict[str, float]
     return {f"{axis}_rms_{unit}": float(value) for axis, value in zip(axes, rms, strict=True)}
 
 
-def angle_metrics(course: Course, statistics: Any) -> dict[str, Metric]:
+def angle_metrics(course: RocketCourse, statistics: Any) -> dict[str, Metric]:
     """Metrics of "magnetic-attitude": axes are roll, pitch, yaw, then the rates.
 
     ``settled_s`` is when the RMS error over runs and angles falls below 0.5 deg for the first time.
@@ -55,7 +55,7 @@ def angle_metrics(course: Course, statistics: Any) -> dict[str, Metric]:
     return out
 
 
-def field_metrics(course: Course, statistics: Any) -> dict[str, Metric]:
+def field_metrics(course: RocketCourse, statistics: Any) -> dict[str, Metric]:
     """Metrics of "field-vector": axes are those of the body, then about the field and across it.
 
     ``total_rms_deg`` is of the angle of the error, ``across_field_rms_deg`` of its part across.

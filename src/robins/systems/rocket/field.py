@@ -79,7 +79,7 @@ class ScaledState(NamedTuple):
 AnyState = FieldState | ScaledState
 
 
-class Turn(NamedTuple):
+class GyroTurn(NamedTuple):
     """Input of a step: what the gyro reports, and how much more it is doubted than its noise."""
 
     theta_b: Any  # (3,) rad
@@ -105,12 +105,12 @@ def field_sensor(sine: Array, name: str = FIELD) -> Sensor:
 
 
 # (B1)
-def propagate(g: GyroNoise, x: AnyState, u: Turn) -> AnyState:
+def propagate(g: GyroNoise, x: AnyState, u: GyroTurn) -> AnyState:
     """Turn by what the gyro reports of a step."""
     return x._replace(q_nb=Rotation(normalise(multiply(x.q_nb.wxyz, from_rotvec(_turn(g, x, u))))))
 
 
-def _turn(g: GyroNoise, x: AnyState, u: Turn) -> Array:
+def _turn(g: GyroNoise, x: AnyState, u: GyroTurn) -> Array:
     """(3,) the true turn w of a step, as the state sees it through what the gyro reports."""
     return (u.theta_b - g.step_s * x.bias) / _stretch(x)
 
@@ -121,7 +121,7 @@ def _stretch(x: AnyState) -> Array:
 
 
 # (B2)
-def propagated(g: GyroNoise, x: AnyState, u: Turn):
+def propagated(g: GyroNoise, x: AnyState, u: GyroTurn):
     """`propagate` with its Jacobian and noise."""
     w, gain = _turn(g, x, u), 1.0 / _stretch(x)
     # a step turns little, but coning bodies turn fast
@@ -133,7 +133,7 @@ def propagated(g: GyroNoise, x: AnyState, u: Turn):
 
 
 # (B3)
-def noise_of(g: GyroNoise, x: AnyState, u: Turn) -> Array:
+def noise_of(g: GyroNoise, x: AnyState, u: GyroTurn) -> Array:
     """(n,) of a step: alike on all axes, so the same in body and navigation axes."""
     angle = jnp.sqrt(g.angle**2 + u.doubt**2)
     return jnp.concatenate([jnp.full(3, angle), jnp.full(3, g.bias), jnp.zeros(dim(x) - 6)])
@@ -158,7 +158,7 @@ def field_noise(sine: Array, x: AnyState, field_n: Array) -> Array:
     return jnp.full(3, sine * jnp.sqrt(field_n @ field_n))
 
 
-def bridged(theta_b: Array) -> Turn:
+def bridged(theta_b: Array) -> GyroTurn:
     """Angles (E, 3) of a gyro with lost samples, NaN: the last turn is held there, and doubted.
 
     Before the first sample nothing is known: no turn, doubted by a radian.
@@ -169,7 +169,7 @@ def bridged(theta_b: Array) -> Turn:
         now = jnp.where(there, theta, last)
         size = jnp.sqrt(jnp.sum(now**2))
         known = jnp.where(size > 0.0, HELD_DOUBT * size, 1.0)
-        return now, Turn(now, jnp.where(there, 0.0, known))
+        return now, GyroTurn(now, jnp.where(there, 0.0, known))
 
     return jax.lax.scan(hold, jnp.zeros(3), theta_b)[1]
 

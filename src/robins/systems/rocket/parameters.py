@@ -29,7 +29,7 @@ class Launch(Parameters):
     year: Annotated[float, pydantic.Field(ge=2020.0, lt=2030.0)] = 2026.0
 
 
-class Body(Parameters):
+class RocketBody(Parameters):
     """A body symmetric about its x axis, that spins and cones; white torque over inertia."""
 
     spin: q.AngleRate
@@ -43,7 +43,7 @@ class Body(Parameters):
     torque: q.RateWalkSize
 
 
-class Gyro(Parameters):
+class RocketGyro(Parameters):
     """A MEMS triad: constant, slow and white errors; sigma of the white one is of a sample."""
 
     white: q.AngleRate
@@ -56,7 +56,7 @@ class Gyro(Parameters):
     lost: tuple[Span, ...] = ()
 
 
-class Disturbance(Parameters):
+class MagneticDisturbance(Parameters):
     """The magnetometer is wrong by an angle, for a while, again and again."""
 
     angle: q.Spread
@@ -64,7 +64,7 @@ class Disturbance(Parameters):
     length: q.Duration = default("1 s")
 
     @pydantic.model_validator(mode="after")
-    def _pauses(self) -> Disturbance:
+    def _pauses(self) -> MagneticDisturbance:
         if self.length >= self.every:
             raise ValueError(
                 f"length ({self.length:g} s) must be below every ({self.every:g} s), or the "
@@ -73,7 +73,7 @@ class Disturbance(Parameters):
         return self
 
 
-class Magnetometer(Parameters):
+class RocketMagnetometer(Parameters):
     """White noise and disturbances, as angles.
 
     In "field-vector" hard iron is what a calibration left over, and an axis saturates at full
@@ -83,11 +83,11 @@ class Magnetometer(Parameters):
     noise: q.Spread = default("1 deg")
     hard_iron: Annotated[q.Three, Quantity("magnetic field")] = default("0 uT")
     full_scale: q.FieldStrength | None = None
-    disturbance: Disturbance | None = None
+    disturbance: MagneticDisturbance | None = None
     lost: tuple[Span, ...] = ()
 
 
-class Start(Parameters):
+class RocketStart(Parameters):
     """Start of the estimate: its error, and its believed sigma."""
 
     attitude_error: q.Angles = default("0 deg")
@@ -95,7 +95,7 @@ class Start(Parameters):
     rate: q.AngleRate = default("1 deg/s")
 
 
-class Flight(Scenario):
+class RocketFlight(Scenario):
     """Parameters that the two studies share."""
 
     system: str = "rocket"
@@ -105,13 +105,13 @@ class Flight(Scenario):
     counted_from: q.Time = default("30 s")
     quiet_after: q.Time = default("10 s")
     launch: Launch
-    body: Body
-    gyro: Gyro
-    magnetometer: Magnetometer = pydantic.Field(default_factory=Magnetometer)
-    start: Start = pydantic.Field(default_factory=Start)
+    body: RocketBody
+    gyro: RocketGyro
+    magnetometer: RocketMagnetometer = pydantic.Field(default_factory=RocketMagnetometer)
+    start: RocketStart = pydantic.Field(default_factory=RocketStart)
 
     @pydantic.model_validator(mode="after")
-    def _long_enough(self) -> Flight:
+    def _long_enough(self) -> RocketFlight:
         refuse_unsettled("counted_from", self.counted_from, self.duration)
         refuse_too_long("step", self.duration, 1.0 / self.step)
         if self.duration < 2.0 * self.step:
@@ -127,7 +127,7 @@ class Flight(Scenario):
         return self
 
 
-class Believed(Parameters):
+class RocketAssumptions(Parameters):
     """Motion as the filters believe it: the paper's equation is wrong by some per cent."""
 
     error: Annotated[float, Quantity("ratio")] = default("0 %")  # of the coefficients
@@ -138,7 +138,7 @@ class Believed(Parameters):
     )
 
 
-class MagneticAttitude(Flight):
+class MagneticAttitude(RocketFlight):
     """Test-bed A: attitude angles "measured" by the magnetometer, the formulation of the paper."""
 
     study: str = "magnetic-attitude"
@@ -148,10 +148,10 @@ class MagneticAttitude(Flight):
         *("federated-vector-stukf", "federated-root", "huber", "gate", "discriminator"),
     )
     gyro_reads: Literal["rate", "attitude"] = "rate"
-    believed: Believed = pydantic.Field(default_factory=Believed)
+    believed: RocketAssumptions = pydantic.Field(default_factory=RocketAssumptions)
 
 
-class FieldVector(Flight):
+class FieldVector(RocketFlight):
     """Test-bed B: attitude on SO(3), driven by the gyro, corrected by the measured field."""
 
     study: str = "field-vector"

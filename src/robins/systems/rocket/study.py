@@ -27,25 +27,25 @@ from robins.filters.rules import discriminator, gate, huber, only, strong_tracki
 from robins.filters.rules.discriminator import PUBLISHED
 from robins.results import array
 from robins.rotation import Rotation
-from robins.systems.aboard import Taken, aboard, taken
+from robins.systems.aboard import Taken, filter_instruments, taken
 from robins.systems.parts import NED
 from robins.systems.rocket import angles, field
 from robins.systems.rocket.angles import GYRO, MAGNETIC, angle_state
 from robins.systems.rocket.claims import CLAIMS, angle_metrics, field_metrics
 from robins.systems.rocket.field import FIELD, SNAPSHOT, FieldState, ScaledState
-from robins.systems.rocket.parameters import FieldVector, Flight, MagneticAttitude
+from robins.systems.rocket.parameters import FieldVector, MagneticAttitude, RocketFlight
 from robins.systems.rocket.world import (
     BODY,
     EULER,
-    Course,
-    World,
+    RocketCourse,
+    RocketWorld,
     body_of,
     faults,
     instruments,
     lay_out,
     simulate,
     start_of,
-    wrong_by,
+    with_angle_errors,
 )
 from robins.systems.study import Case, Contender, Norm, Recipe, StateBlock, Study, View
 from robins.systems.tables import block_array
@@ -69,7 +69,7 @@ def fading(fade: Literal["lumped", "multiple", "projected"] = "lumped", beta: fl
     return strong_tracking(0.95, beta, fade, "classic", limit=1e3)
 
 
-def patient() -> Rule:
+def patient_gate() -> Rule:
     """A gate that gives in when it has refused for too long, and reports it."""
     return gate(PROBABILITY, PATIENCE, "inflate")
 
@@ -91,10 +91,10 @@ def projected_discriminator(robust: Literal["huber", "gate"], looks: int) -> Rul
 
 
 def sensors_of(
-    given: Flight, course: Course, names: tuple[str, ...]
+    given: RocketFlight, course: RocketCourse, names: tuple[str, ...]
 ) -> tuple[tuple[Sensor, ...], Taken]:
-    """`aboard`, of the instruments of these names."""
-    return aboard([i for i in instruments(given) if i.name in names], given, course)
+    """`filter_instruments`, of the instruments of these names."""
+    return filter_instruments([i for i in instruments(given) if i.name in names], given, course)
 
 
 def bank(driver: str, *off: str) -> Filter:
@@ -136,7 +136,7 @@ ANGLE_FILTERS: dict[str, AngleFilter] = {
     "federated-vector-multiple": AngleFilter("half", fading("multiple")),
     "federated-vector-weakened": AngleFilter("half", fading(beta=4.0)),
     "huber": AngleFilter(None, huber(PROBABILITY)),
-    "gate": AngleFilter(None, patient()),
+    "gate": AngleFilter(None, patient_gate()),
     "discriminator": AngleFilter(discriminates=True),
     "adaptive": AngleFilter(adapts=True),
     "federated-root-discriminator": AngleFilter("root", discriminates=True),
@@ -171,7 +171,7 @@ def angle_filter(given: MagneticAttitude, chosen: AngleFilter) -> Filter:
 def shares_by_state(given: MagneticAttitude) -> np.ndarray:
     """(2, 6) by how well gyro and magnetometer see each state at the start."""
     q, omega = start_of(given)
-    start = angle_state(wrong_by(q, given.start.attitude_error), omega)
+    start = angle_state(with_angle_errors(q, given.start.attitude_error), omega)
     channels = [filters.channel((sensor,), kalman()) for sensor in (GYRO, MAGNETIC)]
     model = angle_model(given, lay_out(given), ANGLE_FILTERS["ukf"])
     return filters.observability_shares(
@@ -184,7 +184,7 @@ def angle_sigma(given: MagneticAttitude) -> Array:
     return jnp.repeat(jnp.array([given.start.attitude, given.start.rate]), 3)
 
 
-def angle_model(given: MagneticAttitude, course: Course, chosen: AngleFilter) -> Model:
+def angle_model(given: MagneticAttitude, course: RocketCourse, chosen: AngleFilter) -> Model:
     """Motion and sensors that a filter believes."""
     b, T, white = given.believed, given.step, given.gyro.white
     sensors, _ = sensors_of(given, course, chosen.sensors)
@@ -193,21 +193,21 @@ def angle_model(given: MagneticAttitude, course: Course, chosen: AngleFilter) ->
         motion = Motion(Partial(angles.step, coefficients(given)), jnp.repeat(noise, 3))
     elif chosen.sensors == (GYRO,) and given.gyro_reads == "rate":  # dead reckoning
         noise = jnp.repeat(jnp.array([T * white, white]), 3)
-        motion, sensors = Motion(Partial(angles.reckon, jnp.asarray(T)), noise), ()
+        motion, sensors = Motion(Partial(angles.dead_reckoned, jnp.asarray(T)), noise), ()
     else:
-        motion = Motion(angles.stand_still, jnp.repeat(jnp.array(FORGETS), 3))
+        motion = Motion(angles.no_motion, jnp.repeat(jnp.array(FORGETS), 3))
     return Model(motion, sensors)
 
 
-def coefficients(given: MagneticAttitude) -> angles.Coefficients:
+def coefficients(given: MagneticAttitude) -> angles.AngleCoefficients:
     """Coefficients of the believed motion: the paper's equation is wrong by some per cent."""
     wrong = 1.0 + given.believed.error
     kinematic = wrong if given.believed.wrong == "all" else 1.0
     e1, e2, e3 = (wrong * e for e in body_of(given))
-    return angles.Coefficients(*map(jnp.asarray, (e1, e2, e3, kinematic, given.step)))
+    return angles.AngleCoefficients(*map(jnp.asarray, (e1, e2, e3, kinematic, given.step)))
 
 
-def angle_case(of: Taken, sigma: Array, world: World) -> Case:
+def angle_case(of: Taken, sigma: Array, world: RocketWorld) -> Case:
     """Case of a filter of "magnetic-attitude" in a run; pure."""
     return Case(
         start=Belief(angle_state(world.start_q_nb, world.start_omega_b), jnp.diag(sigma)),
@@ -217,7 +217,7 @@ def angle_case(of: Taken, sigma: Array, world: World) -> Case:
     )
 
 
-def angle_contender(given: MagneticAttitude, course: Course, name: str) -> Contender:
+def angle_contender(given: MagneticAttitude, course: RocketCourse, name: str) -> Contender:
     """A filter of "magnetic-attitude" with its model and its data."""
     chosen = ANGLE_FILTERS[name]
     model = angle_model(given, course, chosen)
@@ -244,18 +244,18 @@ FIELD_FILTERS: dict[str, FieldFilter] = {
     "magnetometer": FieldFilter(kalman(filters.taylor()), (SNAPSHOT,)),
     "usque": FieldFilter(),
     "huber": FieldFilter(ukf(huber(PROBABILITY))),
-    "gate": FieldFilter(ukf(patient())),
+    "gate": FieldFilter(ukf(patient_gate())),
     "discriminator": FieldFilter(discriminates="huber"),
     "discriminator-gate": FieldFilter(discriminates="gate"),
     "adaptive": FieldFilter(bank(GYRO, FIELD), scaled=True),
     "strong-tracking": FieldFilter(ukf(fading())),
     "strong-tracking-projected": FieldFilter(ukf(fading("projected"))),
-    "gate-scale-factor": FieldFilter(ukf(patient()), scaled=True),
+    "gate-scale-factor": FieldFilter(ukf(patient_gate()), scaled=True),
     "usque-scale-factor": FieldFilter(scaled=True),
 }
 
 
-def field_model(given: FieldVector, course: Course, chosen: FieldFilter) -> Model:
+def field_model(given: FieldVector, course: RocketCourse, chosen: FieldFilter) -> Model:
     """Motion and sensor that a filter believes."""
     g, T = given.gyro, given.step
     # a drift of correlation time tau walks away from where it is by this in a step
@@ -273,7 +273,7 @@ def field_sigma(given: FieldVector, chosen: FieldFilter) -> Array:
     return jnp.repeat(jnp.array([given.start.attitude, bias, *scale]), 3)
 
 
-def field_case(scaled: bool, of: Taken, numbers: tuple[Array, Array], world: World) -> Case:
+def field_case(scaled: bool, of: Taken, numbers: tuple[Array, Array], world: RocketWorld) -> Case:
     """Case of a filter of "field-vector" in a run, scale factors being states or not; pure.
 
     Its numbers are the initial sigma (n,) and the field (E, 3) [T] in n.
@@ -293,7 +293,7 @@ def field_case(scaled: bool, of: Taken, numbers: tuple[Array, Array], world: Wor
     )
 
 
-def field_contender(given: FieldVector, course: Course, name: str) -> Contender:
+def field_contender(given: FieldVector, course: RocketCourse, name: str) -> Contender:
     """A filter of "field-vector" with its model and its data."""
     chosen = FIELD_FILTERS[name]
     _, of = sensors_of(given, course, chosen.sensors)
@@ -305,7 +305,7 @@ def field_contender(given: FieldVector, course: Course, name: str) -> Contender:
     return Contender(filter_, field_model(given, course, chosen), case)
 
 
-def _view(given: Flight, course: Course, **own: Any) -> View:
+def _view(given: RocketFlight, course: RocketCourse, **own: Any) -> View:
     """Common report of both studies: path and field for figures, and the unobserved direction."""
     height = array("context", course.alt_m, "height", unit="m", display_unit="km")
     block = StateBlock("field_n", slice(0, 3), "T", "uT", "launch NED", NED)
@@ -326,7 +326,7 @@ def _view(given: Flight, course: Course, **own: Any) -> View:
     )
 
 
-def angle_view(given: MagneticAttitude, course: Course) -> View:
+def angle_view(given: MagneticAttitude, course: RocketCourse) -> View:
     """Report of "magnetic-attitude"."""
     return _view(
         given,
@@ -339,7 +339,7 @@ def angle_view(given: MagneticAttitude, course: Course) -> View:
     )
 
 
-def field_view(given: FieldVector, course: Course) -> View:
+def field_view(given: FieldVector, course: RocketCourse) -> View:
     """Report of "field-vector"."""
     across = ("about", "level", "upright")
     return _view(

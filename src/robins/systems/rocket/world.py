@@ -34,7 +34,7 @@ from robins.systems.parts import outside
 from robins.systems.quantities import Three
 from robins.systems.rocket.angles import GYRO, MAGNETIC, read_angles, read_rate
 from robins.systems.rocket.field import FIELD, SNAPSHOT, field_sensor, plausible
-from robins.systems.rocket.parameters import Flight, MagneticAttitude
+from robins.systems.rocket.parameters import MagneticAttitude, RocketFlight
 from robins.systems.study import Instrument, SensorAxes
 
 PEAK_S = 3.0  # after the beginning of a disturbance, in which its largest error is looked for
@@ -44,7 +44,7 @@ _SECONDS_A_YEAR = 365.25 * 86400.0
 _VECTOR, _ANGLES, _DISTURBED, _INTEGRATED = range(4)
 
 
-class Course(NamedTuple):
+class RocketCourse(NamedTuple):
     """Data that all runs share; E steps."""
 
     time_s: np.ndarray  # (E,) at the end of each step
@@ -56,7 +56,7 @@ class Course(NamedTuple):
     quiet: np.ndarray  # (E,) bool, long after one
 
 
-class World(NamedTuple):
+class RocketWorld(NamedTuple):
     """One run; E steps. Measurements are NaN where there is none."""
 
     q_nb: Array  # (E + 1, 4) true attitude at the start and at the end of each step
@@ -74,7 +74,7 @@ class World(NamedTuple):
         return self.errors.bias_rad_s[None] + self.errors.markov_rad_s
 
 
-def lay_out(given: Flight) -> Course:
+def lay_out(given: RocketFlight) -> RocketCourse:
     """Steps, path and field, in NumPy.
 
     Raises:
@@ -94,7 +94,7 @@ def lay_out(given: Flight) -> Course:
     begun, since = _disturbed(given, time)
     first = np.searchsorted(time, begun - 1e-9)
     width = round(PEAK_S / given.step)
-    return Course(
+    return RocketCourse(
         time_s=time,
         field_n=np.asarray(rotate(path.q_local, jnp.asarray(local))),
         alt_m=np.asarray(path.alt_m),
@@ -105,7 +105,7 @@ def lay_out(given: Flight) -> Course:
     )
 
 
-def _disturbed(given: Flight, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _disturbed(given: RocketFlight, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Start times of disturbances, and (E,) time since the end of the last; infinite before one."""
     burst, since = given.magnetometer.disturbance, np.full(len(time_s), np.inf)
     if burst is None:
@@ -117,7 +117,7 @@ def _disturbed(given: Flight, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return begun, since
 
 
-def faults(given: Flight, time_s: np.ndarray, name: str) -> dict[str, np.ndarray]:
+def faults(given: RocketFlight, time_s: np.ndarray, name: str) -> dict[str, np.ndarray]:
     """Masks (E,) of the disturbed magnetometer, by its name, and of a wrongly believed motion."""
     burst = given.magnetometer.disturbance
     disturbed = np.zeros(len(time_s), bool)
@@ -127,24 +127,24 @@ def faults(given: Flight, time_s: np.ndarray, name: str) -> dict[str, np.ndarray
     return {name: disturbed, "motion": np.full(len(time_s), believed)}
 
 
-def body_of(given: Flight) -> FreeBody:
+def body_of(given: RocketFlight) -> FreeBody:
     """The coefficients of the body as it truly is."""
     b = given.body
     return FreeBody(b.e1, *(0.0 if t is None else 1.0 / t for t in (b.spin_decay, b.cone_decay)))
 
 
-def start_of(given: Flight) -> tuple[Array, Array]:
+def start_of(given: RocketFlight) -> tuple[Array, Array]:
     """True attitude q_nb (4,) and rate (3,) at the start."""
     b = given.body
     return coning_start(b.spin, b.cone, b.elevation, b.azimuth, body_of(given))
 
 
-def wrong_by(q_nb: Array, error_rad: Three) -> Array:
+def with_angle_errors(q_nb: Array, error_rad: Three) -> Array:
     """An attitude with errors of its roll, pitch and yaw."""
     return from_euler(*(a + e for a, e in zip(to_euler(q_nb), error_rad, strict=True)))
 
 
-def simulate(given: Flight, course: Course, seed: int, index: Array) -> World:
+def simulate(given: RocketFlight, course: RocketCourse, seed: int, index: Array) -> RocketWorld:
     """One run, from its number, which may be traced; pure."""
     key = partial(stream, seed, index)
     g, T, torque, count = given.gyro, given.step, given.body.torque, len(course.time_s)
@@ -152,20 +152,20 @@ def simulate(given: Flight, course: Course, seed: int, index: Array) -> World:
     q, omega = free_body(key(Component.TRAJECTORY), body, q0, omega0, T, count, torque)
     gyro = MemsGyro(g.bias, g.drift, g.drift_time, g.white, g.scale_factor)
     theta, errors = delta_angles(key(Component.IMU), q, T, gyro)
-    start = wrong_by(q[0], given.start.attitude_error)
+    start = with_angle_errors(q[0], given.start.attitude_error)
     wrong = given.start.rate * jax.random.normal(key(Component.INITIAL_STATE), (3,))
-    world = World(q, omega, errors, start, omega[0] + wrong, _felt(course, theta))
+    world = RocketWorld(q, omega, errors, start, omega[0] + wrong, _felt(course, theta))
     it = given, course, key(Component.MAGNETOMETER), world
     return world._replace(
         readings={i.name: i.measure(*it) for i in instruments(given) if i.measure is not None}
     )
 
 
-def _felt(course: Course, rows: Array) -> Array:
+def _felt(course: RocketCourse, rows: Array) -> Array:
     return jnp.where(jnp.asarray(course.felt)[:, None], rows, jnp.nan)
 
 
-def instruments(given: Flight) -> tuple[Instrument, ...]:
+def instruments(given: RocketFlight) -> tuple[Instrument, ...]:
     """Instruments whose readings are measurements; in "field-vector" the gyro drives the motion."""
     if isinstance(given, MagneticAttitude):
         return (RATE_GYRO if given.gyro_reads == "rate" else INTEGRATED_GYRO, MAGNETIC_ATTITUDE)
@@ -176,14 +176,16 @@ def instruments(given: Flight) -> tuple[Instrument, ...]:
     )
 
 
-def _rate(given: Flight, course: Course, key: Array, world: World) -> Array:
+def _rate(given: RocketFlight, course: RocketCourse, key: Array, world: RocketWorld) -> Array:
     """(E, 3) rate at the end of each step [rad/s]."""
     e = world.errors
     true = (1.0 + e.scale_factor)[None] * world.omega_b[1:]
     return _felt(course, true + world.bias + e.white_rad_s)
 
 
-def _integrated(given: Flight, course: Course, key: Array, world: World) -> tuple[Angle, ...]:
+def _integrated(
+    given: RocketFlight, course: RocketCourse, key: Array, world: RocketWorld
+) -> tuple[Angle, ...]:
     """Roll, pitch, yaw by a gyro integrated from a start, with its slow errors, and white noise."""
     turned = to_rotvec(multiply(conjugate(world.q_nb[:-1]), world.q_nb[1:]))
     path = integrate_angles(world.start_q_nb, turned + given.step * world.bias)
@@ -192,7 +194,9 @@ def _integrated(given: Flight, course: Course, key: Array, world: World) -> tupl
     return _as_angles(_felt(course, wrap(angles)))
 
 
-def _magnetic(given: Flight, course: Course, key: Array, world: World) -> tuple[Angle, ...]:
+def _magnetic(
+    given: RocketFlight, course: RocketCourse, key: Array, world: RocketWorld
+) -> tuple[Angle, ...]:
     """Roll, pitch, yaw as papers have a magnetometer measure them."""
     magnet, euler = given.magnetometer, jnp.stack(to_euler(world.q_nb[1:]), 1)
     wrong, seen = _burst(angle_bursts, given, course, key), jnp.asarray(course.seen)
@@ -200,7 +204,7 @@ def _magnetic(given: Flight, course: Course, key: Array, world: World) -> tuple[
     return _as_angles(observe_magnetic_attitude(white, euler, magnet.noise, wrong, seen))
 
 
-def _field(given: Flight, course: Course, key: Array, world: World) -> Array:
+def _field(given: RocketFlight, course: RocketCourse, key: Array, world: RocketWorld) -> Array:
     """(E, 3) T."""
     magnet, field_n = given.magnetometer, jnp.asarray(course.field_n)
     return observe_field(
@@ -215,7 +219,9 @@ def _field(given: Flight, course: Course, key: Array, world: World) -> Array:
     )
 
 
-def _burst(draw: Callable[..., Array], given: Flight, course: Course, key: Array) -> Array | None:
+def _burst(
+    draw: Callable[..., Array], given: RocketFlight, course: RocketCourse, key: Array
+) -> Array | None:
     """(E, 3) rad, disturbances of the magnetometer."""
     if (burst := given.magnetometer.disturbance) is None:
         return None
@@ -227,15 +233,15 @@ def _as_angles(rows: Array) -> tuple[Angle, ...]:
     return tuple(Angle(rows[:, i]) for i in range(3))
 
 
-def _believed_field(given: Flight, course: Course, name: str = FIELD) -> Sensor:
+def _believed_field(given: RocketFlight, course: RocketCourse, name: str = FIELD) -> Sensor:
     return field_sensor(jnp.asarray(math.sin(given.magnetometer.noise)), name)
 
 
 @lru_cache
-def taken_field(full_scale_t: float | None) -> Callable[[World], tuple[Array, Array]]:
+def taken_field(full_scale_t: float | None) -> Callable[[RocketWorld], tuple[Array, Array]]:
     """Plausible readings of the magnetometer and the field expected; one function for one scale."""
 
-    def taken(world: World) -> tuple[Array, Array]:
+    def taken(world: RocketWorld) -> tuple[Array, Array]:
         return plausible(world.readings[FIELD], world.field_n, full_scale_t), world.field_n
 
     return taken

@@ -46,32 +46,32 @@ class QuaternionState(NamedTuple):
     gyro_bias: Array  # (3,) rad/s
 
 
-class Noise(NamedTuple):
+class GyroNoiseModel(NamedTuple):
     """Believed noise of the gyro, for a sample of length T."""
 
     step_s: Array  # ()
     factor: Array  # (6, 6) of Q, attitude and bias
 
 
-def noise_of(random_walk: float, rate_walk: float, step_s: float) -> Noise:
+def noise_of(random_walk: float, rate_walk: float, step_s: float) -> GyroNoiseModel:
     """Noise of a sample on three axes, from its densities [rad/sqrt(s), rad/s/sqrt(s)]."""
     one = np.linalg.cholesky(walk_covariance(random_walk, rate_walk, step_s))
-    return Noise(jnp.asarray(step_s), jnp.asarray(np.kron(one, np.eye(3))))
+    return GyroNoiseModel(jnp.asarray(step_s), jnp.asarray(np.kron(one, np.eye(3))))
 
 
-def _turn(x: AttitudeState | QuaternionState, theta: Array, noise: Noise) -> Array:
+def _turn(x: AttitudeState | QuaternionState, theta: Array, noise: GyroNoiseModel) -> Array:
     return theta - noise.step_s * x.gyro_bias
 
 
 # --------------------------------------------------------------------------------- multiplicative
 
 
-def _move(noise: Noise, x: AttitudeState, theta: Array) -> AttitudeState:
+def _move(noise: GyroNoiseModel, x: AttitudeState, theta: Array) -> AttitudeState:
     turn = from_rotvec(_turn(x, theta, noise))
     return AttitudeState(BodyRotation(normalise(multiply(x.attitude.wxyz, turn))), x.gyro_bias)
 
 
-def _linear(noise: Noise, x: AttitudeState, theta: Array):
+def _linear(noise: GyroNoiseModel, x: AttitudeState, theta: Array):
     moved, T = _move(noise, x, theta), noise.step_s
     turn = _turn(x, theta, noise)
     back = to_dcm(conjugate(from_rotvec(turn)))
@@ -99,12 +99,12 @@ def xi(q: Array) -> Array:
     return jnp.stack([-x, -y, -z, w, -z, y, z, w, -x, -y, x, w]).reshape(4, 3)
 
 
-def _move_additive(noise: Noise, x: QuaternionState, theta: Array) -> QuaternionState:
+def _move_additive(noise: GyroNoiseModel, x: QuaternionState, theta: Array) -> QuaternionState:
     q = normalise(x.q_ib)
     return QuaternionState(multiply(q, from_rotvec(_turn(x, theta, noise))), x.gyro_bias)
 
 
-def _noise_additive(noise: Noise, x: QuaternionState, theta: Array) -> Array:
+def _noise_additive(noise: GyroNoiseModel, x: QuaternionState, theta: Array) -> Array:
     top = 0.5 * xi(normalise(x.q_ib)) @ noise.factor[:3]
     return jnp.concatenate([top, noise.factor[3:]])
 
@@ -137,7 +137,9 @@ def _noise_of_frame(x: AttitudeState | QuaternionState, factor: Array) -> Array:
     return factor
 
 
-def model(noise: Noise, star_rad: Listed, additive: bool = False, of_frame: bool = False) -> Model:
+def model(
+    noise: GyroNoiseModel, star_rad: Listed, additive: bool = False, of_frame: bool = False
+) -> Model:
     """Motion and star sensor, whose noise each frame may bring with it."""
     sigma = _noise_of_frame if of_frame else jnp.asarray(star_rad, float)
     if additive:

@@ -3,8 +3,8 @@
     belief, gyro --acm--> command --actuators--> torque, dipole --plant--> motion --gyro, star-->
 
 Each is what a process of the test bench runs, and `react` strings them together for a run inside
-one program. There they are kept `apart`: XLA would else fuse the end of one with the beginning of
-the next, and round otherwise than it does in a process that runs one of them alone.
+one program. There they are kept `compiled_alone`: XLA would else fuse the end of one with the
+beginning of the next, and round otherwise than it does in a process that runs one of them alone.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from robins.sim.spacecraft import (
     Spacecraft,
     advance,
     rate_b,
+    wheel_momenta_after,
     wheel_momentum_b,
-    wheels_after,
-    wheels_give,
+    wheel_torques,
 )
 from robins.sim.star_sensor import StarCamera, measure_attitude, read_star
 
@@ -39,7 +39,7 @@ NO_GAIN = "lmi_step.failed"  # note of a frame: no new gain passed, the last one
 UNIT = 1e-3  # that the length of a quaternion may be off by
 
 
-class StarSays(NamedTuple):
+class StarSensorFault(NamedTuple):
     """Effect of the star sensor on the truth at the end of a step, besides noise."""
 
     seen: Array  # () bool, whether there is a frame
@@ -48,7 +48,7 @@ class StarSays(NamedTuple):
     factor: Array  # () of the components of the quaternion: 1, -1, or wrong
 
 
-class Step(NamedTuple):
+class NoiseFreeInputs(NamedTuple):
     """External inputs of a step; with leading axis E in a course."""
 
     ref_q_ib: Array  # (4,) wanted attitude at its beginning
@@ -59,11 +59,11 @@ class Step(NamedTuple):
     field_i_t: Array  # (3,) magnetic field there
     disturbance_b: Array  # (3,) N m
     wheel_works: Array  # (W,) 1, or 0 for a wheel that gives no torque
-    star: StarSays
+    star: StarSensorFault
     number: Array  # () of the step, from 0
 
 
-class Lens(NamedTuple):
+class CameraOptics(NamedTuple):
     """The camera of a star sensor, and how it knows its stars."""
 
     camera: StarCamera
@@ -71,7 +71,7 @@ class Lens(NamedTuple):
     match_rad: Array  # () how near a star must be to where it is expected
 
 
-class Command(NamedTuple):
+class ActuatorCommand(NamedTuple):
     """Command of control to the actuators."""
 
     wheel_torque: Array  # (W,) N m
@@ -86,7 +86,7 @@ class Actuation(NamedTuple):
     wheel_h: Array  # (W,) N m s, momenta of the wheels after it, from their speeds
 
 
-class Given(NamedTuple):
+class LoopConstants(NamedTuple):
     """Numbers of the loop that stay the same in a run; the gyro and the stars are drawn for it."""
 
     craft: Spacecraft
@@ -94,21 +94,21 @@ class Given(NamedTuple):
     pinv: Array  # (W, 3)
     step_s: Array  # ()
     quantum_rad: Array  # () of the gyro
-    lens: Lens | None = None  # where the star sensor is a camera
+    lens: CameraOptics | None = None  # where the star sensor is a camera
     gyro_matrix: Any = None  # (3, 3) scale factor errors and misalignments, of a run
     star_key: Any = None  # of what a camera sees, of a run
 
 
-class Row(NamedTuple):
+class StepInputs(NamedTuple):
     """External inputs of a step, with the noise of a run."""
 
-    course: Step
+    course: NoiseFreeInputs
     gyro_angle: Array  # (3,) rad
     gyro_bias: Array  # (3,) rad/s
     star_error: Array  # (3,) rad
 
 
-class Frame(NamedTuple):
+class StarFrame(NamedTuple):
     """Report of the star sensor."""
 
     q_ib: Array  # (4,); NaN without a frame
@@ -117,7 +117,7 @@ class Frame(NamedTuple):
     seen_q_ib: Array  # (4,) for the next time
 
 
-class Vehicle(NamedTuple):
+class VehicleState(NamedTuple):
     """State of the vehicle with its gyro."""
 
     craft: CraftState
@@ -126,7 +126,14 @@ class Vehicle(NamedTuple):
     star_q_ib: Array  # (4,) what the star sensor saw last
 
 
-def acm(given: Given, q_ib: Array, bias: Array, theta: Array, wheel_h: Array, row: Step) -> Command:
+def acm(
+    given: LoopConstants,
+    q_ib: Array,
+    bias: Array,
+    theta: Array,
+    wheel_h: Array,
+    row: NoiseFreeInputs,
+) -> ActuatorCommand:
     """Attitude control: from the estimate, the last sample of the gyro and the wheels' speeds.
 
     The rate is that of the gyro less the estimated bias; the field is that of its model, turned
@@ -143,21 +150,25 @@ def acm(given: Given, q_ib: Array, bias: Array, theta: Array, wheel_h: Array, ro
     left = wanted - jnp.cross(dipole, field_b)
     most = given.craft.wheel_momentum_limit
     wheels = allocate_within(given.craft.wheel_axes_b, given.pinv, left, wheel_h, most)
-    return Command(wheels, dipole)
+    return ActuatorCommand(wheels, dipole)
 
 
-def actuators(given: Given, wheel_h: Array, command: Command, row: Step) -> Actuation:
+def actuators(
+    given: LoopConstants, wheel_h: Array, command: ActuatorCommand, row: NoiseFreeInputs
+) -> Actuation:
     """Part of a command that wheels and magnetorquers can give."""
     craft = given.craft._replace(wheel_works=row.wheel_works)
     limit = craft.dipole_limit_a_m2
     return Actuation(
-        wheel_torque=wheels_give(craft, command.wheel_torque),
+        wheel_torque=wheel_torques(craft, command.wheel_torque),
         dipole_b=jnp.clip(command.dipole_b, -limit, limit),
-        wheel_h=wheels_after(craft, wheel_h, command.wheel_torque, given.step_s),
+        wheel_h=wheel_momenta_after(craft, wheel_h, command.wheel_torque, given.step_s),
     )
 
 
-def plant(given: Given, state: CraftState, given_by: Actuation, row: Step) -> CraftState:
+def plant(
+    given: LoopConstants, state: CraftState, given_by: Actuation, row: NoiseFreeInputs
+) -> CraftState:
     """The craft one step on."""
     return advance(
         given.craft,
@@ -171,53 +182,67 @@ def plant(given: Given, state: CraftState, given_by: Actuation, row: Step) -> Cr
     )
 
 
-def gyro(given: Given, before: Array, after: Array, residue: Array, row: Row):
+def gyro(given: LoopConstants, before: Array, after: Array, residue: Array, row: StepInputs):
     """Reported angle of the gyro over a turn (3,), and the residue for the next sample."""
     turned = to_rotvec(multiply(conjugate(before), after))
     return read_gyro(turned, row.gyro_angle, given.gyro_matrix, residue, given.quantum_rad)
 
 
-def expected(given: Given, q_ib: Array, bias: Array, theta: Array) -> Array:
+def expected_attitude(given: LoopConstants, q_ib: Array, bias: Array, theta: Array) -> Array:
     """Attitude where a star camera looks for its stars, from what was believed a step before."""
     return multiply(q_ib, from_rotvec(theta - given.step_s * bias))
 
 
-def star(given: Given, q_ib: Array, expected_q_ib: Array, before: Array, row: Row) -> Frame:
+def star(
+    given: LoopConstants, q_ib: Array, expected_q_ib: Array, before: Array, row: StepInputs
+) -> StarFrame:
     """Frame of the star sensor at the end of a step."""
     if given.lens is None:
-        return told(row, before, read_star(q_ib, row.star_error))
+        return star_frame(row, before, read_star(q_ib, row.star_error))
     looks = partial(_looks, given.lens, given.star_key)
     found = jax.lax.cond(
-        row.course.star.seen, looks, shut, q_ib, expected_q_ib, row.star_error, row.course.number
+        row.course.star.seen,
+        looks,
+        closed_shutter,
+        q_ib,
+        expected_q_ib,
+        row.star_error,
+        row.course.number,
     )
-    return told(row, before, *found)
+    return star_frame(row, before, *found)
 
 
-def told(
-    row: Row, before: Array, q_ib: Array, factor: Array | None = None, stars: Array | None = None
-) -> Frame:
+def star_frame(
+    row: StepInputs,
+    before: Array,
+    q_ib: Array,
+    factor: Array | None = None,
+    stars: Array | None = None,
+) -> StarFrame:
     """Frame of the star sensor from an attitude that it has measured."""
-    says = row.course.star
-    now = multiply(q_ib, from_rotvec(says.turn))
-    now = jnp.where(says.seen & ~says.stuck, now, before)
-    return Frame(jnp.where(says.seen, says.factor * now, jnp.nan), factor, stars, now)
+    effect = row.course.star
+    now = multiply(q_ib, from_rotvec(effect.turn))
+    now = jnp.where(effect.seen & ~effect.stuck, now, before)
+    return StarFrame(jnp.where(effect.seen, effect.factor * now, jnp.nan), factor, stars, now)
 
 
-def _looks(lens: Lens, star_key: Array, q_ib: Array, expected_q_ib: Array, error: Array, number):
+def _looks(
+    lens: CameraOptics, star_key: Array, q_ib: Array, expected_q_ib: Array, error: Array, number
+):
     """Attitude from an image, the factor of its covariance, stars; NaN where these are too few."""
     key = jax.random.fold_in(star_key, number)
-    return solved(
+    return solved_attitude(
         *measure_attitude(key, lens.sky, q_ib, lens.camera, error, expected_q_ib, lens.match_rad)
     )
 
 
-def solved(q_ib: Array, covariance: Array, stars: Array) -> tuple[Array, Array, Array]:
+def solved_attitude(q_ib: Array, covariance: Array, stars: Array) -> tuple[Array, Array, Array]:
     """A measured attitude with the factor of its covariance; that of one where there is none."""
     there = jnp.all(jnp.isfinite(covariance))
     return q_ib, linalg.cholesky(jnp.where(there, covariance, jnp.eye(3))), stars
 
 
-def shut(*_: PyTree) -> tuple[Array, Array, Array]:
+def closed_shutter(*_: PyTree) -> tuple[Array, Array, Array]:
     """Result of a camera with its shutter closed."""
     return jnp.full(4, jnp.nan), jnp.eye(3), jnp.asarray(0)
 
@@ -233,10 +258,10 @@ def pointing_error(q_ref_ib: Array, q_ib: Array) -> Array:
     return to_rotvec(multiply(conjugate(q_ref_ib), q_ib))
 
 
-def begin(given: Given, craft: CraftState) -> Vehicle:
+def begin(given: LoopConstants, craft: CraftState) -> VehicleState:
     """The vehicle before its first step; its gyro has reported the rate that it has."""
     theta = given.step_s * rate_b(given.craft, craft)
-    return Vehicle(craft, jnp.zeros(3), theta, craft.q_ib)
+    return VehicleState(craft, jnp.zeros(3), theta, craft.q_ib)
 
 
 class StateForm(NamedTuple):
@@ -248,21 +273,21 @@ class StateForm(NamedTuple):
     rows: Callable[[Array], Any]  # q_ib -> rows that are reported, or None
 
 
-def apart(node: Callable, *args: PyTree) -> PyTree:
+def compiled_alone(node: Callable, *args: PyTree) -> PyTree:
     """A node as if it were compiled alone, so that it gives the same bits as where it is."""
     settled = jax.lax.optimization_barrier
     return settled(node(*settled(args)))
 
 
-_MOVES, _LOOKS = partial(apart, plant), partial(apart, star)
+_MOVES, _LOOKS = partial(compiled_alone, plant), partial(compiled_alone, star)
 
 
 def react(
     form: StateForm,
-    given: Given,
-    v: Vehicle,
+    given: LoopConstants,
+    v: VehicleState,
     belief: Belief,
-    row: Row,
+    row: StepInputs,
     move: Callable = _MOVES,
     look: Callable = _LOOKS,
 ):
@@ -277,12 +302,12 @@ def react(
         move: the plant, or nodes that do the same, kept apart.
         look: the star sensor, or nodes that do the same, kept apart.
     """
-    q, bias = apart(form.attitude, belief.mean), form.bias(belief.mean)
-    command = apart(acm, given, q, bias, v.theta, v.craft.wheel_h, row.course)
-    acts = apart(actuators, given, v.craft.wheel_h, command, row.course)
+    q, bias = compiled_alone(form.attitude, belief.mean), form.bias(belief.mean)
+    command = compiled_alone(acm, given, q, bias, v.theta, v.craft.wheel_h, row.course)
+    acts = compiled_alone(actuators, given, v.craft.wheel_h, command, row.course)
     craft = move(given, v.craft, acts, row.course)
-    theta, residue = apart(gyro, given, v.craft.q_ib, craft.q_ib, v.residue, row)
-    looks = apart(expected, given, q, bias, theta)
+    theta, residue = compiled_alone(gyro, given, v.craft.q_ib, craft.q_ib, v.residue, row)
+    looks = compiled_alone(expected_attitude, given, q, bias, theta)
     frame = look(given, craft.q_ib, looks, v.star_q_ib, row)
     outputs = {
         "pointing": pointing_error(row.course.ref_end_q_ib, craft.q_ib),
@@ -296,4 +321,4 @@ def react(
         rows=form.rows(craft.q_ib),
         outputs=outputs,
     )
-    return Vehicle(craft, residue, theta, frame.seen_q_ib), reading
+    return VehicleState(craft, residue, theta, frame.seen_q_ib), reading

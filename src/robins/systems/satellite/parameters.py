@@ -14,7 +14,7 @@ from robins.systems.study import Scenario
 _TILTED = (3.0**-0.5, 3.0**-0.5, 3.0**-0.5)
 
 
-class Orbit(Parameters):
+class OrbitParameters(Parameters):
     """A circular orbit, and the model of the magnetic field along it."""
 
     altitude: Annotated[float, Quantity("length", least="100 km")] = default("500 km")
@@ -41,7 +41,7 @@ class Craft(Parameters):
     disturbance: Annotated[float, Quantity("torque", least="0 N m")] = default("1 uN m")
 
 
-class Wheels(Parameters):
+class ReactionWheels(Parameters):
     """Reaction wheels, numbered from 0; those in ``lost`` give no torque, and control knows."""
 
     axes: tuple[tuple[Entry, Entry, Entry], ...] = (
@@ -58,7 +58,7 @@ class Wheels(Parameters):
     loss_known: bool = True  # from the start; then torques are shared out among the others
 
     @pydantic.model_validator(mode="after")
-    def _sound(self) -> Wheels:
+    def _sound(self) -> ReactionWheels:
         for i, axis in enumerate(self.axes):
             if sum(x * x for x in axis) == 0.0:
                 raise ValueError(f"axes: wheel {i} has none: give a vector other than zero")
@@ -89,7 +89,7 @@ class Slew(Parameters):
     grows: q.Time = default("100 s")
 
 
-class Gyro(Parameters):
+class SatelliteGyro(Parameters):
     """A gyro triad whose noise has several sources; each is drawn in each run."""
 
     random_walk: q.AngleWalk = default("1.2 arcsec/sqrt(s)")
@@ -133,7 +133,7 @@ class Camera(Parameters):
     tolerance: q.Spread = default("0.1 deg")  # of a match
 
 
-class Star(Parameters):
+class StarSensor(Parameters):
     """A star sensor, its boresight z; the low-frequency error is a sine of drawn phase."""
 
     period: q.Duration = default("0.5 s")
@@ -147,7 +147,7 @@ class Star(Parameters):
     camera: Camera | None = None
 
 
-class Believed(Parameters):
+class SatelliteAssumptions(Parameters):
     """Assumptions of filters; ``drift`` is the random walk of the gyro's rate, with Markov drift.
 
     Where it is left out they believe the equivalent of the true one.
@@ -170,13 +170,13 @@ class AttitudeLoop(Scenario, Parameters):
     counted_from: q.Time = default("500 s")
     points: Literal["nadir", "inertial"] = "nadir"
     slew: Slew | None = None
-    orbit: Orbit = pydantic.Field(default_factory=Orbit)
+    orbit: OrbitParameters = pydantic.Field(default_factory=OrbitParameters)
     craft: Craft = pydantic.Field(default_factory=Craft)
-    wheels: Wheels = pydantic.Field(default_factory=Wheels)
+    wheels: ReactionWheels = pydantic.Field(default_factory=ReactionWheels)
     control: Control = pydantic.Field(default_factory=Control)
-    gyro: Gyro = pydantic.Field(default_factory=Gyro)
-    star: Star = pydantic.Field(default_factory=Star)
-    believed: Believed = pydantic.Field(default_factory=Believed)
+    gyro: SatelliteGyro = pydantic.Field(default_factory=SatelliteGyro)
+    star: StarSensor = pydantic.Field(default_factory=StarSensor)
+    believed: SatelliteAssumptions = pydantic.Field(default_factory=SatelliteAssumptions)
 
     @pydantic.model_validator(mode="after")
     def _fits(self) -> AttitudeLoop:

@@ -51,7 +51,7 @@ from robins.systems.satellite.nodes import NO_GAIN, STAR
 NAME, _FAILED = NO_GAIN.split(".")
 
 
-class Frozen(NamedTuple):
+class FrozenPlant(NamedTuple):
     """Numbers of the plant that do not turn with the craft, arcsec and s; NumPy or JAX."""
 
     sample_s: Any  # () of the gyro
@@ -61,7 +61,7 @@ class Frozen(NamedTuple):
     star: Any  # (3,) sigma of a star frame
 
 
-def frozen(b: SensorNoise, spec: GainSpec, sample_s: float) -> Frozen:
+def frozen(b: SensorNoise, spec: GainSpec, sample_s: float) -> FrozenPlant:
     """Design data of three axes, from the believed noise of the sensors.
 
     Args:
@@ -77,10 +77,10 @@ def frozen(b: SensorNoise, spec: GainSpec, sample_s: float) -> Frozen:
         noise[np.ix_(rows, rows)] = plant.Bw[:, :2]
         error[rows, i] = plant.Bn[:, 0] / gamma
         star[i] = plant.Dw[0, 2]
-    return Frozen(np.asarray(sample_s), np.asarray(b.period_s), noise, error, star)
+    return FrozenPlant(np.asarray(sample_s), np.asarray(b.period_s), noise, error, star)
 
 
-def plant_at(rate_b: Numbers, of: Frozen) -> Plant:
+def plant_at(rate_b: Numbers, of: FrozenPlant) -> Plant:
     """The plant of a craft that goes on turning at this rate [rad/s], body axes; current form.
 
     Its gain is to have an H-infinity norm of at most one.
@@ -94,7 +94,7 @@ def plant_at(rate_b: Numbers, of: Frozen) -> Plant:
     return current_form(A, of.noise, of.error, seen, np.diag(of.star), L=seen)
 
 
-def gain_at(rate_b: Numbers, of: Frozen) -> tuple[np.ndarray, np.ndarray]:
+def gain_at(rate_b: Numbers, of: FrozenPlant) -> tuple[np.ndarray, np.ndarray]:
     """The certified gain at a rate, on the host.
 
     A function of its arguments alone: the units of the program are those of the craft at rest.
@@ -107,7 +107,7 @@ def gain_at(rate_b: Numbers, of: Frozen) -> tuple[np.ndarray, np.ndarray]:
         (6, 3) gain of attitude and bias [1, 1/s], and () bool, whether there is one: an answer
         whose true norms do not meet the request is none.
     """
-    known = Frozen(*(np.asarray(x, float) for x in of))
+    known = FrozenPlant(*(np.asarray(x, float) for x in of))
     each = _designer(*((x.shape, x.tobytes()) for x in known))
     try:
         return each(plant_at(rate_b, known)), np.asarray(True)
@@ -117,19 +117,19 @@ def gain_at(rate_b: Numbers, of: Frozen) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=16)
 def _designer(*numbers: tuple[tuple[int, ...], bytes]) -> EveryStep:
-    of = Frozen(*(np.frombuffer(data).reshape(shape) for shape, data in numbers))
+    of = FrozenPlant(*(np.frombuffer(data).reshape(shape) for shape, data in numbers))
     with warnings.catch_warnings():  # documented on the page of the filter
         warnings.simplefilter("ignore", FrozenTimeWarning)
         return EveryStep(1.0, like=plant_at(np.zeros(3), of))
 
 
-class Redesigned(NamedTuple):
+class RedesignMemory(NamedTuple):
     """Memory of the rule."""
 
-    of: Frozen
+    of: FrozenPlant
     q_ib: Array  # (4,) believed before the last sample of the gyro
     turn: Array  # (3,) rad, over that sample, body axes
-    gain: Array  # (6, 3) of the last frame whose design passed; before it that of `begun`
+    gain: Array  # (6, 3) of the last frame whose design passed; before it that of `initial_state`
     failed: Array  # () frames whose design did not pass
 
 
@@ -139,19 +139,19 @@ class LmiStep(Rule):
 
     name = NAME
 
-    def init(self, belief: Belief, dims: Mapping[str, int]) -> Redesigned:
-        none = Frozen(*(jnp.zeros(shape) for shape in ((), (), (6, 6), (6, 3), (3,))))
+    def init(self, belief: Belief, dims: Mapping[str, int]) -> RedesignMemory:
+        none = FrozenPlant(*(jnp.zeros(shape) for shape in ((), (), (6, 6), (6, 3), (3,))))
         q_ib = belief.mean.attitude.wxyz
-        return Redesigned(none, q_ib, jnp.zeros(3), jnp.zeros((6, 3)), jnp.asarray(0))
+        return RedesignMemory(none, q_ib, jnp.zeros(3), jnp.zeros((6, 3)), jnp.asarray(0))
 
-    def settle(self, memory: Redesigned, belief: Belief):
+    def settle(self, memory: RedesignMemory, belief: Belief):
         return memory._replace(q_ib=belief.mean.attitude.wxyz), belief, int(Code.DONE)
 
-    def process(self, memory: Redesigned, transition: Transition):
+    def process(self, memory: RedesignMemory, transition: Transition):
         turn = to_rotvec(multiply(conjugate(memory.q_ib), transition.mean.attitude.wxyz))
         return memory._replace(turn=turn), transition
 
-    def after(self, memory: Redesigned, posterior: Belief, info: StepInfo, o: Observation):
+    def after(self, memory: RedesignMemory, posterior: Belief, info: StepInfo, o: Observation):
         shapes = jax.ShapeDtypeStruct((6, 3), float), jax.ShapeDtypeStruct((), bool)
         solved = partial(jax.pure_callback, gain_at, shapes, vmap_method="sequential")
         found, passed = jax.lax.cond(
@@ -167,7 +167,7 @@ class LmiStep(Rule):
         memory = memory._replace(gain=gain, failed=memory.failed + (~passed).astype(int))
         return memory, posterior, info.noted(NAME, **{_FAILED: ~passed})
 
-    def report(self, start: Redesigned, final: Redesigned, again: Any, time: Any) -> None:
+    def report(self, start: RedesignMemory, final: RedesignMemory, again: Any, time: Any) -> None:
         """Report the designs of a run that did not pass; in a stream each note does.
 
         Warns:
@@ -188,14 +188,14 @@ def redesigned() -> Rule:
     """Update with the gain of an LMI for the plant of the moment, solved by the host.
 
     A frame whose design does not pass is used with the last gain that did. The covariance is the
-    one that the gain truly has, as with `constant_gain`. Begin a state by `begun`.
+    one that the gain truly has, as with `constant_gain`. Begin a state by `initial_state`.
 
     Notes: ``lmi_step.failed``, whether the design of this frame did not pass.
     """
     return LmiStep()
 
 
-def begun(state: FilterState, of: Frozen, gain: Numbers) -> FilterState:
+def initial_state(state: FilterState, of: FrozenPlant, gain: Numbers) -> FilterState:
     """A state of such a filter with its numbers.
 
     Args:
@@ -203,11 +203,11 @@ def begun(state: FilterState, of: Frozen, gain: Numbers) -> FilterState:
         of: numbers of the plant.
         gain: (6, 3) until the first design passes.
     """
-    as_arrays = Frozen(*(jnp.asarray(x, float) for x in of))
+    as_arrays = FrozenPlant(*(jnp.asarray(x, float) for x in of))
 
-    def told(memory: PyTree) -> PyTree:
-        if not isinstance(memory, Redesigned):
+    def with_design(memory: PyTree) -> PyTree:
+        if not isinstance(memory, RedesignMemory):
             return memory
         return memory._replace(of=as_arrays, gain=jnp.asarray(gain, float))
 
-    return state._replace(memory=tuple(map(told, state.memory)))
+    return state._replace(memory=tuple(map(with_design, state.memory)))

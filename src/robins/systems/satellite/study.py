@@ -27,9 +27,16 @@ from robins.systems.satellite import design, model, stepwise
 from robins.systems.satellite.design import GainSpec, SensorNoise
 from robins.systems.satellite.gyro import ARCSEC, equivalent_walk
 from robins.systems.satellite.model import Build, make_filter
-from robins.systems.satellite.nodes import STAR, Given, Row, Step, begin, react
+from robins.systems.satellite.nodes import (
+    STAR,
+    LoopConstants,
+    NoiseFreeInputs,
+    StepInputs,
+    begin,
+    react,
+)
 from robins.systems.satellite.parameters import AttitudeLoop
-from robins.systems.satellite.world import Course, World, lay_out, simulate
+from robins.systems.satellite.world import SatelliteCourse, SatelliteWorld, lay_out, simulate
 from robins.systems.study import (
     Case,
     Contender,
@@ -101,11 +108,11 @@ def believed_walk(given: AttitudeLoop, spec: FilterSpec) -> float:
     return math.sqrt(spec.drift) * believed
 
 
-class Surroundings(NamedTuple):
+class FilterEnvironment(NamedTuple):
     """Environment of a filter as data: the loop, the first belief, and a constant gain."""
 
-    given: Given
-    steps: Step  # leading axis E
+    given: LoopConstants
+    steps: NoiseFreeInputs  # leading axis E
     due: Array  # (E,) bool
     attitude_rad: Array  # believed at the start
     bias_rad_s: Array
@@ -117,23 +124,23 @@ class Surroundings(NamedTuple):
 _REACTS = {False: partial(react, model.MULTIPLICATIVE), True: partial(react, model.ADDITIVE)}
 
 
-def as_case(additive: bool, build: Build, around: Surroundings, world: World) -> Case:
+def as_case(additive: bool, build: Build, around: FilterEnvironment, world: SatelliteWorld) -> Case:
     """Case of a filter in a run; pure."""
     given = around.given._replace(gyro_matrix=world.gyro_matrix, star_key=world.star_key)
-    rows = Row(around.steps, world.gyro_angle, world.gyro_bias, world.star_error)
+    rows = StepInputs(around.steps, world.gyro_angle, world.gyro_bias, world.star_error)
     start: Any = model.start(world.start_q_ib, around.attitude_rad, around.bias_rad_s, additive)
     if build.startswith("fixed"):
         start = with_gains(make_filter(build).init(start, {STAR: 3}), {STAR: around.gain})
     if around.frozen is not None:
         state = make_filter(build).init(start, {STAR: 3})
-        start = stepwise.begun(state, around.frozen, around.gain)
+        start = stepwise.initial_state(state, around.frozen, around.gain)
     loop = Loop(
         Partial(_REACTS[additive], given), begin(given, world.craft), rows, {STAR: around.due}
     )
     return Case(start=start, u=None, y={}, aux={}, truth=None, loop=loop)
 
 
-def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
+def contender(given: AttitudeLoop, course: SatelliteCourse, name: str) -> Contender:
     """A filter with its model and its data.
 
     Raises:
@@ -160,7 +167,7 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
             more = design.inflation(sensors, spec.gain) * math.sqrt(given.step / given.star.period)
             noise = noise._replace(factor=jnp.concatenate([noise.factor, more], axis=1))
     start = (jnp.asarray(given.believed.attitude), jnp.asarray(given.believed.bias))
-    around = Surroundings(
+    around = FilterEnvironment(
         course.given, course.steps, jnp.asarray(course.due), *start, jnp.asarray(gain), frozen
     )
     additive = spec.build == "quaternion"
@@ -253,7 +260,7 @@ def faults(given: AttitudeLoop, time_s: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def view(given: AttitudeLoop, course: Course) -> View:
+def view(given: AttitudeLoop, course: SatelliteCourse) -> View:
     """Report: attitude, gyro bias, pointing error, momentum of the wheels."""
     counted = int(np.searchsorted(course.time_s, given.counted_from + 1e-9))
     lost = (course.due & ~np.asarray(course.steps.star.seen)).astype(np.int8)

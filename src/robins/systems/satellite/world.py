@@ -22,21 +22,32 @@ from robins.sim.random import Component, stream
 from robins.sim.spacecraft import CraftState, craft_state, spacecraft
 from robins.sim.star_sensor import StarCamera, index_for, star_errors
 from robins.systems.parts import outside
-from robins.systems.satellite.nodes import Given, Lens, StarSays, Step
-from robins.systems.satellite.parameters import AttitudeLoop, Craft, Gyro, Star, Wheels
+from robins.systems.satellite.nodes import (
+    CameraOptics,
+    LoopConstants,
+    NoiseFreeInputs,
+    StarSensorFault,
+)
+from robins.systems.satellite.parameters import (
+    AttitudeLoop,
+    Craft,
+    ReactionWheels,
+    SatelliteGyro,
+    StarSensor,
+)
 
 # Folded into the key of the gyro next to the streams of `robins.sim.gyro`.
 _BIAS, _RAMP = 16, 17
 _CAMERA = 16  # into that of the star sensor, next to the streams of `robins.sim.star_sensor`
 
 
-class Course(NamedTuple):
+class SatelliteCourse(NamedTuple):
     """The same in all runs; E steps."""
 
     time_s: np.ndarray  # (E,) at the end of each step
-    steps: Step
+    steps: NoiseFreeInputs
     due: np.ndarray  # (E,) bool, whether a step ends with a star frame
-    given: Given  # numbers of the loop
+    given: LoopConstants  # numbers of the loop
 
 
 def inertia(craft: Craft) -> np.ndarray:
@@ -46,13 +57,13 @@ def inertia(craft: Craft) -> np.ndarray:
     return np.diag(craft.moments) + off
 
 
-def wheel_axes(wheels: Wheels) -> np.ndarray:
+def wheel_axes(wheels: ReactionWheels) -> np.ndarray:
     """(3, W) unit columns."""
     axes = np.array(wheels.axes, float).T.reshape(3, len(wheels.axes))
     return axes / np.linalg.norm(axes, axis=0)
 
 
-def lay_out(given: AttitudeLoop) -> Course:
+def lay_out(given: AttitudeLoop) -> SatelliteCourse:
     """Orbit, field and reference.
 
     Raises:
@@ -77,9 +88,9 @@ def lay_out(given: AttitudeLoop) -> Course:
     works = np.ones((count, len(wheels.axes)))
     left = np.array([float(i not in wheels.lost) for i in range(len(wheels.axes))])
     works[edges[:-1] > wheels.lost_at - 1e-9] = left
-    return Course(
+    return SatelliteCourse(
         time_s=time,
-        steps=Step(
+        steps=NoiseFreeInputs(
             wanted.q_ib[:-1],
             wanted.omega_b[:-1],
             wanted.alpha_b[:-1],
@@ -92,7 +103,7 @@ def lay_out(given: AttitudeLoop) -> Course:
             jnp.arange(count),
         ),
         due=due,
-        given=Given(
+        given=LoopConstants(
             spacecraft(
                 moments, axes, wheels.torque, wheels.momentum, control.dipole, given.craft.dipole
             ),
@@ -111,7 +122,7 @@ def _turned(given: AttitudeLoop, base: Reference, time_s: np.ndarray) -> Referen
     return slews(base, slew.angle, slew.period, time_s, fade_in_s=slew.grows)
 
 
-def _lens(star: Star) -> Lens | None:
+def _lens(star: StarSensor) -> CameraOptics | None:
     """The camera of a star sensor that has one, and the stars it may see."""
     if (given := star.camera) is None:
         return None
@@ -123,10 +134,10 @@ def _lens(star: Star) -> Lens | None:
         false_stars=given.false_stars,
     )
     stars = {"synthetic": synthetic, "hipparcos": hipparcos}[given.catalogue](given.magnitude)
-    return Lens(camera, index_for(camera, stars), jnp.asarray(given.tolerance))
+    return CameraOptics(camera, index_for(camera, stars), jnp.asarray(given.tolerance))
 
 
-def _star_says(star: Star, due: np.ndarray, time_s: np.ndarray) -> StarSays:
+def _star_says(star: StarSensor, due: np.ndarray, time_s: np.ndarray) -> StarSensorFault:
     seen, stuck = due & outside(star.lost, time_s), np.zeros(len(due), dtype=bool)
     turn, factor = np.zeros((len(due), 3)), np.ones(len(due))
     for fault in star.faults:
@@ -139,7 +150,7 @@ def _star_says(star: Star, due: np.ndarray, time_s: np.ndarray) -> StarSays:
             factor[here & (np.floor(time_s + 1e-9) % 2 == 1)] *= -1.0
         else:
             factor[here] *= 0.99
-    return StarSays(*(jnp.asarray(x) for x in (seen, stuck, turn, factor)))
+    return StarSensorFault(*(jnp.asarray(x) for x in (seen, stuck, turn, factor)))
 
 
 def _disturbance(given: AttitudeLoop, time_s: np.ndarray) -> np.ndarray:
@@ -150,7 +161,7 @@ def _disturbance(given: AttitudeLoop, time_s: np.ndarray) -> np.ndarray:
     return given.craft.disturbance * np.sin(rate * time_s[:, None] + phase)
 
 
-class World(NamedTuple):
+class SatelliteWorld(NamedTuple):
     """One run; E steps."""
 
     gyro_angle: Array  # (E, 3) error of the angle of each sample [rad]
@@ -162,7 +173,7 @@ class World(NamedTuple):
     start_q_ib: Array  # (4,) attitude that filters begin with
 
 
-def true_errors(gyro: Gyro, bias: Array, ramp: Array) -> TriadErrors:
+def true_errors(gyro: SatelliteGyro, bias: Array, ramp: Array) -> TriadErrors:
     """The gyro as it is; what the parameters give as a half-width of a uniform error is drawn."""
     return TriadErrors(
         bias=bias,
@@ -176,7 +187,9 @@ def true_errors(gyro: Gyro, bias: Array, ramp: Array) -> TriadErrors:
     )
 
 
-def simulate(given: AttitudeLoop, course: Course, seed: int, index: Array) -> World:
+def simulate(
+    given: AttitudeLoop, course: SatelliteCourse, seed: int, index: Array
+) -> SatelliteWorld:
     """One run, from its number, which may be traced; pure."""
     key = partial(stream, seed, index)
     unit, begin = key(Component.IMU), key(Component.INITIAL_STATE)
@@ -202,7 +215,7 @@ def simulate(given: AttitudeLoop, course: Course, seed: int, index: Array) -> Wo
     first = course.steps
     q0 = first.ref_q_ib[0]
     off = given.believed.attitude * jax.random.normal(begin, (3,))
-    return World(
+    return SatelliteWorld(
         gyro_angle=gyro.angle,
         gyro_bias=gyro.bias,
         gyro_matrix=gyro.matrix,

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from robins.bench.broker.faults import Said, nothing
+from robins.bench.broker.faults import DeviceFault, nothing
 from robins.bench.rig import Rig, later, named
 from robins.bench.wire.fields import Field, Values, f64, message, size
 from robins.bench.wire.schema import Wire
@@ -71,15 +71,15 @@ WIRE = Wire(
 )
 
 
-def _shifted(said: Values, fault: Any, _: int) -> Values:
+def _shifted(values: Values, fault: Any, _: int) -> Values:
     """A radar that takes another place for the one below."""
-    return {**said, "place": said["place"] + np.array([fault.shift, 0.0])}
+    return {**values, "place": values["place"] + np.array([fault.shift, 0.0])}
 
 
 _SAID = {
-    "shifted": Said("radar", "fix", "sensed", _shifted, ("shift",)),
-    "blind": Said("star", "attitude", "blind", nothing),
-    "stuck": Said("air", "wind", "repeated"),
+    "shifted": DeviceFault("radar", "fix", "sensed", _shifted, ("shift",)),
+    "blind": DeviceFault("star", "attitude", "blind", nothing),
+    "stuck": DeviceFault("air", "wind", "repeated"),
 }
 _SHIFT = Annotated[float, Quantity("length", least="-100 km", most="100 km")]
 
@@ -114,7 +114,7 @@ class AirshipRig(Rig):
         found = named("robins.systems.airship:SYSTEM").scenarios
         return {f"airship/{name}": path for name, path in sorted(found.items())}
 
-    def said(self) -> tuple[dict[str, Said], dict[str, Any]]:
+    def device_faults(self) -> tuple[dict[str, DeviceFault], dict[str, Any]]:
         """Faults of radar, star sensor and air data."""
         return _SAID, {"shift": (_SHIFT, default("200 m"))}
 

@@ -1,4 +1,4 @@
-"""The kit of a flight of the airship, its parts, and its evaluation."""
+"""The config of a flight of the airship, its parts, and its evaluation."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins import manifold
-from robins.bench.evaluation import Flown, Judged, Ran, figures_of
+from robins.bench.evaluation import MessageSeries, RunFigures, RunResult, figures_of
 from robins.bench.parts.station import Inputs, Part
-from robins.bench.rig import Flight, Timing
+from robins.bench.rig import LoadedRun, Timing
 from robins.bench.run.setup import Setup, counted_from
 from robins.bench.wire.fields import Values
 from robins.earth import Geodetic
@@ -37,7 +37,7 @@ _TAKEN = (fitted.RADAR, fitted.STARS, fitted.SOFT)
 _ARCSEC = math.pi / 648000.0
 
 
-class Kit(NamedTuple):
+class AirshipConfig(NamedTuple):
     """Complete input of a flight; E epochs."""
 
     step_ns: int
@@ -64,8 +64,8 @@ def timing(given: Airship) -> Timing:
     return Timing(given.epoch, round(given.duration / given.epoch), first)
 
 
-def prepare(setup: Setup, given: Airship) -> Kit:
-    """Kit of run 0 of a campaign of this seed."""
+def prepare(setup: Setup, given: Airship) -> AirshipConfig:
+    """Config of run 0 of a campaign of this seed."""
     (study,) = SYSTEM.studies.values()
     problem = study.problem(given, (setup.filter,), setup.seed)
     of = problem.contenders[setup.filter]
@@ -73,7 +73,9 @@ def prepare(setup: Setup, given: Airship) -> Kit:
     u, y, aux, truth = jax.tree_util.tree_map(
         np.asarray, (case.u, dict(case.y), dict(case.aux), nav_of(case.truth))
     )
-    return Kit(round(1e9 * given.epoch), setup.filter, of.model, case.start, u, y, aux, truth)
+    return AirshipConfig(
+        round(1e9 * given.epoch), setup.filter, of.model, case.start, u, y, aux, truth
+    )
 
 
 def _says(part: str, message: str, rows: Mapping[str, np.ndarray]) -> Part:
@@ -86,43 +88,45 @@ def _says(part: str, message: str, rows: Mapping[str, np.ndarray]) -> Part:
     return Part(part, {}, lambda: None, act)
 
 
-def sins(kit: Kit) -> Part:
+def sins(config: AirshipConfig) -> Part:
     """The inertial unit, with what an epoch adds up to."""
-    u = kit.u
+    u = config.u
     rows = {"dt": u.dt, "theta_b": u.theta, "dv_b": u.dv, "dr_b": u.dr}
     return _says("sins", "increment", {name: np.asarray(x) for name, x in rows.items()})
 
 
-def radar(kit: Kit) -> Part:
+def radar(config: AirshipConfig) -> Part:
     """Radar and barometer."""
-    place, heading, alt = kit.y[SAR]
+    place, heading, alt = config.y[SAR]
     return _says("radar", "fix", {"place": place, "heading": heading.rad, "alt": alt[:, 0]})
 
 
-def star(kit: Kit) -> Part:
+def star(config: AirshipConfig) -> Part:
     """The star sensor."""
-    return _says("star", "attitude", {"euler": np.stack([a.rad for a in kit.y[STAR]], axis=1)})
+    return _says("star", "attitude", {"euler": np.stack([a.rad for a in config.y[STAR]], axis=1)})
 
 
-def air(kit: Kit) -> Part:
+def air(config: AirshipConfig) -> Part:
     """Forecast and air data; silent where the filter takes none."""
-    rows = {"wind_n": kit.y[WIND], "through_b": kit.aux[WIND]} if WIND in kit.y else {}
+    rows = {"wind_n": config.y[WIND], "through_b": config.aux[WIND]} if WIND in config.y else {}
     return _says("air", "wind", rows)
 
 
-def navigation(kit: Kit) -> Part:
+def navigation(config: AirshipConfig) -> Part:
     """The navigation computer: any filter that takes what comes; what does not come is missing.
 
     Its state is that of the filter and the last increment.
     """
-    windy = WIND in kit.y
-    begin = Increments(*(np.asarray(x)[0] for x in kit.u))
+    windy = WIND in config.y
+    begin = Increments(*(np.asarray(x)[0] for x in config.u))
     online: list[OnlineFilter] = []  # made when it is needed, not where only its inputs are queried
     starts: list[Any] = []
 
     def first() -> tuple[FilterState, Increments]:
         if not online:
-            online.append(OnlineFilter(CANDIDATES[kit.filter].make(), kit.model, kit.start))
+            online.append(
+                OnlineFilter(CANDIDATES[config.filter].make(), config.model, config.start)
+            )
             starts.append(online[0].state)
         return starts[0], begin
 
@@ -143,7 +147,7 @@ def navigation(kit: Kit) -> Part:
             y[WIND] = nothing[:2] if wind is None else wind["wind_n"]
         aux = {WIND: np.zeros(3) if wind is None else wind["through_b"]} if windy else {}
         x = np.asarray(online[0].step(y, increment, aux, keep=_kept))
-        said = {**_told(x), "held": int(held)}
+        said = {**_state_fields(x), "held": int(held)}
         return (online[0].state, increment), [("state", said)]
 
     takes = {"increment": 0, "fix": 0, "attitude": 0, "wind": 0}
@@ -158,33 +162,33 @@ def _kept(step: Step) -> jax.Array:
     return jnp.concatenate([x.q_nb.wxyz, x.v_n, place, belief.sigma])
 
 
-def _told(x: np.ndarray) -> Values:
+def _state_fields(x: np.ndarray) -> Values:
     """The fields of a state, of a vector or of vectors (E, 19)."""
     place = {"lat": x[..., 7], "lon": x[..., 8], "alt": x[..., 9]}
     return {"q_nb": x[..., :4], "v_n": x[..., 4:7], **place, "sigma": x[..., 10:19]}
 
 
-def inside(kit: Kit, steps: int | None = None) -> dict[str, np.ndarray]:
+def inside(config: AirshipConfig, steps: int | None = None) -> dict[str, np.ndarray]:
     """The first epochs of the same flight, or all, inside one program."""
-    made = CANDIDATES[kit.filter].make()
-    y, u, aux = jax.tree_util.tree_map(lambda x: x[:steps], (kit.y, kit.u, kit.aux))
-    done = run(made, kit.model, kit.start, y, u, aux, keep=_kept)
-    return {f"state.{name}": x for name, x in _told(np.asarray(done.steps)).items()}
+    made = CANDIDATES[config.filter].make()
+    y, u, aux = jax.tree_util.tree_map(lambda x: x[:steps], (config.y, config.u, config.aux))
+    done = run(made, config.model, config.start, y, u, aux, keep=_kept)
+    return {f"state.{name}": x for name, x in _state_fields(np.asarray(done.steps)).items()}
 
 
-def errors(kit: Kit, flown: Flown) -> np.ndarray:
+def errors(config: AirshipConfig, series: MessageSeries) -> np.ndarray:
     """(E, 9) true less estimated attitude [rad], velocity, position [m], each ENU."""
-    q, v, *place = (np.asarray(flown[f"state.{f}"]) for f in ("q_nb", "v_n", "lat", "lon", "alt"))
-    truth = jax.tree_util.tree_map(lambda x: x[: len(q)], kit.truth)
+    q, v, *place = (np.asarray(series[f"state.{f}"]) for f in ("q_nb", "v_n", "lat", "lon", "alt"))
+    truth = jax.tree_util.tree_map(lambda x: x[: len(q)], config.truth)
     estimate = Nav(Rotation(q), jnp.asarray(v), Geodetic(*place))
     off = jax.jit(jax.vmap(manifold.local))(estimate, truth)
     return np.asarray(off) @ ENU_OF_NED.T
 
 
-def judge(flight: Flight, ran: Ran) -> Judged:
+def judge(flight: LoadedRun, result: RunResult) -> RunFigures:
     """Errors over the epochs that count."""
-    flown, counted = ran.flown, slice(counted_from(flight, ran.steps), None)
-    error, sigma = errors(ran.kit, flown), flown["state.sigma"] @ np.abs(ENU_OF_NED).T
+    series, counted = result.series, slice(counted_from(flight, result.steps), None)
+    error, sigma = errors(result.config, series), series["state.sigma"] @ np.abs(ENU_OF_NED).T
     arrays: dict[str, Any] = {}
     for block in BLOCKS:
         arrays |= block_array("error", block, error[None, :, block.where])
@@ -199,5 +203,5 @@ def judge(flight: Flight, ran: Ran) -> Judged:
         squares = np.sum(error[counted, where] ** 2, axis=1)
         known = squares[np.isfinite(squares)]
         metrics[name] = float(np.sqrt(np.mean(known))) / unit if len(known) else None
-    counts = {"steps_without_increment": int(np.sum(flown["state.held"]))}
-    return Judged(metrics, counts, arrays=arrays, lines=figures_of(metrics))
+    counts = {"steps_without_increment": int(np.sum(series["state.held"]))}
+    return RunFigures(metrics, counts, arrays=arrays, lines=figures_of(metrics))

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from robins.bench.broker.faults import Said
+from robins.bench.broker.faults import DeviceFault
 from robins.bench.rig import Rig, later, named
 from robins.bench.wire.fields import Field, Values, f64, message, size
 from robins.bench.wire.schema import Wire
@@ -77,21 +77,21 @@ WIRE = Wire(
 )
 
 
-def _shifted(said: Values, fault: Any, _: int) -> Values:
+def _shifted(values: Values, fault: Any, _: int) -> Values:
     """A position that is off to the north."""
-    return {**said, "lat": said["lat"] + fault.shift / 6.378137e6}
+    return {**values, "lat": values["lat"] + fault.shift / 6.378137e6}
 
 
-def _blind(said: Values, *_: Any) -> Values:
+def _blind(values: Values, *_: Any) -> Values:
     """No satellites: a stamp and no numbers."""
     nothing = np.full(3, np.nan)
-    return {**said, "lat": np.nan, "lon": np.nan, "alt": np.nan, "v_n": nothing, "quality": 0}
+    return {**values, "lat": np.nan, "lon": np.nan, "alt": np.nan, "v_n": nothing, "quality": 0}
 
 
 _SAID = {
-    "shifted": Said("gnss", "fix", "sensed", _shifted, ("shift",)),
-    "stuck": Said("gnss", "fix", "repeated"),
-    "blind": Said("gnss", "fix", "blind", _blind),
+    "shifted": DeviceFault("gnss", "fix", "sensed", _shifted, ("shift",)),
+    "stuck": DeviceFault("gnss", "fix", "repeated"),
+    "blind": DeviceFault("gnss", "fix", "blind", _blind),
 }
 _SHIFT = Annotated[float, Quantity("length", least="-100 km", most="100 km")]
 
@@ -128,7 +128,7 @@ class InsGnssRig(Rig):
         """Machine that steps the filter; left out: as `LiveInsGnss` chooses."""
         return {"machine": (Literal["jax", "vm", "c"] | None, None)}
 
-    def said(self) -> tuple[dict[str, Said], dict[str, Any]]:
+    def device_faults(self) -> tuple[dict[str, DeviceFault], dict[str, Any]]:
         """Faults of the receiver."""
         return _SAID, {"shift": (_SHIFT, default("30 m"))}
 

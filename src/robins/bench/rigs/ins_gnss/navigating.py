@@ -12,12 +12,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins import logs, manifold
-from robins.bench.evaluation import Flown, Judged, Ran, View, figures_of, latest
+from robins.bench.evaluation import (
+    MessageSeries,
+    PageView,
+    RunFigures,
+    RunResult,
+    figures_of,
+    latest,
+)
 from robins.bench.live.feed import Signal
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.recording.topics import JSON, Topic, as_json, nav_sat_fix
 from robins.bench.recording.topics import imu as imu_of_ros
-from robins.bench.rig import Aboard, Flight, RigError, Timing
+from robins.bench.rig import ExportSources, LoadedRun, RigError, Timing
 from robins.bench.rigs.ins_gnss import FLAGS, SUSPECTS
 from robins.bench.wire.fields import Values
 from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
@@ -33,7 +40,7 @@ from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.live import LiveInsGnss
 from robins.systems.ins_gnss.live_answers import Navigation
 from robins.systems.ins_gnss.live_fixes import some
-from robins.systems.ins_gnss.parameters import Drive, Gnss, Replay
+from robins.systems.ins_gnss.parameters import Drive, Gnss, InsGnssReplay
 from robins.systems.ins_gnss.recording import (
     Log,
     as_rates,
@@ -49,7 +56,7 @@ from robins.systems.tables import attitude_array, block_array, track_arrays
 _SHARED = ("system", "title", "imu", "start", "aids", "update", "outages", "log")
 
 
-class Journey(Replay):
+class NavigationParameters(InsGnssReplay):
     """Beliefs of the navigation computer, and the source of the samples.
 
     A configuration of a replay, with the files of a ``log``; or a scenario of a simulated drive,
@@ -66,7 +73,9 @@ class Journey(Replay):
     fix_rate: Annotated[float, Quantity("frequency", above="0 Hz", most="1 kHz")] = default("1 Hz")
 
     @classmethod
-    def model_validate_json(cls, json_data: str | bytes | bytearray, **options: Any) -> Journey:
+    def model_validate_json(
+        cls, json_data: str | bytes | bytearray, **options: Any
+    ) -> NavigationParameters:
         """Parse a scenario; that of a drive is split into truth and beliefs."""
         said = json.loads(json_data)
         if "legs" in said:
@@ -76,11 +85,11 @@ class Journey(Replay):
         return super().model_validate_json(json.dumps(said), **options)
 
 
-class Kit(NamedTuple):
+class InsGnssConfig(NamedTuple):
     """Complete input of a run."""
 
     step_ns: int
-    given: Replay
+    given: InsGnssReplay
     filter: str
     machine: str | None  # that steps the filter; None: as `LiveInsGnss` chooses
     rates_hz: tuple[float, float]  # of samples and fixes
@@ -103,7 +112,7 @@ def _rate_hz(table: ImuTable | GnssTable | None) -> float:
     return 1.0 / float(np.median(np.diff(table.time_ns) * 1e-9))
 
 
-def timing(given: Journey) -> Timing:
+def timing(given: NavigationParameters) -> Timing:
     """A step is a sample: of the log in the order of its rows, whatever gaps there are."""
     if given.log:
         samples = _logged(given.log).imu
@@ -114,14 +123,17 @@ def timing(given: Journey) -> Timing:
     return Timing(1.0 / rate_hz, round(lasts_s * rate_hz), 0)
 
 
-def prepare(setup: Any, given: Journey) -> Kit:
-    """The kit of a run.
+def prepare(setup: Any, given: NavigationParameters) -> InsGnssConfig:
+    """The config of a run.
 
     Raises:
         RigError: nothing sends as imu or gnss.
         robins.logs.LogError: a file of the log cannot be read.
     """
-    believed, dataset = Replay(**{k: getattr(given, k) for k in Replay.model_fields}), None
+    believed, dataset = (
+        InsGnssReplay(**{k: getattr(given, k) for k in InsGnssReplay.model_fields}),
+        None,
+    )
     if given.log:
         dataset = _logged(given.log)
         believed = with_lever_arm(believed, dataset.lever_arm_b_m)
@@ -135,12 +147,12 @@ def prepare(setup: Any, given: Journey) -> Kit:
     if dataset is not None:
         rates_hz = _rate_hz(dataset.imu), _rate_hz(dataset.gnss)
     step_ns = round(1e9 * timing(given).step_s)
-    return Kit(step_ns, believed, setup.filter, setup.machine, rates_hz, dataset)
+    return InsGnssConfig(step_ns, believed, setup.filter, setup.machine, rates_hz, dataset)
 
 
-def imu(kit: Kit) -> Part:
+def imu(config: InsGnssConfig) -> Part:
     """The inertial unit: a sample a step."""
-    samples = None if kit.dataset is None else kit.dataset.imu
+    samples = None if config.dataset is None else config.dataset.imu
 
     def act(state: None, k: int, inputs: Inputs):
         if samples is None or k >= len(samples):
@@ -151,19 +163,19 @@ def imu(kit: Kit) -> Part:
     return Part("imu", {}, lambda: None, act)
 
 
-def gnss(kit: Kit) -> Part:
+def gnss(config: InsGnssConfig) -> Part:
     """The receiver: a fix with the first sample that is not older; in an outage, one of NaN.
 
     Its state is the number of the next fix.
     """
-    if kit.dataset is None or kit.dataset.gnss is None:
+    if config.dataset is None or config.dataset.gnss is None:
         return Part("gnss", {}, lambda: 0, lambda sent, k, inputs: (sent, []))
-    fixes, sample_ns = kit.dataset.gnss, kit.dataset.imu.time_ns
+    fixes, sample_ns = config.dataset.gnss, config.dataset.imu.time_ns
     since_s = (fixes.time_ns - sample_ns[0]) * 1e-9
     place = np.stack([fixes.lat_rad, fixes.lon_rad, fixes.alt_m], axis=1)
     nothing = np.full(place.shape, np.nan)
     v_n, sigma_v = (nothing if x is None else np.array(x) for x in (fixes.v_n, fixes.sigma_v))
-    withheld = kit.given.withheld(since_s, since_s)
+    withheld = config.given.withheld(since_s, since_s)
     place[withheld] = v_n[withheld] = np.nan
 
     def act(sent: int, k: int, inputs: Inputs):
@@ -178,22 +190,24 @@ def gnss(kit: Kit) -> Part:
     return Part("gnss", {}, lambda: int(np.searchsorted(since_s, 0.0, side="right")), act)
 
 
-Navigating = tuple[LiveInsGnss, tuple[Navigation, ...]]
+InsGnssNavigationState = tuple[LiveInsGnss, tuple[Navigation, ...]]
 """State of the navigation computer: an object that is always the same, and changes; and epochs that
 have not been sent: one is sent a step."""
 
 
-def navigation(kit: Kit) -> Part:
+def navigation(config: InsGnssConfig) -> Part:
     """The navigation computer: sends what `LiveInsGnss` reports."""
     made: list[LiveInsGnss] = []
 
-    def begin() -> Navigating:
+    def begin() -> InsGnssNavigationState:
         if not made:  # which compiles, and is not needed where only its inputs are queried
-            made.append(LiveInsGnss(kit.given, *kit.rates_hz, kit.filter, machine=kit.machine))
+            made.append(
+                LiveInsGnss(config.given, *config.rates_hz, config.filter, machine=config.machine)
+            )
         made[0].start_over()
         return made[0], ()
 
-    def act(state: Navigating, k: int, inputs: Inputs):
+    def act(state: InsGnssNavigationState, k: int, inputs: Inputs):
         live, waiting = state
         answer, flags = None, 0
         if (sample := inputs["sample"]) is not None:
@@ -208,41 +222,41 @@ def navigation(kit: Kit) -> Part:
             flags, waiting = flags | answer.flags, (*waiting, *live.passed)
         said: list[tuple[str, Values]] = []
         if answer is not None:
-            said.append(("state", {**_told(answer), "flags": int(flags)}))
+            said.append(("state", {**_answer_fields(answer), "flags": int(flags)}))
         if waiting:
-            said.append(("epoch", _told(waiting[0])))
+            said.append(("epoch", _answer_fields(waiting[0])))
         return (live, waiting[1:]), said
 
     nothing = {"sample": None, "fix": None}
     return Part("navigation", {"sample": 0, "fix": 0}, begin, act, nothing)
 
 
-def _told(n: Navigation) -> Values:
+def _answer_fields(n: Navigation) -> Values:
     place = {"lat": n.lat_rad, "lon": n.lon_rad, "alt": n.alt_m}
     wrong = np.array([n.wrong.get(name, np.nan) for name in SUSPECTS])
     state = {"time": n.time_ns, "q_nb": n.q_nb, "v_n": n.v_n, **place}
     return {**state, "sigma": n.sigma, "wrong": wrong}
 
 
-def aboard(flight: Flight) -> Aboard:
+def aboard(flight: LoadedRun) -> ExportSources:
     """Filter and loop of the navigation computer as a program, for the drive or log of a flight.
 
     Raises:
         RobinsError: nothing sends as imu or gnss, the log cannot be read or navigated, or the part
             needs what the loop does not do.
     """
-    kit = prepare(flight.setup, flight.given)
-    if kit.dataset is None or kit.dataset.gnss is None:
+    config = prepare(flight.setup, flight.given)
+    if config.dataset is None or config.dataset.gnss is None:
         raise RigError("the filter is tried on a drive or a log, and there is none", "--board")
-    problem, constants = program.aboard(
-        kit.given, kit.dataset, kit.rates_hz, flight.setup.filter, SUSPECTS, flight.name
+    problem, constants = program.export_sources(
+        config.given, config.dataset, config.rates_hz, flight.setup.filter, SUSPECTS, flight.name
     )
     here = sorted(Path(__file__).parent.glob("navigation_*.[ch]"))
     files = {path.name: path.read_text("utf-8") for path in here}
-    return Aboard(problem, "filter", {**files, "navigation_given.h": constants})
+    return ExportSources(problem, "filter", {**files, "navigation_given.h": constants})
 
 
-def topics(kit: Kit) -> tuple[Topic, ...]:
+def topics(config: InsGnssConfig) -> tuple[Topic, ...]:
     """Samples and fixes as ROS 2 has them, so that `robins replay` reads a record; states."""
 
     def fix(v: Values) -> Message:
@@ -259,21 +273,21 @@ def topics(kit: Kit) -> tuple[Topic, ...]:
     )
 
 
-def judge(flight: Flight, ran: Ran) -> Judged:
+def judge(flight: LoadedRun, result: RunResult) -> RunFigures:
     """Figures of a replay of the log, and errors where the truth is known."""
-    flown, kit, blocks = ran.flown, ran.kit, model.state_blocks(False)[:3]
-    arrays = track_arrays([_nav(flown, "state").position], "{} of the unit")
-    arrays |= attitude_array(flown["state.q_nb"][None], "FRD to NED")
+    series, config, blocks = result.series, result.config, model.state_blocks(False)[:3]
+    arrays = track_arrays([_nav(series, "state").position], "{} of the unit")
+    arrays |= attitude_array(series["state.q_nb"][None], "FRD to NED")
     for block in blocks:
-        arrays |= block_array("sigma", block, flown["state.sigma"][None, :, block.where])
+        arrays |= block_array("sigma", block, series["state.sigma"][None, :, block.where])
     metrics: dict[str, Any] = {}
-    if kit.dataset is not None:
-        log = on_one_clock(in_body_axes(kit.dataset, kit.given.imu.orientation), kit.given)
-        metrics, flew = against_fixes(kit, log, flown), log.gnss_s <= flown.time_s[-1]
+    if config.dataset is not None:
+        log = on_one_clock(in_body_axes(config.dataset, config.given.imu.orientation), config.given)
+        metrics, flew = against_fixes(config, log, series), log.gnss_s <= series.time_s[-1]
         flown_by = log._replace(gnss=some(log.gnss, flew), gnss_s=log.gnss_s[flew])
         arrays |= fix_arrays(flown_by)
-    if kit.dataset is not None and kit.dataset.truth is not None:
-        error = against_truth(kit.dataset.truth, flown)
+    if config.dataset is not None and config.dataset.truth is not None:
+        error = against_truth(config.dataset.truth, series)
         for block in blocks:
             arrays |= block_array("error", block, error[None, :, block.where])
         for name, e in (
@@ -284,51 +298,51 @@ def judge(flight: Flight, ran: Ran) -> Judged:
             known = e[np.isfinite(e)]
             metrics[name] = float(np.sqrt(np.mean(known**2))) if len(known) else None
     counts = {
-        f"steps_{name}": int(np.sum(flown["state.flags"] >> k & 1))
+        f"steps_{name}": int(np.sum(series["state.flags"] >> k & 1))
         for k, name in enumerate(FLAGS[:2])
     }
-    each = zip(SUSPECTS, flown["state.wrong"].T, strict=True)
+    each = zip(SUSPECTS, series["state.wrong"].T, strict=True)
     wrong = {name: x for name, x in each if np.any(np.isfinite(x))}
     arrays |= tables("wrong", [wrong])
-    said = sentences("navigation", flown.time_s, wrong)
-    return Judged(metrics, counts, arrays=arrays, lines=[*figures_of(metrics), *said])
+    said = sentences("navigation", series.time_s, wrong)
+    return RunFigures(metrics, counts, arrays=arrays, lines=[*figures_of(metrics), *said])
 
 
-def _nav(flown: Flown, message: str, rows: np.ndarray | slice = slice(None)) -> Nav:
-    q, v, *place = (flown[f"{message}.{f}"][rows] for f in ("q_nb", "v_n", "lat", "lon", "alt"))
+def _nav(series: MessageSeries, message: str, rows: np.ndarray | slice = slice(None)) -> Nav:
+    q, v, *place = (series[f"{message}.{f}"][rows] for f in ("q_nb", "v_n", "lat", "lon", "alt"))
     return Nav(Rotation(q), jnp.asarray(v), Geodetic(*place))
 
 
-def epochs_of(flown: Flown) -> np.ndarray:
+def epochs_of(series: MessageSeries) -> np.ndarray:
     """Steps in which the filter's final report of each epoch was sent, in the order of epochs."""
-    heard = np.flatnonzero(flown["epoch.time"] > 0)[::-1]
-    return heard[np.unique(flown["epoch.time"][heard], return_index=True)[1]]
+    heard = np.flatnonzero(series["epoch.time"] > 0)[::-1]
+    return heard[np.unique(series["epoch.time"][heard], return_index=True)[1]]
 
 
-def against_fixes(kit: Kit, log: Log, flown: Flown) -> dict[str, Any]:
+def against_fixes(config: InsGnssConfig, log: Log, series: MessageSeries) -> dict[str, Any]:
     """Distances of the antenna from the fixes, as of `robins replay`.
 
     The gyro bias is not on the wire: with a latency it would move the antenna by the lever arm
     times both.
     """
-    assert kit.dataset is not None
-    if not len(rows := epochs_of(flown)):
+    assert config.dataset is not None
+    if not len(rows := epochs_of(series)):
         return {}
-    epoch_s = (flown["epoch.time"][rows] - int(kit.dataset.imu.time_ns[0])) * 1e-9
+    epoch_s = (series["epoch.time"][rows] - int(config.dataset.imu.time_ns[0])) * 1e-9
     nothing = jnp.zeros((len(rows), 3))
-    mean = InsState(*_nav(flown, "epoch", rows), nothing, nothing)
+    mean = InsState(*_nav(series, "epoch", rows), nothing, nothing)
     rate_b = rate_about(log.increments, log.time_s, epoch_s)
-    antenna = antenna_of(model.mount_of(kit.given.gnss, kit.given.aids), mean, rate_b)
+    antenna = antenna_of(model.mount_of(config.given.gnss, config.given.aids), mean, rate_b)
     near = np.minimum(np.searchsorted(epoch_s, log.gnss_s - 1e-6), len(epoch_s) - 1)
     return distances(log, np.abs(epoch_s[near] - log.gnss_s) < 1e-6, epoch_s, antenna)
 
 
-def against_truth(t: Trajectory, flown: Flown) -> np.ndarray:
+def against_truth(t: Trajectory, series: MessageSeries) -> np.ndarray:
     """(E, 9) true less estimated attitude [rad], velocity and position [m], each NED."""
-    at = np.clip(np.searchsorted(t.time_ns, flown["state.time"]), 0, len(t) - 1)
+    at = np.clip(np.searchsorted(t.time_ns, series["state.time"]), 0, len(t) - 1)
     place = Geodetic(*(np.asarray(x)[at] for x in (t.lat_rad, t.lon_rad, t.alt_m)))
     truth = Nav(Rotation(np.asarray(t.q_nb)[at]), jnp.asarray(t.v_n)[at], place)
-    return np.asarray(jax.jit(jax.vmap(manifold.local))(_nav(flown, "state"), truth))
+    return np.asarray(jax.jit(jax.vmap(manifold.local))(_nav(series, "state"), truth))
 
 
 _OFFERED = (
@@ -340,7 +354,7 @@ _OFFERED = (
 """Faults that the page offers."""
 
 
-def view() -> View:
+def view() -> PageView:
     """A page with attitude, velocity, and where the vehicle is from where it was first."""
     plots = (("velocity", "m/s"), ("position from the start", "m"), ("sigma of the position", "m"))
     three = [
@@ -351,13 +365,15 @@ def view() -> View:
     drawn = [*(Signal(f"q {c}", "1", "attitude", "attitude", "navigated") for c in "wxyz"), *three]
     drawn += [Signal(words(name), "1", "probability of being wrong") for name in SUSPECTS]
 
-    def sample(flown: Flown, kit: Kit, since: int, step: int) -> list[float]:
+    def sample(series: MessageSeries, config: InsGnssConfig, since: int, step: int) -> list[float]:
         names = ("q_nb", "v_n", "sigma", "wrong", "lat", "lon", "alt")
-        q, v, sigma, wrong, *place = (latest(flown[f"state.{name}"], since, step) for name in names)
-        known = np.flatnonzero(np.isfinite(flown["state.lat"][: step + 1]))
+        q, v, sigma, wrong, *place = (
+            latest(series[f"state.{name}"], since, step) for name in names
+        )
+        known = np.flatnonzero(np.isfinite(series["state.lat"][: step + 1]))
         first = known[0] if len(known) else step
-        begin = [flown[f"state.{name}"][first] for name in names[4:]]
+        begin = [series[f"state.{name}"][first] for name in names[4:]]
         to_m = np.array([1.0, np.cos(begin[0]), 0.0]) * 6.378137e6 - np.array([0.0, 0.0, 1.0])
         return [*q, *v, *((np.array(place) - begin) * to_m), *sigma[6:], *wrong]
 
-    return View(lambda given: drawn, sample, offered=_OFFERED)
+    return PageView(lambda given: drawn, sample, offered=_OFFERED)

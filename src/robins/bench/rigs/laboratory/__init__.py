@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 import pydantic
 
-from robins.bench.broker.faults import Said, nothing
+from robins.bench.broker.faults import DeviceFault, nothing
 from robins.bench.rig import later, named
 from robins.bench.rigs.satellite import SatelliteRig, messages
 from robins.bench.wire.fields import Values, f64, message
 from robins.bench.wire.schema import Wire
 
 if TYPE_CHECKING:
-    from robins.bench.evaluation import View
+    from robins.bench.evaluation import PageView
 
 __all__ = ["RIG", "STARS", "TAKES", "WIRE"]
 
@@ -73,9 +73,9 @@ def _hidden(said: Values, fault: Any, _: int) -> Values:
     return said
 
 
-_SAID: dict[str, Said] = {
-    "dark": Said("sky", "stars", "blind", nothing),
-    "hidden": Said("sky", "stars", "said", _hidden, ("stars",)),
+_SAID: dict[str, DeviceFault] = {
+    "dark": DeviceFault("sky", "stars", "blind", nothing),
+    "hidden": DeviceFault("sky", "stars", "said", _hidden, ("stars",)),
 }
 """A star simulator that shows nothing, or all but its brightest ``stars``."""
 _STARS = Annotated[int, pydantic.Field(ge=1, le=STARS)]
@@ -103,12 +103,12 @@ class LaboratoryRig(SatelliteRig):
         """The scenario of the satellite that has a camera."""
         return {"laboratory/stars": named("robins.systems.satellite:SYSTEM").scenarios["stars"]}
 
-    def said(self) -> tuple[dict[str, Said], dict[str, Any]]:
+    def device_faults(self) -> tuple[dict[str, DeviceFault], dict[str, Any]]:
         """Faults of the satellite and of the star simulator."""
-        kinds, parameters = super().said()
+        kinds, parameters = super().device_faults()
         return {**kinds, **_SAID}, {**parameters, "stars": (_STARS, 1)}
 
-    def view(self) -> View:
+    def view(self) -> PageView:
         """Page of the satellite, with the faults of the star simulator."""
         shown = super().view()
         return shown._replace(offered=(*shown.offered, *_OFFERED))

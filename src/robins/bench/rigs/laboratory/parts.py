@@ -1,11 +1,11 @@
 """The parts of the laboratory that the rig of the satellite has not, and its run in one program.
 
 The equations are those of the satellite, cut in two. `robins.sim.spacecraft.advance` is `dynamics`
-and then `kinematics`; `robins.sim.star_sensor.measure_attitude` is `show`, `expose` and `solve`. On
-the bench each is compiled by itself, and `inside` keeps them apart in the same way, so in lock-step
-a run over lines has the bits of `inside`. These are also the bits of the satellite's own rig,
-unless its stars have an error in common: there it turns the camera, and here the directions that
-the camera is shown, which is the same but for rounding.
+and then `kinematics`; `robins.sim.star_sensor.measure_attitude` is `visible_stars`, `expose` and
+`solve`. On the bench each is compiled by itself, and `inside` keeps them apart in the same way, so
+in lock-step a run over lines has the bits of `inside`. These are also the bits of the satellite's
+own rig, unless its stars have an error in common: there it turns the camera, and here the
+directions that the camera is shown, which is the same but for rounding.
 """
 
 from __future__ import annotations
@@ -19,29 +19,37 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from robins.bench.evaluation import Spoken
+from robins.bench.evaluation import OperatorEvent
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.rigs.laboratory import STARS
 from robins.bench.rigs.satellite import computers, judging
-from robins.bench.rigs.satellite import kit as satellite
-from robins.bench.rigs.satellite.kit import Kit, driven
+from robins.bench.rigs.satellite import config as satellite
+from robins.bench.rigs.satellite.config import SatelliteConfig, driven
 from robins.bench.rigs.satellite.messages import SAFE
-from robins.bench.rigs.satellite.vehicle import Held, acting, rest
+from robins.bench.rigs.satellite.vehicle import LatchedInput, acting_command, zero_command
 from robins.bench.wire.fields import Values
 from robins.rotation import multiply, normalise
 from robins.scenario import ScenarioError
 from robins.sim import spacecraft
-from robins.sim.spacecraft import CraftState, Turn, rate_b
-from robins.sim.star_sensor import Shown, expose, show, solve, turned
+from robins.sim.spacecraft import CraftState, TurnDynamics, rate_b
+from robins.sim.star_sensor import StarField, expose, solve, turned, visible_stars
 from robins.systems.satellite import nodes
-from robins.systems.satellite.nodes import Actuation, Frame, Given, Lens, Row, Step, apart
+from robins.systems.satellite.nodes import (
+    Actuation,
+    CameraOptics,
+    LoopConstants,
+    NoiseFreeInputs,
+    StarFrame,
+    StepInputs,
+    compiled_alone,
+)
 from robins.systems.satellite.parameters import AttitudeLoop
 
 MARGIN_RAD = 2e-3  # shown beyond that edge, for a camera that is turned a little
 
 
-def prepare(setup: Any, given: AttitudeLoop) -> Kit:
-    """The kit of a run, which is that of the satellite.
+def prepare(setup: Any, given: AttitudeLoop) -> SatelliteConfig:
+    """The config of a run, which is that of the satellite.
 
     Raises:
         ScenarioError: there is no camera that a sky can be shown.
@@ -59,54 +67,59 @@ def prepare(setup: Any, given: AttitudeLoop) -> Kit:
 # ------------------------------------------------------------------------- the craft in two halves
 
 
-def _dynamics(given: Given, craft: CraftState, acts: Actuation, row: Step) -> Turn:
+def _dynamics(
+    given: LoopConstants, craft: CraftState, acts: Actuation, row: NoiseFreeInputs
+) -> TurnDynamics:
     torque, where = (acts.wheel_torque, acts.dipole_b), (row.r_i_m, row.field_i_t)
     return spacecraft.dynamics(given.craft, craft, *torque, *where, row.disturbance_b, given.step_s)
 
 
-def _turns(given: Given, craft: CraftState, acts: Actuation, row: Row):
-    turn = apart(_dynamics, given, craft, acts, row.course)
+def _turns(given: LoopConstants, craft: CraftState, acts: Actuation, row: StepInputs):
+    turn = compiled_alone(_dynamics, given, craft, acts, row.course)
     q = spacecraft.kinematics(craft.q_ib, turn.gibbs_b)
     after = CraftState(q, turn.momentum_i, turn.wheel_h)
     return jnp.stack(turn.gibbs_b), rate_b(given.craft, after), after
 
 
-_follows = jax.jit(partial(apart, spacecraft.kinematics))
+_follows = jax.jit(partial(compiled_alone, spacecraft.kinematics))
 
 
-def dynamics(kit: Kit) -> Part:
+def dynamics(config: SatelliteConfig) -> Part:
     """Part that computes how the craft turns in a step: its momentum, under all torques.
 
     The attitude at the beginning of the step is the last of kinematics; if nothing came, it is
     the end of the turn before.
     """
-    wheels = len(kit.vehicle.craft.wheel_h)
-    turns = driven(kit, _turns)
+    wheels = len(config.vehicle.craft.wheel_h)
+    turns = driven(config, _turns)
 
-    def begin() -> tuple[CraftState, Held]:
-        return kit.vehicle.craft, Held(rest())
+    def begin() -> tuple[CraftState, LatchedInput]:
+        return config.vehicle.craft, LatchedInput(zero_command())
 
-    def act(state: tuple[CraftState, Held], k: int, inputs: Inputs):
+    def act(state: tuple[CraftState, LatchedInput], k: int, inputs: Inputs):
         craft, held = state
         if (motion := inputs["motion"]) is not None:
             craft = craft._replace(q_ib=motion["q_ib"])
-        held, torque, dipole = acting(held, inputs["actuation"], wheels)
+        held, torque, dipole = acting_command(held, inputs["actuation"], wheels)
         gibbs, omega, craft = turns(k, craft, Actuation(torque, dipole, craft.wheel_h))
         said = {"gibbs_b": np.asarray(gibbs), "omega_b": np.asarray(omega)}
         return (craft, held), [("turn", said)]
 
-    example = {"actuation": rest(), "motion": {"q_ib": np.asarray(kit.vehicle.craft.q_ib)}}
+    example = {
+        "actuation": zero_command(),
+        "motion": {"q_ib": np.asarray(config.vehicle.craft.q_ib)},
+    }
     return Part("dynamics", {"actuation": 0, "motion": 1}, begin, act, example)
 
 
-def kinematics(kit: Kit) -> Part:
+def kinematics(config: SatelliteConfig) -> Part:
     """Part that computes the attitude after each turn; if none comes, the last is repeated.
 
     Its state is the attitude (4,) and the last turn.
     """
-    craft = kit.vehicle.craft
-    omega = np.asarray(rate_b(kit.given.craft, craft))
-    first = {"gibbs_b": 0.5e-9 * kit.step_ns * omega, "omega_b": omega}
+    craft = config.vehicle.craft
+    omega = np.asarray(rate_b(config.given.craft, craft))
+    first = {"gibbs_b": 0.5e-9 * config.step_ns * omega, "omega_b": omega}
     begin = np.asarray(craft.q_ib), first
 
     def act(state: tuple[np.ndarray, Values], k: int, inputs: Inputs):
@@ -120,62 +133,64 @@ def kinematics(kit: Kit) -> Part:
 # ------------------------------------------------------------------------- the sky and the sensor
 
 
-def _sky(given: Given, q_ib: Array) -> tuple[Array, Array]:
+def _sky(given: LoopConstants, q_ib: Array) -> tuple[Array, Array]:
     """Directions (N, 3) in sensor axes and magnitudes (N,), NaN where there is no star."""
     assert given.lens is not None
     camera = given.lens.camera
     q_is = multiply(q_ib, normalise(jnp.asarray(camera.q_bs, float)))
-    shown = show(given.lens.sky, q_is, camera, STARS, MARGIN_RAD)
+    shown = visible_stars(given.lens.sky, q_is, camera, STARS, MARGIN_RAD)
     there = shown.star >= 0
     vectors = jnp.where(there[:, None], shown.vectors_s, jnp.nan)
     return vectors, jnp.where(there, shown.magnitude, jnp.nan)
 
 
-_shows = jax.jit(partial(apart, _sky))
+_shows = jax.jit(partial(compiled_alone, _sky))
 
 
-def _sensor(given: Given, vectors_s, magnitude, looks_q_ib, before, row: Row) -> Frame:
+def _sensor(
+    given: LoopConstants, vectors_s, magnitude, looks_q_ib, before, row: StepInputs
+) -> StarFrame:
     """Frame of the star sensor from the stars that it is shown; as `nodes.star`."""
     assert given.lens is not None
     solves = partial(_solves, given.lens, given.star_key)
     seen, number = row.course.star.seen, row.course.number
     found = jax.lax.cond(
-        seen, solves, nodes.shut, vectors_s, magnitude, looks_q_ib, row.star_error, number
+        seen, solves, nodes.closed_shutter, vectors_s, magnitude, looks_q_ib, row.star_error, number
     )
-    return nodes.told(row, before, *found)
+    return nodes.star_frame(row, before, *found)
 
 
-def _solves(lens: Lens, star_key: Array, vectors_s, magnitude, looks_q_ib, error, number):
+def _solves(lens: CameraOptics, star_key: Array, vectors_s, magnitude, looks_q_ib, error, number):
     # Which stars they are is for the sensor to find out: here only whether there is one.
-    there = Shown(vectors_s, magnitude, jnp.where(jnp.isnan(magnitude), -1, 0))
+    there = StarField(vectors_s, magnitude, jnp.where(jnp.isnan(magnitude), -1, 0))
     key = jax.random.fold_in(star_key, number)
     image = expose(key, turned(there, lens.camera, error), lens.camera)
-    return nodes.solved(*solve(image, lens.sky, lens.camera, looks_q_ib, lens.match_rad))
+    return nodes.solved_attitude(*solve(image, lens.sky, lens.camera, looks_q_ib, lens.match_rad))
 
 
-def _is_due(kit: Kit, step: int) -> bool:
-    return bool(kit.due[min(step, len(kit.due) - 1)])
+def _is_due(config: SatelliteConfig, step: int) -> bool:
+    return bool(config.due[min(step, len(config.due) - 1)])
 
 
-def sky(kit: Kit) -> Part:
+def sky(config: SatelliteConfig) -> Part:
     """The star simulator: the stars before the sensor, without an error, when a frame is due."""
 
     def act(state: None, k: int, inputs: Inputs):
         motion = inputs["motion"]
-        if motion is None or not _is_due(kit, k):
+        if motion is None or not _is_due(config, k):
             return None, []
-        vectors, magnitude = _shows(kit.given, motion["q_ib"])
+        vectors, magnitude = _shows(config.given, motion["q_ib"])
         said = {"vectors_s": np.asarray(vectors), "magnitude": np.asarray(magnitude)}
         return None, [("stars", said)]
 
-    example = {"motion": {"q_ib": np.asarray(kit.vehicle.craft.q_ib)}}
+    example = {"motion": {"q_ib": np.asarray(config.vehicle.craft.q_ib)}}
     return Part("sky", {"motion": 0}, lambda: None, act, example)
 
 
-_expected = jax.jit(nodes.expected)
+_expected = jax.jit(nodes.expected_attitude)
 
 
-def star(kit: Kit) -> Part:
+def star(config: SatelliteConfig) -> Part:
     """The star sensor: a camera that identifies stars near its predicted attitude.
 
     That is the last of attitude determination, turned by the gyro. As long as there is none, or
@@ -183,9 +198,11 @@ def star(kit: Kit) -> Part:
     attitude (4,) that it saw last, for one that is stuck, the attitude (4,) where it looks for its
     stars, and the bias (3,) [rad/s] of the gyro.
     """
-    sees = driven(kit._replace(machine="jax"), _sensor)  # an image has no place in a program
-    q_first, bias = (f(kit.belief.mean) for f in (jax.jit(kit.form.attitude), kit.form.bias))
-    first = tuple(map(np.asarray, (kit.vehicle.star_q_ib, q_first, bias)))
+    sees = driven(config._replace(machine="jax"), _sensor)  # an image has no place in a program
+    q_first, bias = (
+        f(config.belief.mean) for f in (jax.jit(config.form.attitude), config.form.bias)
+    )
+    first = tuple(map(np.asarray, (config.vehicle.star_q_ib, q_first, bias)))
 
     def act(state: tuple[np.ndarray, ...], k: int, inputs: Inputs):
         estimate, stars = inputs["estimate"], inputs["stars"]
@@ -193,8 +210,10 @@ def star(kit: Kit) -> Part:
         if estimate is not None and not estimate["flags"] & SAFE:
             q, bias = estimate["q_ib"], estimate["gyro_bias"]
         theta = computers.sample_of(inputs["gyro"])
-        looks = np.asarray(_expected(kit.given, q, bias, np.zeros(3) if theta is None else theta))
-        if stars is None or not _is_due(kit, k):
+        looks = np.asarray(
+            _expected(config.given, q, bias, np.zeros(3) if theta is None else theta)
+        )
+        if stars is None or not _is_due(config, k):
             return (seen, looks, bias), []
         directions = stars["vectors_s"].reshape(STARS, 3)
         frame = sees(k, directions, stars["magnitude"], looks, seen)
@@ -211,21 +230,27 @@ def star(kit: Kit) -> Part:
 # -------------------------------------------------------------------------------- one program
 
 
-def _move(given: Given, craft: CraftState, acts: Actuation, row: Step) -> CraftState:
-    turn = apart(_dynamics, given, craft, acts, row)
-    q = apart(spacecraft.kinematics, craft.q_ib, turn.gibbs_b)
+def _move(
+    given: LoopConstants, craft: CraftState, acts: Actuation, row: NoiseFreeInputs
+) -> CraftState:
+    turn = compiled_alone(_dynamics, given, craft, acts, row)
+    q = compiled_alone(spacecraft.kinematics, craft.q_ib, turn.gibbs_b)
     return CraftState(q, turn.momentum_i, turn.wheel_h)
 
 
-def _look(given: Given, q_ib: Array, looks_q_ib: Array, before: Array, row: Row) -> Frame:
-    return apart(_sensor, given, *apart(_sky, given, q_ib), looks_q_ib, before, row)
+def _look(
+    given: LoopConstants, q_ib: Array, looks_q_ib: Array, before: Array, row: StepInputs
+) -> StarFrame:
+    return compiled_alone(
+        _sensor, given, *compiled_alone(_sky, given, q_ib), looks_q_ib, before, row
+    )
 
 
 _REACT = partial(nodes.react, move=_move, look=_look)
 
 
 def inside(
-    kit: Kit, steps: int | None = None, said: Sequence[Spoken] = ()
+    config: SatelliteConfig, steps: int | None = None, said: Sequence[OperatorEvent] = ()
 ) -> Mapping[str, np.ndarray] | None:
     """The same run inside one program, of the same parts."""
-    return judging.inside(kit, steps, said, _REACT)
+    return judging.inside(config, steps, said, _REACT)

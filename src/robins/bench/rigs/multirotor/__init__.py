@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 import pydantic
 
-from robins.bench.broker.faults import Said, nothing
+from robins.bench.broker.faults import DeviceFault, nothing
 from robins.bench.rig import Rig, later
 from robins.bench.wire.fields import Field, Values, f64, message
 from robins.bench.wire.schema import Wire
@@ -69,22 +69,22 @@ WIRE = Wire(
 )
 
 
-def _magnet(said: Values, fault: Any, _: int) -> Values:
+def _magnet(values: Values, fault: Any, _: int) -> Values:
     """A magnet to the right of the compass."""
-    return {**said, "field_b": said["field_b"] + np.array([0.0, fault.field, 0.0])}
+    return {**values, "field_b": values["field_b"] + np.array([0.0, fault.field, 0.0])}
 
 
-def _motor(said: Values, fault: Any, _: int) -> Values:
+def _motor(values: Values, fault: Any, _: int) -> Values:
     """A motor that gives a share of its command, or nothing."""
     share = np.ones(len(MOTORS))
     share[fault.motor] = fault.left
-    return {**said, "control": said["control"] * share}
+    return {**values, "control": values["control"] * share}
 
 
 _SAID = {
-    "magnet": Said("imu", "sample", "sensed", _magnet, ("field",)),
-    "blind": Said("gnss", "fix", "blind", nothing),
-    "motor": Said("autopilot", "motors", "said", _motor, ("motor", "left"), needs="motor"),
+    "magnet": DeviceFault("imu", "sample", "sensed", _magnet, ("field",)),
+    "blind": DeviceFault("gnss", "fix", "blind", nothing),
+    "motor": DeviceFault("autopilot", "motors", "said", _motor, ("motor", "left"), needs="motor"),
 }
 _MOTOR: Any = Annotated[int, pydantic.Field(ge=0, lt=len(MOTORS))]
 _FAULTS: dict[str, Any] = {
@@ -130,7 +130,7 @@ class MultirotorRig(Rig):
         """Autopilot, and where one that is another program connects."""
         return _OPTIONS
 
-    def said(self) -> tuple[dict[str, Said], dict[str, Any]]:
+    def device_faults(self) -> tuple[dict[str, DeviceFault], dict[str, Any]]:
         """Faults of compass, receiver and motors."""
         return _SAID, _FAULTS
 

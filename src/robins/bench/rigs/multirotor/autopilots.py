@@ -22,7 +22,7 @@ from robins.bench.bridges.px4_messages import GnssFix, Sensors
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.rigs.multirotor import craft
 from robins.bench.rigs.multirotor.craft import DOWN, INERTIA_KG_M2, MASS_KG
-from robins.bench.rigs.multirotor.flight import Kit
+from robins.bench.rigs.multirotor.flight import MultirotorConfig
 from robins.bench.wire.fields import Values
 from robins.earth.atmosphere import G0
 from robins.rotation import conjugate, from_dcm, from_rotvec, multiply, rotate, to_rotvec
@@ -32,9 +32,9 @@ ANSWER_S = 10.0
 _AGAIN = "begin the run anew, then start the autopilot's SITL again"
 
 
-def autopilot(kit: Kit) -> Part:
+def autopilot(config: MultirotorConfig) -> Part:
     """The selected autopilot."""
-    return {"own": own, "px4": px4, "ardupilot": ardupilot}[kit.autopilot](kit)
+    return {"own": own_autopilot, "px4": px4, "ardupilot": ardupilot}[config.autopilot](config)
 
 
 def _motors(shares: ArrayLike | Sequence[float] = (0.0,) * 4, answered: bool = True) -> Values:
@@ -52,7 +52,7 @@ TURN_1_S, RATE_1_S = 6.0, 20.0  # of attitude, of turn rate
 _UNMIX = np.linalg.inv(np.vstack([np.ones(4), craft.MIXER]))  # thrusts of a force and torques
 
 
-class Mind(NamedTuple):
+class EstimatorState(NamedTuple):
     """Estimates of our autopilot, and the acceleration with which it leans against the wind."""
 
     q_nb: Any  # (4,)
@@ -62,9 +62,15 @@ class Mind(NamedTuple):
 
 
 @jax.jit
-def believed(
-    s: Mind, omega_b: Array, f_b: Array, field_b: Array, fix: Array, field_n: Array, dt: Array
-) -> Mind:
+def estimated(
+    s: EstimatorState,
+    omega_b: Array,
+    f_b: Array,
+    field_b: Array,
+    fix: Array,
+    field_n: Array,
+    dt: Array,
+) -> EstimatorState:
     """A step of strapdown, held to the vertical of a hover, to the compass and to the fixes.
 
     A complementary filter of constant gains (Mahony, Hamel & Pflimlin, IEEE Trans. Automatic
@@ -84,11 +90,13 @@ def believed(
     p = s.p_n + dt * v
     off = fix - jnp.concatenate([p, v])
     off = jnp.where(jnp.isfinite(off), off, 0.0)
-    return Mind(q, v + SPEED * off[3:], p + PLACE * off[:3], s.lean_n)
+    return EstimatorState(q, v + SPEED * off[3:], p + PLACE * off[:3], s.lean_n)
 
 
 @jax.jit
-def controlled(s: Mind, omega_b: Array, height_m: Array, dt: Array) -> tuple[Mind, Array]:
+def controlled(
+    s: EstimatorState, omega_b: Array, height_m: Array, dt: Array
+) -> tuple[EstimatorState, Array]:
     """Position over velocity over attitude over rate; the motors' shares (4,), not yet limited."""
     down = jnp.asarray(DOWN)
     off = HOLD_1_S * (-height_m * down - s.p_n)
@@ -107,25 +115,28 @@ def controlled(s: Mind, omega_b: Array, height_m: Array, dt: Array) -> tuple[Min
     return s._replace(lean_n=lean), thrust / craft.MOST_N
 
 
-def own(kit: Kit) -> Part:
+def own_autopilot(config: MultirotorConfig) -> Part:
     """Ours: hovers at the height of the scenario. Its state is its mind and the last sample."""
-    dt, nothing = kit.step_ns * 1e-9, np.full(6, np.nan)
+    dt, nothing = config.step_ns * 1e-9, np.full(6, np.nan)
     none = np.zeros(3)
     rest = {"omega_b": none, "f_b": -G0 * DOWN, "field_b": nothing[:3], "pressure": np.nan}
-    begin = (Mind(np.array([1.0, 0.0, 0.0, 0.0]), none, none, none), rest)
+    begin = (EstimatorState(np.array([1.0, 0.0, 0.0, 0.0]), none, none, none), rest)
 
-    def act(state: tuple[Mind, Values], k: int, inputs: Inputs):
-        mind, sample = state[0], inputs["sample"] or state[1]
+    def act(state: tuple[EstimatorState, Values], k: int, inputs: Inputs):
+        estimate, sample = state[0], inputs["sample"] or state[1]
         fix = nothing
         if (found := inputs["fix"]) is not None:
-            place = kit.p_n(np.array([found["lat"], found["lon"], found["alt"]]))
+            place = config.p_n(np.array([found["lat"], found["lon"], found["alt"]]))
             fix = np.concatenate([place, found["v_n"]])
         seen = [sample[name] for name in ("omega_b", "f_b", "field_b")]
-        mind, asked = believed(mind, *seen, fix, kit.field_n_T, dt), _motors(answered=False)
+        estimate, asked = (
+            estimated(estimate, *seen, fix, config.field_n_T, dt),
+            _motors(answered=False),
+        )
         if (k + 1) * dt > READY_S:
-            mind, shares = controlled(mind, sample["omega_b"], kit.given.height, dt)
+            estimate, shares = controlled(estimate, sample["omega_b"], config.given.height, dt)
             asked = _motors(shares)
-        return (Mind(*map(np.asarray, mind)), sample), [("motors", asked)]
+        return (EstimatorState(*map(np.asarray, estimate)), sample), [("motors", asked)]
 
     takes = {"sample": 0, "fix": 0}
 
@@ -151,17 +162,17 @@ def _until_lost(line: of_px4.Px4Simulator | of_ardupilot.ArduPilotPhysics) -> It
         raise
 
 
-def px4(kit: Kit) -> Part:
+def px4(config: MultirotorConfig) -> Part:
     """The simulator's end of the line to PX4; while PX4 starts, the motors rest."""
     lines: list[of_px4.Px4Simulator] = []
 
     def connect() -> None:
-        lines.append(of_px4.Px4Simulator(kit.address, kit.port or of_px4.PORT))
+        lines.append(of_px4.Px4Simulator(config.address, config.port or of_px4.PORT))
         with _until_lost(lines[0]):
             lines[0].accept(CONNECT_S)
 
     def act(last: Values, k: int, inputs: Inputs):
-        time_us, sample, fix = (k + 1) * kit.step_ns // 1000, inputs["sample"], inputs["fix"]
+        time_us, sample, fix = (k + 1) * config.step_ns // 1000, inputs["sample"], inputs["fix"]
         with _until_lost(lines[0]):
             if fix is not None and np.isfinite([fix["lat"], *fix["v_n"]]).all():
                 place = {"lat_rad": fix["lat"], "lon_rad": fix["lon"], "alt_m": fix["alt"]}
@@ -186,7 +197,7 @@ def _sensors(time_us: int, sample: Values) -> Sensors:
     )
 
 
-def ardupilot(kit: Kit) -> Part:
+def ardupilot(config: MultirotorConfig) -> Part:
     """The physics' end of the line to ArduPilot, which makes its own samples of the motion."""
     lines: list[of_ardupilot.ArduPilotPhysics] = []
 
@@ -199,14 +210,16 @@ def ardupilot(kit: Kit) -> Part:
         return servos
 
     def connect() -> None:
-        lines.append(of_ardupilot.ArduPilotPhysics(kit.address, kit.port or of_ardupilot.PORT))
+        lines.append(
+            of_ardupilot.ArduPilotPhysics(config.address, config.port or of_ardupilot.PORT)
+        )
         with _until_lost(lines[0]):
             asked(CONNECT_S, "start ArduPilot's SITL")
 
     def act(last: Values, k: int, inputs: Inputs):
         if (motion := inputs["motion"]) is not None:
             state = of_ardupilot.BodyState(
-                time_s=(k + 1) * kit.step_ns * 1e-9,
+                time_s=(k + 1) * config.step_ns * 1e-9,
                 f_b_m_s2=motion["f_b"],
                 omega_ib_b_rad_s=motion["omega_b"],
                 position_n_m=motion["p_n"],

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array
 
 from robins.bench.parts.station import Inputs, Part
-from robins.bench.rigs.multirotor.flight import Kit
+from robins.bench.rigs.multirotor.flight import MultirotorConfig
 from robins.earth.atmosphere import G0, pressure_Pa
 from robins.rotation import conjugate, from_rotvec, multiply, rotate, to_dcm
 
@@ -73,9 +73,9 @@ def moved(s: Airframe, control: Array, wind_n: Array, dt: Array) -> Airframe:
     return jax.tree_util.tree_map(lambda a, b: jnp.where(on_ground, a, b), stands, flies)
 
 
-def craft(kit: Kit) -> Part:
+def craft(config: MultirotorConfig) -> Part:
     """The craft; a motor command stands until the next."""
-    wind_n, dt = np.asarray(kit.given.wind), kit.step_ns * 1e-9
+    wind_n, dt = np.asarray(config.given.wind), config.step_ns * 1e-9
     begin = (at_rest(), np.zeros(4))
 
     def act(state: tuple[Airframe, np.ndarray], k: int, inputs: Inputs):
@@ -91,27 +91,27 @@ def craft(kit: Kit) -> Part:
     return Part("craft", {"motors": 1}, lambda: begin, act, rare=compiled)
 
 
-def _noise(kit: Kit, part: int, k: int, count: int) -> np.ndarray:
+def _noise(config: MultirotorConfig, part: int, k: int, count: int) -> np.ndarray:
     """Standard normal numbers of a part in a step, addressed and not drawn in turn."""
-    key = np.array([kit.seed, part], np.uint64)
+    key = np.array([config.seed, part], np.uint64)
     return np.random.Generator(np.random.Philox(key=key, counter=[0, k, 0, 0])).normal(size=count)
 
 
-def _every(kit: Kit, seconds: float) -> int:
-    return max(1, round(seconds * 1e9 / kit.step_ns))
+def _every(config: MultirotorConfig, seconds: float) -> int:
+    return max(1, round(seconds * 1e9 / config.step_ns))
 
 
-def imu(kit: Kit) -> Part:
+def imu(config: MultirotorConfig) -> Part:
     """The inertial unit: a sample a step, in which compass and barometer are now and then."""
-    given, every = kit.given, _every(kit, SLOW_S)
+    given, every = config.given, _every(config, SLOW_S)
 
     def act(state: None, k: int, inputs: Inputs):
         if (motion := inputs["motion"]) is None:
             return None, []
-        noise = _noise(kit, 0, k, 10)
+        noise = _noise(config, 0, k, 10)
         field_b, pressure = np.full(3, np.nan), np.nan
         if k % every == 0:
-            field_b = to_dcm(motion["q_nb"]).T @ kit.field_n_T + given.compass * noise[6:9]
+            field_b = to_dcm(motion["q_nb"]).T @ config.field_n_T + given.compass * noise[6:9]
             pressure = pressure_Pa(given.alt - motion["p_n"][2]) + given.barometer * noise[9]
         said = {
             "omega_b": motion["omega_b"] + given.gyro * noise[:3],
@@ -124,16 +124,16 @@ def imu(kit: Kit) -> Part:
     return Part("imu", {"motion": 0}, lambda: None, act)
 
 
-def gnss(kit: Kit) -> Part:
+def gnss(config: MultirotorConfig) -> Part:
     """The receiver, five times a second."""
-    given, every = kit.given, _every(kit, FIX_S)
+    given, every = config.given, _every(config, FIX_S)
 
     def act(state: None, k: int, inputs: Inputs):
         motion = inputs["motion"]
         if motion is None or k % every:
             return None, []
-        noise = _noise(kit, 1, k, 6)
-        lat, lon, alt = kit.place(motion["p_n"] + given.receiver * noise[:3])
+        noise = _noise(config, 1, k, 6)
+        lat, lon, alt = config.place(motion["p_n"] + given.receiver * noise[:3])
         v_n = motion["v_n"] + given.receiver_velocity * noise[3:]
         return None, [("fix", {"lat": lat, "lon": lon, "alt": alt, "v_n": v_n})]
 

@@ -7,8 +7,8 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import pydantic
 
-from robins.bench.evaluation import Judged, Ran, arrays_of, figures_of
-from robins.bench.rig import Flight
+from robins.bench.evaluation import RunFigures, RunResult, arrays_of, figures_of
+from robins.bench.rig import LoadedRun
 from robins.bench.run.setup import counted_from
 from robins.earth import curvature_radii
 from robins.earth.magnetic import field_n, wmm_for
@@ -50,7 +50,7 @@ class Multirotor(Parameters):
     )
 
 
-class Kit(NamedTuple):
+class MultirotorConfig(NamedTuple):
     """The numbers of a run."""
 
     step_ns: int
@@ -74,25 +74,25 @@ class Kit(NamedTuple):
         return (place - start) * np.array([*self.m_per_rad, -1.0])
 
 
-def prepare(setup: Any, given: Multirotor) -> Kit:
-    """The kit of a run; the Earth is flat over the tens of metres of a flight."""
+def prepare(setup: Any, given: Multirotor) -> MultirotorConfig:
+    """The config of a run; the Earth is flat over the tens of metres of a flight."""
     field_T = np.asarray(field_n(wmm_for(given.year), given.lat, given.lon, given.alt, given.year))
     north_m, east_m = (float(x) + given.alt for x in curvature_radii(given.lat))
     m_per_rad = np.array([north_m, east_m * np.cos(given.lat)])
     ends = (setup.autopilot, setup.address, setup.port)
-    return Kit(round(1e9 * given.step), given, setup.seed, *ends, field_T, m_per_rad)
+    return MultirotorConfig(round(1e9 * given.step), given, setup.seed, *ends, field_T, m_per_rad)
 
 
-def judge(flight: Flight, ran: Ran) -> Judged:
+def judge(flight: LoadedRun, result: RunResult) -> RunFigures:
     """Figures of a run: distance from the hover point [m], tilt and heading [deg]."""
-    flown, height_m = ran.flown, flight.given.height
-    off_n = flown["motion.p_n"] + np.array([0.0, 0.0, height_m])
+    series, height_m = result.series, flight.given.height
+    off_n = series["motion.p_n"] + np.array([0.0, 0.0, height_m])
     known = np.all(np.isfinite(off_n), axis=1)
-    known[: counted_from(flight, ran.steps)] = False
+    known[: counted_from(flight, result.steps)] = False
     metrics: dict[str, float | None] = {}
     if known.any():
         off_m = np.linalg.norm(off_n[known], axis=1)
-        C_nb = to_dcm(flown["motion.q_nb"][known])
+        C_nb = to_dcm(series["motion.q_nb"][known])
         tilt_rad = np.arccos(np.clip(C_nb[:, 2, 2], -1.0, 1.0))
         heading_rad = np.arctan2(C_nb[:, 1, 0], C_nb[:, 0, 0])
         metrics = {
@@ -101,15 +101,15 @@ def judge(flight: Flight, ran: Ran) -> Judged:
             "tilt_max_deg": float(np.degrees(np.max(tilt_rad))),
             "heading_rms_deg": float(np.degrees(np.sqrt(np.mean(heading_rad**2)))),
         }
-    silent = int(np.sum(flown["motors.answered"] == 0))
-    never = ["the autopilot never controlled the motors"] * (silent == len(flown.time_s))
+    silent = int(np.sum(series["motors.answered"] == 0))
+    never = ["the autopilot never controlled the motors"] * (silent == len(series.time_s))
     caption = "Where the craft is, less where it is to hover."
     about = {"unit": "m", "frame": "NED", "comment": caption}
     off = array("error", off_n[None], "position", axes=("north", "east", "down"), **about)
-    return Judged(
+    return RunFigures(
         metrics,
         {"steps_without_control": silent},
         never,
-        off | arrays_of(flight.rig.noted, flown),
+        off | arrays_of(flight.rig.noted, series),
         figures_of(metrics),
     )

@@ -1,7 +1,7 @@
 """The satellite on the bench: seven parts, each a function of what reaches it over its line.
 
 - `messages`: their messages.
-- `kit`: the numbers that they are given before a run.
+- `config`: the numbers that they are given before a run.
 - `vehicle`: plant, rate table, actuators, gyro, star sensor.
 - `computers`: attitude determination and control. `reference`: target attitude.
 - `judging`: evaluation of a run, and its page.
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 import pydantic
 
-from robins.bench.broker.faults import Said
+from robins.bench.broker.faults import DeviceFault
 from robins.bench.rig import Rig, later, named
 from robins.bench.rigs.satellite.messages import CONSOLE, SENDS, TAKES, WHEELS, WIRE
 from robins.bench.wire.fields import Values
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from robins.sim.rate_table import RateTable
 
 
-class Carrier(Parameters):
+class RateTableParameters(Parameters):
     """A rate table that is a little late; without one the gyro turns with the craft exactly."""
 
     lag: Annotated[float, Quantity("time", above="0 s")] = default("20 ms")
@@ -71,12 +71,14 @@ def _without_wheel(said: Values, fault: Any, _: int) -> Values:
     return said
 
 
-SAID: dict[str, Said] = {
-    "stuck": Said("star", "star", "repeated"),
-    "turned": Said("star", "star", "sensed", _turned, ("angle",)),
-    "lost": Said("star", "star", "blind", _lost),
-    "sign": Said("star", "star", "said", _sign),
-    "wheel": Said("actuators", "actuation", "said", _without_wheel, ("wheel",), needs="wheel"),
+SAID: dict[str, DeviceFault] = {
+    "stuck": DeviceFault("star", "star", "repeated"),
+    "turned": DeviceFault("star", "star", "sensed", _turned, ("angle",)),
+    "lost": DeviceFault("star", "star", "blind", _lost),
+    "sign": DeviceFault("star", "star", "said", _sign),
+    "wheel": DeviceFault(
+        "actuators", "actuation", "said", _without_wheel, ("wheel",), needs="wheel"
+    ),
 }
 """A star sensor that says again and again what it said last, whose attitude is turned by ``angle``
 about its boresight z, that says none, or one of the other sign, which is no fault; a wheel, by its
@@ -140,13 +142,16 @@ class SatelliteRig(Rig):
 
     def options(self) -> dict[str, Any]:
         """A rate table that lags, and what the parts compute by."""
-        return {"table": (Carrier | None, None), "machine": (Literal["jax", "vm", "c"], "jax")}
+        return {
+            "table": (RateTableParameters | None, None),
+            "machine": (Literal["jax", "vm", "c"], "jax"),
+        }
 
-    def said(self) -> tuple[dict[str, Said], dict[str, Any]]:
+    def device_faults(self) -> tuple[dict[str, DeviceFault], dict[str, Any]]:
         """Faults of star sensor and wheels."""
         return SAID, PARAMETERS
 
 
 RIG = SatelliteRig()
 
-__all__ = ["RIG", "Carrier", "SatelliteRig"]
+__all__ = ["RIG", "RateTableParameters", "SatelliteRig"]

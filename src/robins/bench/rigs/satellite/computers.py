@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array
 
 from robins.bench.parts.station import Inputs, Part
-from robins.bench.rigs.satellite.kit import Kit, compiled, driven
+from robins.bench.rigs.satellite.config import SatelliteConfig, compiled, driven
 from robins.bench.rigs.satellite.messages import (
     AS_IT_IS,
     HELD,
@@ -32,8 +32,21 @@ from robins.bench.rigs.satellite.messages import (
     STAND_BY,
     USED,
 )
-from robins.bench.rigs.satellite.reference import Plan, rehearse, told, wanted
-from robins.bench.rigs.satellite.vehicle import Held, Numbers, padded, renew, rest, stale, trusted
+from robins.bench.rigs.satellite.reference import (
+    SlewPlan,
+    attitude_target,
+    plan_after_command,
+    precompile,
+)
+from robins.bench.rigs.satellite.vehicle import (
+    LatchedInput,
+    Numbers,
+    latched,
+    per_wheel,
+    stale,
+    trusted,
+    zero_command,
+)
 from robins.bench.wire.fields import Values
 from robins.filters import Belief, Code, OnlineFilter
 from robins.filters.chi_square import chi_square
@@ -41,7 +54,7 @@ from robins.filters.kalman import FilterState
 from robins.rotation import Rotation, normalise
 from robins.systems.satellite import nodes
 from robins.systems.satellite.model import GATE, make_filter, start
-from robins.systems.satellite.nodes import NO_GAIN, STAR, Command, Given, Row
+from robins.systems.satellite.nodes import NO_GAIN, STAR, ActuatorCommand, LoopConstants, StepInputs
 
 StateT = TypeVar("StateT")
 SILENT_PERIODS = 4  # of the star sensor without a frame, after which it is flagged as silent
@@ -69,53 +82,53 @@ def late(part: Part, forgets: Callable[[StateT], StateT]) -> Part:
     return part._replace(begin=lambda: first, act=act)
 
 
-class Determined(NamedTuple):
+class DeterminationState(NamedTuple):
     """State of the attitude determination."""
 
     filter: FilterState
-    gyro: Held
+    gyro: LatchedInput
     since_star: int = 0  # steps
     lost: bool = False  # waits for a star frame to start again
 
 
-def adm(kit: Kit) -> Part:
+def adm(config: SatelliteConfig) -> Part:
     """Attitude determination: predicts with the gyro, updates with the star sensor."""
-    form, additive = kit.form, kit.build == "quaternion"
-    online = OnlineFilter(kit.filter, kit.model, kit.start, machine=kit.machine)
+    form, additive = config.form, config.build == "quaternion"
+    online = OnlineFilter(config.filter, config.model, config.start, machine=config.machine)
     first = online.state
-    period = int(np.max(np.diff(np.flatnonzero(kit.due)), initial=1))
+    period = int(np.max(np.diff(np.flatnonzero(config.due)), initial=1))
 
     attitude = jax.jit(form.attitude)
-    believable = compiled(kit, nodes.believable)
+    believable = compiled(config, nodes.believable)
 
-    @partial(compiled, kit)
+    @partial(compiled, config)
     def report(belief: Belief):
-        q = nodes.apart(form.attitude, belief.mean)  # as in `nodes.react`
+        q = nodes.compiled_alone(form.attitude, belief.mean)  # as in `nodes.react`
         rows = form.rows(q)
         factor = belief.factor if rows is None else rows @ belief.factor
         return q, form.bias(belief.mean), jnp.sqrt(jnp.sum(factor * factor, -1))
 
     # A filter that refuses a frame gives no distance; one without rules does.
-    plain, sensor = make_filter("quaternion" if additive else "mekf"), kit.model.sensor(STAR)
+    plain, sensor = make_filter("quaternion" if additive else "mekf"), config.model.sensor(STAR)
 
-    @partial(compiled, kit)
+    @partial(compiled, config)
     def judge(belief: Belief, y: Rotation, factor: Array | None):
-        info = plain.update(plain.init(belief, kit.model.dims), sensor, y, factor)[1]
+        info = plain.update(plain.init(belief, config.model.dims), sensor, y, factor)[1]
         return info.innovation, info.sigma, info.nis
 
-    @partial(compiled, kit)
+    @partial(compiled, config)
     def fresh(q_ib: Array, bias: Array, state: FilterState) -> FilterState:
         q = normalise(q_ib)
-        believed = start(q, kit.attitude_rad, 0.0, additive)
+        believed = start(q, config.attitude_rad, 0.0, additive)
         old = state.belief
         mean = form.state(q, bias)
         block = believed.factor.shape[-1] - 3
         factor = believed.factor.at[block:, :].set(old.factor[block:, :])
-        return kit.filter.reset(state, Belief(mean, factor))  # all modes of a bank, too
+        return config.filter.reset(state, Belief(mean, factor))  # all modes of a bank, too
 
-    def act(state: Determined, k: int, inputs: Inputs):
+    def act(state: DeterminationState, k: int, inputs: Inputs):
         frame = inputs["star"]
-        gyro = renew(state.gyro, sample_of(inputs["gyro"]))
+        gyro = latched(state.gyro, sample_of(inputs["gyro"]))
         flags = 0 if gyro.age == 0 else HELD
         online.state, lost = state.filter, state.lost or not trusted(gyro)
         if (mode := inputs["mode"]) is not None and mode["reset"]:
@@ -135,7 +148,7 @@ def adm(kit: Kit) -> Part:
                 )
                 flags |= USED
             elif not lost:
-                factor = _factor(kit, frame)
+                factor = _factor(config, frame)
                 if heard:
                     said.append(("innovation", _innovation(*judge(online.belief, y, factor))))
                 info = online.update(y, STAR, factor)
@@ -156,12 +169,12 @@ def adm(kit: Kit) -> Part:
                 },
             )
         )
-        return Determined(online.state, gyro, since, lost), said
+        return DeterminationState(online.state, gyro, since, lost), said
 
     # The rate before the first sample is that which the gyro reported last.
-    begin = Determined(first, Held(np.asarray(kit.vehicle.theta)))
+    begin = DeterminationState(first, LatchedInput(np.asarray(config.vehicle.theta)))
     example = {
-        "gyro": {"theta_b": np.asarray(kit.vehicle.theta)},
+        "gyro": {"theta_b": np.asarray(config.vehicle.theta)},
         "star": {"q_ib": np.asarray(attitude(first.belief.mean)), "factor": np.ravel(np.eye(3))},
     }
 
@@ -174,9 +187,9 @@ def adm(kit: Kit) -> Part:
     return late(part, lambda state: state._replace(lost=True))
 
 
-def _factor(kit: Kit, frame: Values) -> np.ndarray | None:
+def _factor(config: SatelliteConfig, frame: Values) -> np.ndarray | None:
     """Factor of the covariance of a frame, where frames bring theirs."""
-    return None if kit.given.lens is None else frame["factor"].reshape(3, 3)
+    return None if config.given.lens is None else frame["factor"].reshape(3, 3)
 
 
 def _innovation(innovation: Numbers, sigma: Numbers, nis: Numbers | float) -> Values:
@@ -188,33 +201,37 @@ def _innovation(innovation: Numbers, sigma: Numbers, nis: Numbers | float) -> Va
     }
 
 
-class Steered(NamedTuple):
+class ControlState(NamedTuple):
     """State of the attitude control: its last inputs, and the target."""
 
-    estimate: Held  # q_ib, bias, whether it may be steered by
-    theta: Held
+    estimate: LatchedInput  # q_ib, bias, whether it may be steered by
+    theta: LatchedInput
     wheel_h: Any
-    plan: Plan | None = None  # None: the course of the scenario
+    plan: SlewPlan | None = None  # None: the course of the scenario
     stands_by: bool = False
 
 
 def _steers(
-    given: Given, q_ib: Array, bias: Array, theta: Array, wheel_h: Array, row: Row
-) -> Command:
+    given: LoopConstants, q_ib: Array, bias: Array, theta: Array, wheel_h: Array, row: StepInputs
+) -> ActuatorCommand:
     return nodes.acm(given, q_ib, bias, theta, wheel_h, row.course)
 
 
-def acm(kit: Kit) -> Part:
+def acm(config: SatelliteConfig) -> Part:
     """Attitude control: a torque of the wheels, a dipole of the magnetorquers."""
-    steers = driven(kit, _steers)
-    vehicle = kit.vehicle
+    steers = driven(config, _steers)
+    vehicle = config.vehicle
     wheels = len(vehicle.craft.wheel_h)
-    mean = kit.belief.mean
-    q0 = np.asarray(jax.jit(kit.form.attitude)(mean))
-    first = (q0, np.asarray(kit.form.bias(mean)), True)
-    begin = Steered(Held(first), Held(np.asarray(vehicle.theta)), np.asarray(vehicle.craft.wheel_h))
+    mean = config.belief.mean
+    q0 = np.asarray(jax.jit(config.form.attitude)(mean))
+    first = (q0, np.asarray(config.form.bias(mean)), True)
+    begin = ControlState(
+        LatchedInput(first),
+        LatchedInput(np.asarray(vehicle.theta)),
+        np.asarray(vehicle.craft.wheel_h),
+    )
 
-    def act(state: Steered, k: int, inputs: Inputs):
+    def act(state: ControlState, k: int, inputs: Inputs):
         estimate, gyro, speeds = inputs["estimate"], inputs["gyro"], inputs["wheels"]
         if k > 0:  # before the first step there are no messages
             known = estimate and (
@@ -222,29 +239,31 @@ def acm(kit: Kit) -> Part:
                 estimate["gyro_bias"],
                 not estimate["flags"] & SAFE,
             )
-            state = Steered(
-                renew(state.estimate, known),
-                renew(state.theta, sample_of(gyro)),
+            state = ControlState(
+                latched(state.estimate, known),
+                latched(state.theta, sample_of(gyro)),
                 state.wheel_h if speeds is None else speeds["momentum"][:wheels],
                 state.plan,
                 state.stands_by,
             )
         if (asked := inputs["reference"]) is not None:
-            state = state._replace(plan=told(kit, state.plan, k, asked["q_ib"], asked["rate"]))
+            state = state._replace(
+                plan=plan_after_command(config, state.plan, k, asked["q_ib"], asked["rate"])
+            )
         if (mode := inputs["mode"]) is not None and mode["mode"] != AS_IT_IS:
             state = state._replace(stands_by=mode["mode"] == STAND_BY)
         q, bias, steered = state.estimate.values
         heard = trusted(state.estimate) and trusted(state.theta)
         if state.stands_by or not (steered and heard):
-            return state, [("command", rest())]
+            return state, [("command", zero_command())]
         # A row begins with where the craft is to point.
-        at = () if state.plan is None else np.concatenate(wanted(kit, state.plan, k))
+        at = () if state.plan is None else np.concatenate(attitude_target(config, state.plan, k))
         command = steers(k, q, bias, state.theta.values, state.wheel_h, begins=at)
-        torque = padded(np.asarray(command.wheel_torque))
+        torque = per_wheel(np.asarray(command.wheel_torque))
         return state, [
             ("command", {"wheel_torque": torque, "dipole_b": np.asarray(command.dipole_b)})
         ]
 
     takes = {"estimate": 1, "gyro": 1, "wheels": 1, "reference": 1, "mode": 1}
-    part = Part("acm", takes, lambda: begin, act, dict.fromkeys(takes), lambda: rehearse(kit))
+    part = Part("acm", takes, lambda: begin, act, dict.fromkeys(takes), lambda: precompile(config))
     return late(part, lambda state: state._replace(estimate=stale(state.estimate)))

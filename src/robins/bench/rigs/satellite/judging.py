@@ -11,12 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from robins.bench.evaluation import Flown, Judged, Ran, Spoken, Told, View, latest
+from robins.bench.evaluation import (
+    Alert,
+    MessageSeries,
+    OperatorEvent,
+    PageView,
+    RunFigures,
+    RunResult,
+    latest,
+)
 from robins.bench.live.feed import Signal
 from robins.bench.recording.topics import JSON, Topic, as_json, imu
-from robins.bench.rig import Flight
+from robins.bench.rig import LoadedRun
 from robins.bench.rigs.satellite import OFFERED
-from robins.bench.rigs.satellite.kit import Kit
+from robins.bench.rigs.satellite.config import SatelliteConfig
 from robins.bench.rigs.satellite.messages import (
     AS_IT_IS,
     FLAGS,
@@ -30,8 +38,13 @@ from robins.bench.rigs.satellite.messages import (
     STAND_BY,
     USED,
 )
-from robins.bench.rigs.satellite.reference import Said, followed, reference_q_ib, wanted_after
-from robins.bench.rigs.satellite.vehicle import padded
+from robins.bench.rigs.satellite.reference import (
+    Said,
+    reference_q_ib,
+    target_after,
+    target_attitudes,
+)
+from robins.bench.rigs.satellite.vehicle import per_wheel
 from robins.bench.run.setup import counted_from
 from robins.bench.wire.fields import Values
 from robins.filters import Belief, Loop, run_closed
@@ -39,7 +52,7 @@ from robins.filters.run import Step
 from robins.results import array, variable
 from robins.rotation import conjugate, from_rotvec, multiply, to_rotvec
 from robins.systems.satellite.model import AttitudeState, QuaternionState
-from robins.systems.satellite.nodes import STAR, Row, StateForm, react
+from robins.systems.satellite.nodes import STAR, StateForm, StepInputs, react
 from robins.systems.satellite.parameters import AttitudeLoop
 
 ARCSEC = np.pi / 648000.0
@@ -51,14 +64,14 @@ def turn(q_from: np.ndarray, q_to: np.ndarray) -> np.ndarray:
     return np.asarray(to_rotvec(multiply(conjugate(q_from), q_to)))
 
 
-def attitude_error(flown: Arrays) -> np.ndarray:
+def attitude_error(series: Arrays) -> np.ndarray:
     """(E, 3) true less estimated attitude [rad], body axes."""
-    return turn(flown["estimate.q_ib"], flown["motion.q_ib"])
+    return turn(series["estimate.q_ib"], series["motion.q_ib"])
 
 
-def flag(flown: Arrays, text: str) -> np.ndarray:
+def flag(series: Arrays, text: str) -> np.ndarray:
     """(E,) bool, whether a flag of the estimate was set; by its text in `FLAGS`."""
-    return (flown["estimate.flags"] >> FLAGS.index(text)) & 1 == 1
+    return (series["estimate.flags"] >> FLAGS.index(text)) & 1 == 1
 
 
 def rms_arcsec(error: np.ndarray, counted: slice) -> float:
@@ -80,16 +93,16 @@ UNFIT = "safe: do not steer by this"
 _AXES = ("x", "y", "z (boresight)")
 
 
-def judge(flight: Flight, ran: Ran) -> Judged:
+def judge(flight: LoadedRun, result: RunResult) -> RunFigures:
     """Errors of attitude determination and of pointing, over the steps that count.
 
     Those of the determination are of the estimates that it does not itself call unfit for use.
     """
-    flown, counted = ran.flown, slice(counted_from(flight, ran.steps), None)
-    attitude, unfit = attitude_error(flown), flag(flown, UNFIT)
+    series, counted = result.series, slice(counted_from(flight, result.steps), None)
+    attitude, unfit = attitude_error(series), flag(series, UNFIT)
     stated = np.where(unfit[:, None], np.nan, attitude)
-    wanted = reference_q_ib(ran.kit, flown, len(flown.time_s))
-    pointing = turn(wanted, flown["motion.q_ib"])
+    wanted = reference_q_ib(result.config, series, len(series.time_s))
+    pointing = turn(wanted, series["motion.q_ib"])
     metrics = {
         "attitude_rms_arcsec": rms_arcsec(stated, counted),
         "attitude_peak_arcsec": peak_arcsec(stated, counted),
@@ -97,19 +110,19 @@ def judge(flight: Flight, ran: Ran) -> Judged:
         "pointing_peak_arcsec": peak_arcsec(pointing, counted),
         "attitude_end_arcsec": float(np.linalg.norm(stated[-1])) / ARCSEC,
     }
-    return Judged(
+    return RunFigures(
         metrics,
         {
-            "refused_measurements": int(np.sum(flag(flown, "star refused"))),
+            "refused_measurements": int(np.sum(flag(series, "star refused"))),
             "quaternions_of_wrong_length": int(
-                np.sum(flag(flown, "star of a length other than one"))
+                np.sum(flag(series, "star of a length other than one"))
             ),
-            "designs_not_passed": int(np.sum(flag(flown, "last gain kept: no new one passed"))),
-            "steps_without_gyro": int(np.sum(flag(flown, "gyro held"))),
+            "designs_not_passed": int(np.sum(flag(series, "last gain kept: no new one passed"))),
+            "steps_without_gyro": int(np.sum(flag(series, "gyro held"))),
             "steps_in_safe_mode": int(np.sum(unfit)),
         },
         warnings(attitude[counted], unfit[counted]),
-        arrays(ran, attitude, pointing),
+        arrays(result, attitude, pointing),
         [
             f"{name.removesuffix('_arcsec').replace('_', ' '):<16}{value:10.2f} arcsec"
             for name, value in list(metrics.items())[:4]
@@ -133,17 +146,17 @@ def warnings(error: np.ndarray, unfit: np.ndarray) -> list[str]:
     return [f"{what} in {steps} {rest}" for what, steps in unusable if steps]
 
 
-def arrays(ran: Ran, attitude: np.ndarray, pointing: np.ndarray) -> dict[str, Any]:
+def arrays(result: RunResult, attitude: np.ndarray, pointing: np.ndarray) -> dict[str, Any]:
     """Time series of the run, as `robins.results` names them."""
-    f = ran.flown
+    f = result.series
     sigma, bias, innovation = (
         f["estimate.sigma"],
         f["estimate.gyro_bias"],
         f["innovation.innovation"],
     )
     heard = np.flatnonzero(np.isfinite(innovation[:, 0]))
-    true_bias = np.asarray(ran.kit.rows.gyro_bias)[: ran.steps]
-    wheels = f["wheels.momentum"][:, : len(ran.kit.vehicle.craft.wheel_h)]
+    true_bias = np.asarray(result.config.rows.gyro_bias)[: result.steps]
+    wheels = f["wheels.momentum"][:, : len(result.config.vehicle.craft.wheel_h)]
     body: dict[str, Any] = {"unit": "rad", "frame": "body", "axes": _AXES, "display_unit": "arcsec"}
     rate = body | {"unit": "rad/s", "display_unit": "arcsec/s"}
     out: dict[str, Any] = {}
@@ -201,12 +214,15 @@ def _attitudes(form: StateForm, mean: AttitudeState | QuaternionState) -> Array:
 
 
 def inside(
-    kit: Kit, steps: int | None = None, said: Sequence[Spoken] = (), react: Callable = react
+    config: SatelliteConfig,
+    steps: int | None = None,
+    said: Sequence[OperatorEvent] = (),
+    react: Callable = react,
 ) -> dict[str, np.ndarray] | None:
     """The same run inside one program, by `run_closed`, as `robins run --runs 1` does it.
 
     Args:
-        kit: of the run.
+        config: of the run.
         steps: number of first steps that are done; None: all.
         said: messages of the operator. One program cannot put computers on standby or reset them:
             the result is then None.
@@ -216,32 +232,32 @@ def inside(
         return None
     heard = [(one.step, one.values["q_ib"], one.values["rate"]) for one in said]
     loop = Loop(
-        jax.tree_util.Partial(_reacts(react, kit.form), kit.given),
-        kit.vehicle,
-        jax.tree_util.tree_map(lambda x: x[:steps], _rows(kit, heard)),
-        {STAR: kit.due[:steps]},
+        jax.tree_util.Partial(_reacts(react, config.form), config.given),
+        config.vehicle,
+        jax.tree_util.tree_map(lambda x: x[:steps], _rows(config, heard)),
+        {STAR: config.due[:steps]},
     )
-    done = run_closed(kit.filter, kit.model, kit.start, loop, keep=_posterior)
+    done = run_closed(config.filter, config.model, config.start, loop, keep=_posterior)
     mean, seen = done.steps.mean, done.readings
     momenta = np.asarray(seen.outputs["wheel_momentum"])
     return {
         # the first leaf of the state of each kind
         "motion.q_ib": np.asarray(jax.tree_util.tree_leaves(seen.truth)[0]),
-        "estimate.q_ib": np.asarray(_attitudes(kit.form, mean)),
-        "estimate.gyro_bias": np.asarray(kit.form.bias(mean)),
-        "wheels.momentum": np.stack([padded(h) for h in momenta]),
+        "estimate.q_ib": np.asarray(_attitudes(config.form, mean)),
+        "estimate.gyro_bias": np.asarray(config.form.bias(mean)),
+        "wheels.momentum": np.stack([per_wheel(h) for h in momenta]),
     }
 
 
-def _rows(kit: Kit, said: list[Said]) -> Row:
+def _rows(config: SatelliteConfig, said: list[Said]) -> StepInputs:
     """Inputs of each step, with the target attitudes that the operator sent."""
     if not said:
-        return kit.rows
-    q, omega, alpha = (np.stack(x) for x in zip(*followed(kit, said), strict=True))
-    course = kit.rows.course._replace(
+        return config.rows
+    q, omega, alpha = (np.stack(x) for x in zip(*target_attitudes(config, said), strict=True))
+    course = config.rows.course._replace(
         ref_q_ib=q[:-1], ref_omega_b=omega[:-1], ref_alpha_b=alpha[:-1], ref_end_q_ib=q[1:]
     )
-    return kit.rows._replace(course=course)
+    return config.rows._replace(course=course)
 
 
 # --------------------------------------------------------------------------------------------- page
@@ -280,37 +296,37 @@ def signals(given: AttitudeLoop) -> list[Signal]:
     ]
 
 
-def sample(flown: Flown, kit: Kit, since: int, step: int) -> list[float]:
+def sample(series: MessageSeries, config: SatelliteConfig, since: int, step: int) -> list[float]:
     """The signals of a step; of star frames, which are rarer than samples, the latest."""
     now = slice(step, step + 1)
-    q_ib = flown["motion.q_ib"][now]
-    error = turn(flown["estimate.q_ib"][now], q_ib)[0] / ARCSEC
-    sigma = flown["estimate.sigma"][step, :3] / ARCSEC
-    pointing = turn(wanted_after(kit, flown, step + 1).q_ib[None], q_ib)[0] / ARCSEC
+    q_ib = series["motion.q_ib"][now]
+    error = turn(series["estimate.q_ib"][now], q_ib)[0] / ARCSEC
+    sigma = series["estimate.sigma"][step, :3] / ARCSEC
+    pointing = turn(target_after(config, series, step + 1).q_ib[None], q_ib)[0] / ARCSEC
     innovation, its_sigma, ratio = (
-        latest(flown[f"innovation.{name}"], since, step)
+        latest(series[f"innovation.{name}"], since, step)
         for name in ("innovation", "sigma", "ratio")
     )
-    wheels = len(kit.vehicle.craft.wheel_h)
-    limit = 1e3 * float(np.asarray(kit.given.craft.wheel_momentum_limit)[0])
+    wheels = len(config.vehicle.craft.wheel_h)
+    limit = 1e3 * float(np.asarray(config.given.craft.wheel_momentum_limit)[0])
     return [
-        *flown["motion.q_ib"][step],
-        *flown["estimate.q_ib"][step],
+        *series["motion.q_ib"][step],
+        *series["estimate.q_ib"][step],
         *np.ravel([error, sigma], order="F"),
         *pointing,
         *np.ravel([innovation / ARCSEC, its_sigma / ARCSEC], order="F"),
         float(ratio),
         1.0,
-        *np.degrees(flown["motion.omega_b"][step]),
-        *(1e3 * flown["wheels.momentum"][step, :wheels]),
+        *np.degrees(series["motion.omega_b"][step]),
+        *(1e3 * series["wheels.momentum"][step, :wheels]),
         limit,
         -limit,
     ]
 
 
-def counts(flown: Flown, done: int) -> dict[str, int]:
+def counts(series: MessageSeries, done: int) -> dict[str, int]:
     """Counts on the page."""
-    return {"refused_measurements": int(np.sum(flag(flown, "star refused")[:done]))}
+    return {"refused_measurements": int(np.sum(flag(series, "star refused")[:done]))}
 
 
 class Alarms:
@@ -320,12 +336,12 @@ class Alarms:
         self._stands = 0  # flags whose start was reported and whose end was not
         self._frames = 0  # refused in a row
 
-    def hear(self, flown: Flown, step: int) -> list[Told]:
+    def observe(self, series: MessageSeries, step: int) -> list[Alert]:
         """Notices of the estimate of a step."""
-        flags = int(flown["estimate.flags"][step])
-        return [one._replace(text=f"adm: {one.text}") for one in self.said(flags)]
+        flags = int(series["estimate.flags"][step])
+        return [one._replace(text=f"adm: {one.text}") for one in self.alerts_of(flags)]
 
-    def said(self, flags: int) -> list[Told]:
+    def alerts_of(self, flags: int) -> list[Alert]:
         """Notices of the next estimate.
 
         Frames that are refused one after another are reported once, and their number when one
@@ -340,23 +356,25 @@ class Alarms:
         self._stands = now & ~USED
         said = []
         if new & REFUSED:
-            said.append(Told("alarm", "star refused"))
+            said.append(Alert("alarm", "star refused"))
         if over & REFUSED:
             frames = "one frame was" if self._frames == 1 else f"{self._frames} frames were"
-            said.append(Told("info", f"star used again, {frames} refused"))
+            said.append(Alert("info", f"star used again, {frames} refused"))
         for flag_ in (HELD, SILENT, SHORT, KEPT):
             if new & flag_:
-                said.append(Told("warning", FLAGS[flag_.bit_length() - 1]))
+                said.append(Alert("warning", FLAGS[flag_.bit_length() - 1]))
         if new & SAFE:
-            said.append(Told("alarm", FLAGS[SAFE.bit_length() - 1]))
+            said.append(Alert("alarm", FLAGS[SAFE.bit_length() - 1]))
         if over & SAFE:
-            said.append(Told("info", "the estimate can be steered by again"))
+            said.append(Alert("info", "the estimate can be steered by again"))
         return said
 
 
-def _turned(flown: Flown, kit: Kit, step: int, turn_rad: np.ndarray) -> tuple[str, Values]:
+def _turned(
+    series: MessageSeries, config: SatelliteConfig, step: int, turn_rad: np.ndarray
+) -> tuple[str, Values]:
     """Attitude turned from the present target; it stays inertial."""
-    now = wanted_after(kit, flown, step + 1).q_ib
+    now = target_after(config, series, step + 1).q_ib
     return "reference", {"q_ib": np.asarray(multiply(now, from_rotvec(jnp.asarray(turn_rad))))}
 
 
@@ -367,17 +385,17 @@ SAYS = {
         for axis, turn_rad in zip(_XYZ, np.radians(_SLEW_DEG) * np.eye(3), strict=True)
     },
     "hold this attitude": partial(_turned, turn_rad=np.zeros(3)),
-    "back to the course": lambda flown, kit, step: ("reference", {}),
-    "control: stand by": lambda flown, kit, step: ("mode", {"mode": STAND_BY}),
-    "control: run": lambda flown, kit, step: ("mode", {"mode": RUN}),
-    "determination: reset": lambda flown, kit, step: ("mode", {"mode": AS_IT_IS, "reset": 1}),
+    "back to the course": lambda series, config, step: ("reference", {}),
+    "control: stand by": lambda series, config, step: ("mode", {"mode": STAND_BY}),
+    "control: run": lambda series, config, step: ("mode", {"mode": RUN}),
+    "determination: reset": lambda series, config, step: ("mode", {"mode": AS_IT_IS, "reset": 1}),
 }
 """Operator messages that the page offers."""
 
 
-def view() -> View:
+def view() -> PageView:
     """Page of the satellite."""
-    return View(signals, sample, Alarms, counts, OFFERED, SAYS)
+    return PageView(signals, sample, Alarms, counts, OFFERED, SAYS)
 
 
 # ------------------------------------------------------------------------------------------ viewers
@@ -385,9 +403,9 @@ def view() -> View:
 _IMU = "sensor_msgs/msg/Imu"
 
 
-def topics(kit: Kit) -> Sequence[Topic]:
+def topics(config: SatelliteConfig) -> Sequence[Topic]:
     """Rates, and attitudes with their covariance, along the body's own axes, from inertial ones."""
-    step_s = kit.step_ns * 1e-9
+    step_s = config.step_ns * 1e-9
     return (
         Topic("gyro", "/gyro/imu", _IMU, lambda v: imu(v["theta_b"] / step_s), "body"),
         Topic("motion", "/plant/imu", _IMU, lambda v: imu(v["omega_b"], q_nb=v["q_ib"]), "body"),

@@ -13,10 +13,15 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from robins.bench.rigs.satellite.kit import Kit
+from robins.bench.rigs.satellite.config import SatelliteConfig
 from robins.bench.wire.fields import Values
 from robins.rotation import conjugate, multiply, rotate, to_rotvec
-from robins.sim.attitude_reference import PEAK_ACCELERATION, PEAK_RATE, Reference, handed_over
+from robins.sim.attitude_reference import (
+    PEAK_ACCELERATION,
+    PEAK_RATE,
+    Reference,
+    handover_reference,
+)
 from robins.systems.satellite.nodes import UNIT
 
 SHARE = 0.5  # of what the wheels can give, that a slew takes
@@ -27,7 +32,7 @@ _BRAKES = 4.0  # greatest acceleration times length over rate, of a rate that di
 Said = tuple[int, np.ndarray, float]  # first step that received it, q_ib, rate
 
 
-class Wanted(NamedTuple):
+class AttitudeTarget(NamedTuple):
     """Target attitude at an edge of two steps; in the order of a row of the course."""
 
     q_ib: Any  # (4,)
@@ -35,7 +40,7 @@ class Wanted(NamedTuple):
     alpha_b: Any  # (3,) rad/s^2
 
 
-class Plan(NamedTuple):
+class SlewPlan(NamedTuple):
     """Last command of the operator, and the turn to it."""
 
     edge: int  # at which it was received: the beginning of the step of that number
@@ -48,31 +53,33 @@ class Plan(NamedTuple):
 _STILL = np.zeros(3)
 
 
-def wanted(kit: Kit, plan: Plan | None, edge: int) -> Wanted:
+def attitude_target(config: SatelliteConfig, plan: SlewPlan | None, edge: int) -> AttitudeTarget:
     """Target attitude at an edge, 0 to E, by the last plan before it."""
     if plan is None or np.isnan(plan.q_ib[0]):
-        course, last = kit.rows.course, len(kit.due) - 1
+        course, last = config.rows.course, len(config.due) - 1
         k = min(edge, last)
         q = course.ref_q_ib[k] if edge <= last else course.ref_end_q_ib[last]
-        base = Wanted(q, course.ref_omega_b[k], course.ref_alpha_b[k])
+        base = AttitudeTarget(q, course.ref_omega_b[k], course.ref_alpha_b[k])
     else:
-        base = Wanted(plan.q_ib, _STILL, _STILL)
+        base = AttitudeTarget(plan.q_ib, _STILL, _STILL)
     if plan is None:
         return base
-    since_s = (edge - plan.edge) * kit.step_ns * 1e-9
+    since_s = (edge - plan.edge) * config.step_ns * 1e-9
     if since_s >= plan.length_s:
         return base
     # one epoch at a time, so that all callers get the same bits
     one = Reference(*(x[None] for x in base))
-    way = handed_over(one, plan.turn, plan.rate, plan.length_s, np.array([since_s]))
-    return Wanted(*(np.asarray(x)[0] for x in way))
+    way = handover_reference(one, plan.turn, plan.rate, plan.length_s, np.array([since_s]))
+    return AttitudeTarget(*(np.asarray(x)[0] for x in way))
 
 
-def told(kit: Kit, plan: Plan | None, edge: int, q_ib: np.ndarray, rate: float) -> Plan | None:
+def plan_after_command(
+    config: SatelliteConfig, plan: SlewPlan | None, edge: int, q_ib: np.ndarray, rate: float
+) -> SlewPlan | None:
     """Plan after a command of the operator.
 
     Args:
-        kit: of the run.
+        config: of the run.
         plan: until then.
         edge: at which it was received.
         q_ib: (4,) to point at; NaN: back to the course. One whose length is not one is not
@@ -82,37 +89,37 @@ def told(kit: Kit, plan: Plan | None, edge: int, q_ib: np.ndarray, rate: float) 
     square = float(np.sum(q_ib * q_ib))
     if abs(square - 1.0) > _OFF:
         return plan
-    now, to = wanted(kit, plan, edge), q_ib / np.sqrt(square)
-    there = wanted(kit, Plan(edge, to, _STILL, _STILL, 0.0), edge)
+    now, to = attitude_target(config, plan, edge), q_ib / np.sqrt(square)
+    there = attitude_target(config, SlewPlan(edge, to, _STILL, _STILL, 0.0), edge)
     turn, against = (np.asarray(x) for x in _between(there, now))
     angle, speed = float(np.sqrt(np.sum(turn**2))), float(np.sqrt(np.sum(against**2)))
-    most, acceleration = limits(kit)
+    most, acceleration = limits(config)
     at_most = min(rate or _AS_IT_CAN * most, most)
     way_s = max(
         PEAK_RATE * angle / at_most,
         (PEAK_ACCELERATION * angle / acceleration) ** 0.5,
         _BRAKES * speed / acceleration,
-        kit.step_ns * 1e-9,
+        config.step_ns * 1e-9,
     )
-    return Plan(edge, to, turn, against, way_s)
+    return SlewPlan(edge, to, turn, against, way_s)
 
 
 @jax.jit
-def _between(there: Wanted, now: Wanted):
+def _between(there: AttitudeTarget, now: AttitudeTarget):
     """Turn and rate of the second against the first, in the axes of the second."""
     turn = multiply(conjugate(there.q_ib), now.q_ib)
     return to_rotvec(turn), now.omega_b - rotate(conjugate(turn), there.omega_b)
 
 
-def limits(kit: Kit) -> tuple[float, float]:
+def limits(config: SatelliteConfig) -> tuple[float, float]:
     """Greatest rate [rad/s] and acceleration [rad/s^2] of a slew about any axis.
 
     They take half of the momentum and of the torque of the wheels, about the axis where the
     allocation gives least, for the greatest inertia (bounded by its rows).
     """
-    craft = kit.given.craft
+    craft = config.given.craft
     inertia = float(np.max(np.sum(np.abs(np.asarray(craft.inertia_b)), axis=1)))
-    shares = np.sqrt(np.sum(np.asarray(kit.given.pinv) ** 2, axis=1))  # of a torque of one
+    shares = np.sqrt(np.sum(np.asarray(config.given.pinv) ** 2, axis=1))  # of a torque of one
     used = shares > 0.0
     h, tau = (
         float(np.min(np.asarray(x)[used] / shares[used]))
@@ -121,45 +128,49 @@ def limits(kit: Kit) -> tuple[float, float]:
     return SHARE * h / inertia, SHARE * tau / inertia
 
 
-def followed(kit: Kit, said: Iterable[Said]) -> list[Wanted]:
+def target_attitudes(config: SatelliteConfig, said: Iterable[Said]) -> list[AttitudeTarget]:
     """Target attitudes at each edge of the E steps, E + 1 of them.
 
     Args:
-        kit: of the run.
+        config: of the run.
         said: commands of the operator, in their order; of two in one step the later one stands.
     """
     heard = {step: (q_ib, rate) for step, q_ib, rate in said}
-    out: list[Wanted] = []
+    out: list[AttitudeTarget] = []
     plan = None
-    for edge in range(len(kit.due) + 1):
+    for edge in range(len(config.due) + 1):
         if edge in heard:
-            plan = told(kit, plan, edge, *heard[edge])
-        out.append(wanted(kit, plan, edge))
+            plan = plan_after_command(config, plan, edge, *heard[edge])
+        out.append(attitude_target(config, plan, edge))
     return out
 
 
-def said_in(flown: Mapping[str, np.ndarray], steps: int) -> list[Said]:
+def commands_until(series: Mapping[str, np.ndarray], steps: int) -> list[Said]:
     """Commands sent by the end of so many steps; their rate is a number, even where the attitude is
     NaN.
     """
-    rate = flown["reference.rate"][:steps]
+    rate = series["reference.rate"][:steps]
     heard = np.flatnonzero(np.isfinite(rate))
-    return [(int(k) + 1, flown["reference.q_ib"][k], float(rate[k])) for k in heard]
+    return [(int(k) + 1, series["reference.q_ib"][k], float(rate[k])) for k in heard]
 
 
-def wanted_after(kit: Kit, flown: Mapping[str, np.ndarray], steps: int) -> Wanted:
+def target_after(
+    config: SatelliteConfig, series: Mapping[str, np.ndarray], steps: int
+) -> AttitudeTarget:
     """Target attitude after so many steps."""
     plan = None
-    for step, q_ib, rate in said_in(flown, steps):
-        plan = told(kit, plan, step, q_ib, rate)
-    return wanted(kit, plan, steps)
+    for step, q_ib, rate in commands_until(series, steps):
+        plan = plan_after_command(config, plan, step, q_ib, rate)
+    return attitude_target(config, plan, steps)
 
 
-def reference_q_ib(kit: Kit, flown: Mapping[str, np.ndarray], steps: int) -> np.ndarray:
+def reference_q_ib(
+    config: SatelliteConfig, series: Mapping[str, np.ndarray], steps: int
+) -> np.ndarray:
     """Target attitudes (steps, 4) at the end of each step."""
-    if not (said := said_in(flown, steps)):
-        return np.asarray(kit.rows.course.ref_end_q_ib)[:steps]
-    return np.array([at.q_ib for at in followed(kit, said)[1 : steps + 1]])
+    if not (said := commands_until(series, steps)):
+        return np.asarray(config.rows.course.ref_end_q_ib)[:steps]
+    return np.array([at.q_ib for at in target_attitudes(config, said)[1 : steps + 1]])
 
 
 def refuses(message: str, values: Values) -> str:
@@ -172,7 +183,7 @@ def refuses(message: str, values: Values) -> str:
     return f"q_ib {what}: give a quaternion of length one, w x y z, or none for the course"
 
 
-def rehearse(kit: Kit) -> None:
+def precompile(config: SatelliteConfig) -> None:
     """Compile what is computed at a command."""
-    plan = told(kit, None, 0, np.array([0.5, 0.5, 0.5, 0.5]), 0.0)
-    wanted(kit, plan, 1)
+    plan = plan_after_command(config, None, 0, np.array([0.5, 0.5, 0.5, 0.5]), 0.0)
+    attitude_target(config, plan, 1)

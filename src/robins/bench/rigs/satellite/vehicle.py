@@ -11,83 +11,85 @@ import numpy as np
 from jaxtyping import Array
 
 from robins.bench.parts.station import Inputs, Part
-from robins.bench.rigs.satellite.kit import Kit, driven
+from robins.bench.rigs.satellite.config import SatelliteConfig, driven
 from robins.bench.rigs.satellite.messages import WHEELS
 from robins.bench.wire.fields import Values
 from robins.rotation import conjugate, multiply, to_rotvec
 from robins.sim.rate_table import RateTable, TableState, step
 from robins.sim.spacecraft import CraftState, rate_b
 from robins.systems.satellite import nodes
-from robins.systems.satellite.nodes import Actuation, Command, Given, Row
+from robins.systems.satellite.nodes import Actuation, ActuatorCommand, LoopConstants, StepInputs
 
 Numbers = Array | np.ndarray
 HELD = 1  # steps for which what came last stands for what did not come
 
 
-class Held(NamedTuple):
+class LatchedInput(NamedTuple):
     """Last values received, and the number of steps without any since."""
 
     values: Any
     age: int = 0
 
 
-def renew(held: Held, came: Values | np.ndarray | tuple | None) -> Held:
+def latched(held: LatchedInput, came: Values | np.ndarray | tuple | None) -> LatchedInput:
     """Values to act on in this step; `trusted` limits for how long."""
-    return Held(held.values, held.age + 1) if came is None else Held(came, 0)
+    return LatchedInput(held.values, held.age + 1) if came is None else LatchedInput(came, 0)
 
 
-def trusted(held: Held) -> bool:
+def trusted(held: LatchedInput) -> bool:
     """True if the last values are still valid."""
     return held.age <= HELD
 
 
-def stale(held: Held) -> Held:
+def stale(held: LatchedInput) -> LatchedInput:
     """The same values, marked as no longer valid."""
     return held._replace(age=HELD + 1)
 
 
-def padded(torque: np.ndarray) -> np.ndarray:
+def per_wheel(torque: np.ndarray) -> np.ndarray:
     """Numbers of each wheel, as the wire has them."""
     out = np.zeros(WHEELS)
     out[: len(torque)] = torque
     return out
 
 
-def rest() -> dict[str, np.ndarray]:
+def zero_command() -> dict[str, np.ndarray]:
     """A command, or an actuation, of zero."""
     return {"wheel_torque": np.zeros(WHEELS), "dipole_b": np.zeros(3)}
 
 
-def acting(held: Held, came: Values | None, wheels: int) -> tuple[Held, Any, Any]:
+def acting_command(
+    held: LatchedInput, came: Values | None, wheels: int
+) -> tuple[LatchedInput, Any, Any]:
     """Torques and dipole that act in this step: those that came, the last ones, or none."""
-    held = renew(held, came)
-    use = held.values if trusted(held) else rest()
+    held = latched(held, came)
+    use = held.values if trusted(held) else zero_command()
     return held, use["wheel_torque"][:wheels], use["dipole_b"]
 
 
-def _moves(given: Given, craft: CraftState, acts: Actuation, row: Row):
-    craft = nodes.apart(nodes.plant, given, craft, acts, row.course)
+def _moves(given: LoopConstants, craft: CraftState, acts: Actuation, row: StepInputs):
+    craft = nodes.compiled_alone(nodes.plant, given, craft, acts, row.course)
     return craft, rate_b(given.craft, craft)
 
 
-def plant(kit: Kit) -> Part:
+def plant(config: SatelliteConfig) -> Part:
     """Dynamics and kinematics of the craft; without actuation nothing acts on it."""
-    wheels = len(kit.vehicle.craft.wheel_h)
-    moves = driven(kit, _moves)
+    wheels = len(config.vehicle.craft.wheel_h)
+    moves = driven(config, _moves)
 
-    def begin() -> tuple[CraftState, Held]:
-        return kit.vehicle.craft, Held(rest())
+    def begin() -> tuple[CraftState, LatchedInput]:
+        return config.vehicle.craft, LatchedInput(zero_command())
 
-    def act(state: tuple[CraftState, Held], k: int, inputs: Inputs):
+    def act(state: tuple[CraftState, LatchedInput], k: int, inputs: Inputs):
         craft, held = state
-        held, torque, dipole = acting(held, inputs["actuation"], wheels)
+        held, torque, dipole = acting_command(held, inputs["actuation"], wheels)
         acts = Actuation(torque, dipole, craft.wheel_h)
         craft, omega = moves(k, craft, acts)
         return (craft, held), [
             ("motion", {"q_ib": np.asarray(craft.q_ib), "omega_b": np.asarray(omega)})
         ]
 
-    return Part("plant", {"actuation": 0}, begin, act, {"actuation": rest()})
+    return Part("plant", {"actuation": 0}, begin, act, {"actuation": zero_command()})
 
 
 @jax.jit
@@ -103,11 +105,11 @@ def _turn_on(given: RateTable, state: TableState, dt_s: Array):
     return step(given, state, state.rate_b, dt_s)
 
 
-def table(kit: Kit) -> Part:
+def table(config: SatelliteConfig) -> Part:
     """The rate table: it turns its sensors as the craft turns, exactly or a little late."""
-    first = np.asarray(kit.vehicle.craft.q_ib)
-    rate = rate_b(kit.given.craft, kit.vehicle.craft)
-    dt = jnp.asarray(kit.step_ns * 1e-9)
+    first = np.asarray(config.vehicle.craft.q_ib)
+    rate = rate_b(config.given.craft, config.vehicle.craft)
+    dt = jnp.asarray(config.step_ns * 1e-9)
 
     ideal = RateTable(*(jnp.full(3, x) for x in (1e-9, jnp.inf, jnp.inf)))
     begin = TableState(jnp.asarray(first), rate)
@@ -115,52 +117,54 @@ def table(kit: Kit) -> Part:
     def act(state: TableState, k: int, inputs: Inputs):
         motion = inputs["motion"]
         if motion is None:
-            state, q = _turn_on(kit.table or ideal, state, dt)
-        elif kit.table is None:
+            state, q = _turn_on(config.table or ideal, state, dt)
+        elif config.table is None:
             state, q = TableState(motion["q_ib"], motion["omega_b"]), motion["q_ib"]
         else:
-            state, q = _follow(kit.table, state, motion["q_ib"], motion["omega_b"], dt)
+            state, q = _follow(config.table, state, motion["q_ib"], motion["omega_b"], dt)
         return state, [("mounted", {"q_ib": np.asarray(q)})]
 
     example = {"motion": {"q_ib": first, "omega_b": np.asarray(rate)}}
-    rare = partial(_turn_on, kit.table or ideal, begin, dt)
+    rare = partial(_turn_on, config.table or ideal, begin, dt)
     return Part("table", {"motion": 0}, lambda: begin, act, example, rare)
 
 
-def _gives(given: Given, wheel_h: Array, command: Command, row: Row) -> Actuation:
+def _gives(
+    given: LoopConstants, wheel_h: Array, command: ActuatorCommand, row: StepInputs
+) -> Actuation:
     return nodes.actuators(given, wheel_h, command, row.course)
 
 
-def actuators(kit: Kit) -> Part:
+def actuators(config: SatelliteConfig) -> Part:
     """Wheels and magnetorquers; a command stands for a step longer, then they give nothing."""
-    wheels = len(kit.vehicle.craft.wheel_h)
-    gives = driven(kit, _gives)
+    wheels = len(config.vehicle.craft.wheel_h)
+    gives = driven(config, _gives)
 
-    def begin() -> tuple[Numbers, Held]:
-        return kit.vehicle.craft.wheel_h, Held(rest())
+    def begin() -> tuple[Numbers, LatchedInput]:
+        return config.vehicle.craft.wheel_h, LatchedInput(zero_command())
 
-    def act(state: tuple[Numbers, Held], k: int, inputs: Inputs):
+    def act(state: tuple[Numbers, LatchedInput], k: int, inputs: Inputs):
         wheel_h, held = state
-        held, torque, dipole = acting(held, inputs["command"], wheels)
-        command = Command(torque, dipole)
+        held, torque, dipole = acting_command(held, inputs["command"], wheels)
+        command = ActuatorCommand(torque, dipole)
         acts = gives(k, wheel_h, command)
         given = {
-            "wheel_torque": padded(np.asarray(acts.wheel_torque)),
+            "wheel_torque": per_wheel(np.asarray(acts.wheel_torque)),
             "dipole_b": np.asarray(acts.dipole_b),
         }
-        speeds = {"momentum": padded(np.asarray(acts.wheel_h))}
+        speeds = {"momentum": per_wheel(np.asarray(acts.wheel_h))}
         return (acts.wheel_h, held), [("actuation", given), ("wheels", speeds)]
 
-    return Part("actuators", {"command": 0}, begin, act, {"command": rest()})
+    return Part("actuators", {"command": 0}, begin, act, {"command": zero_command()})
 
 
-_expected = jax.jit(nodes.expected)
+_expected = jax.jit(nodes.expected_attitude)
 
 
-def gyro(kit: Kit) -> Part:
+def gyro(config: SatelliteConfig) -> Part:
     """The gyro triad: it reports the turn since its last sample, in whole counts."""
-    reads = driven(kit, nodes.gyro)
-    first = (jnp.asarray(kit.vehicle.craft.q_ib), kit.vehicle.residue)
+    reads = driven(config, nodes.gyro)
+    first = (jnp.asarray(config.vehicle.craft.q_ib), config.vehicle.residue)
 
     def act(state: tuple[Numbers, Numbers], k: int, inputs: Inputs):
         before, residue = state
@@ -169,20 +173,20 @@ def gyro(kit: Kit) -> Part:
         theta, residue = reads(k, before, mounted["q_ib"], residue)
         return (mounted["q_ib"], residue), [("gyro", {"theta_b": np.asarray(theta)})]
 
-    example = {"mounted": {"q_ib": np.asarray(kit.vehicle.craft.q_ib)}}
+    example = {"mounted": {"q_ib": np.asarray(config.vehicle.craft.q_ib)}}
     return Part("gyro", {"mounted": 0}, lambda: first, act, example)
 
 
-def star(kit: Kit) -> Part:
+def star(config: SatelliteConfig) -> Part:
     """The star sensor; a camera is given the direction in which to look for its stars."""
-    lens = kit.given.lens
+    lens = config.given.lens
     # An image has no place in a program.
-    sees = driven(kit if lens is None else kit._replace(machine="jax"), nodes.star)
+    sees = driven(config if lens is None else config._replace(machine="jax"), nodes.star)
     takes = {"motion": 0} if lens is None else {"motion": 0, "gyro": 0, "estimate": 1}
-    at_first = np.asarray(kit.vehicle.star_q_ib)
+    at_first = np.asarray(config.vehicle.star_q_ib)
 
     def begin() -> tuple[np.ndarray, ...]:
-        return at_first, np.asarray(kit.form.attitude(kit.belief.mean)), np.zeros(3)
+        return at_first, np.asarray(config.form.attitude(config.belief.mean)), np.zeros(3)
 
     def act(state: tuple[np.ndarray, ...], k: int, inputs: Inputs):
         seen, q, bias = state
@@ -191,10 +195,10 @@ def star(kit: Kit) -> Part:
         turned = inputs.get("gyro")
         theta = np.zeros(3) if turned is None else turned["theta_b"]
         motion = inputs["motion"]
-        if motion is None or not kit.due[min(k, len(kit.due) - 1)]:
+        if motion is None or not config.due[min(k, len(config.due) - 1)]:
             return (seen, q, bias), []
         at = motion["q_ib"]
-        looks = at if lens is None else _expected(kit.given, q, bias, theta)
+        looks = at if lens is None else _expected(config.given, q, bias, theta)
         frame = sees(k, at, looks, seen)
         factor = np.zeros(9) if frame.factor is None else np.ravel(np.asarray(frame.factor))
         stars = 0 if frame.stars is None else int(frame.stars)

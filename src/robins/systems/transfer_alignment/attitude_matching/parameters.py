@@ -25,7 +25,7 @@ class BankTurn(Parameters):
     heading: q.Angle = default("0 deg")  # at the start, clockwise from north
 
 
-class Master(Parameters):
+class MatchingMaster(Parameters):
     """The attitude that the master reports, with white noise at each update."""
 
     attitude_noise: q.Spread
@@ -33,7 +33,7 @@ class Master(Parameters):
     outage: Annotated[tuple[float, float], Quantity("time", least="0 s")] | None = None
 
 
-class Slave(Parameters):
+class MatchingSlave(Parameters):
     """True errors of the slave: constant drift, noise, and where its attitude begins."""
 
     gyro_bias: Annotated[q.Three, Quantity("angle rate")]
@@ -41,14 +41,14 @@ class Slave(Parameters):
     attitude_error: Annotated[q.Three, Quantity("angle", least="-30 deg", most="30 deg")]  # E, N, U
 
 
-class Mounting(Parameters):
+class MatchingMounting(Parameters):
     """Mounting of the slave on the master: nominal, and the true error (slave axes)."""
 
     nominal: q.Angles = default("0 deg")  # rotation vector
     error: Annotated[q.Three, Quantity("angle", least="-30 deg", most="30 deg")]
 
 
-class Flexing(Parameters):
+class FlexureParameters(Parameters):
     """Motion of the structure between the two, in axes right, forward, up of the master."""
 
     sigma: q.AngleSizes
@@ -68,7 +68,7 @@ class BelievedSpread(Parameters):
     flexure_time_factor: Positive = 1.0  # of the correlation time
 
 
-class HInfinity(Parameters):
+class HInfinityRequirements(Parameters):
     """Requirements of the H-infinity filters."""
 
     gamma: Positive = 50.0  # of those with R = 1 unit^2, in their unit
@@ -89,12 +89,12 @@ class AttitudeMatching(Scenario):
     # initial errors as given, or of that size with a sign drawn for each axis and run
     signs: Literal["fixed", "random"] = "fixed"
     manoeuvre: BankTurn
-    master: Master
-    slave: Slave
-    mounting: Mounting
-    flexure: Flexing
+    master: MatchingMaster
+    slave: MatchingSlave
+    mounting: MatchingMounting
+    flexure: FlexureParameters
     believed: BelievedSpread
-    h_infinity: HInfinity = pydantic.Field(default_factory=HInfinity)
+    h_infinity: HInfinityRequirements = pydantic.Field(default_factory=HInfinityRequirements)
 
     @pydantic.model_validator(mode="after")
     def _fits(self) -> AttitudeMatching:

@@ -23,7 +23,7 @@ from jaxtyping import Array, ArrayLike
 
 from robins import units
 from robins.filters import Filter, Motion, kalman
-from robins.filters.composite.bank import EVERY, Row, bank, transitions
+from robins.filters.composite.bank import EVERY, HypothesisRow, bank, transitions
 from robins.filters.composite.imm import Mode
 from robins.filters.rule import Rule
 from robins.filters.rules import huber
@@ -40,7 +40,7 @@ START = Flexure(np.full(3, 10.0 * _ARCMIN), np.full(3, 1.0))
 """Uncertainty at the start of the states of an unknown structure."""
 
 
-class Supposed(NamedTuple):
+class StructureHypothesis(NamedTuple):
     """A structure."""
 
     sigma: ArrayLike  # rad, of the swing; 0: stiff
@@ -48,11 +48,14 @@ class Supposed(NamedTuple):
     flutter: ArrayLike  # of the noise of the records
 
 
-def hypotheses() -> list[Row]:
+def hypotheses() -> list[HypothesisRow]:
     """18 structures: every swing with every flutter; wrong is what no structure of none has."""
     swings = [(0.0, 1.0), *((s * _ARCMIN, t) for s in _SIGMAS for t in _TIMES_S)]
     return [
-        Row(Supposed(*swing, f), ("flexure",) * (swing[0] > 0.0) + (am.ATTITUDE,) * (f > 0.0))
+        HypothesisRow(
+            StructureHypothesis(*swing, f),
+            ("flexure",) * (swing[0] > 0.0) + (am.ATTITUDE,) * (f > 0.0),
+        )
         for swing in swings
         for f in _FLUTTERS
     ]
@@ -71,7 +74,7 @@ def _moved(swing, noise, x, F):
     return F @ x, F, noise
 
 
-def _mode(weight: Rule, given: tuple[Numbers, ...], row: Supposed) -> Mode:
+def _mode(weight: Rule, given: tuple[Numbers, ...], row: StructureHypothesis) -> Mode:
     gyro, noise_rad, period_s = map(jnp.asarray, given)
     Phi, L = transition(row.sigma, row.time, 1.0, period_s)
     # a stiff structure forgets what the start supposes
@@ -83,15 +86,15 @@ def _mode(weight: Rule, given: tuple[Numbers, ...], row: Supposed) -> Mode:
     return Mode(kalman(rules=(weight,)), motion, (am.reading(white),))
 
 
-def supposed(
+def structure_filter(
     system: am.LinearSystem, noise_rad: float, period_s: float
-) -> Callable[[Supposed], Mode]:
-    """Function that makes the filter of a hypothesis (see `blind`)."""
+) -> Callable[[StructureHypothesis], Mode]:
+    """Function that makes the filter of a hypothesis (see `structure_bank`)."""
     given = system.G[:, :3], noise_rad, period_s
     return Partial(_mode, huber(_WEIGHED), tuple(number("numbers are real", x) for x in given))
 
 
-def blind(system: am.LinearSystem, noise_rad: float, period_s: float) -> Filter:
+def structure_bank(system: am.LinearSystem, noise_rad: float, period_s: float) -> Filter:
     """The bank over `hypotheses`.
 
     Args:
@@ -103,4 +106,4 @@ def blind(system: am.LinearSystem, noise_rad: float, period_s: float) -> Filter:
     stiff = np.array([row.numbers.sigma == 0.0 for row in rows])
     start = np.where(stiff, 0.5 / np.sum(stiff), 0.5 / np.sum(~stiff))
     change = transitions(len(rows), [(EVERY, EVERY, _OTHER)])
-    return bank(supposed(system, noise_rad, period_s), rows, change, start)
+    return bank(structure_filter(system, noise_rad, period_s), rows, change, start)

@@ -29,8 +29,8 @@ from robins.systems.transfer_alignment.attitude_matching import model as am
 from robins.systems.transfer_alignment.attitude_matching import structures
 from robins.systems.transfer_alignment.attitude_matching.parameters import AttitudeMatching
 from robins.systems.transfer_alignment.attitude_matching.world import (
-    Course,
-    World,
+    MatchingCourse,
+    MatchingWorld,
     lay_out,
     simulate,
 )
@@ -47,7 +47,7 @@ TOLD = {
 }
 
 
-class InUnit(NamedTuple):
+class PaperFilter(NamedTuple):
     """The paper's filter: R = I, L = I and gamma in a unit of angle."""
 
     unit: str
@@ -56,11 +56,11 @@ class InUnit(NamedTuple):
 
 
 IN_UNIT = {
-    "hinf-rad": InUnit("rad"),
-    "hinf-rad-identity": InUnit("rad", identity=True),
-    "hinf-deg": InUnit("deg"),
-    "hinf-deg-inf": InUnit("deg", bounded=False),
-    "hinf-arcmin": InUnit("arcmin"),
+    "hinf-rad": PaperFilter("rad"),
+    "hinf-rad-identity": PaperFilter("rad", identity=True),
+    "hinf-deg": PaperFilter("deg"),
+    "hinf-deg-inf": PaperFilter("deg", bounded=False),
+    "hinf-arcmin": PaperFilter("arcmin"),
 }
 FILTERS = (*TOLD, *IN_UNIT, "hinf-weighted", "adaptive")
 
@@ -75,7 +75,7 @@ def weighted_filter() -> Filter:
     return kalman(rules=[h_infinity(np.inf, np.eye(am.STATES)[am.PHI] / ARCMIN)])
 
 
-def contender(given: AttitudeMatching, course: Course, name: str) -> Contender:
+def contender(given: AttitudeMatching, course: MatchingCourse, name: str) -> Contender:
     """A filter of `FILTERS` with its assumptions."""
     flexure, updates = given.flexure, len(course.epoch_s)
     sizes = {
@@ -93,7 +93,7 @@ def contender(given: AttitudeMatching, course: Course, name: str) -> Contender:
         return _contender(kalman(), am.linear_system(given, updates, believed), sigma)
     if name == "adaptive":
         system = am.linear_system(given, updates, structures.START)
-        filter_ = structures.blind(system, given.master.attitude_noise, given.period)
+        filter_ = structures.structure_bank(system, given.master.attitude_noise, given.period)
         return _contender(filter_, system, sigma)
     system = am.linear_system(given, updates)
     if name in TOLD:
@@ -130,7 +130,7 @@ def _contender(
     return Contender(filter_, model, case, rows, bounds=bool(np.isfinite(gamma)), facts=known)
 
 
-def _case(start: Any, F: Any, H: Any, world: World) -> Case:
+def _case(start: Any, F: Any, H: Any, world: MatchingWorld) -> Case:
     """Case of a filter of n states in a run; F is (E, n, n) and H (E, 3, n)."""
     truth = world.state[:, : F.shape[-1]]
     return Case(start, F, {am.ATTITUDE: world.measured}, {am.ATTITUDE: H}, truth)
@@ -140,7 +140,7 @@ def existence(
     filter_: Filter,
     system: am.LinearSystem,
     sigma_rad: float,
-    course: Course,
+    course: MatchingCourse,
     gamma: float = np.nan,
     over_least: float | None = None,
 ) -> dict[str, Metric]:
@@ -151,7 +151,7 @@ def existence(
     units of its L x, or `over_least` times the least.
     """
     model, (u, aux) = system.model(sigma_rad), system.inputs()
-    y = np.where(course.heard[:, None], np.zeros((len(course.heard), 3)), np.nan)
+    y = np.where(course.received[:, None], np.zeros((len(course.received), 3)), np.nan)
 
     def attempt(gamma: float):
         return run(
@@ -199,7 +199,7 @@ def _existing(step: Step):
     return jnp.where(counts, bound, 0.0), jnp.where(counts, margin, 1.0)
 
 
-def view(given: AttitudeMatching, course: Course) -> View:
+def view(given: AttitudeMatching, course: MatchingCourse) -> View:
     """Report of every filter."""
     roll, count = am.roll_rad(given.manoeuvre, course.epoch_s), len(course.epoch_s)
     return View(
@@ -218,7 +218,7 @@ def view(given: AttitudeMatching, course: Course) -> View:
         context=xr.Dataset(
             array("context", roll, "roll", unit="rad")
             | array("context", course.load[course.at], "load_factor", unit="1")
-            | array("outage", (~course.heard).astype(np.int8), long_name="no attitude")
+            | array("outage", (~course.received).astype(np.int8), long_name="no attitude")
         ),
         count_from=int(np.searchsorted(course.epoch_s, given.settle - 1e-9)),
         limits=(FIVE_ARCMIN,),

@@ -30,7 +30,7 @@ from robins.systems.transfer_alignment.attitude_matching.model import (
 from robins.systems.transfer_alignment.attitude_matching.parameters import AttitudeMatching
 
 
-class Course(NamedTuple):
+class MatchingCourse(NamedTuple):
     """Data that all runs share; N steps of the truth, E updates."""
 
     q_nm: np.ndarray  # (N + 1, 4) master to n
@@ -39,17 +39,17 @@ class Course(NamedTuple):
     q_nominal: np.ndarray  # (4,) slave to master, as drawn
     at: np.ndarray  # (E,) step at each update
     epoch_s: np.ndarray  # (E,)
-    heard: np.ndarray  # (E,) bool, the master's attitude arrives
+    received: np.ndarray  # (E,) bool, the master's attitude arrives
 
 
-class World(NamedTuple):
+class MatchingWorld(NamedTuple):
     """One run."""
 
     measured: Any  # (E, 3) rad, Z; NaN where nothing came
     state: Any  # (E, 15) the true [phi, eps, mu, lambda, lambda']
 
 
-def lay_out(given: AttitudeMatching) -> Course:
+def lay_out(given: AttitudeMatching) -> MatchingCourse:
     """Everything that does not depend on a run, in NumPy.
 
     Warns where errors will outgrow the linear model.
@@ -76,22 +76,24 @@ def lay_out(given: AttitudeMatching) -> Course:
     time_s = given.step * np.arange(count * every + 1)
     omega = rate_in_enu(turn, time_s[:-1] + 0.5 * given.step)
     at = every * np.arange(1, count + 1)
-    heard = np.ones(count, bool)
+    received = np.ones(count, bool)
     if given.master.outage is not None:
         begin, end = given.master.outage
-        heard = (time_s[at] < begin - 1e-9) | (time_s[at] > end + 1e-9)
-    return Course(
+        received = (time_s[at] < begin - 1e-9) | (time_s[at] > end + 1e-9)
+    return MatchingCourse(
         q_nm=np.asarray(rotation.from_dcm(jnp.asarray(attitude_enu(turn, time_s)))),
         turned_n=np.asarray(rotation.from_rotvec(jnp.asarray(omega * given.step))),
         load=load_factor(turn, time_s),
         q_nominal=np.asarray(rotation.from_rotvec(jnp.asarray(given.mounting.nominal))),
         at=at,
         epoch_s=given.period * np.arange(1, count + 1),
-        heard=heard,
+        received=received,
     )
 
 
-def simulate(given: AttitudeMatching, course: Course, seed: int, index: Array) -> World:
+def simulate(
+    given: AttitudeMatching, course: MatchingCourse, seed: int, index: Array
+) -> MatchingWorld:
     """One run, from its number; pure."""
     key = partial(stream, seed, index)
     c = jax.tree_util.tree_map(jnp.asarray, course)
@@ -140,8 +142,8 @@ def simulate(given: AttitudeMatching, course: Course, seed: int, index: Array) -
     Z = matched(seen_m, c.q_nominal, rotation.multiply(error, true_s))
     constant = (jnp.broadcast_to(x, shape) for x in (eps, mu))
     phi = -rotation.to_rotvec(error)
-    return World(
-        measured=jnp.where(c.heard[:, None], Z, jnp.nan),
+    return MatchingWorld(
+        measured=jnp.where(c.received[:, None], Z, jnp.nan),
         state=jnp.concatenate([phi, *constant, angle[c.at], rate[c.at]], axis=1),
     )
 

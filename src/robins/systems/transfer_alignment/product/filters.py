@@ -32,7 +32,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
 
 from robins.filters import Filter, kalman, taylor, unscented
-from robins.filters.composite.bank import Row, bank
+from robins.filters.composite.bank import HypothesisRow, bank
 from robins.filters.linearise import Transition
 from robins.filters.rule import Memory, Rule
 from robins.filters.rules import huber
@@ -46,7 +46,7 @@ _STIFF = 1e-3  # of the flexure is left of one that is not there: nothing that m
 _WEIGHED = 0.99  # share of right records that keep their weight
 
 
-class Hypothesis(NamedTuple):
+class NoiseHypothesis(NamedTuple):
     """Factors on process noise."""
 
     gyro: ArrayLike = 1.0  # noise of the gyros
@@ -54,15 +54,19 @@ class Hypothesis(NamedTuple):
     flexure: ArrayLike = 1.0  # drive of the flexure
 
 
-QUIET, NOISY, DRIFTING = Hypothesis(), Hypothesis(gyro=15.0), Hypothesis(gyro=15.0, walk=15.0)
-KICKED = Hypothesis(flexure=10.0)
+QUIET, NOISY, DRIFTING = (
+    NoiseHypothesis(),
+    NoiseHypothesis(gyro=15.0),
+    NoiseHypothesis(gyro=15.0, walk=15.0),
+)
+KICKED = NoiseHypothesis(flexure=10.0)
 
 
 @value
-class Supposing(Rule):
-    """The rule of `supposing`."""
+class HypothesisNoise(Rule):
+    """The rule of `under_hypothesis`."""
 
-    hypothesis: Hypothesis
+    hypothesis: NoiseHypothesis
     stiff: Numbers  # () one where the structure is, else zero
 
     name = "supposing"
@@ -82,10 +86,10 @@ class Supposing(Rule):
         return memory, t._replace(mean=mean, spread=spread, noise=noise)
 
 
-def supposing(hypothesis: Hypothesis, stiff: ArrayLike) -> Rule:
+def under_hypothesis(hypothesis: NoiseHypothesis, stiff: ArrayLike) -> Rule:
     """Filter as if a hypothesis held; a stiff structure has no flexure worth the name."""
-    own = Hypothesis(*(number("a hypothesis is of real numbers", x) for x in hypothesis))
-    return Supposing(own, number("stiff is one or zero", stiff))
+    own = NoiseHypothesis(*(number("a hypothesis is of real numbers", x) for x in hypothesis))
+    return HypothesisNoise(own, number("stiff is one or zero", stiff))
 
 
 GYROS, FLEXURE = ("gyros",), ("flexure",)  # what is wrong in a mode
@@ -108,7 +112,7 @@ _FLEXING_START = (0.97, 0.01, 0.01, 0.01)
 _OTHER_HALF = 1e-5  # that a structure comes loose or stiffens in a step
 
 
-def changes() -> np.ndarray:
+def hypothesis_changes() -> np.ndarray:
     """(7, 7) probabilities of a change in one step: three stiff hypotheses, four flexing ones."""
     stiff, flexing = np.array(_STIFF_CHANGES), np.array(_FLEXING_CHANGES)
     stay = 1.0 - _OTHER_HALF
@@ -120,16 +124,16 @@ def changes() -> np.ndarray:
     )
 
 
-def _mode(weight: Rule, row: tuple[Hypothesis, Array]) -> Filter:
-    return kalman(taylor(), (supposing(*row), weight), form="joseph")
+def _mode(weight: Rule, row: tuple[NoiseHypothesis, Array]) -> Filter:
+    return kalman(taylor(), (under_hypothesis(*row), weight), form="joseph")
 
 
-def seven() -> Filter:
+def hypothesis_bank() -> Filter:
     """The bank of hypotheses, for a product model with flexure states."""
     halves = (1.0, _STIFF_MODES), (0.0, _FLEXING_MODES)
-    rows = [Row((one, stiff), wrong) for stiff, modes in halves for one, wrong in modes]
+    rows = [HypothesisRow((one, stiff), wrong) for stiff, modes in halves for one, wrong in modes]
     start = 0.5 * np.array([*_STIFF_START, *_FLEXING_START])
-    return bank(Partial(_mode, huber(_WEIGHED)), rows, changes(), start)
+    return bank(Partial(_mode, huber(_WEIGHED)), rows, hypothesis_changes(), start)
 
 
 # ----------------------------------------------------------------------------------- by name
@@ -160,7 +164,7 @@ VARIANTS = {
     "product-joseph": Variant("believed", lambda: kalman(taylor(), (huber(OUTLIERS),), "joseph")),
     "product-flexure": Variant("always", lambda: kalman(taylor(), (huber(OUTLIERS),))),
     "product-ukf": Variant("believed", lambda: kalman(unscented(), (huber(OUTLIERS),))),
-    "adaptive": Variant("untold", seven),
-    "product-adaptive": Variant("untold", seven),  # its name in earlier versions
+    "adaptive": Variant("untold", hypothesis_bank),
+    "product-adaptive": Variant("untold", hypothesis_bank),  # its name in earlier versions
 }
 FILTERS = tuple(VARIANTS)

@@ -27,16 +27,16 @@ from robins.ins.blocks import cut, epochs_between
 from robins.ins.frames import to_ned_frd
 from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, nav_at, refuse_polar, vector
-from robins.results import Outcome, Progress, silent, variable
+from robins.results import Outcome, Progress, ignore_progress, variable
 from robins.rotation import Rotation
 from robins.systems import replaying
 from robins.systems.judgement import Metric
-from robins.systems.replaying import Answer, Piece, Reported
-from robins.systems.study import Alignment, Case, Contender, Recipe
+from robins.systems.replaying import FilterEstimates, LogPiece, ReportedItems
+from robins.systems.study import Case, Contender, PairAlignment, Recipe
 from robins.systems.tables import place_arrays
 from robins.systems.transfer_alignment.product.filters import FILTERS
 from robins.systems.transfer_alignment.product.model import Installation, ProductState
-from robins.systems.transfer_alignment.product.parameters import PairParameters, Replay
+from robins.systems.transfer_alignment.product.parameters import PairParameters, PairReplay
 from robins.systems.transfer_alignment.product.study import (
     BLOCKS,
     SENSORS,
@@ -52,7 +52,7 @@ _ATTITUDE, _MOUNTING, _FLEXURE = slice(0, 3), slice(15, 18), slice(18, 21)
 # -------------------------------------------------------------------------------- log to pieces
 
 
-class Recorded(NamedTuple):
+class RecordedPair(NamedTuple):
     """A recorded pair on one clock, whose zero is the slave's first sample; NED/FRD."""
 
     increments: Increments  # of the slave: (N,), (N, 3), (N, 3)
@@ -62,7 +62,7 @@ class Recorded(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairPiece(Piece):
+class PairPiece(LogPiece):
     """A stretch of a recorded pair without a long gap in the slave's samples."""
 
     world: PairRun
@@ -70,7 +70,7 @@ class PairPiece(Piece):
     first: int  # row that the slave starts from
 
 
-def on_one_clock(dataset: Dataset) -> Recorded:
+def on_one_clock(dataset: Dataset) -> RecordedPair:
     """The tables of a pair that was examined and cleaned (`robins.logs`).
 
     Raises:
@@ -89,12 +89,12 @@ def on_one_clock(dataset: Dataset) -> Recorded:
             f"{time_s[-1]:.1f} s, the master {master_s[0]:.1f} to {master_s[-1]:.1f} s; do both "
             "use the same time scale?"
         )
-    return Recorded(
+    return RecordedPair(
         Increments(*(np.asarray(a, float) for a in increments[:3])), time_s, master, master_s
     )
 
 
-def pieces_of(recorded: Recorded, parameters: Replay) -> tuple[list[PairPiece], list[str]]:
+def pieces_of(recorded: RecordedPair, parameters: PairReplay) -> tuple[list[PairPiece], list[str]]:
     """The pieces made ready for filters, and a sentence for each stretch that cannot be used.
 
     Raises:
@@ -102,10 +102,12 @@ def pieces_of(recorded: Recorded, parameters: Replay) -> tuple[list[PairPiece], 
     """
     longest = parameters.recording.longest_gap
     prepare = partial(_prepare, recorded, parameters)
-    return replaying.prepared(recorded.time_s, np.asarray(recorded.increments.dt), longest, prepare)
+    return replaying.prepare_pieces(
+        recorded.time_s, np.asarray(recorded.increments.dt), longest, prepare
+    )
 
 
-def _prepare(recorded: Recorded, parameters: Replay, rows: slice) -> PairPiece:
+def _prepare(recorded: RecordedPair, parameters: PairReplay, rows: slice) -> PairPiece:
     increments = Increments(*(np.asarray(a)[rows] for a in recorded.increments[:3]))
     time_s, master_s, delay = recorded.time_s[rows], recorded.master_s, parameters.master.delay
     begin_s, end_s = float(time_s[0] - increments.dt[0]), float(time_s[-1])
@@ -137,8 +139,8 @@ def _prepare(recorded: Recorded, parameters: Replay, rows: slice) -> PairPiece:
     at_s = np.clip(master_s - delay, begin_s, end_s)
     of_slave = _gyro_rate(increments, time_s, float(np.median(recorded.increments.dt)), at_s)
     turn = np.asarray(at.q_ms.apply(jnp.asarray(of_slave)))
-    if (told := recorded.master.omega_ib_b) is not None:
-        turn = np.where(np.isfinite(told), told, turn)
+    if (omega := recorded.master.omega_ib_b) is not None:
+        turn = np.where(np.isfinite(omega), omega, turn)
     scale = replaying.noise_scale(blocks, np.asarray(increments.dt), recording.gap_noise)
     world = PairRun(
         increments=blocks.increments,
@@ -208,7 +210,7 @@ def start_belief(belief: Belief, parameters: PairParameters) -> Belief:
     return Belief(belief.mean, linalg.tria(S.at[_ATTITUDE].set(attitude), of_record))
 
 
-def contender(parameters: Replay, name: str) -> Contender:
+def contender(parameters: PairReplay, name: str) -> Contender:
     """A filter of the product model, for pieces of a recorded pair.
 
     Raises:
@@ -218,7 +220,7 @@ def contender(parameters: Replay, name: str) -> Contender:
     return replace(made, case=Recipe(_case, (parameters,), made.case))
 
 
-def _case(parameters: Replay, simulated: Recipe, run: PairRun) -> Case:
+def _case(parameters: PairReplay, simulated: Recipe, run: PairRun) -> Case:
     """The case of a simulated pair, but for the start."""
     given = simulated(run)
     return given._replace(start=start_belief(given.start, parameters))
@@ -239,7 +241,7 @@ def _estimates(mean: ProductState) -> Mapping[str, Numbers]:
     return found if mean.flexure is None else found | {"flexure": mean.flexure[..., :3]}
 
 
-REPORTED = Reported(
+REPORTED = ReportedItems(
     blocks=BLOCKS,
     sensors=SENSORS,
     estimates=_estimates,
@@ -252,7 +254,7 @@ _UNKNOWN = 0.7  # of the sigma at the start; what keeps more of it was hardly se
 _LARGE_RAD = np.deg2rad(5.0)
 
 
-def metrics_of(answer: Answer) -> dict[str, Metric]:
+def metrics_of(answer: FilterEstimates) -> dict[str, Metric]:
     """Mounting, biases and attitude at the end with their sigmas."""
     out: dict[str, Any] = {}
     found, last = _estimates(answer.mean), np.asarray(answer.sigma)[-1]
@@ -268,9 +270,9 @@ def metrics_of(answer: Answer) -> dict[str, Metric]:
     return out
 
 
-def remarks(name: str, answer: Answer) -> list[str]:
+def remarks(name: str, answer: FilterEstimates) -> list[str]:
     """Sentences on what the motion did not show, and on a mounting far from the nominal one."""
-    said = []
+    remarks_found = []
     before, after = np.asarray(answer.start.sigma), np.asarray(answer.sigma)[-1]
     for block in BLOCKS:
         hidden = [
@@ -279,21 +281,21 @@ def remarks(name: str, answer: Answer) -> list[str]:
             if t > _UNKNOWN * s > 0
         ]
         if hidden and block.name in _FOUND:
-            said.append(
+            remarks_found.append(
                 f"{name}: {block.name.replace('_', ' ')} {', '.join(hidden)} was hardly observed; "
                 "its sigma is near what it was before. Another manoeuvre would show it."
             )
     size = float(np.linalg.norm(answer.mean.mounting_rad[-1]))
     if size > _LARGE_RAD:
-        said.append(
+        remarks_found.append(
             f"{name}: the slave sits {np.degrees(size):.1f} deg from its nominal mounting. Models "
             "of first order do not hold beyond 5 deg; this one keeps whole rotations, but a better "
             "nominal mounting makes it converge sooner."
         )
-    return said
+    return remarks_found
 
 
-def _started(piece: PairPiece, recorded: Recorded, delay_s: float) -> str:
+def _started(piece: PairPiece, recorded: RecordedPair, delay_s: float) -> str:
     old = f", which was {delay_s:g} s old" if delay_s else ""
     return (
         f"Aligned from {piece.begin_s:.2f} to {piece.epoch_s[-1]:.2f} s, starting from the "
@@ -303,9 +305,9 @@ def _started(piece: PairPiece, recorded: Recorded, delay_s: float) -> str:
 
 def replay(
     dataset: Dataset,
-    parameters: Replay,
+    parameters: PairReplay,
     filters: tuple[str, ...] = (),
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> Outcome:
     """Align the slave of a recorded pair, examined and cleaned; see `System.replay`.
 
@@ -315,7 +317,9 @@ def replay(
     recorded = on_one_clock(dataset)
     pieces, problems = pieces_of(recorded, parameters)
     wanted = tuple(filters) or parameters.filters
-    answers = replaying.navigated(pieces, wanted, partial(contender, parameters), progress=progress)
+    answers = replaying.run_filters(
+        pieces, wanted, partial(contender, parameters), progress=progress
+    )
     master = recorded.master
     notes = [_started(piece, recorded, parameters.master.delay) for piece in pieces]
     notes += [f"Not aligned, {problem}." for problem in problems]
@@ -341,11 +345,11 @@ def replay(
     )
 
 
-def orientation(parameters: Replay) -> tuple[float, float, float]:
+def orientation(parameters: PairReplay) -> tuple[float, float, float]:
     """Roll, pitch, yaw [rad] of the master's axes as seen from the slave's."""
     back = Rotation.from_euler(*parameters.mounting.nominal).inverse()
     roll, pitch, yaw = (float(angle) for angle in back.as_euler())
     return roll, pitch, yaw
 
 
-ALIGNMENT = Alignment("product", Replay, FILTERS, replay)
+ALIGNMENT = PairAlignment("product", PairReplay, FILTERS, replay)

@@ -28,7 +28,7 @@ Measurement: what the master is expected to read, through mounting, flexure and 
     p_m  = p_s - C_nm r                                                  position                (6)
 
 A record stamped t is of t - d. So all of (3) to (6) is of t - d, to where the slave is taken back
-by theta and dv, what its own inertial unit felt since (`Lag`):
+by theta and dv, what its own inertial unit felt since (`RecordDelay`):
 
     C_ns(t - d) = exp(omega_in d x) C_ns exp((bg d - theta) x)                                   (7)
     v_s(t - d)  = v_s - C_ns (dv - ba d) - (g - (2 omega_ie + omega_en) x v_s) d                 (8)
@@ -67,7 +67,7 @@ from robins.ins.increments import Increments
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 from robins.rotation import Rotation, left_jacobian, skew
 from robins.sim.flexure import Flexure, transition
-from robins.systems.parts import NED, Block, moved_by
+from robins.systems.parts import NED, ImuBlock, moved_by
 from robins.systems.study import SensorAxes
 
 ATTITUDE, VELOCITY, POSITION = "master_attitude", "master_velocity", "master_position"
@@ -88,7 +88,7 @@ class Installation(NamedTuple):
     lever_m: Array  # (3,) m, master to slave, master axes
 
 
-class Lag(NamedTuple):
+class RecordDelay(NamedTuple):
     """Inputs of a reading of the master, besides the state.
 
     The slave's raw increments from when the record was true to now, and the master's turn rate.
@@ -100,12 +100,12 @@ class Lag(NamedTuple):
     omega_m: ArrayLike  # (3,) rad/s, omega_im of the master when the record was true
 
 
-class _Drive(NamedTuple):
+class _ProductNoise(NamedTuple):
     noise: InsNoise
     flexure: Flexure | None
 
 
-def _swing(flexure: Flexure, block: Block) -> tuple[Array, Array]:
+def _swing(flexure: Flexure, block: ImuBlock) -> tuple[Array, Array]:
     """(2) over a block: Phi (6, 6) of (l, l'), and a factor (6, 6) of Q."""
     dt = jnp.sum(jnp.asarray(block.increments.dt))
     given = (flexure.sigma_rad, flexure.tau_s, flexure.damping)
@@ -116,7 +116,7 @@ def _swing(flexure: Flexure, block: Block) -> tuple[Array, Array]:
     return Phi, L
 
 
-def _step(drive: _Drive, x: ProductState, block: Block) -> ProductState:
+def _step(drive: _ProductNoise, x: ProductState, block: ImuBlock) -> ProductState:
     new = x._replace(ins=propagate(x.ins, block.increments, drive.noise))
     if drive.flexure is None:
         return new
@@ -124,7 +124,7 @@ def _step(drive: _Drive, x: ProductState, block: Block) -> ProductState:
     return new._replace(flexure=Phi @ x.flexure)
 
 
-def _step_linear(drive: _Drive, x: ProductState, block: Block):
+def _step_linear(drive: _ProductNoise, x: ProductState, block: ImuBlock):
     """(1): the state after a block of samples, Phi and a factor of Q."""
     ins, Phi, L = propagate_linear(x.ins, block.increments, drive.noise, segments=1)
     new = x._replace(ins=ins)
@@ -139,7 +139,7 @@ def _step_linear(drive: _Drive, x: ProductState, block: Block):
 # ---------------------------------------------------------------------------------- the master
 
 
-class _Then(NamedTuple):
+class _DelayedState(NamedTuple):
     """The slave and the master when the record was true."""
 
     v_n: Array  # (3,) of the slave
@@ -150,7 +150,7 @@ class _Then(NamedTuple):
     gained_n: Array  # (3,) m/s by the specific force since
 
 
-def _then(at: Installation, x: ProductState, lag: Lag) -> _Then:
+def _then(at: Installation, x: ProductState, lag: RecordDelay) -> _DelayedState:
     """(3), (4), (7), (8), (10)."""
     dt = jnp.asarray(lag.dt, float)
     ins, p = x.ins, x.ins.position
@@ -163,26 +163,26 @@ def _then(at: Installation, x: ProductState, lag: Lag) -> _Then:
     v_n = ins.v_n - gained_n - (gravity_n(p.lat, p.alt) - coriolis) * dt
     flexure = jnp.zeros(3) if x.flexure is None else x.flexure[:3] - x.flexure[3:] * dt
     q_ms = Rotation.from_rotvec(flexure) @ at.q_ms @ Rotation.from_rotvec(x.mounting_rad)
-    return _Then(v_n, q_ns, q_ns @ q_ms.inverse(), flexure, omega_ie + omega_en, gained_n)
+    return _DelayedState(v_n, q_ns, q_ns @ q_ms.inverse(), flexure, omega_ie + omega_en, gained_n)
 
 
-def _read_attitude(at: Installation, x: ProductState, lag: Lag) -> Rotation:
+def _read_attitude(at: Installation, x: ProductState, lag: RecordDelay) -> Rotation:
     return _then(at, x, lag).q_nm
 
 
-def _arm_velocity(at: Installation, then: _Then, lag: Lag) -> Array:
+def _arm_velocity(at: Installation, then: _DelayedState, lag: RecordDelay) -> Array:
     """Velocity [m/s, NED] of the slave about the master."""
     turning = then.q_nm.apply(jnp.cross(jnp.asarray(lag.omega_m), at.lever_m))
     return turning - jnp.cross(then.omega_in, then.q_nm.apply(at.lever_m))
 
 
-def _read_velocity(at: Installation, x: ProductState, lag: Lag) -> Array:
+def _read_velocity(at: Installation, x: ProductState, lag: RecordDelay) -> Array:
     """(5)."""
     then = _then(at, x, lag)
     return then.v_n - _arm_velocity(at, then, lag)
 
 
-def _read_position(at: Installation, x: ProductState, lag: Lag) -> Geodetic:
+def _read_position(at: Installation, x: ProductState, lag: RecordDelay) -> Geodetic:
     """(6), (9)."""
     then = _then(at, x, lag)
     dt = jnp.asarray(lag.dt, float)
@@ -190,7 +190,9 @@ def _read_position(at: Installation, x: ProductState, lag: Lag) -> Geodetic:
     return x.ins.position.retract(-back - then.q_nm.apply(at.lever_m))
 
 
-def _attitude_rows(at: Installation, x: ProductState, lag: Lag, then: _Then) -> Array:
+def _attitude_rows(
+    at: Installation, x: ProductState, lag: RecordDelay, then: _DelayedState
+) -> Array:
     """(3, n) derivative of C_nm, as a rotation vector in n; (11) where the delay is zero."""
     dt = jnp.asarray(lag.dt, float)
     frame_turn = then.omega_in * dt
@@ -212,12 +214,12 @@ def _attitude_rows(at: Installation, x: ProductState, lag: Lag, then: _Then) -> 
     return jnp.concatenate(columns, 1)
 
 
-def _linear_attitude(at: Installation, x: ProductState, lag: Lag):
+def _linear_attitude(at: Installation, x: ProductState, lag: RecordDelay):
     then = _then(at, x, lag)
     return then.q_nm, _attitude_rows(at, x, lag, then)
 
 
-def _linear_velocity(at: Installation, x: ProductState, lag: Lag):
+def _linear_velocity(at: Installation, x: ProductState, lag: RecordDelay):
     """(5) and its Jacobian, (12) where the delay is zero."""
     then = _then(at, x, lag)
     dt = jnp.asarray(lag.dt, float)
@@ -236,22 +238,26 @@ def _linear_velocity(at: Installation, x: ProductState, lag: Lag):
     return then.v_n - _arm_velocity(at, then, lag), H
 
 
-class Record(NamedTuple):
+class MasterQuantity(NamedTuple):
     """A quantity that the master reports: all that simulator, filter and report know of it."""
 
     axes: SensorAxes
     field: str  # of the master's `Nav`
     sigma: str  # among the parameters of the master, by axis
     struck: bool  # an outlier spoils it
-    read: Callable[[Installation, ProductState, Lag], Any]
+    read: Callable[[Installation, ProductState, RecordDelay], Any]
     linear: Callable[..., Any] | None = None  # likewise, with the Jacobian
 
 
 _NED = {unit: SensorAxes(unit, "NED", NED) for unit in ("rad", "m/s", "m")}
 RECORDS = {
-    ATTITUDE: Record(_NED["rad"], "q_nb", "attitude_noise", True, _read_attitude, _linear_attitude),
-    VELOCITY: Record(_NED["m/s"], "v_n", "velocity_noise", True, _read_velocity, _linear_velocity),
-    POSITION: Record(_NED["m"], "position", "position_noise", False, _read_position),
+    ATTITUDE: MasterQuantity(
+        _NED["rad"], "q_nb", "attitude_noise", True, _read_attitude, _linear_attitude
+    ),
+    VELOCITY: MasterQuantity(
+        _NED["m/s"], "v_n", "velocity_noise", True, _read_velocity, _linear_velocity
+    ),
+    POSITION: MasterQuantity(_NED["m"], "position", "position_noise", False, _read_position),
 }
 
 
@@ -273,11 +279,11 @@ def product_model(
             and bending are not modelled.
 
     Returns:
-        A model of `ProductState` whose input is a `Block` of the slave's raw increments. Its
+        A model of `ProductState` whose input is a `ImuBlock` of the slave's raw increments. Its
         sensors bear the names of `sigmas`; an attitude is a `Rotation`, a velocity (3,) NED, a
-        position a `Geodetic`; the aux of each is a `Lag`.
+        position a `Geodetic`; the aux of each is a `RecordDelay`.
     """
-    motion = moved_by(_step, _step_linear, _Drive(noise, flexure))
+    motion = moved_by(_step, _step_linear, _ProductNoise(noise, flexure))
 
     def sensor(name: str, sigma: ArrayLike) -> Sensor:
         record, noisy = RECORDS[name], jnp.broadcast_to(jnp.asarray(sigma, float), 3)
@@ -287,7 +293,7 @@ def product_model(
     return Model(motion, tuple(sensor(*one) for one in sigmas.items()))
 
 
-def lag_of(increments: Increments, delay_s: ArrayLike, omega_m: ArrayLike) -> Lag:
+def lag_of(increments: Increments, delay_s: ArrayLike, omega_m: ArrayLike) -> RecordDelay:
     """Lag of each record of the master, from the slave's own increments.
 
     Args:
@@ -297,8 +303,8 @@ def lag_of(increments: Increments, delay_s: ArrayLike, omega_m: ArrayLike) -> La
         omega_m: (E, 3) rad/s, the master's turn rate as recorded; NaN counts as zero.
 
     Returns:
-        `Lag` with a leading axis of E. Before the first increment the motion is taken to have been
-        as in it.
+        `RecordDelay` with a leading axis of E. Before the first increment the motion is taken to
+        have been as in it.
     """
     dt = jnp.asarray(increments.dt, float)
     epochs, width = dt.shape
@@ -325,4 +331,4 @@ def lag_of(increments: Increments, delay_s: ArrayLike, omega_m: ArrayLike) -> La
     _, _, q, dv = jax.lax.while_loop(reaches, back, start)
     rate = jnp.asarray(omega_m, float)
     rate = jnp.where(jnp.isfinite(rate), rate, 0.0)
-    return Lag(age, q.inverse().as_rotvec(), dv, rate)
+    return RecordDelay(age, q.inverse().as_rotvec(), dv, rate)

@@ -16,10 +16,10 @@ from robins.scenario import Dof, Parameters, Positive, Quantity, Share, Span, de
 from robins.sim.flexure import Flexure
 from robins.systems import quantities as q
 from robins.systems.parts import (
-    Cutting,
     Departure,
     Draw,
     Leg,
+    LogPartition,
     Names,
     as_array,
     refuse_too_long,
@@ -83,7 +83,7 @@ class Ship(Departure):
         return self.seconds
 
 
-class Vehicle(Departure):
+class GroundVehicle(Departure):
     """A ground vehicle that drives legs, on a road that may be rough."""
 
     kind: Literal["vehicle"]
@@ -98,7 +98,7 @@ class Vehicle(Departure):
         return sum(leg.lasts_s for leg in self.legs)
 
 
-class Slave(Parameters):
+class PairSlave(Parameters):
     """The inertial unit to be aligned; constants are drawn in each run, with these sigmas.
 
     Its errors after compensation are, as a patent of Southeast University has them, (6) and (7),
@@ -144,7 +144,7 @@ class Slave(Parameters):
         return np.asarray(self.gyro_slow) * np.sqrt(2.0 / np.asarray(self.gyro_slow_time))
 
 
-class Master(Parameters):
+class PairMaster(Parameters):
     """The records of the master; one at each epoch of the filters."""
 
     rate: q.Frequency = default("10 Hz")
@@ -155,7 +155,7 @@ class Master(Parameters):
     delay: q.Time = default("0 s")  # a record stamped t describes t - delay
 
 
-class Mounting(Parameters):
+class PairMounting(Parameters):
     """Mounting of the slave: ``C_ms = C(nominal) exp(error x)``, the error in slave axes."""
 
     nominal: q.Angles = default("0 deg")  # roll, pitch, yaw of the slave
@@ -180,7 +180,7 @@ class Structure(Parameters):
         return Flexure(sigma, time, self.damping, self.tail_dof, bending)
 
 
-class Disturbance(Parameters):
+class PairDisturbance(Parameters):
     """Disturbances unknown to the filters, unless a scenario states otherwise."""
 
     # records of the master with attitude and velocity noise that many times as large
@@ -195,7 +195,7 @@ class Disturbance(Parameters):
     dropouts: tuple[Span, ...] = ()  # no records of the master
 
 
-class Start(Parameters):
+class PairStart(Parameters):
     """One sigma of the initial errors of the slave's navigation, north, east, down.
 
     They are drawn from normal distributions; or all +1 sigma; or 1 sigma of random sign.
@@ -210,14 +210,14 @@ class Start(Parameters):
 class PairParameters(Parameters):
     """A master, a slave, what is between them, and how they move."""
 
-    manoeuvre: Annotated[Aircraft | Ship | Vehicle, pydantic.Field(discriminator="kind")]
-    slave: Slave
-    master: Master
-    start: Start
-    mounting: Mounting = pydantic.Field(default_factory=Mounting)
+    manoeuvre: Annotated[Aircraft | Ship | GroundVehicle, pydantic.Field(discriminator="kind")]
+    slave: PairSlave
+    master: PairMaster
+    start: PairStart
+    mounting: PairMounting = pydantic.Field(default_factory=PairMounting)
     lever_arm: q.Arm = default("0 m")  # master to slave, master axes
     flexure: Structure = pydantic.Field(default_factory=Structure)
-    disturbance: Disturbance = pydantic.Field(default_factory=Disturbance)
+    disturbance: PairDisturbance = pydantic.Field(default_factory=PairDisturbance)
 
     @pydantic.model_validator(mode="after")
     def _fits(self) -> PairParameters:
@@ -229,7 +229,7 @@ class PairParameters(Parameters):
         return self
 
 
-class Believed(Parameters):
+class PairAssumptions(Parameters):
     """Assumptions of the filters; left out: the stated noise, start and mounting are true."""
 
     mounting: q.AngleSizes = default("0.3 deg")  # one sigma of the mounting error
@@ -247,16 +247,16 @@ class Product(Scenario, PairParameters):
     study: str = "product"
     title: str = "Transfer alignment, closed loop"
     filters: Names = ("kf", "product")
-    believed: Believed = pydantic.Field(default_factory=Believed)
+    believed: PairAssumptions = pydantic.Field(default_factory=PairAssumptions)
     # figures pooled over time count from here, when the manoeuvre has shown what there is to see
     settle: q.Time = default("0 s")
 
 
-class Replay(Product):
+class PairReplay(Product):
     """Assumptions on a recorded pair; the log brings its own motion."""
 
     manoeuvre: (  # pyright: ignore[reportIncompatibleVariableOverride]
-        Annotated[Aircraft | Ship | Vehicle, pydantic.Field(discriminator="kind")] | None
+        Annotated[Aircraft | Ship | GroundVehicle, pydantic.Field(discriminator="kind")] | None
     ) = None
-    recording: Cutting = pydantic.Field(default_factory=Cutting)
+    recording: LogPartition = pydantic.Field(default_factory=LogPartition)
     filters: Names = ("product",)

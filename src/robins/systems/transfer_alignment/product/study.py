@@ -30,14 +30,18 @@ from robins.systems.judgement import (
     rms_by_axis,
     rms_by_component,
 )
-from robins.systems.parts import FRD, NED, Block, during, refuse_unsettled
+from robins.systems.parts import FRD, NED, ImuBlock, during, refuse_unsettled
 from robins.systems.study import Case, Contender, Limit, Recipe, StateBlock, Study, View
 from robins.systems.tables import place_arrays, track_arrays
 from robins.systems.transfer_alignment.product import model as pm
 from robins.systems.transfer_alignment.product.filters import FILTERS, VARIANTS
-from robins.systems.transfer_alignment.product.parameters import Believed, PairParameters, Product
+from robins.systems.transfer_alignment.product.parameters import (
+    PairAssumptions,
+    PairParameters,
+    Product,
+)
 from robins.systems.transfer_alignment.product.world import (
-    Course,
+    PairCourse,
     PairRun,
     lay_out,
     simulate_pair,
@@ -72,7 +76,7 @@ def installation_of(pair: PairParameters) -> pm.Installation:
     return pm.Installation(q_ms, jnp.asarray(pair.lever_arm, float))
 
 
-def model_of(pair: PairParameters, believed: Believed, flexure: Flexure | None) -> Model:
+def model_of(pair: PairParameters, believed: PairAssumptions, flexure: Flexure | None) -> Model:
     """The product model by its parameters.
 
     Raises:
@@ -97,7 +101,9 @@ def model_of(pair: PairParameters, believed: Believed, flexure: Flexure | None) 
     return pm.product_model(noise, installation_of(pair), sigmas, flexure)
 
 
-def start_sigma(pair: PairParameters, believed: Believed, flexure: Flexure | None) -> np.ndarray:
+def start_sigma(
+    pair: PairParameters, believed: PairAssumptions, flexure: Flexure | None
+) -> np.ndarray:
     """(n,) standard deviations of the initial tangent components, uncorrelated."""
     start, slave = pair.start, pair.slave
     parts = [start.attitude, start.velocity, start.position]
@@ -125,7 +131,7 @@ def _case(matched: tuple[str, ...], start: tuple[Array, Array], run: PairRun) ->
     lag = pm.lag_of(run.increments, delay_s, run.master_omega_b)
     return Case(
         start=Belief(mean, jnp.diag(sigma)),
-        u=Block(run.increments, run.noise_scale),
+        u=ImuBlock(run.increments, run.noise_scale),
         y={name: getattr(run.master, pm.RECORDS[name].field) for name in matched},
         aux=dict.fromkeys(matched, lag),
         truth=truth,
@@ -155,7 +161,7 @@ def reported(n: int, blocks: Sequence[str] = tuple(_REPORTED), frame: str = "NED
 def product_contender(
     pair: PairParameters,
     name: str = "product",
-    believed: Believed | None = None,
+    believed: PairAssumptions | None = None,
     blocks: Sequence[str] = tuple(_REPORTED),
     frame: str = "NED",
 ) -> Contender:
@@ -173,9 +179,9 @@ def product_contender(
         ValueError: no such filter, block or frame; a noise of the master that is zero.
     """
     require_known("filter", name, FILTERS)
-    told = Believed() if believed is None else believed
-    flexure = VARIANTS[name].flexure(told.flexure)
-    model, sigma = model_of(pair, told, flexure), start_sigma(pair, told, flexure)
+    assumed = PairAssumptions() if believed is None else believed
+    flexure = VARIANTS[name].flexure(assumed.flexure)
+    model, sigma = model_of(pair, assumed, flexure), start_sigma(pair, assumed, flexure)
     start = jnp.asarray(sigma), jnp.asarray(pair.master.delay)
     return Contender(
         filter=VARIANTS[name].make(),
@@ -233,7 +239,7 @@ def product_metrics(statistics: Any) -> dict[str, Metric]:
     return out | consistency(statistics) | {"diverged_runs": statistics.diverged}
 
 
-def _contender(given: Product, course: Course, name: str) -> Contender:
+def _contender(given: Product, course: PairCourse, name: str) -> Contender:
     return product_contender(given, name, given.believed)
 
 
@@ -258,7 +264,7 @@ def faults(given: PairParameters, epoch_s: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def _view(given: Product, course: Course) -> View:
+def _view(given: Product, course: PairCourse) -> View:
     refuse_unsettled("settle", given.settle, float(course.epoch_s[-1]))
     path = course.path.position
     used = (pm.ATTITUDE, pm.VELOCITY, *((pm.POSITION,) if given.believed.position else ()))

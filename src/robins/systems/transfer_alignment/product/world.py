@@ -40,17 +40,17 @@ from robins.sim.disturbance import drift_step, outlier_factor, student_t, window
 from robins.sim.flexure import simulate_flexure
 from robins.sim.ideal_imu import ideal_increments
 from robins.sim.imu_sensor import corrupt
-from robins.sim.manoeuvres import MODERATE_SEA, Bank, Sea, Wave, fly, roughen, sail
+from robins.sim.manoeuvres import MODERATE_SEA, BankedTurn, SeaMotion, Wave, fly, roughen, sail
 from robins.sim.random import Component, stream, unit
-from robins.sim.trajectory import Motion, at_lever_arm
+from robins.sim.trajectory import MotionProfile, at_lever_arm
 from robins.systems.parts import any_there, as_array, outside, signed
-from robins.systems.transfer_alignment.product.model import RECORDS, ProductState, Record
+from robins.systems.transfer_alignment.product.model import RECORDS, MasterQuantity, ProductState
 from robins.systems.transfer_alignment.product.parameters import (
     Aircraft,
-    Disturbance,
+    GroundVehicle,
+    PairDisturbance,
     PairParameters,
     Ship,
-    Vehicle,
 )
 
 SLACK_S = 1e-8  # times are rounded to nanoseconds
@@ -60,14 +60,14 @@ _NAVIGATION, _MOUNTING = 0, 1  # of the initial state
 _MASTER = unit(Component.IMU, 1)
 
 
-class Course(NamedTuple):
+class PairCourse(NamedTuple):
     """Data that all runs share: the motion, and increments of an ideal slave.
 
     This slave has its nominal mounting and its lever arm, no flexure, no mounting error and no
     sensor errors; `simulate_pair` adds these run by run.
     """
 
-    motion: Motion  # of the master
+    motion: MotionProfile  # of the master
     epoch_s: np.ndarray  # (E,)
     each: int  # K, samples in an epoch
     dt: np.ndarray  # (N,) s, N = E K
@@ -84,7 +84,7 @@ class Course(NamedTuple):
     there: np.ndarray  # (E,) bool: the record is not lost
 
 
-def motion_of(manoeuvre: Aircraft | Ship | Vehicle) -> Motion:
+def motion_of(manoeuvre: Aircraft | Ship | GroundVehicle) -> MotionProfile:
     """The motion of the master.
 
     Raises:
@@ -93,13 +93,13 @@ def motion_of(manoeuvre: Aircraft | Ship | Vehicle) -> Motion:
     m = manoeuvre
     start = Geodetic(m.latitude, m.longitude, m.height)
     if isinstance(m, Aircraft):
-        banks = [Bank(leg.bank, leg.seconds) for leg in m.legs]
+        banks = [BankedTurn(leg.bank, leg.seconds) for leg in m.legs]
         return fly(start, banks, m.speed, m.heading, m.pitch, m.roll_time)
     if isinstance(m, Ship):
         given = (m.roll, m.pitch, m.yaw, m.heave)
         sea = MODERATE_SEA
         if any(waves is not None for waves in given):
-            sea = Sea(*(_waves(waves or ()) for waves in given))
+            sea = SeaMotion(*(_waves(waves or ()) for waves in given))
         return sail(start, m.seconds, m.speed, m.heading, sea)
     legs = [leg.command() for leg in m.legs]
     return roughen(from_commands(start, legs, m.heading, m.speed), _waves(m.roll), _waves(m.pitch))
@@ -109,7 +109,7 @@ def _waves(waves) -> tuple[Wave, ...]:
     return tuple(Wave(w.amplitude, w.period, w.phase) for w in waves)
 
 
-def lay_out(pair: PairParameters) -> Course:
+def lay_out(pair: PairParameters) -> PairCourse:
     """Everything that does not depend on a run.
 
     Raises:
@@ -143,7 +143,7 @@ def lay_out(pair: PairParameters) -> Course:
     described_s = epoch_s - pair.master.delay
     described_ns = np.round(np.maximum(described_s, 0.0) * 1e9).astype(np.int64)
     there = (described_s >= -SLACK_S) & outside(pair.disturbance.dropouts, epoch_s)
-    return Course(
+    return PairCourse(
         motion=motion,
         epoch_s=epoch_s,
         each=each,
@@ -175,7 +175,7 @@ def _samples_an_epoch(slave_hz: float, master_hz: float) -> int:
     return each
 
 
-def _check_disturbance(disturbance: Disturbance, end_s: float) -> None:
+def _check_disturbance(disturbance: PairDisturbance, end_s: float) -> None:
     d = disturbance
 
     def inside(name: str, window: Span) -> None:
@@ -216,7 +216,7 @@ class PairRun(NamedTuple):
     truth: ProductState | None  # of the slave, leading axis E; None where it is not known
 
 
-def simulate_pair(pair: PairParameters, course: Course, seed: int, index: Array) -> PairRun:
+def simulate_pair(pair: PairParameters, course: PairCourse, seed: int, index: Array) -> PairRun:
     """One run of the course of a pair, from its number, which may be traced; pure."""
     initial = stream(seed, index, Component.INITIAL_STATE)
     normal = jax.random.normal(jax.random.fold_in(initial, _MOUNTING), (3,))
@@ -262,7 +262,7 @@ def start_estimate(run: PairRun) -> Nav:
     return retract(run.start, -run.initial_error)
 
 
-def _flexure(pair: PairParameters, course: Course, key: Array) -> tuple[Array, Array]:
+def _flexure(pair: PairParameters, course: PairCourse, key: Array) -> tuple[Array, Array]:
     f = pair.flexure
     if not any_there((*f.sigma, *f.bending)):
         stiff = jnp.zeros((len(course.dt) + 1, 3))
@@ -271,14 +271,14 @@ def _flexure(pair: PairParameters, course: Course, key: Array) -> tuple[Array, A
     return simulate_flexure(f.flexure, key, 1.0 / pair.slave.rate, len(course.dt), load)
 
 
-def _felt(course: Course, d: Float[Array, "n 4"]) -> tuple[Array, Array]:
+def _felt(course: PairCourse, d: Float[Array, "n 4"]) -> tuple[Array, Array]:
     """Increments of the true slave axes, (N, 3) each."""
     back = conjugate(d[:-1])
     turned = multiply(multiply(back, jnp.asarray(course.turn)), d[1:])
     return to_rotvec(turned), rotate(back, jnp.asarray(course.nominal.dv))
 
 
-def _slave_errors(pair: PairParameters, course: Course, key: Array) -> tuple[Array, ...]:
+def _slave_errors(pair: PairParameters, course: PairCourse, key: Array) -> tuple[Array, ...]:
     """Errors of theta and dv, biases of gyros and accelerometers after each sample; (N, 3) each.
 
     All errors add, so they are the reports of the unit for a body at rest in free fall.
@@ -309,14 +309,14 @@ def _slave_errors(pair: PairParameters, course: Course, key: Array) -> tuple[Arr
     return theta, dv, bias, seen.accel.bias
 
 
-def _records(pair: PairParameters, course: Course, seed: int, index: Array) -> Nav:
+def _records(pair: PairParameters, course: PairCourse, seed: int, index: Array) -> Nav:
     """Records of the master at each epoch, NaN where one is lost."""
     d, count, key = pair.disturbance, len(course.epoch_s), stream(seed, index, _MASTER)
     struck = outlier_factor(
         stream(seed, index, Component.FAULT), (count,), d.outlier_share, d.outlier_factor
     )
 
-    def noise(part: int, record: Record) -> Array:
+    def noise(part: int, record: MasterQuantity) -> Array:
         own, shape = jax.random.fold_in(key, part), (count, 3)
         tails = d.tail_dof
         white = jax.random.normal(own, shape) if tails is None else student_t(own, shape, tails)

@@ -58,7 +58,7 @@ STEEPEST_RAD = math.radians(85.0)
 # --------------------------------------------------------------------------------- the error model
 
 
-class Flight(NamedTuple):
+class SlaveFlight(NamedTuple):
     """Flight of the slave."""
 
     lat_rad: Array  # ()
@@ -71,12 +71,12 @@ class Flight(NamedTuple):
 class Interval(NamedTuple):
     """Inputs of the motion between two epochs."""
 
-    flight: Flight  # on average
+    flight: SlaveFlight  # on average
     dt_s: Array  # ()
     sigma: Array  # (12,) process noise of the interval
 
 
-def error_dynamics(flight: Flight) -> Float[Array, "12 12"]:
+def error_dynamics(flight: SlaveFlight) -> Float[Array, "12 12"]:
     """F of x' = F x, eqs. (1) to (5), with the radii of curvature taken as constant."""
     RM, RN = curvature_radii(flight.lat_rad)
     RM, RN = RM + flight.alt_m, RN + flight.alt_m
@@ -219,7 +219,7 @@ def start_with_error(start: Nav, error: ArrayLike) -> Nav:
     return estimate._replace(v_n=jnp.asarray(estimate.v_n).at[2].set(0.0))
 
 
-def navigate(start: Nav, increments: Increments) -> tuple[Nav, Flight]:
+def navigate(start: Nav, increments: Increments) -> tuple[Nav, SlaveFlight]:
     """Navigate over E blocks of K increments; pure, for any number of runs under `vmap`.
 
     Args:
@@ -250,7 +250,7 @@ def navigate(start: Nav, increments: Increments) -> tuple[Nav, Flight]:
     path = jnp.concatenate([first[None], path])
     dv = increments.dv.reshape(E * K, 3)
     felt = rotate(path[:-1, _Q], dv).reshape(E, K, 3)  # dv has the axes of a sample's begin
-    flight = Flight(
+    flight = SlaveFlight(
         lat_rad=average(path[:, _LAT]),
         alt_m=average(path[:, _ALT]),
         v_enu=swap(average(path[:, _V])),
@@ -260,7 +260,9 @@ def navigate(start: Nav, increments: Increments) -> tuple[Nav, Flight]:
     return unpacked(path[K::K]), flight
 
 
-def as_master_sees(own: Nav, flight: Flight, master: Nav) -> tuple[Flight, Float[Array, "e 3 3"]]:
+def as_master_sees(
+    own: Nav, flight: SlaveFlight, master: Nav
+) -> tuple[SlaveFlight, Float[Array, "e 3 3"]]:
     """The slave's flight and attitudes, corrected by the reports of the master.  A model linearised
     there errs less than one about the slave's own estimate, whose attitude is off by degrees. Each
     interval is turned and shifted by the difference at its end, so that the motion within it is
@@ -282,7 +284,7 @@ def as_master_sees(own: Nav, flight: Flight, master: Nav) -> tuple[Flight, Float
     def off(own: Array, reported: Array) -> Array:
         return jnp.where(jnp.isfinite(reported), own - reported, 0.0)
 
-    about = Flight(
+    about = SlaveFlight(
         lat_rad=flight.lat_rad - off(own.position.lat, master.position.lat),
         alt_m=flight.alt_m,
         v_enu=flight.v_enu - swap(off(own.v_n, master.v_n)),

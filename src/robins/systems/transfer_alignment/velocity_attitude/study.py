@@ -52,8 +52,8 @@ from robins.systems.study import (
 )
 from robins.systems.transfer_alignment.product import world as product
 from robins.systems.transfer_alignment.product.parameters import (
-    Believed,
-    Disturbance,
+    PairAssumptions,
+    PairDisturbance,
     PairParameters,
     Structure,
 )
@@ -79,11 +79,11 @@ PRODUCT = ("product", "adaptive", "product-adaptive")
 FILTERS = (*TOLD, *FIXED, *ADAPTIVE, *PRODUCT)
 
 
-class Informed(Parameters):
+class AssumedDisturbances(Parameters):
     """Disturbances that the "told" filters assume, whether they happen or not."""
 
     flexure: Structure = pydantic.Field(default_factory=Structure)
-    disturbance: Disturbance = pydantic.Field(default_factory=Disturbance)
+    disturbance: PairDisturbance = pydantic.Field(default_factory=PairDisturbance)
 
 
 class VelocityAttitude(Scenario, PairParameters):
@@ -95,16 +95,16 @@ class VelocityAttitude(Scenario, PairParameters):
     runs: Runs = 100
     filters: Names = FILTERS[:-2]
     claims: tuple[str, ...] | None = ()
-    told: Informed = pydantic.Field(default_factory=Informed)
+    told: AssumedDisturbances = pydantic.Field(default_factory=AssumedDisturbances)
     # figures pooled over time count from here
     settle: Annotated[float, Quantity("time", least="0 s")] = default("30 s")
 
 
-class World(NamedTuple):
+class VelocityAttitudeWorld(NamedTuple):
     """One run: the pair, and the open-loop errors that the filters of twelve states estimate."""
 
     pair: Any  # a `PairRun`, for the filters of the product model
-    flight: va.Flight  # over each interval, as linearised about; leading axis E
+    flight: va.SlaveFlight  # over each interval, as linearised about; leading axis E
     C_nb: Any  # (E, 3, 3) at the epochs
     velocity: Any  # (E, 2) m/s, slave minus master
     attitude: Any  # (E, 3) rad, heading, pitch, roll likewise
@@ -112,11 +112,11 @@ class World(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Course:
+class VelocityAttitudeCourse:
     """Data that all runs share."""
 
     given: VelocityAttitude
-    pair: product.Course
+    pair: product.PairCourse
 
     @cached_property
     def least_gamma(self) -> float:
@@ -130,12 +130,12 @@ class Course:
         start = va.start_with_error(self.pair.start, np.zeros(9))
         own, flight = jax.jit(va.navigate)(start, perfect)
         zeros = (jnp.zeros((E, n)) for n in (2, 3, va.STATES))
-        world = World(None, flight, va.dcm_enu(own.q_nb.wxyz), *zeros)
+        world = VelocityAttitudeWorld(None, flight, va.dcm_enu(own.q_nb.wxyz), *zeros)
         case = _case_of(self.given, "hinf-fixed", self.pair.epoch_s)(world)
         return gamma_min(va.MODEL, case.start, case.y, ATTITUDE_ROWS, case.u, case.aux)
 
 
-def lay_out(given: VelocityAttitude) -> Course:
+def lay_out(given: VelocityAttitude) -> VelocityAttitudeCourse:
     """Everything that does not depend on a run.
 
     Warns where errors will outgrow the linear model.
@@ -161,10 +161,12 @@ def lay_out(given: VelocityAttitude) -> Course:
             "disturbance.drift_step": since * np.max(np.abs(d.drift_step)),
         }
     )
-    return Course(given, pair)
+    return VelocityAttitudeCourse(given, pair)
 
 
-def simulate(given: VelocityAttitude, course: Course, seed: int, index: Array) -> World:
+def simulate(
+    given: VelocityAttitude, course: VelocityAttitudeCourse, seed: int, index: Array
+) -> VelocityAttitudeWorld:
     """One run, from its number, which may be traced; pure."""
     pair = product.simulate_pair(given, course.pair, seed, index)
     own, flown = va.navigate(va.start_with_error(pair.start, pair.initial_error), pair.increments)
@@ -173,7 +175,7 @@ def simulate(given: VelocityAttitude, course: Course, seed: int, index: Array) -
     master = pair.master._replace(q_nb=Rotation(master_q))
     flight, C_nb = va.as_master_sees(own, flown, master)
     assert pair.truth is not None
-    return World(
+    return VelocityAttitudeWorld(
         pair=pair,
         flight=flight,
         C_nb=C_nb,
@@ -186,7 +188,7 @@ def simulate(given: VelocityAttitude, course: Course, seed: int, index: Array) -
 # ------------------------------------------------------------------------- assumptions of filters
 
 
-class Noise(NamedTuple):
+class BelievedNoises(NamedTuple):
     """Believed noise at each epoch, standard deviations."""
 
     process: Any  # (E, 12)
@@ -194,7 +196,7 @@ class Noise(NamedTuple):
     attitude: Any  # (E, 3) rad, heading, pitch, roll
 
 
-def believed_noise(given: VelocityAttitude, name: str, epoch_s: np.ndarray) -> Noise:
+def believed_noise(given: VelocityAttitude, name: str, epoch_s: np.ndarray) -> BelievedNoises:
     """The noise that a filter believes in: that of the data sheets, worst axis where axes differ.
 
     A filter "told r" adds the variance of outliers in all measurements and of flexure in
@@ -208,7 +210,7 @@ def believed_noise(given: VelocityAttitude, name: str, epoch_s: np.ndarray) -> N
     rows = (sigma, [east, north], [m.attitude_noise[2], tilt, tilt])
     process, velocity, attitude = (np.tile(row, (len(epoch_s), 1)) for row in rows)
     if name == "hinf-patent-weights":  # R = I in SI units, whatever that means
-        return Noise(process, np.ones_like(velocity), np.ones_like(attitude))
+        return BelievedNoises(process, np.ones_like(velocity), np.ones_like(attitude))
     if "r" in told:
         factor = math.sqrt(1.0 + d.outlier_share * (d.outlier_factor**2 - 1.0))
         roll, pitch, heading = given.told.flexure.sigma
@@ -223,7 +225,7 @@ def believed_noise(given: VelocityAttitude, name: str, epoch_s: np.ndarray) -> N
         step = np.abs(np.asarray(swap(np.asarray(d.drift_step))))
         walk = step / math.sqrt(max(np.count_nonzero(after), 1))
         process[after, va.EPS] = np.hypot(process[after, va.EPS], walk)
-    return Noise(process, velocity, attitude)
+    return BelievedNoises(process, velocity, attitude)
 
 
 def start_sigma(given: VelocityAttitude) -> np.ndarray:
@@ -240,7 +242,7 @@ def start_sigma(given: VelocityAttitude) -> np.ndarray:
     return sigma
 
 
-def _case(noise: Noise, sigma: Array, dt_s: Array, world: World) -> Case:
+def _case(noise: BelievedNoises, sigma: Array, dt_s: Array, world: VelocityAttitudeWorld) -> Case:
     """Case of a filter of twelve states in a run; pure, and its numbers are data."""
     count = world.error.shape[0]
     return Case(
@@ -255,8 +257,10 @@ def _case(noise: Noise, sigma: Array, dt_s: Array, world: World) -> Case:
     )
 
 
-def _case_of(given: VelocityAttitude, name: str, epoch_s: np.ndarray) -> Callable[[World], Case]:
-    noise = Noise(*(jnp.asarray(a) for a in believed_noise(given, name, epoch_s)))
+def _case_of(
+    given: VelocityAttitude, name: str, epoch_s: np.ndarray
+) -> Callable[[VelocityAttitudeWorld], Case]:
+    noise = BelievedNoises(*(jnp.asarray(a) for a in believed_noise(given, name, epoch_s)))
     return Partial(
         _case, noise, jnp.asarray(start_sigma(given)), jnp.asarray(1.0 / given.master.rate)
     )
@@ -271,7 +275,7 @@ def make_filter(name: str, gamma: float = math.inf) -> Filter:
     return kalman(rules=[adaptive_h_infinity(**ADAPTIVE[name])])
 
 
-def contender(given: VelocityAttitude, course: Course, name: str) -> Contender:
+def contender(given: VelocityAttitude, course: VelocityAttitudeCourse, name: str) -> Contender:
     """A filter of `FILTERS` with its assumptions."""
     if name in PRODUCT:
         return of_product(given, name)
@@ -289,7 +293,9 @@ def contender(given: VelocityAttitude, course: Course, name: str) -> Contender:
     )
 
 
-def of_product(given: VelocityAttitude, name: str, believed: Believed | None = None) -> Contender:
+def of_product(
+    given: VelocityAttitude, name: str, believed: PairAssumptions | None = None
+) -> Contender:
     """A filter of the product model that reports as the others do.
 
     It has the assumptions of the plain ones, unless `believed` is given.
@@ -301,11 +307,11 @@ def of_product(given: VelocityAttitude, name: str, believed: Believed | None = N
     return replace(made, case=Partial(_of_pair, made.case), reported=made.reported[level])
 
 
-def _of_pair(case: Callable[[product.PairRun], Case], world: World) -> Case:
+def _of_pair(case: Callable[[product.PairRun], Case], world: VelocityAttitudeWorld) -> Case:
     return case(world.pair)
 
 
-def view(given: VelocityAttitude, course: Course) -> View:
+def view(given: VelocityAttitude, course: VelocityAttitudeCourse) -> View:
     """Report of every filter, errors being true minus estimated."""
     epoch_s, path = course.pair.epoch_s, course.pair.path
     roll, _, heading = (np.asarray(a) for a in to_euler(jnp.asarray(path.q_nb.wxyz)))

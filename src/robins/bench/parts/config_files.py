@@ -1,4 +1,4 @@
-"""Transfer of a kit to processes: its arrays lie in a file that all of them map, read only.
+"""Transfer of a config to processes: its arrays lie in a file that all of them map, read only.
 
 So the inputs of a long run are in memory once, however many parts read them, and only as far as
 they have come. Anything that pickles can be sent (PEP 574: arrays travel outside the pickle).
@@ -27,7 +27,7 @@ _PREFIX, _LOCKED = "robins-parts-", "locked"
 
 
 @contextlib.contextmanager
-def held_folder() -> Iterator[Path]:
+def private_folder() -> Iterator[Path]:
     """Make a folder that only this user can open, for as long as the context lasts."""
     _sweep()
     with contextlib.ExitStack() as stack:
@@ -64,14 +64,14 @@ def _sweep() -> None:
                     shutil.rmtree(path, ignore_errors=True)
 
 
-def put(kit: Any, path: Path) -> None:
-    """Write a kit to a file.
+def put(config: Any, path: Path) -> None:
+    """Write a config to a file.
 
     Raises:
         OSError: it cannot be written.
     """
     arrays: list[pickle.PickleBuffer] = []
-    whole = pickle.dumps(kit, protocol=5, buffer_callback=arrays.append)
+    whole = pickle.dumps(config, protocol=5, buffer_callback=arrays.append)
     places: list[tuple[int, int]] = []
     with path.open("wb") as file:
         for array in arrays:
@@ -84,7 +84,7 @@ def put(kit: Any, path: Path) -> None:
 
 
 def take(path: Path) -> Any:
-    """A kit from a file; its arrays cannot be written to.
+    """A config from a file; its arrays cannot be written to.
 
     Raises:
         OSError: it cannot be read.

@@ -37,11 +37,11 @@ def carry_out(name: str, *given: Any, out: Path, as_json: bool, **settings: Any)
             folder = workbench.publishing(out, command=command, progress=writing)
             publish = held.enter_context(folder)
             outcome = getattr(workbench, name)(*given, progress=progress, **settings)
-        deliver(outcome, lambda: publish(outcome), writing, as_json)
+        print_and_write(outcome, lambda: publish(outcome), writing, as_json)
     return outcome
 
 
-def deliver(
+def print_and_write(
     outcome: Outcome, write: Callable[[], Result], writing: Progress, as_json: bool
 ) -> None:
     """Print what was found, have it written, print where it is; or one object for scripts.
@@ -92,6 +92,6 @@ def _warn(outcome: Outcome, as_json: bool) -> None:
         click.secho(f"Warning: {warning}", fg="yellow", bold=True, err=as_json)
 
 
-def say(data: Any, text: str, as_json: bool) -> None:
+def print_data(data: Any, text: str, as_json: bool) -> None:
     """Print what has no folder: one object for scripts, or text."""
     click.echo(json.dumps(data, indent=2, ensure_ascii=False) if as_json else text)

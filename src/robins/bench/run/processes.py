@@ -14,8 +14,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from robins.bench.parts.config_files import private_folder, put
 from robins.bench.parts.idle import idleness
-from robins.bench.parts.kits import held_folder, put
 from robins.bench.parts.node import REALTIME
 from robins.bench.parts.station import path_of
 from robins.bench.rig import Rig
@@ -24,28 +24,28 @@ _ERROR = re.compile(r"[\w.]*(Error|Exception|Interrupt)\b")
 _GRACE_S = 2.0  # between the signal to stop and being killed
 
 
-class Death(NamedTuple):
+class ProcessExit(NamedTuple):
     """A process that has ended."""
 
     part: str
     code: int  # negative: the signal that ended it
-    said: str  # its last words on standard error
+    error_output: str  # its last words on standard error
 
     def __str__(self) -> str:
         how = f"ended with status {self.code}"
         if self.code < 0:
             with contextlib.suppress(ValueError):
                 how = f"was killed by {signal.Signals(-self.code).name}"
-        return f"'{self.part}' {how}" + (f": {self.said}" if self.said else "")
+        return f"'{self.part}' {how}" + (f": {self.error_output}" if self.error_output else "")
 
 
-class Crew:
+class PartProcesses:
     """Processes, one a part; a context that ends them all however it is left."""
 
     def __init__(
         self,
         rig: Rig,
-        kit: Any,
+        config: Any,
         realtime: bool = False,
         restarts: bool = False,
         programs: Mapping[str, Path] = MappingProxyType({}),
@@ -54,22 +54,22 @@ class Crew:
 
         Args:
             rig: whose parts they are.
-            kit: for all of them.
+            config: for all of them.
             realtime: whether they request a real-time scheduler.
             restarts: whether they save their memory, to be restarted from it.
             programs: in the place of a part of the rig, by part; each is given the path of a port.
         """
-        self._rig, self._kit, self._programs = rig, kit, programs
+        self._rig, self._config, self._programs = rig, config, programs
         self._realtime, self._restarts = realtime, restarts
         self._folder: Path | None = None
         self._held = contextlib.ExitStack()
         self._running: dict[str, subprocess.Popen] = {}
         self._idle_s = idleness()
 
-    def __enter__(self) -> Crew:
+    def __enter__(self) -> PartProcesses:
         with contextlib.ExitStack() as stack:
-            self._folder = stack.enter_context(held_folder())
-            put(self._kit, self._folder / "kit")
+            self._folder = stack.enter_context(private_folder())
+            put(self._config, self._folder / "kit")
             self._held = stack.pop_all()
         return self
 
@@ -122,13 +122,13 @@ class Crew:
         assert self._folder is not None
         return path_of(self._folder, part, step).exists()
 
-    def deaths(self, among: str | None = None) -> list[Death]:
+    def deaths(self, among: str | None = None) -> list[ProcessExit]:
         """Processes that have ended since the last call; of one part, or of all."""
         asked = {k: p for k, p in self._running.items() if among in (None, k)}
         dead = [(part, code) for part, p in asked.items() if (code := p.poll()) is not None]
         for part, _ in dead:
             del self._running[part]
-        return [Death(part, code, self._said(part)) for part, code in dead]
+        return [ProcessExit(part, code, self._said(part)) for part, code in dead]
 
     def kill(self, part: str) -> None:
         """Kill a part at once, as a fault."""

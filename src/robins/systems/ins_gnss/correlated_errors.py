@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from robins.earth import curvature_radii
-from robins.systems.ins_gnss.parameters import Replay
+from robins.systems.ins_gnss.parameters import InsGnssReplay
 from robins.systems.ins_gnss.recording import Log
 
 LEAST = 0.3  # share of the variance from which on it is taken to last; less may be chance
@@ -65,7 +65,7 @@ def _spread(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     return out
 
 
-def with_lasting(parameters: Replay, log: Log) -> tuple[Replay, list[str]]:
+def with_correlated_share(parameters: InsGnssReplay, log: Log) -> tuple[InsGnssReplay, list[str]]:
     """The parameters with the share that lasts, and a note where it was found from the log."""
     if parameters.gnss.lasting_share is not None:
         return parameters, []

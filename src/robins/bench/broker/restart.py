@@ -18,15 +18,15 @@ from robins.bench.wire.frames import Header, encode_frame
 from robins.bench.wire.receiver import Receiver
 from robins.bench.wire.schema import BARE, NUMBERS
 
-Told = tuple[int | None, bytes]
+SentFrame = tuple[int | None, bytes]
 """Bytes that went out to a part, after the step of the tick that they are; None: other frames."""
 
 
-class History:
+class SentFrames:
     """Frames sent to a part since it last saved its memory.
 
     Attributes:
-        told: those frames.
+        sent_frames: those frames.
         since: the step after which the memory was saved; -1: never.
     """
 
@@ -36,56 +36,56 @@ class History:
         Args:
             is_there: whether the memory of a step has been written.
         """
-        self.told: list[Told] = []
+        self.sent_frames: list[SentFrame] = []
         self.since = -1
         self._is_there = is_there
 
     def add(self, step: int | None, raw: bytes) -> None:
-        """Remember what goes out, as `Told`."""
-        self.told.append((step, raw))
+        """Remember what goes out, as `SentFrame`."""
+        self.sent_frames.append((step, raw))
 
     def forget(self) -> None:
         """Start again: the part has lost its memory and has received nothing."""
-        self.told.clear()
+        self.sent_frames.clear()
         self.since = -1
 
     def answered(self, step: int) -> None:
         """Drop frames up to a step whose memory the part has saved."""
         if is_due(step) and step > self.since and self._is_there(step):
-            first = next(k for k, (of, _) in enumerate(self.told) if of == step)
-            del self.told[: first + 1]
+            first = next(k for k, (of, _) in enumerate(self.sent_frames) if of == step)
+            del self.sent_frames[: first + 1]
             self.since = step
 
 
 def catch_up(
     link: Link,
-    told: Sequence[Told],
+    sent_frames: Sequence[SentFrame],
     begin: bytes,
     answered: int,
     patience_s: float,
-    glance: Callable[[], None],
+    poll_processes: Callable[[], None],
     idle_s: Callable[[], float] = lambda: math.inf,
 ) -> None:
     """Wait for the hello of a restarted part, and bring it to the state of the old one.
 
     Args:
         link: its link; nothing else reads or writes it meanwhile.
-        told: all frames sent to the old one since the memory of this one, in order.
+        sent_frames: all frames sent to the old one since the memory of this one, in order.
         begin: the frame that begins the run.
         answered: the last step whose tick the old one answered; ticks beyond are sent, but their
             answers are left to the broker. -1: none.
         patience_s: for its hello, and for each answer.
-        glance: called now and then.
+        poll_processes: called now and then.
         idle_s: for how long its process has done nothing [s]; one that computes is waited for.
 
     Raises:
         BenchError: it does not answer.
         OSError: the far end is gone.
     """
-    talk = _Talk(link, patience_s, glance, idle_s)
+    talk = _Dialogue(link, patience_s, poll_processes, idle_s)
     talk.until("hello", None)
     talk.say(begin)
-    for step, raw in told:
+    for step, raw in sent_frames:
         talk.say(raw)
         if step is not None and step <= answered:
             talk.until("done", step)
@@ -98,16 +98,16 @@ def beginning(run: int, step_ns: int) -> bytes:
     )
 
 
-class _Talk:
+class _Dialogue:
     def __init__(
         self,
         link: Link,
         patience_s: float,
-        glance: Callable[[], None],
+        poll_processes: Callable[[], None],
         idle_s: Callable[[], float],
     ):
         self._link, self._patience_s = link, patience_s
-        self._glance, self._idle_s = glance, idle_s
+        self._poll, self._idle_s = poll_processes, idle_s
         self._receiver = Receiver()
         self._come: list[tuple[int, bytes]] = []
 
@@ -134,7 +134,7 @@ class _Talk:
                     f"'{self._link.name}' was restarted, but there is no {what} from it in "
                     f"{self._patience_s:g} s"
                 )
-            self._glance()
+            self._poll()
             if select.select([self._link.fd], [], [], 0.05)[0]:
                 for frame in self._receiver.feed(os.read(self._link.fd, 65536)):
                     self._come.append((frame.header.type, frame.payload))

@@ -11,18 +11,18 @@ import threading
 from collections.abc import Sequence
 
 from robins.errors import RobinsError
-from robins.program.stages import Loop, Staged
+from robins.program.stages import AxisLoop, StagedFunction
 
 LOOP_S = 0.6  # of the compiler, for any loop
 NODE_S = 3e-4  # and for a node of its program (`benchmarks/campaigns.py --compile`)
 SAVED = 0.5  # of the interpreter's time, by compiled lanes (`benchmarks/program.py`)
 
 
-class HandOver:
+class CompilationTrigger:
     """The loops of a campaign, interpreted until compiling them pays."""
 
-    def __init__(self, stages: Sequence[Staged]):
-        self._loops: list[Loop] = [
+    def __init__(self, stages: Sequence[StagedFunction]):
+        self._loops: list[AxisLoop] = [
             loop for staged in stages for loop in staged.loops if loop.is_worth
         ]
         self._each_s: float | None = None  # for a run, on one core

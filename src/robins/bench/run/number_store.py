@@ -21,7 +21,7 @@ _PIECE = 1 << 17  # numbers written at once
 Shapes = Mapping[str, tuple[tuple[int, ...], float | int]]  # by name, with what fills them
 
 
-class Room:
+class NumberStore:
     """Arrays of 64-bit numbers by name.
 
     Attributes:

@@ -23,20 +23,26 @@ from robins.filters.kalman import FilterState
 from robins.scenario import ScenarioError
 from robins.sim.rate_table import RateTable
 from robins.systems.satellite.model import ADDITIVE, MULTIPLICATIVE, Build, make_filter
-from robins.systems.satellite.nodes import Given, Row, StateForm, Vehicle, apart
+from robins.systems.satellite.nodes import (
+    LoopConstants,
+    StateForm,
+    StepInputs,
+    VehicleState,
+    compiled_alone,
+)
 from robins.systems.satellite.parameters import AttitudeLoop
 
 _BLOCK = 1024  # rows of a run that a part has as vectors at a time
 
 
-class Kit(NamedTuple):
+class SatelliteConfig(NamedTuple):
     """Complete input of a run of the satellite; E steps."""
 
     step_ns: int
     due: np.ndarray  # (E,) bool, whether a step ends with a star frame
-    given: Given
-    rows: Row  # leading axis E, NumPy
-    vehicle: Vehicle  # before the first step
+    given: LoopConstants
+    rows: StepInputs  # leading axis E, NumPy
+    vehicle: VehicleState  # before the first step
     build: Build
     model: Model
     start: Belief | FilterState
@@ -65,8 +71,8 @@ class Kit(NamedTuple):
         return int(np.argmin(self.due)), int(np.argmax(self.due))
 
 
-def prepare(setup: Any, given: AttitudeLoop) -> Kit:
-    """The kit of a run of the bench.
+def prepare(setup: Any, given: AttitudeLoop) -> SatelliteConfig:
+    """The config of a run of the bench.
 
     Raises:
         ScenarioError: the filter has no place in a program of C.
@@ -78,13 +84,15 @@ def prepare(setup: Any, given: AttitudeLoop) -> Kit:
         fix = f'leave machine = "{setup.machine}" out, or choose another filter'
         raise ScenarioError([f"machine: {what}; {fix}"])
     table = None if setup.table is None else setup.table.table()
-    return kit_for(given, setup.filter, setup.seed, table=table)._replace(machine=setup.machine)
+    return satellite_config(given, setup.filter, setup.seed, table=table)._replace(
+        machine=setup.machine
+    )
 
 
-def kit_for(
+def satellite_config(
     given: AttitudeLoop, name: str, seed: int, index: int = 0, table: RateTable | None = None
-) -> Kit:
-    """The kit of a run: the same numbers that run ``index`` of a campaign of this seed has.
+) -> SatelliteConfig:
+    """The config of a run: the same numbers that run ``index`` of a campaign of this seed has.
 
     Args:
         given: the satellite.
@@ -112,7 +120,7 @@ def kit_for(
     loop = case.loop
     assert loop is not None
     assert isinstance(loop.react, Partial)
-    return Kit(
+    return SatelliteConfig(
         step_ns=round(given.step * 1e9),
         due=np.asarray(course.due),
         given=loop.react.args[0],
@@ -126,14 +134,14 @@ def kit_for(
     )
 
 
-def compiled(kit: Kit, function: Callable) -> Callable:
+def compiled(config: SatelliteConfig, function: Callable) -> Callable:
     """A pure function as the parts of a run compute it: by JAX, or as a program."""
-    if kit.machine == "jax":
+    if config.machine == "jax":
         return jax.jit(function)
     # what runs by JAX does not need it
     from robins.program import compiled_step, interpreted_step, native
 
-    engine = compiled_step if kit.machine == "c" else interpreted_step
+    engine = compiled_step if config.machine == "c" else interpreted_step
     made: list[Callable] = []
 
     def call(*args: Any) -> Any:
@@ -144,14 +152,14 @@ def compiled(kit: Kit, function: Callable) -> Callable:
     return call
 
 
-def driven(kit: Kit, node: Callable) -> Callable:
+def driven(config: SatelliteConfig, node: Callable) -> Callable:
     """A node compiled, driven by the rows of a run.
 
     A row travels as one vector: to be given an array more costs compiled code more than most nodes
     compute.
 
     Args:
-        kit: with the rows.
+        config: with the rows.
         node: ``(given, *args, row) -> out``, kept apart as `robins.systems.satellite.nodes.react`
             does.
 
@@ -159,14 +167,14 @@ def driven(kit: Kit, node: Callable) -> Callable:
         ``(step, *args, begins=()) -> out``; a step beyond the last has the row of the last, so that
         a part may compute beyond it. ``begins`` takes the place of the first numbers of the row.
     """
-    columns, shape = jax.tree_util.tree_flatten(kit.rows)
-    steps = len(kit.due)
+    columns, shape = jax.tree_util.tree_flatten(config.rows)
+    steps = len(config.due)
     ends = np.cumsum([x[0].size for x in columns])
 
-    def run(given: Given, numbers: Array, *args: Any):
+    def run(given: LoopConstants, numbers: Array, *args: Any):
         pieces = zip(jnp.split(numbers, ends[:-1]), columns, strict=True)
         row = shape.unflatten([p.reshape(x.shape[1:]).astype(x.dtype) for p, x in pieces])
-        return apart(node, given, *args, row)
+        return compiled_alone(node, given, *args, row)
 
     @lru_cache(maxsize=1)
     def block(number: int) -> np.ndarray:
@@ -174,8 +182,12 @@ def driven(kit: Kit, node: Callable) -> Callable:
         return np.concatenate([x.reshape(len(x), -1).astype(float) for x in some], axis=1)
 
     # JAX is given what stays the same, as `react` is; in a program it is folded.
-    by_jax = kit.machine == "jax"
-    call = partial(jax.jit(run), kit.given) if by_jax else compiled(kit, partial(run, kit.given))
+    by_jax = config.machine == "jax"
+    call = (
+        partial(jax.jit(run), config.given)
+        if by_jax
+        else compiled(config, partial(run, config.given))
+    )
 
     def at(step: int, *args: Any, begins: Sequence[float] | np.ndarray = ()):
         number, row = divmod(min(step, steps - 1), _BLOCK)

@@ -22,11 +22,11 @@ from robins.scenario import Parameters, Quantity
 _KINDS = {known[0]: kind for kind, known in reversed(units.KINDS.items())}  # by the unit of the SI
 
 
-class SayError(RobinsError, ValueError):
+class OperatorMessageError(RobinsError, ValueError):
     """An operator message that the bench cannot send; names the message, field and limit."""
 
 
-class Desk(NamedTuple):
+class Console(NamedTuple):
     """Operator messages of a rig.
 
     Attributes:
@@ -48,21 +48,21 @@ class Desk(NamedTuple):
                 message has that for missing, else 0.
 
         Raises:
-            SayError: the bench does not send this message, it has no such field, or a value is
-                beyond its limits.
+            OperatorMessageError: the bench does not send this message, it has no such field, or a
+                value is beyond its limits.
         """
         if message not in self.console:
             known = f"{hint(message, self.console)} It says {', '.join(self.console) or 'nothing'}"
-            raise SayError(f"message: the bench does not say '{message}'{known}")
+            raise OperatorMessageError(f"message: the bench does not say '{message}'{known}")
         blank = {f.name: _blank(f) for f in self.wire.message(message).fields}
         try:
             payload = self.wire.encode(message, blank | dict(values))
         except RecordError as error:
-            raise SayError(str(error)) from None
+            raise OperatorMessageError(str(error)) from None
         if why := self.wire.unsound(message, payload):
-            raise SayError(f"message '{message}': {why.text}")
+            raise OperatorMessageError(f"message '{message}': {why.text}")
         if no := self.refuses(message, self.wire.decode(message, payload)):
-            raise SayError(f"message '{message}': {no}")
+            raise OperatorMessageError(f"message '{message}': {no}")
         return payload
 
 
@@ -71,7 +71,7 @@ def _blank(f: Field) -> Any:
     return [nothing] * f.length
 
 
-class Saying(Parameters):
+class OperatorMessage(Parameters):
     """Operator message `at` a time of the run: at the first boundary of steps from then on, and not
     before the end of the first step.
 
@@ -79,43 +79,49 @@ class Saying(Parameters):
     where the message allows that, else 0. Of two in one step the later one stands.
     """
 
-    desk: ClassVar[Desk] = Desk()
+    operator_console: ClassVar[Console] = Console()
 
     at: Annotated[float, Quantity("time", least="0 s")]
     message: str
 
     @pydantic.model_validator(mode="after")
-    def _sound(self) -> Saying:
+    def _sound(self) -> OperatorMessage:
         _ = self.payload
         return self
 
     @property
     def payload(self) -> bytes:
         """Encoded message."""
-        given = self.model_fields_set - set(Saying.model_fields)
-        return self.desk.payload(self.message, {name: getattr(self, name) for name in given})
+        given = self.model_fields_set - set(OperatorMessage.model_fields)
+        return self.operator_console.payload(
+            self.message, {name: getattr(self, name) for name in given}
+        )
 
     def step(self, step_ns: int) -> int:
         """First step whose parts receive it, from 1."""
         return max(1, -(-round(self.at * 1e9) // step_ns))
 
 
-def sayings_of(desk: Desk) -> type[Saying]:
+def operator_messages_of(operator_console: Console) -> type[OperatorMessage]:
     """Operator messages of a rig as parameters: every field of its messages.
 
     Raises:
-        SayError: two messages have a field of one name that is not the same.
+        OperatorMessageError: two messages have a field of one name that is not the same.
     """
     fields: dict[str, Field] = {}
-    for f in (f for name in desk.console for f in desk.wire.message(name).fields):
+    for f in (
+        f for name in operator_console.console for f in operator_console.wire.message(name).fields
+    ):
         same = fields.setdefault(f.name, f)
         if (same.kind, same.length, same.unit) != (f.kind, f.length, f.unit) or hasattr(
-            Saying, f.name
+            OperatorMessage, f.name
         ):
-            raise SayError(f"field '{f.name}' of the console is there twice and not the same")
+            raise OperatorMessageError(
+                f"field '{f.name}' of the console is there twice and not the same"
+            )
     typed: dict[str, Any] = {name: (_type(f) | None, None) for name, f in fields.items()}
-    made = pydantic.create_model("Saying", __base__=Saying, **typed)
-    made.__doc__, made.desk = Saying.__doc__, desk
+    made = pydantic.create_model("OperatorMessage", __base__=OperatorMessage, **typed)
+    made.__doc__, made.operator_console = OperatorMessage.__doc__, operator_console
     return made
 
 
