@@ -129,8 +129,8 @@ class PageView(NamedTuple):
         counts: (arrays, steps done) -> what was counted, by name.
         offered: faults that can be injected, each with its label; left out: those of every line,
             and those of sensors and actuators that need no parameter.
-        console_messages: operator messages, by label: (arrays, config, last step that was done) -> the
-            message and its values.
+        console_messages: what the operator can send, by label: (arrays, config, last step that was
+            done) -> the message and its values.
     """
 
     signals: Callable[[Any], list[Signal]]

@@ -158,14 +158,6 @@ def replay(
         nees = float(np.mean(ratio**2)) if ratio.size else float("nan")
         return found | {"heading_nees": nees} | share
 
-    notes = _sentences(log, answers)
-    if dataset.mag is None:
-        notes.append("There is no magnetometer in this log: the heading is that of the gyros.")
-    if north is not None:
-        notes.append(
-            f"North is true north: the field of the Earth is turned by {math.degrees(north):.1f} "
-            "deg at the first fix (World Magnetic Model)."
-        )
     lasted = np.asarray(log.world.u.samples.dt_s)
     warned = monitor.of_samples(log.counts, len(log.time_ns))
     for name, answer in answers.items():
@@ -179,10 +171,21 @@ def replay(
         metrics=metrics,
         variables=variables,
         counts=dict(dataset.counts) | log.counts | {"steps_not_taken": lost},
-        notes=notes,
+        notes=[*_sentences(log, answers), *_about_north(dataset, north)],
         origin_ns=int(log.time_ns[0]),
     )
     return replace(outcome, warnings=[*warned, *outcome.warnings])
+
+
+def _about_north(dataset: Dataset, north: float | None) -> list[str]:
+    if dataset.mag is None:
+        return ["There is no magnetometer in this log: the heading is that of the gyros."]
+    if north is None:
+        return []
+    return [
+        f"North is true north: the field of the Earth is turned by {math.degrees(north):.1f} "
+        "deg at the first fix (World Magnetic Model)."
+    ]
 
 
 def _answers(
