@@ -178,14 +178,15 @@ def replay(
 
 
 def _about_north(dataset: Dataset, north: float | None) -> list[str]:
+    notes = []
     if dataset.mag is None:
-        return ["There is no magnetometer in this log: the heading is that of the gyros."]
-    if north is None:
-        return []
-    return [
-        f"North is true north: the field of the Earth is turned by {math.degrees(north):.1f} "
-        "deg at the first fix (World Magnetic Model)."
-    ]
+        notes.append("There is no magnetometer in this log: the heading is that of the gyros.")
+    if north is not None:
+        notes.append(
+            f"North is true north: the field of the Earth is turned by {math.degrees(north):.1f} "
+            "deg at the first fix (World Magnetic Model)."
+        )
+    return notes
 
 
 def _answers(
