@@ -281,7 +281,7 @@ def test_a_file_in_place_of_a_campaign_is_bad_input(tmp_path, capsys, command):
 def test_a_worker_that_finds_the_disk_full_is_told_once(monkeypatch):
     error = RobinsError("cannot write shards/a: No space left", "out", f"make room; {GOES_ON}")
     monkeypatch.setattr(work._Process, "status", 1)
-    monkeypatch.setattr(work._Process, "said", f"robins: a warning\nrobins: {error}")
+    monkeypatch.setattr(work._Process, "error_output", f"robins: a warning\nrobins: {error}")
     ended = object.__new__(work._Process)
     with pytest.raises(RobinsError) as caught:
         work._judged(ended, "out")
@@ -289,7 +289,7 @@ def test_a_worker_that_finds_the_disk_full_is_told_once(monkeypatch):
         "out: a worker failed: cannot write shards/a: No space left; make room; the same command "
         "goes on."
     )
-    monkeypatch.setattr(work._Process, "said", "")
+    monkeypatch.setattr(work._Process, "error_output", "")
     with pytest.raises(RobinsError, match="ended with 1; the same command goes on"):
         work._judged(ended, "out")
 

@@ -139,7 +139,7 @@ def with_matrices(x):
 def test_what_a_template_writes_has_the_nodes_of_a_walk(function, templates, monkeypatch):
     x, written = np.array([0.3, 0.7, 1.9]), []
     write = calls.write_template
-    monkeypatch.setattr(calls, "written", lambda *all_: written.append(1) or write(*all_))
+    monkeypatch.setattr(calls, "write_template", lambda *all_: written.append(1) or write(*all_))
     program = trace(function, x)
     assert len(written) >= templates
     for found, wanted in zip(Native(program, interpreted_step)(x), function(x), strict=True):

@@ -104,7 +104,7 @@ class InsGnssRig(Rig):
     sends: ClassVar = {"imu": ("sample",), "gnss": ("fix",), "navigation": ("state", "epoch")}
     takes: ClassVar = {"imu": (), "gnss": (), "navigation": ("sample", "fix")}
     code = f"{__name__}.navigating"
-    parameters = f"{code}:Journey"
+    parameters = f"{code}:NavigationParameters"
     kept = ("state", "epoch")
     exported = "navigation"
     prepare = later(f"{code}:prepare")

@@ -123,7 +123,7 @@ class SatelliteRig(Rig):
     truth = "motion"
     kept = ("motion", "estimate", "innovation", "wheels", *CONSOLE)
     example = exported = "adm"
-    prepare = later(f"{__name__}.kit:prepare")
+    prepare = later(f"{__name__}.config:prepare")
     refuses = later(f"{__name__}.reference:refuses")
     topics = later(f"{__name__}.judging:topics")
     inside = later(f"{__name__}.judging:inside")
