@@ -46,15 +46,15 @@ def main() -> None:
         record = Path(folder) / "bench.mcap"
         flight = changed(read("satellite/s1"), {"seconds": asked.seconds, "machine": asked.machine})
         ran = Session(flight, record).run()
-        inside(ran.kit)  # compiles
+        inside(ran.config)  # compiles
         began = time.perf_counter()
-        alone = inside(ran.kit)
+        alone = inside(ran.config)
         spent = (time.perf_counter() - began) / ran.steps
         steps = ran.steps / ran.seconds
         print(f"lock-step, seven processes   {steps:10.0f} steps/s")
         ratio = 1.0 / spent / steps
         print(f"one program                  {1.0 / spent:10.0f} steps/s, {ratio:.0f} times")
-        print(f"difference                   {difference(ran.flown, alone):10.3g}")
+        print(f"difference                   {difference(ran.series, alone):10.3g}")
         print(f"record                       {record.stat().st_size / ran.steps:10.0f} bytes/step")
         print(ran.latencies.table())
         cores = sorted(os.sched_getaffinity(0))
@@ -64,7 +64,7 @@ def main() -> None:
         print(f"each core alone, {LOOK_S:g} s        {len(lost):6d} gaps above {GAP_MS:g} ms")
         print(f"above 3 ms, and the longest  {long:6d}, {max(lost, default=0.0):.1f} ms")
         real = changed(flight, {"clock": "realtime", "rate": 100.0})
-        ran = Session(real, record, kit=ran.kit).run()
+        ran = Session(real, record, config=ran.config).run()
         late = ran.latencies.summary()
         print(f"real time, 100 Hz            {late['missed']:6d} of {ran.steps} deadlines missed")
         print(f"lateness p50, p99, max [us]  {late['cycle']['lateness_us']}")

@@ -40,9 +40,9 @@ def flown(case: str, filter_: str, seed: int, seconds: float) -> dict:
     told = figures(flight, ran, run_figures(flight, ran), None)
     # As in the specification: peaks and figures of the time from the fault on.
     after = slice(round(600.0 / flight.given.step), None)
-    error = judging.attitude_error(ran.flown)
-    wanted = reference_q_ib(ran.kit, ran.flown, ran.steps)
-    pointing = judging.turn(wanted, ran.flown["motion.q_ib"])
+    error = judging.attitude_error(ran.series)
+    wanted = reference_q_ib(ran.config, ran.series, ran.steps)
+    pointing = judging.turn(wanted, ran.series["motion.q_ib"])
     return told | {
         "attitude_peak": judging.peak_arcsec(error, after),
         "attitude_end": told["attitude_end_arcsec"],

@@ -102,7 +102,8 @@ def informed(given: VelocityAttitude, epoch_s: np.ndarray) -> Contender:
     told = Motion(
         *(Partial(told_part, motion) for told_part in (told_step, told_noise, told_linear))
     )
-    return own(base)._replace(
+    return replace(
+        own(base),
         filter=WEIGHED if d.outlier_share else PLAIN,
         model=Model(told, base.model.sensors),
         case=Partial(told_case, base.case, jnp.asarray(gyro), jnp.asarray(jump)),

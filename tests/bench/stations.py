@@ -152,7 +152,7 @@ class Threads(PartProcesses):
         if part in {*self._programs, *self.processes}:
             return super().start(part, port, since)
         (self._folder / f"{part}.txt").touch()
-        given = [parts(self._kit, self._rig)[part], self._rig.wire]
+        given = [parts(self._config, self._rig)[part], self._rig.wire]
         if self._restarts:
             memory = None if since < 0 else path_of(self._folder, part, since).read_bytes()
             given += [memory, partial(save_memory, self._folder, part)]

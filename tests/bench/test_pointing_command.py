@@ -223,11 +223,21 @@ def test_a_quaternion_of_another_length_is_not_followed(of, asked):
 def test_control_follows_what_it_hears_alone(of, asked):
     """A frame that is lost on its line is not followed; it stays on its course."""
     loop = Loop(of).run(50)
-    loop.to("acm", "reference", RIG.desk.payload("reference", {"q_ib": asked}), 49 * of.step_ns)
+    loop.to(
+        "acm",
+        "reference",
+        RIG.operator_console.payload("reference", {"q_ib": asked}),
+        49 * of.step_ns,
+    )
     loop.run(100)  # it came too late: its step was over
     course = np.asarray(of.rows.course.ref_end_q_ib)
     assert np.max(away(loop.all("motion", "q_ib"), course[:150])) < 0.1
-    loop.to("acm", "reference", RIG.desk.payload("reference", {"q_ib": asked}), 150 * of.step_ns)
+    loop.to(
+        "acm",
+        "reference",
+        RIG.operator_console.payload("reference", {"q_ib": asked}),
+        150 * of.step_ns,
+    )
     loop.run(100)
     assert away(loop.all("motion", "q_ib")[-1], course[249]) > 0.3
 
@@ -237,7 +247,12 @@ def test_control_follows_what_it_hears_alone(of, asked):
 
 def mode(loop: Loop, **values: int) -> None:
     for part in ("adm", "acm"):
-        loop.to(part, "mode", RIG.desk.payload("mode", values), loop.step * loop.config.step_ns)
+        loop.to(
+            part,
+            "mode",
+            RIG.operator_console.payload("mode", values),
+            loop.step * loop.config.step_ns,
+        )
 
 
 def test_control_stands_by_while_the_determination_goes_on(of):
@@ -335,7 +350,7 @@ def test_all_that_the_page_offers_can_be_said(of):
     series = Telemetry(RIG, 4, of.step_ns).series
     for label, says in SAYS.items():
         message, values = says(series, of, 2)
-        said = WIRE.decode(message, RIG.desk.payload(message, values))
+        said = WIRE.decode(message, RIG.operator_console.payload(message, values))
         if message == "mode":
             continue
         assert np.isnan(said["q_ib"][0]) == (label == "back to the course")

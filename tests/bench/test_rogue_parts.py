@@ -263,7 +263,7 @@ def test_a_part_that_dies_again_and_again_fails_the_run(monkeypatch, restarts, w
 
     on_threads(monkeypatch, Mortal)
     mortal = session(changed(FLIGHT, {"on_death": "restart", "restarts": restarts}))
-    monkeypatch.setattr(mortal, "_poll", lambda: mortal.done > 2 and mortal._bury())
+    monkeypatch.setattr(mortal, "_poll", lambda: mortal.done > 2 and mortal._reap())
     result = mortal.run()
     assert result.failure.startswith("'adm' was killed by SIGKILL, at 0.4 s of the run; that is ")
     assert result.failure.endswith(why)

@@ -107,9 +107,9 @@ def test_a_folder_that_is_not_there_is_told(on_disk, tmp_path):
 
 def test_an_interrupted_process_leaves_nothing(tmp_path):
     code = (
-        "import sys; from robins.bench.run import room; from pathlib import Path; import time\n"
-        "import numpy; room.LARGE = 0\n"
-        "r = room.Room({'x': ((1000, 3), numpy.nan)}, Path(sys.argv[1]))\n"
+        "import sys; from robins.bench.run import number_store as s; from pathlib import Path\n"
+        "import time; import numpy; s.LARGE = 0\n"
+        "r = s.NumberStore({'x': ((1000, 3), numpy.nan)}, Path(sys.argv[1]))\n"
         "print('ready', flush=True); time.sleep(60)"
     )
     command = [sys.executable, "-c", code, str(tmp_path)]

@@ -310,7 +310,7 @@ def test_a_clock_that_was_set_is_a_new_start(live):
 
 def test_which_stamps_come_in():
     door, fine = TimestampGate(1.0, 3), np.zeros(6)
-    ask = lambda seconds: door.ask(round(seconds * 1e9), fine)  # noqa: E731
+    ask = lambda seconds: door.check(round(seconds * 1e9), fine)  # noqa: E731
     assert [ask(t) for t in (5.0, 5.1, 5.1, 5.0, 9.0, 5.2, 9.1)] == [
         "", "", "duplicate", "backward", "ahead", "", "ahead",
     ]  # fmt: skip

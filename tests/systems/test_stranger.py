@@ -298,7 +298,7 @@ def test_hindsight_is_that_of_all_sequences_of_modes():
     found = smoothed_probabilities(np.array(filtered), change)
     np.testing.assert_allclose(found.off, total[:, HYPOTHESES.read > 0].sum(axis=1), rtol=1e-9)
     np.testing.assert_allclose(found.scale, np.exp(total @ np.log(HYPOTHESES.scale)), rtol=1e-9)
-    np.testing.assert_allclose(found.strayed, total[:, STRAYED], rtol=1e-9)
+    np.testing.assert_allclose(found.diverged, total[:, STRAYED], rtol=1e-9)
 
 
 def test_spans_are_first_and_last_times():

@@ -294,12 +294,14 @@ def test_gamma_min_in_each_unit(unit, identity, least, exists):
 
 def test_an_outage_counts_for_nothing():
     # local bounds only grow while nothing is measured, but the cost is not counted there
-    heard = COURSE.heard.copy()
+    heard = COURSE.received.copy()
     heard[100:200] = False
     system = SYSTEM.in_unit("deg")
     with_gap = existence(central_filter(), system, 1.0, COURSE._replace(heard=heard), 50.0)
     whole = existence(central_filter(), system, 1.0, COURSE, 50.0)
     assert with_gap["feasible"]
     assert with_gap["gamma_min"] != pytest.approx(whole["gamma_min"], rel=1e-2)
-    none = existence(central_filter(), system, 1.0, COURSE._replace(heard=~COURSE.heard), 50.0)
+    none = existence(
+        central_filter(), system, 1.0, COURSE._replace(received=~COURSE.received), 50.0
+    )
     assert (none["gamma_min"], none["margin"]) == (0.0, 1.0)
