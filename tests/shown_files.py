@@ -90,6 +90,7 @@ def write_files(here):
     logs.write_log(here / "master.csv", dataset.master)
     logs.write_log(here / "slave.csv", dataset.imu)
     (here / "my_system.py").write_bytes((ROOT / "docs/examples/balloon.py").read_bytes())
+    (here / "first.py").write_bytes((ROOT / "docs/examples/first.py").read_bytes())
     (here / "my_rig.py").write_bytes((ROOT / "docs/examples/pendulum.py").read_bytes())
     problem = ROOT / "src/robins/workbench/problems/baro-height.toml"
     (here / "my-problem.toml").write_text(problem.read_text())

@@ -241,7 +241,8 @@ def test_parts_end_when_the_bench_is_killed(tmp_path):
         "    def over(self, *a): pass\n"
         "    def commands(self, s): return []\n"
         "    def step(self, s, k):\n"
-        "        if k == 5: print(*(s.part_processes.process(p) for p in s.broker.links), flush=True)\n"
+        "        if k != 5: return\n"
+        "        print(*(s.part_processes.process(p) for p in s.broker.links), flush=True)\n"
         "if __name__ == '__main__':\n"
         f"    Session(of, pathlib.Path({str(tmp_path / 'k.mcap')!r}), Watch()).run()\n"
     )

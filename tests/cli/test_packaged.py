@@ -209,6 +209,7 @@ STANDS_FOR = {
     "record.mcap": "results/bench-satellite-s1/record.mcap",
     "other.mcap": "results/bench-satellite-s1/record.mcap",
     "docs/examples/balloon.py:study": "my_system.py:study",
+    "docs/examples/first.py:study": "first.py:study",
     "docs/examples/pendulum.py:rig": "my_rig.py:rig",
 }
 # A reader's own devices and autopilots, and pages that stay open until someone closes them.
