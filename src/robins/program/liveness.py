@@ -10,7 +10,7 @@ sum. The most is held while the product is made: three arrays of 300 numbers.
 >>> import jax
 >>> a = jax.ShapeDtypeStruct((300,), "float64")
 >>> jaxpr = jax.make_jaxpr(lambda a: (jax.numpy.sin(a) * a).sum())(a).jaxpr
->>> stages = [Touched(e.invars, e.outvars) for e in jaxpr.eqns]
+>>> stages = [StageMemory(e.invars, e.outvars) for e in jaxpr.eqns]
 >>> [len(dropped) for dropped in last_uses(stages, {*jaxpr.invars, *jaxpr.outvars})]
 [0, 1, 1]
 >>> most_bytes(stages, jaxpr.invars, jaxpr.outvars) == 8 * 3 * 300

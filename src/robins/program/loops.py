@@ -15,9 +15,9 @@ along the axis of 300, and the loop reads one array and writes one:
 >>> def added(a):
 ...     return jax.numpy.sin(a) + jax.lax.scan(lambda c, x: (c + x, c + x), 0.0, a)[1]
 >>> jaxpr = jax.make_jaxpr(added)(jax.ShapeDtypeStruct((300,), "float64")).jaxpr
->>> [(e.primitive.name, along(e)) for e in jaxpr.eqns]
+>>> [(e.primitive.name, axis_of(e)) for e in jaxpr.eqns]
 [('sin', (300, False)), ('scan', (300, False)), ('add', (300, False))]
->>> body = Body(jaxpr.eqns, (300, False), lambda v: v in jaxpr.outvars)
+>>> body = LoopBody(jaxpr.eqns, (300, False), lambda v: v in jaxpr.outvars)
 >>> len(body.rows), len(body.after), len(body.made)  # taken row by row, carried, made row by row
 (1, 1, 1)
 """

@@ -19,7 +19,8 @@ loop. The difference needs the last value, so it is a second loop one level late
 >>> def centred(a):
 ...     c = jax.numpy.cumsum(2.0 * a)
 ...     return c - c[-1]
->>> staged = Staged(centred, jax.ShapeDtypeStruct((300,), "float64"), engine=interpreted_rounds)
+>>> shape = jax.ShapeDtypeStruct((300,), "float64")
+>>> staged = StagedFunction(centred, shape, engine=interpreted_rounds)
 >>> [[e.primitive.name for e in loop.equations] for loop in staged.loops]
 [['mul', 'scan'], ['sub']]
 

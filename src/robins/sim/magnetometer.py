@@ -33,7 +33,7 @@ _ROUNDING_S = 1e-6  # a sample this near to the edge of a burst is on it
 def observe_field(
     key: Array,
     q_nb: _given.Listed,
-    field_n: Number,
+    field_n: _given.Listed,
     sigma_t: _given.Listed,
     present: _given.Listed,
     *,
@@ -206,7 +206,7 @@ def _turned(field: Array, turn: Array) -> Array:
     return rotate(from_rotvec(jnp.where(turns, ratio * across, 0.0)), field)
 
 
-def _vectors(name: str, value: Number, count: int) -> Array:
+def _vectors(name: str, value: _given.Listed, count: int) -> Array:
     x = jnp.asarray(value, float)
     return jnp.broadcast_to(x, (count, 3)) if x.shape == (3,) else _given.rows(name, x, count, 3)
 
