@@ -297,7 +297,7 @@ def test_an_outage_counts_for_nothing():
     heard = COURSE.received.copy()
     heard[100:200] = False
     system = SYSTEM.in_unit("deg")
-    with_gap = existence(central_filter(), system, 1.0, COURSE._replace(heard=heard), 50.0)
+    with_gap = existence(central_filter(), system, 1.0, COURSE._replace(received=heard), 50.0)
     whole = existence(central_filter(), system, 1.0, COURSE, 50.0)
     assert with_gap["feasible"]
     assert with_gap["gamma_min"] != pytest.approx(whole["gamma_min"], rel=1e-2)

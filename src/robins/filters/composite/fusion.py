@@ -268,7 +268,7 @@ def covariance_intersection(
 
 
 def intersection_weights(
-    beliefs: Sequence[Belief], criterion: Criterion | ArrayLike | Sequence[float]
+    beliefs: Sequence[Belief], criterion: str | ArrayLike | Sequence[float]
 ) -> Array:
     """(N,) weights of `covariance_intersection`."""
     check_criterion(criterion, len(beliefs))
