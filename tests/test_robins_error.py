@@ -17,7 +17,7 @@ from robins.scenario import ScenarioError
 from robins.workbench import InputError
 
 SOURCE = Path(robins.__file__).parent
-OF_THE_SYSTEM = {"Busy"}  # an OSError that becomes a ResultError
+OF_THE_SYSTEM = {"TargetBusyError"}  # an OSError that becomes a ResultError
 
 
 def strays(tree: ast.AST) -> Iterator[str]:

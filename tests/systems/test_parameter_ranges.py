@@ -99,9 +99,10 @@ def absurd(kind, marks):
 def test_the_walk_finds_what_there_is():
     paths = {f"{cls.__name__}.{path}" for cls, path, *_ in NUMBERS}
     assert paths >= {
-        "Drive.settle", "Imu.gyro_noise", "Start.tilt", "Gnss.sigma_factor.key", "Scenario.runs",
-        "Magnetometer.matrix.0.0", "Wheels.axes.0.0", "Wheels.lost.0", "HInfinity.gamma",
-        "Imu.gyro_bias_time", "Departure.height", "Span.begin", "Setup.patience", "LinkFault.bits",
+        "Drive.settle", "InsGnssImu.gyro_noise", "InsGnssStart.tilt", "Gnss.sigma_factor.key",
+        "Scenario.runs", "MargMagnetometer.matrix.0.0", "ReactionWheels.axes.0.0",
+        "ReactionWheels.lost.0", "HInfinityRequirements.gamma", "InsGnssImu.gyro_bias_time",
+        "Departure.height", "Span.begin", "Setup.patience", "LinkFault.bits",
     }  # fmt: skip
     assert len(NUMBERS) > 300
 

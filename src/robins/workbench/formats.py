@@ -260,7 +260,7 @@ def _kml(solution: xr.Dataset, name: str) -> dict[str, bytes]:
                 places = (f"{lon},{lat},{alt}" for lat, lon, alt in rows)
                 _child(line, "coordinates", " ".join(places))
                 continue
-            line = _child(several, "gx:ExportTrack")
+            line = _child(several, "gx:Track")
             _child(line, "altitudeMode", "clampToGround")
             for date in dates:
                 _child(line, "when", date)
