@@ -2,7 +2,7 @@
 
 import math
 import time
-from functools import partial
+from functools import partial, partialmethod
 
 import numpy as np
 import pytest
@@ -50,6 +50,9 @@ class Rogue(Station):
 
 @pytest.fixture
 def fly(monkeypatch):
+    # A slow machine's ticks would be sent again after a second, and answered again.
+    monkeypatch.setattr(Broker, "step", partialmethod(Broker.step, again_ns=100_000_000_000))
+
     def now(name: str = "", *modes: str):
         on_threads(monkeypatch, **{name: partial(Rogue, modes=modes)})
         return session(FLIGHT).run()

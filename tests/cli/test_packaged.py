@@ -339,11 +339,12 @@ def begins(*_, **__):
 def reaches(words):
     """Let click parse a command line without running it."""
     words = words[: words.index(">")] if ">" in words else words
-    command = app
+    command, context = app, click.Context(app, **app.context_settings)
     while isinstance(command, click.Group):
         name, *words = words
         command = command.commands[name]
-    command.make_context(name, list(words))
+    # A command keeps the help option of its first context: without a parent that has no "-h".
+    command.make_context(name, list(words), parent=context)
 
 
 # What a log or runs so short say to a tuning, which then refuses them, as it should.
