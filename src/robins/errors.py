@@ -7,7 +7,7 @@ import importlib
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -182,5 +182,26 @@ def moved(package: str) -> Callable[[str], Callable]:
         last = f"the old name works before robins {major}.{minor + KEPT}"
         warnings.warn(f"{sentence}; {last}", DeprecationWarning, stacklevel=2)
         return getattr(importlib.import_module(place), now)
+
+    return attribute
+
+
+def lazy(package: str, places: Mapping[str, str]) -> Callable:
+    """The `__getattr__` of a package whose names are imported when they are first used.
+
+    Args:
+        package: its ``__name__``.
+        places: by name "module:attribute", or "module" where the attribute has the same name;
+            other names are treated as `moved` does.
+    """
+    other = moved(package)
+
+    def attribute(name: str):
+        if name not in places:
+            return other(name)
+        module, _, own = places[name].partition(":")
+        found = getattr(importlib.import_module(module), own or name)
+        setattr(sys.modules[package], name, found)
+        return found
 
     return attribute

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from robins.errors import lazy
 from robins.systems.catalogue import SUMMARIES, installed, summaries
 
 if TYPE_CHECKING:
@@ -72,9 +73,4 @@ class _Registry(Mapping[str, "System"]):
 SYSTEMS: Mapping[str, System] = _Registry()
 
 
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = getattr(importlib.import_module(f"{__name__}.study"), name)
-    globals()[name] = found
-    return found
+__getattr__ = lazy(__name__, dict.fromkeys(__all__, f"{__name__}.study"))

@@ -17,10 +17,11 @@ list of scenarios for JAX. A new command is a function in a module here, and its
 
 from __future__ import annotations
 
-import importlib
 import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
+
+from robins.errors import lazy
 
 if TYPE_CHECKING:  # the functions that are named as their file, for editors
     from robins.workbench.allan import allan as allan
@@ -76,12 +77,7 @@ _WHERE = {
 __all__ = list(_WHERE)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _WHERE:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = getattr(importlib.import_module(f"{__name__}.{_WHERE[name]}"), name)
-    globals()[name] = found
-    return found
+__getattr__ = lazy(__name__, {name: f"{__name__}.{file}" for name, file in _WHERE.items()})
 
 
 class _Functions(ModuleType):

@@ -7,7 +7,9 @@ that can work, the filters that it is compared with, and the one to use instead.
 start much sooner without the campaign's packages.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from robins.errors import lazy
 
 if TYPE_CHECKING:
     from robins.systems.satellite.study import SYSTEM
@@ -15,9 +17,4 @@ if TYPE_CHECKING:
 __all__ = ["SYSTEM"]
 
 
-def __getattr__(name: str) -> Any:
-    if name == "SYSTEM":
-        from robins.systems.satellite.study import SYSTEM
-
-        return SYSTEM
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy(__name__, {"SYSTEM": f"{__name__}.study"})
