@@ -56,6 +56,20 @@ class StaticCheck(NamedTuple):
     sigma_f: np.ndarray  # (3,) m/s^2, of a sample
 
 
+def _record(omega_ib_b: ArrayLike, f_b: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    omega, f = np.asarray(omega_ib_b, float), np.asarray(f_b, float)
+    if omega.ndim != 2 or omega.shape[1] != 3 or f.shape != omega.shape or len(omega) < 10:
+        raise ValueError(
+            "omega_ib_b and f_b must both have shape (n, 3) with at least 10 samples, got "
+            f"{omega.shape} and {f.shape}"
+        )
+    for name, x in (("omega_ib_b", omega), ("f_b", f)):
+        bad = np.flatnonzero(~np.all(np.isfinite(x), axis=1))
+        if bad.size:
+            raise ValueError(f"{name} is not finite at row {bad[0]}: {x[bad[0]]}; clean it first")
+    return omega, f
+
+
 def is_static(
     omega_ib_b: ArrayLike,
     f_b: ArrayLike,
@@ -84,16 +98,7 @@ def is_static(
     Raises:
         ValueError: other shapes, fewer than ten samples, values not finite.
     """
-    omega, f = np.asarray(omega_ib_b, float), np.asarray(f_b, float)
-    if omega.ndim != 2 or omega.shape[1] != 3 or f.shape != omega.shape or len(omega) < 10:
-        raise ValueError(
-            "omega_ib_b and f_b must both have shape (n, 3) with at least 10 samples, got "
-            f"{omega.shape} and {f.shape}"
-        )
-    for name, x in (("omega_ib_b", omega), ("f_b", f)):
-        bad = np.flatnonzero(~np.all(np.isfinite(x), axis=1))
-        if bad.size:
-            raise ValueError(f"{name} is not finite at row {bad[0]}: {x[bad[0]]}; clean it first")
+    omega, f = _record(omega_ib_b, f_b)
     mean_omega, mean_f = omega.mean(0), f.mean(0)
     sigma_omega, sigma_f = omega.std(0, ddof=1), f.std(0, ddof=1)
     size_omega, size_f = np.linalg.norm(mean_omega), np.linalg.norm(mean_f)
@@ -168,6 +173,19 @@ def level(
     return Alignment(Rotation(jnp.asarray(q_nb)), covariance, "level")
 
 
+def _refuse_poor_heading(
+    lat: np.ndarray, horizontal: np.ndarray | float, sigma_omega: float
+) -> None:
+    predicted = sigma_omega / horizontal
+    if np.any(predicted > _LARGEST_HEADING_SIGMA_RAD):
+        raise ValueError(
+            f"the Earth turns by {np.min(horizontal) / _DEG_H:.3g} deg/h about north at latitude "
+            f"{np.rad2deg(lat)} deg and the gyros are good to {sigma_omega / _DEG_H:.3g} deg/h: "
+            f"a heading sigma of {np.rad2deg(np.max(predicted)):.3g} deg is too large; take the "
+            "heading from elsewhere and use level, or average for longer"
+        )
+
+
 def gyrocompass(
     omega_ib_b: ArrayLike,
     f_b: ArrayLike,
@@ -206,15 +224,7 @@ def gyrocompass(
             "accelerates, or the unit is not m/s^2"
         )
     horizontal = OMEGA_E * np.cos(lat)
-    predicted = sigma_of_omega / horizontal
-    if np.any(predicted > _LARGEST_HEADING_SIGMA_RAD):
-        raise ValueError(
-            f"the Earth turns by {np.min(horizontal) / _DEG_H:.3g} deg/h about north at latitude "
-            f"{np.rad2deg(lat)} deg and the gyros are good to {sigma_of_omega / _DEG_H:.3g} deg/h: "
-            f"a heading sigma of {np.rad2deg(np.max(predicted)):.3g} deg is too large; take the "
-            "heading from elsewhere and use level, or average for longer"
-        )
-
+    _refuse_poor_heading(lat, horizontal, sigma_of_omega)
     down = -f / size[..., None]
     vertical = np.sum(omega * down, -1)
     east = np.cross(down, omega)

@@ -60,6 +60,28 @@ def usual_width(longest_s: float, usual_s: float) -> int:
     return -(-math.ceil(1.1 * longest_s / usual_s + 2.0) // 8) * 8
 
 
+_SLACK_S = 1e-9  # rounding of a time stamp
+
+
+def _shares(
+    time_s: np.ndarray, dt: np.ndarray, start_s: float, epoch_s: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Pieces between epochs: end [s], number of the increment, share of it, and share before."""
+    begin_s = time_s - dt
+    inside = (time_s > start_s) & (begin_s < epoch_s[-1])
+    edges = np.concatenate([[start_s], epoch_s, time_s[inside]])
+    edges = np.unique(edges[(edges >= start_s) & (edges <= epoch_s[-1])])
+    ends, starts = edges[1:], edges[:-1]
+    middle = 0.5 * (starts + ends)
+    parent = np.minimum(np.searchsorted(time_s, middle), len(dt) - 1)
+    real = (ends - starts) > _SLACK_S  # edges that differ by less are one edge
+    starts, ends, parent = starts[real], ends[real], parent[real]
+    share = np.clip((ends - starts) / dt[parent], 0.0, 1.0)
+    before = np.clip((starts - begin_s[parent]) / dt[parent], 0.0, 1.0)
+    whole = share > 1.0 - 1e-6
+    return ends, parent, np.where(whole, 1.0, share), np.where(whole, 0.0, before)
+
+
 def cut(
     increments: Increments,
     time_s: np.ndarray,
@@ -89,35 +111,20 @@ def cut(
     dt, theta, dv = (np.asarray(a, dtype=float) for a in increments[:3])
     time_s, epoch_s = np.asarray(time_s, dtype=float), np.asarray(epoch_s, dtype=float)
     begin_s = time_s - dt
-    slack = 1e-9
-    if len(dt) == 0 or begin_s[0] > start_s + slack or time_s[-1] < epoch_s[-1] - slack:
+    if len(dt) == 0 or begin_s[0] > start_s + _SLACK_S or time_s[-1] < epoch_s[-1] - _SLACK_S:
         have = "none" if len(dt) == 0 else f"{begin_s[0]:.6f} to {time_s[-1]:.6f} s"
         raise ValueError(
             f"the IMU does not cover the blocks from {start_s:.6f} to {epoch_s[-1]:.6f} s: "
             f"its increments reach from {have}"
         )
-    inside = (time_s > start_s) & (begin_s < epoch_s[-1])
-    edges = np.concatenate([[start_s], epoch_s, time_s[inside]])
-    edges = np.unique(edges[(edges >= start_s) & (edges <= epoch_s[-1])])
-    ends, starts = edges[1:], edges[:-1]
-    middle = 0.5 * (starts + ends)
-    parent = np.minimum(np.searchsorted(time_s, middle), len(dt) - 1)
-    # edges that differ only by the rounding of a time stamp are one edge
-    real = (ends - starts) > slack
-    starts, ends, parent = starts[real], ends[real], parent[real]
-
-    share = np.clip((ends - starts) / dt[parent], 0.0, 1.0)
-    before = np.clip((starts - begin_s[parent]) / dt[parent], 0.0, 1.0)
-    whole = share > 1.0 - 1e-6
-    share, before = np.where(whole, 1.0, share), np.where(whole, 0.0, before)
+    ends, parent, share, before = _shares(time_s, dt, start_s, epoch_s)
     piece_theta = share[:, None] * theta[parent]
     piece_dv = share[:, None] * dv[parent]
     late = before > 0.0
     if np.any(late):
         turn = SciRotation.from_rotvec(-before[late, None] * theta[parent[late]])
         piece_dv[late] = _applied(turn, piece_dv[late])
-
-    block = np.searchsorted(epoch_s, ends - slack)
+    block = np.searchsorted(epoch_s, ends - _SLACK_S)
     count = np.bincount(block, minlength=len(epoch_s))
     needed = int(count.max(initial=1))
     if width is None:
@@ -133,7 +140,7 @@ def cut(
     out_theta[block, column] = piece_theta
     out_dv[block, column] = piece_dv
     out_parent[block, column] = parent
-    duration = np.diff(np.concatenate([[start_s], epoch_s]))
+    duration = np.diff(epoch_s, prepend=start_s)
     return Blocks(Increments(out_dt, out_theta, out_dv), epoch_s, duration, out_parent)
 
 

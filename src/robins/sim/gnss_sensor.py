@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -182,6 +183,50 @@ def _turn(C: Array, v: Array) -> Array:
     return jnp.einsum("...ij,...j->...i", C, v)
 
 
+def _truth(*given: Array) -> tuple[Array, ...]:
+    names = ("valid_s", "lat_rad", "lon_rad", "alt_m", "v_n", "q_nb", "omega_ib_b")
+    time = given[0]
+    for name, x, tail in zip(names, given, ((), (), (), (), (3,), (4,), (3,)), strict=True):
+        if time.ndim != 1 or x.shape != (*time.shape, *tail):
+            wanted = ("m", *tail) if tail else "(m,)"
+            raise ValueError(f"{name} must have shape {wanted}, m as in valid_s, got {x.shape}")
+    return given
+
+
+def _rows(count: int, sigma: ArrayLike) -> Array:
+    return jnp.broadcast_to(jnp.asarray(sigma), (count, 3))
+
+
+def _standard(white: Array, direction: Array, gross: Array) -> Array:
+    """Errors in sigmas: white ones, and gross ones along a random direction."""
+    return white + gross * (direction / jnp.linalg.norm(direction, axis=1, keepdims=True))
+
+
+def _lost(model: GnssErrorModel, time_s: Array, chance: Array) -> Array:
+    """Fixes that are dropped by chance, or fall into an outage."""
+    lost = chance < model.drop_share
+    if model.outages_s is None:
+        return lost
+    begin, end, now = model.outages_s[None, :, 0], model.outages_s[None, :, 1], time_s[:, None]
+    return lost | jnp.any((begin <= now) & (now < end), axis=1)
+
+
+def _position_errors(
+    model: GnssErrorModel, time_s: Array, normal: Array, gross: Array
+) -> tuple[Array, Array]:
+    """(m, 3) errors north, east, down [m], and the sigmas that the receiver states."""
+    rows = partial(_rows, len(time_s))
+    draws = normal[:, _FixRow.POSITION], normal[:, _FixRow.OUTLIER_POSITION]
+    error_m, sigma_m = rows(model.sigma_m) * _standard(*draws, gross), rows(model.sigma_m)
+    if model.markov_sigma_m is not None:
+        slow = _markov(time_s, rows(model.markov_tau_s), normal[:, _FixRow.MARKOV])
+        error_m = error_m + rows(model.markov_sigma_m) * slow
+        sigma_m = jnp.sqrt(sigma_m**2 + rows(model.markov_sigma_m) ** 2)
+    if model.stated_sigma_m is not None:
+        sigma_m = rows(model.stated_sigma_m)
+    return error_m, sigma_m
+
+
 def observe(
     model: GnssErrorModel,
     key: Array,
@@ -214,49 +259,26 @@ def observe(
     Raises:
         ValueError: shapes that do not fit together.
     """
-    names = ("valid_s", "lat_rad", "lon_rad", "alt_m", "v_n", "q_nb", "omega_ib_b")
     given = (valid_s, lat_rad, lon_rad, alt_m, v_n, q_nb, omega_ib_b)
-    time, lat, lon, alt, v, q, omega = truth = tuple(jnp.asarray(x, float) for x in given)
-    for name, x, tail in zip(names, truth, ((), (), (), (), (3,), (4,), (3,)), strict=True):
-        if time.ndim != 1 or x.shape != (*time.shape, *tail):
-            wanted = ("m", *tail) if tail else "(m,)"
-            raise ValueError(f"{name} must have shape {wanted}, m as in valid_s, got {x.shape}")
+    time, lat, lon, alt, v, q, omega = _truth(*(jnp.asarray(x, float) for x in given))
     if model.lever_b_m is not None:
         lat, lon, alt, v = antenna(lat, lon, alt, v, q, omega, jnp.asarray(model.lever_b_m))
 
     numbers = jnp.arange(len(time))
     normal, chance = jax.vmap(lambda number: _drawn(key, number))(numbers)
-    missing = chance[:, _FixChance.DROPPED] < model.drop_share
-    if model.outages_s is not None:
-        begin, end = model.outages_s[None, :, 0], model.outages_s[None, :, 1]
-        now = time[:, None]
-        missing = missing | jnp.any((begin <= now) & (now < end), axis=1)
+    missing = _lost(model, time, chance[:, _FixChance.DROPPED])
     outlier = chance[:, _FixChance.OUTLIER] < model.outlier_share
     gross = jnp.where(outlier, model.outlier_size, 0.0)[:, None]
-
-    def rows(sigma):
-        return jnp.broadcast_to(jnp.asarray(sigma), (len(time), 3))
-
-    def error(sigma, white, direction):
-        unit = direction / jnp.linalg.norm(direction, axis=1, keepdims=True)
-        return rows(sigma) * (white + gross * unit)
-
-    error_m = error(model.sigma_m, normal[:, _FixRow.POSITION], normal[:, _FixRow.OUTLIER_POSITION])
-    sigma_m = rows(model.sigma_m)
-    if model.markov_sigma_m is not None:
-        slow = _markov(time, rows(model.markov_tau_s), normal[:, _FixRow.MARKOV])
-        error_m = error_m + rows(model.markov_sigma_m) * slow
-        sigma_m = jnp.sqrt(sigma_m**2 + rows(model.markov_sigma_m) ** 2)
-    if model.stated_sigma_m is not None:
-        sigma_m = rows(model.stated_sigma_m)
+    rows = partial(_rows, len(time))
+    error_m, sigma_m = _position_errors(model, time, normal, gross)
     measured = Geodetic(lat, lon, alt).retract(error_m)
-    lat, lon, alt = (
-        jnp.where(missing, jnp.nan, x) for x in (measured.lat, measured.lon, measured.alt)
-    )
+    places = measured.lat, measured.lon, measured.alt
+    lat, lon, alt = (jnp.where(missing, jnp.nan, x) for x in places)
     v_measured, sigma_v = None, None
     if model.sigma_v is not None:
         draws = normal[:, _FixRow.VELOCITY], normal[:, _FixRow.OUTLIER_VELOCITY]
-        v_measured = jnp.where(missing[:, None], jnp.nan, v + error(model.sigma_v, *draws))
+        error_v = rows(model.sigma_v) * _standard(*draws, gross)
+        v_measured = jnp.where(missing[:, None], jnp.nan, v + error_v)
         sigma_v = rows(model.sigma_v if model.stated_sigma_v is None else model.stated_sigma_v)
     return GnssFixes(lat, lon, alt, v_measured, sigma_m, sigma_v, missing, outlier, error_m)
 

@@ -88,13 +88,18 @@ def observe_field(
     if hard_iron_t is not None:
         z = z + _given.rows("hard_iron_t", hard_iron_t, 3)[None]
     z = z + _sigma(sigma_t, count) * jax.random.normal(key, (count, 3))
+    return jnp.where(there[:, None], _converted(z, range_t, quantum_t), jnp.nan)
+
+
+def _converted(z: Array, range_t: Number | None, quantum_t: Number | None) -> Array:
+    """Digits of the converter: rounded, and saturated."""
     if quantum_t is not None:
         _given.number("quantum_t", quantum_t, 0.0, above=True)
         z = quantum_t * jnp.round(z / quantum_t)
     if range_t is not None:
         _given.number("range_t", range_t, 0.0, above=True)
         z = jnp.clip(z, -range_t, range_t)
-    return jnp.where(there[:, None], z, jnp.nan)
+    return z
 
 
 def observe_magnetic_attitude(

@@ -200,33 +200,27 @@ def bench_replay(
     rig = recorded_rig(first.header, record)
     if node not in rig.parts:
         raise InputError(f"there is no part '{node}', only {', '.join(rig.parts)}", "--node")
-    wire = rig.wire
     step_ns, first_difference = int(first.header["step_ns"]), None
     if second is None:
         flight = recorded_flight(first.header, record, filter_)
         if once := rig.once(flight.setup, node):
             raise InputError(once, "--node", "compare two records with --diff")
         other = None if filter_ else program(flight.setup.ports.get(node, ""))
+
+        def heard_so_far(k: int, n: int) -> None:
+            progress(k / max(n, 1), "hearing")
+
         with _starter(flight, node, other) as start:
-            heard = replay(
-                first.entries,
-                wire,
-                node,
-                start,
-                progress=lambda k, n: progress(k / max(n, 1), "hearing"),
-            )
+            heard = replay(first.entries, rig.wire, node, start, progress=heard_so_far)
         frames, first_difference = heard.compared, heard.first_difference
     else:
-        frames = Differences(wire, step_ns)
-        for pair in zip_longest(recorded(first.entries, node), recorded(second.entries, node)):
+        frames, both = Differences(rig.wire, step_ns), (first.entries, second.entries)
+        for pair in zip_longest(*(recorded(entries, node) for entries in both)):
             frames.take_both(*pair)
     found = frames.found()
     same = not found if second is not None else first_difference is None
-    damages = [
-        f"{path} is not whole: {one.why}"
-        for path, one in ((record, first), (diff, second))
-        if one is not None and not one.whole
-    ]
+    both = ((record, first), (diff, second))
+    damages = [f"{path} is not whole: {one.why}" for path, one in both if one and not one.whole]
     return ReplayComparison(
         node=node,
         frames=frames.frames[1],

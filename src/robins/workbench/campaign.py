@@ -48,6 +48,21 @@ SWEEP = "sweep.json"  # in the folder of several campaigns
 _POINT = re.compile(r"points/\d+(-\d+)?")
 
 
+def _check_same(where: Where, before: CampaignPlan, text: str, seed: int, machine: str) -> None:
+    for what, was, now in (
+        ("scenario", _of_runs(before.text), _of_runs(text)),
+        ("seed", before.seed, seed),
+        ("machine", before.machine, machine or before.machine),
+    ):
+        if was != now:
+            shown = "" if what == "scenario" else f": {was} there, {now} asked for"
+            raise InputError(
+                f"holds a campaign of another {what}{shown}",
+                where,
+                "ask for the same to go on with it, or choose another folder.",
+            )
+
+
 def plan_campaign(
     where: Where,
     name: str,
@@ -97,18 +112,7 @@ def plan_campaign(
         )
     else:
         check_code(store, before)
-        for what, was, now in (
-            ("scenario", _of_runs(before.text), _of_runs(text)),
-            ("seed", before.seed, seed),
-            ("machine", before.machine, machine or before.machine),
-        ):
-            if was != now:
-                shown = "" if what == "scenario" else f": {was} there, {now} asked for"
-                raise InputError(
-                    f"holds a campaign of another {what}{shown}",
-                    where,
-                    "ask for the same to go on with it, or choose another folder.",
-                )
+        _check_same(where, before, text, seed, machine)
         plan = replace(before.with_more(wanted, chosen), text=text)
     if beyond := [run for run in plan.keep if run >= plan.runs]:
         raise InputError(

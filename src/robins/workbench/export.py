@@ -92,28 +92,15 @@ def export_filter(
     if to.exists() and (not to.is_dir() or any(to.iterdir())):
         raise InputError("it is there and not empty", str(to), "name a new folder with --to.")
     rig = _rig_for(name) if board else None
-    if rig is not None and rig.aboard is not None:
-        if float32:
-            what = f"the {rig.name} is not navigated in single precision"
-            raise InputError(what, "--float32", "leave it out with --board")
-        asked = _aboard(rig, name, filter_name, seed, settings)
-    else:
-        asked = _export_request(name, filter_name, seed, settings)
-    problem, wanted, label = asked.problem, asked.filter, asked.label
-    if why := problem.contenders[wanted].on_host:
-        what = f"filter '{wanted}' cannot be exported: {why}, which no program in C does"
-        raise InputError(what, label, "choose another by --filter")
-    if adjust:
-        with refusing("--adjust"):
-            asked = with_adjustable(asked, adjust)
+    asked = _exportable(_requested(rig, float32, name, filter_name, seed, settings), adjust)
     precision = SINGLE if float32 else DOUBLE
     texts, library, found = files_of(asked, None if fast else SMALL, precision)
     files = {**texts, **(firmware(rig.wire) if rig else {}), **asked.files}
     write_folder(to, files)
     made = _built(to, rig.exported) if rig else None
     scalars = {entry.name: len(entry.program.live) for entry in library.entries}
-    size = len(texts[f"{library.name}.c"])
-    return FilterExport(to, tuple(files), wanted, scalars, size, precision.kind, found, made)
+    size, kind = len(texts[f"{library.name}.c"]), precision.kind
+    return FilterExport(to, tuple(files), asked.filter, scalars, size, kind, found, made)
 
 
 def _rig_for(name: str) -> Rig:
@@ -156,6 +143,33 @@ def _aboard(rig: Rig, name: str, filter_name: str, seed: int, settings: Sequence
     flight = changed(read(name, tuple(settings)), options)
     made, label = rig.aboard(flight), find_scenario(name, recorded=True)[1]
     return Request(made.problem, flight.setup.filter, label, made.library, made.files)
+
+
+def _requested(
+    rig: Rig | None,
+    float32: bool,
+    name: str,
+    filter_name: str,
+    seed: int,
+    settings: Sequence[str],
+) -> Request:
+    if rig is None or rig.aboard is None:
+        return _export_request(name, filter_name, seed, settings)
+    if float32:
+        what = f"the {rig.name} is not navigated in single precision"
+        raise InputError(what, "--float32", "leave it out with --board")
+    return _aboard(rig, name, filter_name, seed, settings)
+
+
+def _exportable(asked: Request, adjust: Sequence[str]) -> Request:
+    """The request with its adjustable numbers, refused where no program in C does it."""
+    if why := asked.problem.contenders[asked.filter].on_host:
+        what = f"filter '{asked.filter}' cannot be exported: {why}, which no program in C does"
+        raise InputError(what, asked.label, "choose another by --filter")
+    if not adjust:
+        return asked
+    with refusing("--adjust"):
+        return with_adjustable(asked, adjust)
 
 
 def _export_request(name: str, filter_name: str, seed: int, settings: Sequence[str]) -> Request:

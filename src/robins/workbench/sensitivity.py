@@ -10,9 +10,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 import jax
+import numpy as np
+import xarray as xr
 
 from robins import _float64
 from robins.campaign.sensitivity import (
@@ -31,7 +34,7 @@ from robins.report import sensitivity as page
 from robins.results import Outcome, Progress, ignore_progress
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.options import MOST_OF_SEED, Filter, Option, Scenario
-from robins.workbench.scenarios import check_filters, read_scenario, request_fields
+from robins.workbench.scenarios import Simulated, check_filters, read_scenario, request_fields
 
 MOST = 1 << 14  # samples
 _TRACED = 0.1  # share of the time after which batches are computed
@@ -121,10 +124,38 @@ def sensitivity(
     _float64.require()
     every = _checked(vary, samples)
     read = read_scenario(name, settings)
-    study, given = read.study, read.parameters
     wanted = filter_name or read.own[0]
-    check_filters(read.label, study.filters, [wanted])
+    check_filters(read.label, read.study.filters, [wanted])
     progress(0.0, "setting up the simulation")
+    budget = _budget(name, read, wanted, every, settings, seed)
+    points = sobol_points(len(every), samples, seed)
+    squares, follow, jax_parts = _simulated(budget, every, points, runs, progress)
+    ends = [(one.key, one.text(one.low), one.text(one.high)) for one in every]
+    blocks = budget.view.blocks
+    solution = labelled(wanted, ends, points, squares, blocks, indices(squares, seed))
+    return replace(
+        _outcome(solution, follow, every, points, budget, jax_parts),
+        scenario=read.label,
+        seed=seed,
+        runs=runs,
+        machine="vm",
+        last_lines=[
+            "Table:  {out}/sensitivity.csv   all indices with their bounds; points.csv has samples",
+            *_next(name, wanted, every, page.greatest(solution)),
+        ],
+        **request_fields(read.text, settings),
+    )
+
+
+def _budget(
+    name: str,
+    read: Simulated,
+    wanted: str,
+    every: Sequence[UncertainParameter],
+    settings: Sequence[str],
+    seed: int,
+) -> SensitivityRuns:
+    study, given = read.study, read.parameters
     with refusing(name):
         course, again = study.lay_out(given), study.lay_out(given)
         view, contender = study.view(given, course), study.contender(given, course, wanted)
@@ -141,28 +172,45 @@ def sensitivity(
                 f"--vary {one.key}",
                 "`robins sweep` lays out the scenario again for each of its values.",
             )
-    budget = SensitivityRuns(study, given, course, view, contender, seed, tuple(ranges))
-    points = sobol_points(len(every), samples, seed)
-    count = points.shape[0] * samples
+    return SensitivityRuns(study, given, course, view, contender, seed, tuple(ranges))
 
-    def told(share: float) -> None:
-        done = round(share * count)
-        progress(_TRACED + (1.0 - _TRACED) * share, f"{done} of {count} points")
+
+def _simulated(
+    budget: SensitivityRuns,
+    every: Sequence[UncertainParameter],
+    points: np.ndarray,
+    runs: int,
+    progress: Progress,
+) -> tuple[np.ndarray, list[bool], list[str]]:
+    """Squared errors (d + 2, samples, runs, s), as of `follows`, and as of `simulate_points`."""
+    count = points.shape[0] * points.shape[1]
+
+    def done(share: float) -> None:
+        words = f"{round(share * count)} of {count} points"
+        progress(_TRACED + (1.0 - _TRACED) * share, words)
 
     progress(0.01, f"tracing {count} points of {runs} runs")
     try:
-        found, believed, jax_parts = simulate_points(budget, points.reshape(count, -1), runs, told)
+        found, believed, jax_parts = simulate_points(budget, points.reshape(count, -1), runs, done)
     except jax.errors.JAXTypeError as error:
         raise _refused(budget, every) from error
     squares = found.reshape(*points.shape[:2], *found.shape[1:])
-    follow = follows(believed.reshape(*points.shape[:2], runs))
-    ends = [(one.key, one.text(one.low), one.text(one.high)) for one in every]
-    solution = labelled(wanted, ends, points, squares, view.blocks, indices(squares, seed))
-    laws = [one.law for one in ranges]
+    return squares, follows(believed.reshape(*points.shape[:2], runs)), jax_parts
+
+
+def _outcome(
+    solution: xr.Dataset,
+    follow: Sequence[bool],
+    every: Sequence[UncertainParameter],
+    points: np.ndarray,
+    budget: SensitivityRuns,
+    jax_parts: list[str],
+) -> Outcome:
+    laws = [one.law for one in budget.ranges]
     shares = points[:2].reshape(-1, len(every)).T
     drawn = [
         one_at(share, one.low, one.high, range_.by_logarithm)
-        for one, range_, share in zip(every, ranges, shares, strict=True)
+        for one, range_, share in zip(every, budget.ranges, shares, strict=True)
     ]
     return Outcome(
         solution=solution,
@@ -171,18 +219,9 @@ def sensitivity(
             "sensitivity.csv": page.csv(solution, laws),
             "points.csv": page.points(solution, drawn),
         },
-        notes=[*page.sentences(solution, laws), *view.notes, *jax_parts],
+        notes=[*page.sentences(solution, laws), *budget.view.notes, *jax_parts],
         warnings=page.doubts(solution, follow),
-        scenario=read.label,
-        seed=seed,
-        runs=runs,
-        machine="vm",
         tables=[page.table(solution)],
-        last_lines=[
-            "Table:  {out}/sensitivity.csv   all indices with their bounds; points.csv has samples",
-            *_next(name, wanted, every, page.greatest(solution)),
-        ],
-        **request_fields(read.text, settings),
     )
 
 

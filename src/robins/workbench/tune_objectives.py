@@ -245,15 +245,8 @@ def on_log(
 
     with refusing(opened.source):
         first = trial(np.zeros(len(tuned)))
-    _, model, cases = first.numbers
-    count = sum(_components(y, model.dims[s]) for case in cases for s, y in case[1].items())
-    segments = min(SEGMENTS, count // _FEWEST)
-    held = np.arange(segments) % 3 == 2
-    if np.sum(held) < 3:
-        raise UndeterminedError(
-            f"the log says too little: {count} components are measured, and {9 * _FEWEST} are the "
-            "least that can be parted into what is chosen on and what is held out"
-        )
+    held = _held_out(first)
+    segments = len(held)
     label = f"{system.name}/{dataset.name}"
     return TuningRequest(
         filter=chosen,
@@ -272,6 +265,19 @@ def on_log(
         "judge.",
         checked=parsed,
     )
+
+
+def _held_out(first: Trial) -> np.ndarray:
+    """Bool by segment of equally many components: true for every third."""
+    _, model, cases = first.numbers
+    count = sum(_components(y, model.dims[s]) for case in cases for s, y in case[1].items())
+    held = np.arange(min(SEGMENTS, count // _FEWEST)) % 3 == 2
+    if np.sum(held) < 3:
+        raise UndeterminedError(
+            f"the log says too little: {count} components are measured, and {9 * _FEWEST} are the "
+            "least that can be parted into what is chosen on and what is held out"
+        )
+    return held
 
 
 def _components(y: Tree, dim: int) -> int:

@@ -25,27 +25,17 @@ class PayloadFault(NamedTuple):
     sized: bool  # it has the length of its message, so one of its numbers is to blame
 
 
-class _Number(NamedTuple):
-    """Limits of a number of a payload."""
-
-    name: str
-    least: float
-    most: float
-    field: Field
-
-
 class MessageCodec:
     """The payloads of one message."""
 
     def __init__(self, of: Message):
         """Lay out its numbers."""
         self.message, self.size, self._names = of, of.size, {f.name for f in of.fields}
-        numbers: list[_Number] = []
-        for f in of.fields:
-            least, most = f.limits or (0.0, 256.0 ** SIZES[f.kind])
-            for k in range(f.length):
-                numbers.append(_Number(f.name + f"[{k}]" * (f.length > 1), least, most, f))
-        self._numbers = tuple(numbers)
+        self._numbers = tuple(
+            (f.name + f"[{k}]" * (f.length > 1), *(f.limits or (0.0, 256.0 ** SIZES[f.kind])), f)
+            for f in of.fields
+            for k in range(f.length)
+        )  # name, least, most, field of each number
         self._all = struct.Struct("<" + "".join(f"{f.length}{_CODES[f.kind]}" for f in of.fields))
 
     def encode(self, values: Values) -> bytes:
@@ -94,10 +84,11 @@ class MessageCodec:
         if len(payload) != self.size:
             why = f"it has {len(payload)} bytes, '{self.message.name}' has {self.size}"
             return PayloadFault(why, False)
-        for x, n in zip(self._all.unpack(payload), self._numbers, strict=True):
-            if not n.least <= x <= n.most and not (n.field.missing and math.isnan(x)):
-                unit = "" if n.field.unit == "1" else f" {n.field.unit}"
-                return PayloadFault(f"{n.name} is {x:g}{unit}, not {n.field.span}", True)
+        numbers = zip(self._all.unpack(payload), self._numbers, strict=True)
+        for x, (name, least, most, field) in numbers:
+            if not least <= x <= most and not (field.missing and math.isnan(x)):
+                unit = "" if field.unit == "1" else f" {field.unit}"
+                return PayloadFault(f"{name} is {x:g}{unit}, not {field.span}", True)
         return None
 
 

@@ -202,6 +202,32 @@ def _desired(
     )
 
 
+def _between_sights(
+    given: Airship,
+    course: AirshipCourse,
+    carried: WindMotion,
+    errors: ImuErrorModel,
+    noise: Array,
+    k: Array,
+) -> tuple[Increments, Increments, Increments]:
+    """Increments from the k-th sight to the next: true as one, reported as parts and as one."""
+    imu, n = given.imu, course.samples
+    dt = jnp.full(n, 1.0 / imu.rate)
+    time = (k * n + jnp.arange(n + 1)).astype(float) / imu.rate
+    grid = _desired(given, course, carried, time)
+    before, after = (
+        jax.tree.map(lambda x, at=at: x[at], grid) for at in (slice(-1), slice(1, None))
+    )
+    true = increments_between(before, after, dt)
+    gained = rotate(conjugate(before.q_nb.wxyz), after.v_n - before.v_n)
+    felt = true.dv - imu.unsensed * gained
+    theta, dv, _ = corrupt(dt, true.theta, felt, errors, jax.random.fold_in(noise, k))
+    each = (course.parts, n // course.parts)
+    cut = Increments(dt.reshape(each), theta.reshape(*each, 3), dv.reshape(*each, 3))
+    parts = jax.vmap(joined)(cut)
+    return joined(true), parts, joined(parts)
+
+
 def simulate(
     instruments: Sequence[Instrument],
     given: Airship,
@@ -214,7 +240,7 @@ def simulate(
     wind, step = draw_wind(given, key(Component.WIND))
     commanded = jnp.asarray(given.hull.air_speed * _towards(given.hull.course))
     carried = move_in_wind(wind, step, commanded, given.hull.response, course.start.v_n[:2])
-    imu, n = given.imu, course.samples
+    imu = given.imu
     unit = key(Component.IMU)
     bias = jax.random.split(jax.random.fold_in(unit, _BIASES))
     gyro_bias = signed(bias[0], imu.gyro_bias, imu.draw)
@@ -223,27 +249,10 @@ def simulate(
         TriadErrors(bias=gyro_bias, white=as_array(imu.gyro_noise)),
         TriadErrors(bias=accel_bias, white=as_array(imu.accel_noise)),
     )
-    dt = jnp.full(n, 1.0 / imu.rate)
     noise = jax.random.fold_in(unit, _SAMPLES)
-
-    def between_sights(k: Array):
-        """Increments: true as one, reported as parts and as one."""
-        time = (k * n + jnp.arange(n + 1)).astype(float) / imu.rate
-        grid = _desired(given, course, carried, time)
-        before, after = (
-            jax.tree.map(lambda x, at=at: x[at], grid) for at in (slice(-1), slice(1, None))
-        )
-        true = increments_between(before, after, dt)
-        gained = rotate(conjugate(before.q_nb.wxyz), after.v_n - before.v_n)
-        felt = true.dv - imu.unsensed * gained
-        theta, dv, _ = corrupt(dt, true.theta, felt, errors, jax.random.fold_in(noise, k))
-        each = (course.parts, n // course.parts)
-        cut = Increments(dt.reshape(each), theta.reshape(*each, 3), dv.reshape(*each, 3))
-        parts = jax.vmap(joined)(cut)
-        return joined(true), parts, joined(parts)
-
+    measured = partial(_between_sights, given, course, carried, errors, noise)
     count, sights = len(course.epoch_s), course.sights
-    true, parts, single = jax.lax.map(between_sights, jnp.arange(count * sights))
+    true, parts, single = jax.lax.map(measured, jnp.arange(count * sights))
     path = mechanise(course.start, true)
 
     def by_epoch(x: Array) -> Array:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -91,99 +90,105 @@ class DeterminationState(NamedTuple):
     lost: bool = False  # waits for a star frame to start again
 
 
-def adm(config: SatelliteConfig) -> Part:
-    """Attitude determination: predicts with the gyro, updates with the star sensor."""
-    form, additive = config.form, config.build == "quaternion"
-    online = OnlineFilter(config.filter, config.model, config.start, machine=config.machine)
-    first = online.state
-    period = int(np.max(np.diff(np.flatnonzero(config.due)), initial=1))
+class _Determination:
+    """The filter and the functions around it, compiled or interpreted as the config has it."""
 
-    attitude = jax.jit(form.attitude)
-    believable = compiled(config, nodes.believable)
+    def __init__(self, config: SatelliteConfig):
+        self.config, self.form = config, config.form
+        self.additive = config.build == "quaternion"
+        self.online = OnlineFilter(
+            config.filter, config.model, config.start, machine=config.machine
+        )
+        self.first = self.online.state
+        self.period = int(np.max(np.diff(np.flatnonzero(config.due)), initial=1))
+        # A filter that refuses a frame gives no distance; one without rules does.
+        self.plain = make_filter("quaternion" if self.additive else "mekf")
+        self.sensor = config.model.sensor(STAR)
+        self.believable = compiled(config, nodes.believable)
+        self.report = compiled(config, self._report)
+        self.judge = compiled(config, self._judge)
+        self.fresh = compiled(config, self._fresh)
 
-    @partial(compiled, config)
-    def report(belief: Belief):
-        q = nodes.compiled_alone(form.attitude, belief.mean)  # as in `nodes.react`
-        rows = form.rows(q)
+    def _report(self, belief: Belief):
+        q = nodes.compiled_alone(self.form.attitude, belief.mean)  # as in `nodes.react`
+        rows = self.form.rows(q)
         factor = belief.factor if rows is None else rows @ belief.factor
-        return q, form.bias(belief.mean), jnp.sqrt(jnp.sum(factor * factor, -1))
+        return q, self.form.bias(belief.mean), jnp.sqrt(jnp.sum(factor * factor, -1))
 
-    # A filter that refuses a frame gives no distance; one without rules does.
-    plain, sensor = make_filter("quaternion" if additive else "mekf"), config.model.sensor(STAR)
-
-    @partial(compiled, config)
-    def judge(belief: Belief, y: Rotation, factor: Array | None):
-        info = plain.update(plain.init(belief, config.model.dims), sensor, y, factor)[1]
+    def _judge(self, belief: Belief, y: Rotation, factor: Array | None):
+        state = self.plain.init(belief, self.config.model.dims)
+        info = self.plain.update(state, self.sensor, y, factor)[1]
         return info.innovation, info.sigma, info.nis
 
-    @partial(compiled, config)
-    def fresh(q_ib: Array, bias: Array, state: FilterState) -> FilterState:
+    def _fresh(self, q_ib: Array, bias: Array, state: FilterState) -> FilterState:
         q = normalise(q_ib)
-        believed = start(q, config.attitude_rad, 0.0, additive)
+        believed = start(q, self.config.attitude_rad, 0.0, self.additive)
         old = state.belief
-        mean = form.state(q, bias)
+        mean = self.form.state(q, bias)
         block = believed.factor.shape[-1] - 3
         factor = believed.factor.at[block:, :].set(old.factor[block:, :])
-        return config.filter.reset(state, Belief(mean, factor))  # all modes of a bank, too
+        return self.config.filter.reset(state, Belief(mean, factor))  # all modes of a bank, too
 
-    def act(state: DeterminationState, k: int, inputs: Inputs):
-        frame = inputs["star"]
+    def act(self, state: DeterminationState, k: int, inputs: Inputs):
+        """Predict with a sample of the gyro, update with a star frame, and report."""
+        online, frame = self.online, inputs["star"]
         gyro = latched(state.gyro, sample_of(inputs["gyro"]))
         flags = 0 if gyro.age == 0 else HELD
         online.state, lost = state.filter, state.lost or not trusted(gyro)
         if (mode := inputs["mode"]) is not None and mode["reset"]:
-            online.state, lost = first, True
+            online.state, lost = self.first, True
         if not lost:
             online.predict(gyro.values)
-        said, heard = [], False
+        sent, received = [], False
         if frame is not None:
-            y = believable(frame["q_ib"])
-            heard = bool(np.isfinite(np.asarray(y.wxyz)[0]))
-            if not heard and np.all(np.isfinite(frame["q_ib"])):
+            y = self.believable(frame["q_ib"])
+            received = bool(np.isfinite(np.asarray(y.wxyz)[0]))
+            if not received and np.all(np.isfinite(frame["q_ib"])):
                 flags |= SHORT
-            if lost and heard and trusted(gyro):
-                online.state, lost = (
-                    fresh(frame["q_ib"], form.bias(online.belief.mean), first),
-                    False,
-                )
+            if lost and received and trusted(gyro):
+                bias = self.form.bias(online.belief.mean)
+                online.state, lost = self.fresh(frame["q_ib"], bias, self.first), False
                 flags |= USED
             elif not lost:
-                factor = _factor(config, frame)
-                if heard:
-                    said.append(("innovation", _innovation(*judge(online.belief, y, factor))))
-                info = online.update(y, STAR, factor)
-                code = Code(int(info.code))
-                flags |= USED * (code is Code.DONE) | REFUSED * (code is Code.REFUSED)
-                flags |= KEPT * bool(info.notes.get(NO_GAIN, False))
-        since = 0 if heard else state.since_star + 1
-        flags |= SILENT * (since > SILENT_PERIODS * period) | SAFE * lost
-        q, bias, sigma = (np.asarray(x) for x in report(online.belief))
-        said.append(
-            (
-                "estimate",
-                {
-                    "q_ib": q,
-                    "gyro_bias": bias,
-                    "sigma": np.full(6, np.nan) if lost else sigma,
-                    "flags": flags,
-                },
-            )
-        )
-        return DeterminationState(online.state, gyro, since, lost), said
+                more, innovation = self._update(frame, y, received)
+                flags, sent = flags | more, innovation
+        since = 0 if received else state.since_star + 1
+        flags |= SILENT * (since > SILENT_PERIODS * self.period) | SAFE * lost
+        q, bias, sigma = (np.asarray(x) for x in self.report(online.belief))
+        sigma = np.full(6, np.nan) if lost else sigma
+        estimate = {"q_ib": q, "gyro_bias": bias, "sigma": sigma, "flags": flags}
+        return DeterminationState(online.state, gyro, since, lost), [*sent, ("estimate", estimate)]
 
+    def _update(self, frame: Values, y: Rotation, received: bool):
+        """Flags of an update, and the innovation of a frame that was received."""
+        sent, factor = [], _factor(self.config, frame)
+        if received:
+            judged = self.judge(self.online.belief, y, factor)
+            sent.append(("innovation", _innovation(*judged)))
+        info = self.online.update(y, STAR, factor)
+        code = Code(int(info.code))
+        flags = USED * (code is Code.DONE) | REFUSED * (code is Code.REFUSED)
+        return flags | KEPT * bool(info.notes.get(NO_GAIN, False)), sent
+
+
+def adm(config: SatelliteConfig) -> Part:
+    """Attitude determination: predicts with the gyro, updates with the star sensor."""
+    made = _Determination(config)
     # The rate before the first sample is that which the gyro reported last.
-    begin = DeterminationState(first, LatchedInput(np.asarray(config.vehicle.theta)))
+    begin = DeterminationState(made.first, LatchedInput(np.asarray(config.vehicle.theta)))
+    q_ib = np.asarray(jax.jit(config.form.attitude)(made.first.belief.mean))
     example = {
         "gyro": {"theta_b": np.asarray(config.vehicle.theta)},
-        "star": {"q_ib": np.asarray(attitude(first.belief.mean)), "factor": np.ravel(np.eye(3))},
+        "star": {"q_ib": q_ib, "factor": np.ravel(np.eye(3))},
+        "mode": None,
     }
 
     def rare() -> None:
-        anew, _ = act(begin._replace(lost=True), 0, {"mode": None, **example})
-        act(anew, 0, {**example, "star": None, "mode": None})
+        fresh, _ = made.act(begin._replace(lost=True), 0, example)
+        made.act(fresh, 0, {**example, "star": None})
 
     takes = {"gyro": 0, "star": 0, "mode": 1}
-    part = Part("adm", takes, lambda: begin, act, {"mode": None, **example}, rare)
+    part = Part("adm", takes, lambda: begin, made.act, example, rare)
     return late(part, lambda state: state._replace(lost=True))
 
 
