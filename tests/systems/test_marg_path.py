@@ -3,6 +3,8 @@
 import jax
 import numpy as np
 import pytest
+from marg_logs import hand, log_of
+from scipy.spatial.transform import Rotation
 from test_live_marg import PARAMETERS, RATE_HZ, made_log
 
 from robins.systems.marg.path import SamplePath, joined
@@ -10,13 +12,15 @@ from robins.systems.marg.saturation import levels
 
 
 def samples():
-    """Stamps and rows of a hand whose gyro is cut off at 4 rad/s; a gap, a sample without field."""
+    """Stamps and rows of a hand whose gyro is cut off at 4 rad/s; gaps, a sample without field."""
     log = made_log(20.0, 2)
     gyro = log.imu.gyro.copy()
     peaks = np.array([900, 1005, 1104, 1317, 1500])
     peak = np.exp(-(((np.arange(len(gyro))[:, None] - peaks) / 5.0) ** 2))
     gyro[:, 1] = np.clip(gyro[:, 1] + 9.0 * peak.sum(axis=1), -4.0, 4.0)
     whole = np.all(np.isfinite(gyro), axis=1)
+    for first, last in ((520, 640), (700, 770), (1840, 1920)):  # too long to be bridged by rates
+        whole[first:last] = False
     at = np.searchsorted(log.mag.time_ns, log.imu.time_ns[whole])
     return log.imu.time_ns[whole], np.hstack([gyro, log.imu.accel])[whole], log.mag.field_t[at]
 
@@ -45,3 +49,27 @@ def test_chunks_of_any_size_give_the_same_bits(kind, of, known):
     assert kind != "rate" or whole[2]["imu_bridged"] > 20
     for other in others:
         jax.tree_util.tree_map(np.testing.assert_array_equal, other, whole)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_turn_over_a_gap_is_that_of_gravity_and_field_on_both_sides(seed, seen):
+    q_nb, p_n = hand(24.0, seed)
+    log = log_of(q_nb, p_n, gyro_noise=2e-3, accel_noise=0.02, field_noise=5e-7, seed=seed)
+    first, last = round(15.0 * RATE_HZ), round(17.0 * RATE_HZ)  # samples, the last before a gap
+    rows = np.hstack([log.imu.gyro, log.imu.accel, log.mag.field_t * (1.0 if seen else np.nan)])
+    keep = np.r_[0 : first + 1, last : len(rows)]
+    path = SamplePath(PARAMETERS, 1.0 / RATE_HZ)
+    steps = joined([*path.push(log.imu.time_ns[keep], rows[keep]), *path.finish()])
+    block, at = np.unravel_index(np.argmax(steps.samples.dt_s), steps.samples.dt_s.shape)
+    turn = Rotation.from_rotvec(steps.samples.theta[block, at])
+    found, true = q_nb[first + 1] * turn, q_nb[last + 1]
+    spread = float(np.max(steps.u.lost_turn[block]))
+    assert spread < np.radians(60.0) if seen else spread > np.radians(110.0)
+    tilt = true.inv().apply([0.0, 0.0, 1.0]) @ found.inv().apply([0.0, 0.0, 1.0])
+    assert np.arccos(tilt) < np.radians(10.0)
+    assert not seen or (found * true.inv()).magnitude() < min(np.radians(15.0), spread)
+    # without the gap the unit would have felt gravity alone, but for what it was shaken by
+    mean = steps.samples.dv[block, at] / steps.samples.dt_s[block, at]
+    up_b = q_nb[first + 1].inv().apply([0.0, 0.0, -1.0])
+    assert mean @ up_b > 9.81 * np.cos(np.radians(10.0))

@@ -8,6 +8,8 @@ one sample. Later samples are used as far as the latency of each stage reaches:
   and `FLANK` samples;
 - where the ends of the ranges are given (`saturation.levels` of a whole log), peaks before the
   first that shows them are put back too; else they are those that the samples so far show;
+- the turn over a gap that can be of more than `_LOST_RAD` is found from gravity and field on both
+  sides of it, over `start.moving`;
 - samples that are values at an instant need the next one, and so does a stamp after a long
   interval, which may be late and not after a gap;
 - the start needs `start.still` of rest or `start.moving` of motion, and `rest.after` of rest.
@@ -34,9 +36,10 @@ from robins.systems.marg.parameters import MargReplay
 from robins.systems.marg.rest import RestDetector
 from robins.systems.marg.saturation import FLANK, LONGEST_S, GyroRange, beyond, bridged
 from robins.systems.marg.sites import Look, Sites
-from robins.systems.marg.start import FilterStart, first_belief, initial_alignment
+from robins.systems.marg.start import FilterStart, first_belief, initial_alignment, turn_across
 
 _FALLING = 0.3  # of gravity: below it nothing holds the unit up, and tilt cannot be seen
+_LOST_RAD = math.radians(30.0)  # turn of a gap, beyond which rates at its ends do not bridge it
 
 
 class MargSteps(NamedTuple):
@@ -79,6 +82,7 @@ class SamplePath:
         self.n = max(1, round(parameters.update.block / usual_s))
         # a peak that ends in a block may have started in those before
         self._most_context = math.ceil(LONGEST_S / usual_s) + 2 * FLANK
+        self._side = math.ceil(parameters.start.moving / usual_s)  # samples beside a gap
         self._by_sample = levels is None and kind == "rate"
         self.range = GyroRange(levels)
         self._watch, self._pace = RestDetector(self.n * usual_s, parameters.rest), MeasurementPace()
@@ -185,6 +189,10 @@ class SamplePath:
             return False
         if more == 0 and after_gap(np.diff(time_ns[-2:]) * 1e-9, self._usual_s)[-1]:
             return False  # the next stamp shows whether samples are missing
+        if len(lost := self._lost(begin, end)):
+            reach = int(lost[-1]) + 1 + self._side + self._most_context
+            if len(time_ns) <= reach:
+                return False
         for axis in np.flatnonzero(np.any(full[begin:needed], axis=0)):
             last = begin + int(np.flatnonzero(full[begin:needed, axis])[-1])
             # a longer peak is not put back, so no more of it has to be looked at
@@ -208,8 +216,15 @@ class SamplePath:
         rate, doubt = bridged(self.time_ns, self.rows[:, :3], full)
         made = self.increments(self.time_ns, rate, accel)
         block, own, ends = slice(context, end), slice(context - 1, end - 1), slice(context - 1, end)
-        dt, theta, dv = (np.asarray(a, float)[own] for a in made[:3])
+        dt, theta, dv = (np.array(a, float)[own] for a in made[:3])
         turn, lost_s, gaps = not_sampled(dt, full[ends], doubt[ends], hard[ends], self._usual_s, p)
+        for at in self._lost(context, end):
+            across = self._across(int(at), made, field)
+            if across is not None:
+                k = at - context + 1
+                theta[k], up_b, spread = across
+                dv[k] = p.accelerometer.gravity * dt[k] * up_b
+                turn[k] = np.minimum(turn[k], spread)
         turn += p.update.gap_rate * (self._hung(end)[block] * dt)[:, None]
         self.counts["imu_gaps"] += gaps
         self.counts["imu_saturated"] += int(np.sum((np.any(full, axis=1) | hard)[block]))
@@ -219,10 +234,32 @@ class SamplePath:
         parts = (dt, 0.0), (theta, 0.0), (dv, 0.0), (field[block], np.nan)
         samples = model.Samples(*(_in_blocks(a, n, blank) for a, blank in parts))
         lost = (_in_blocks(a, n, 0.0).sum(axis=1) for a in (turn, lost_s))
-        drop = max(0, end - self._most_context)
+        drop = max(0, end - self._most_context - self._side)
         self.time_ns, self.rows = self.time_ns[drop:], self.rows[drop:]
         self._context = end - drop
         return self._steps(samples, *lost)
+
+    def _lost(self, begin: int, end: int) -> np.ndarray:
+        """Numbers of samples before gaps that are not bridged, of those before `begin` to `end`."""
+        p = self._parameters.update
+        dt = np.diff(self.time_ns[max(begin - 1, 0) : end]) * 1e-9
+        lost = (dt > p.gap * self._usual_s) & (p.gap_rate * dt > _LOST_RAD)
+        return max(begin - 1, 0) + np.flatnonzero(lost)
+
+    def _across(
+        self, at: int, made: Increments, field: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, float] | None:
+        """Turn over the gap after a sample, as of `turn_across`; None with no sample on a side."""
+        ends = [*self._lost(0, at + 1), *self._lost(at + 2, len(self.time_ns))]
+        first = max([at - self._side, *(k + 1 for k in ends if k < at)])
+        last = min([at + 1 + self._side, len(self.time_ns) - 1, *(k for k in ends if k > at)])
+        if not first < at < at + 1 < last:
+            return None
+        before, after = (
+            (Increments(*(np.asarray(a)[side] for a in made[:3])), field[1:][side])
+            for side in (slice(first, at), slice(at + 1, last))
+        )
+        return turn_across(before, np.asarray(made.theta)[at], after, self._parameters)
 
     def _hung(self, end: int) -> np.ndarray:
         """(M,) of the samples kept: weight of the turn that gyros which hang up to `end` missed.

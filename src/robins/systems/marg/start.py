@@ -104,6 +104,38 @@ def initial_alignment(
     return FilterStart(q_nb, np.array([north, down]), tilt, heading, gravity, still, sentence)
 
 
+def turn_across(
+    before: tuple[Increments, np.ndarray],
+    bridge: np.ndarray,
+    after: tuple[Increments, np.ndarray],
+    parameters: MargReplay,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Turn over a gap, by gravity and the field on both sides of it.
+
+    Where one side has no field, gravity gives the tilt and the heading is that of the bridge.
+
+    Args:
+        before: increments up to the gap, and field (N, 3) [T]; as of `initial_alignment`.
+        bridge: (3,) rad, the turn by the rates at the ends of the gap.
+        after: the same after the gap.
+        parameters: of the start.
+
+    Returns:
+        Rotation vector (3,) [rad], direction of up at the begin of the gap (3,), both in body axes
+        there, and the spread of the turn [rad]; infinite where its heading is not known.
+    """
+    first, last = (initial_alignment(*side, parameters) for side in (before, after))
+    start, end = (SciRotation.from_quat(np.roll(one.q_nb, -1)) for one in (first, last))
+    start = start * _turned(before[0].theta)[-1]
+    spread = np.hypot(*(max(one.tilt_rad, one.heading_rad) for one in (first, last)))
+    if not (np.any(first.field_t) and np.any(last.field_t)):
+        _, _, z, w = (start * SciRotation.from_rotvec(bridge) * end.inv()).as_quat()
+        end = SciRotation.from_rotvec([0.0, 0.0, 2.0 * np.arctan2(z, w)]) * end
+        spread = np.inf
+    up_b = start.inv().apply([0.0, 0.0, -1.0])
+    return (start.inv() * end).as_rotvec(), up_b, float(spread)
+
+
 def _turned(theta: np.ndarray) -> SciRotation:
     """Attitude before each interval and after the last, against the first."""
     out = [SciRotation.identity()]
