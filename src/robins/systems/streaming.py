@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from enum import IntFlag
 from functools import partial
 from typing import Any, ClassVar, TypeVar
@@ -225,6 +226,10 @@ class Live:
     def __reduce__(self) -> tuple:
         """Pickle as it is saved: compiled code is compiled again."""
         return _made_again, (type(self), *self._all_known())
+
+    def __copy__(self: LiveT) -> LiveT:
+        """An object of its own: neither hears the samples of the other."""
+        return deepcopy(self)
 
     def _all_known(self) -> tuple[str, dict[str, Any]]:
         """Parameters as TOML, and all else."""
