@@ -15,8 +15,11 @@ from robins.logs.ordering import rows_where
 from robins.results import ResultError
 from robins.systems import replaying
 from robins.systems.ins_gnss import SYSTEM, Drive, InsGnssReplay, LiveInsGnss, drive_dataset
+from robins.systems.ins_gnss.live_fixes import row_of
 from robins.systems.ins_gnss.log import contender, prepare, steps_of
+from robins.systems.ins_gnss.path import InsGnssPath
 from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock
+from robins.systems.ins_gnss.rest import usual_of
 from robins.systems.ins_gnss.robust import navigation
 from robins.systems.streaming import Flag, LiveError
 
@@ -82,10 +85,21 @@ def push(live, dataset, event):
     imu, g = dataset.imu, dataset.gnss
     if not fix:
         return live.push_imu(int(imu.time_ns[k]), imu.gyro[k], imu.accel[k])
+    time_ns, place, *others = row_of_fix(g, k)
+    return live.push_fix(time_ns, *place, *others)
+
+
+def row_of_fix(g, k):
+    """A fix as `push_fix` takes it, but for its place in one piece."""
     place = float(g.lat_rad[k]), float(g.lon_rad[k]), float(g.alt_m[k])
-    velocity = () if g.v_n is None else (g.v_n[k], g.sigma_v[k])
-    quality = {} if g.quality is None else {"quality": int(g.quality[k])}
-    return live.push_fix(int(g.time_ns[k]), *place, g.sigma_m[k], *velocity, **quality)
+    velocity = (None, None) if g.v_n is None else (g.v_n[k], g.sigma_v[k])
+    return (
+        int(g.time_ns[k]),
+        place,
+        g.sigma_m[k],
+        *velocity,
+        0 if g.quality is None else int(g.quality[k]),
+    )
 
 
 def played(live, dataset, all_events):
@@ -194,6 +208,57 @@ def test_steps_have_the_bits_of_those_of_a_replay(live, log, parameters, begin_s
             jax.tree_util.tree_map(np.testing.assert_array_equal, tuple(mine), of)
             found += 1
     assert found > 0.9 * len(piece.epoch_s)
+
+
+def chunked(dataset, parameters, size):
+    """Start and steps of a path whose samples come in chunks, each with the fixes up to its end."""
+    usual = usual_of(on_one_clock(dataset, parameters))
+    path, begun, made, imu = InsGnssPath(parameters, usual, 1.0), None, [], dataset.imu
+    arrived = 0
+    for at in range(0, len(imu), size):
+        rows = slice(at, at + size)
+        path.push(imu.time_ns[rows], np.hstack([imu.gyro[rows], imu.accel[rows]]))
+        while arrived < len(dataset.gnss) and dataset.gnss.time_ns[arrived] <= path.time_ns[-1]:
+            time_ns, *fix = row_of_fix(dataset.gnss, arrived)
+            path.push_fix(row_of(path.seconds(time_ns), *fix))
+            arrived += 1
+        if begun is None and (begun := path.start()):
+            epoch = begun[0], begun[0]
+        if begun and (epochs := path.due(*epoch)):
+            ends = np.array([edge_s for edge_s, _ in epochs])
+            made.append((ends, *path.steps(epoch[0], ends)[:3]))
+            epoch = epochs[-1]
+            path.forget(epoch[0])
+    return begun, jax.tree_util.tree_map(lambda *rows: np.concatenate(rows), *made)
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+@pytest.mark.parametrize("parameters", [InsGnssReplay(), HEADED], ids=["course", "heading given"])
+def test_chunks_of_any_size_give_the_bits_of_a_replay(log, velocities, parameters):
+    """Samples are missing, so is a fix, another has no height, one is far off; fixes jitter."""
+    late_ns = np.random.default_rng(1).integers(0, 90_000_000, len(log.gnss))
+    lat = log.gnss.lat_rad + np.radians(1.0) * (np.arange(len(log.gnss)) == 20)
+    alt = np.where(np.arange(len(log.gnss)) == 24, np.nan, log.gnss.alt_m)
+    gnss = replace(log.gnss, time_ns=log.gnss.time_ns + late_ns, lat_rad=lat, alt_m=alt)
+    if not velocities:
+        gnss = replace(gnss, v_n=None, sigma_v=None)
+    there = ~np.isin(np.arange(len(log.imu)), [*range(580, 590), 700])
+    gnss = rows_where(gnss, np.arange(len(gnss)) != 17)
+    log = replace(log, imu=rows_where(log.imu, there), gnss=gnss)
+    _, (piece,) = pieces_of(log, parameters)
+    world = piece.world
+    for size in (1, 7, 1000, len(log.imu)):
+        (begin_s, start, belief), found = chunked(log, parameters, size)
+        assert (begin_s, start.sentence) == (piece.begin_s, piece.start.sentence)
+        count = len(found[0])
+        assert count > len(piece.epoch_s) - 5
+        of = jax.tree_util.tree_map(
+            lambda a, n=count: np.asarray(a)[:n], (piece.epoch_s, world.u, world.y, world.aux)
+        )
+        for one, other in zip(found, of, strict=True):
+            one = {k: one[k] for k in other} if isinstance(other, dict) else one
+            jax.tree_util.tree_map(np.testing.assert_array_equal, one, other)
+        jax.tree_util.tree_map(np.testing.assert_array_equal, belief, world.start)
 
 
 def test_an_answer_is_the_state_carried_on_over_the_samples_since(live, log):
