@@ -18,9 +18,11 @@ from robins.systems.ins_gnss import SYSTEM, Drive, InsGnssReplay, LiveInsGnss, d
 from robins.systems.ins_gnss.live_fixes import row_of
 from robins.systems.ins_gnss.log import contender, prepare, steps_of
 from robins.systems.ins_gnss.path import InsGnssPath
+from robins.systems.ins_gnss.positions import heading_of
 from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock
-from robins.systems.ins_gnss.rest import usual_of
+from robins.systems.ins_gnss.rest import UsualIntervals, usual_of
 from robins.systems.ins_gnss.robust import navigation
+from robins.systems.ins_gnss.start import find_start
 from robins.systems.streaming import Flag, LiveError
 
 RATE_HZ, FIX_HZ = 50.0, 2.0
@@ -387,7 +389,9 @@ def test_a_fix_that_is_far_off_is_flagged_and_counted_once(live, log, late_s):
     late, flagged = np.full(count, 0.1), {}
     late[far] += late_s
     for event in events(log, late):
-        push(live, log, event)
+        answer = push(live, log, event)
+        if event[1:] == (1, far):
+            assert Flag.OUTLIER in answer.flags
         for epoch in live.passed:
             flagged[epoch.time_ns] = Flag.OUTLIER in epoch.flags
             if flagged[epoch.time_ns] and epoch.time_ns == int(log.gnss.time_ns[far]):
@@ -401,6 +405,49 @@ def test_a_fix_of_the_future_waits(live, log):
     stamps, vectors = epochs_of_replay(log, InsGnssReplay(), "ekf")
     compare(at, stamps, vectors, len(stamps) - 3)
     assert live.counts["steps_again"] == 0
+
+
+def standing(parameters, turn_s=0.0, field_t=None, fixes_s=0.0):
+    """Path of a unit at 50 Hz and its start, if it finds one; it turns by 30 deg/s from 1 s on.
+
+    The first of its fixes, which do not move, comes after a time.
+    """
+    path, noise = InsGnssPath(parameters, UsualIntervals(0.02, 0.5), 1.0), np.random.default_rng(0)
+    for k in range(600):
+        row = [0.0, 0.0, np.pi / 6.0 * (50 < k <= 50 * (1.0 + turn_s)), 0.0, 0.0, -9.8]
+        path.push(np.array([20_000_000 * k]), row + noise.normal(size=(1, 6)) * 1e-4)
+        if field_t is not None:
+            path.push_field(20_000_000 * k, field_t)
+        if k % 25 == 0 and 0.02 * k > fixes_s:
+            velocity = np.zeros(3), np.full(3, 0.05)
+            path.push_fix(row_of(0.02 * k - 0.1, (0.7, 0.1, 100.0), np.ones(3), *velocity, 1))
+        if found := path.start():
+            return found[1]
+    return None
+
+
+@pytest.mark.parametrize("most_s", [600.0, 6.0, 2.0])
+def test_a_given_heading_is_that_of_the_first_sample_also_where_it_is_dropped(monkeypatch, most_s):
+    monkeypatch.setattr("robins.systems.ins_gnss.path._MOST_START_S", most_s)
+    start = standing(HEADED, turn_s=3.0, fixes_s=9.0)
+    turned = heading_of(start.q_nb) - HEADED.start.known_heading
+    assert np.degrees(turned) == pytest.approx(90.0, abs=0.01)
+
+
+def test_a_magnetometer_that_is_refused_is_asked_ever_more_rarely(monkeypatch):
+    asked = []
+
+    def counted(*of):
+        asked.append(float(of[0].time_s[-1]))
+        return find_start(*of)
+
+    monkeypatch.setattr("robins.systems.ins_gnss.path.find_start", counted)
+    monkeypatch.setattr("robins.systems.ins_gnss.path._COURSE_S", 2.0)
+    assert standing(InsGnssReplay(), field_t=np.array([3e-4, 0.0, 0.0])) is None
+    assert 10 < len(asked) < 25  # of 98 times that the start is looked for
+    assert np.all(np.diff(asked)[-3:] > 0.7)
+    # it is not worn out: a field of the Earth starts it at once
+    assert standing(InsGnssReplay(), field_t=np.array([2e-5, 0.0, 4e-5])).sentence.count("magnet")
 
 
 def test_a_long_gap_is_a_new_start(live, log):

@@ -65,7 +65,7 @@ class Flag(IntFlag):
     DISTURBED = 16  # the last look at the magnetometer was refused
     DOUBTFUL = 32  # states or innovations contradict what was assumed
     BEHIND = 64  # the filter waits for later samples; the gyros carry on
-    OUTLIER = 128  # the filter refused a measurement of its last step
+    OUTLIER = 128  # the filter refused a measurement of its last step, or of one for this answer
 
 
 class TimestampGate:

@@ -22,8 +22,9 @@ at once and a live object has not:
 from __future__ import annotations
 
 import math
-from functools import partial
+from functools import partial, reduce
 from itertools import chain
+from operator import or_
 from typing import Any, ClassVar
 
 import jax
@@ -300,7 +301,7 @@ class LiveInsGnss(Live):
         answer = answer_of(time_ns, np.asarray(found), mark)
         if self.epoch is None:
             return answer
-        flags = mark | self.epoch.flags
+        flags = reduce(or_, (one.flags for one in (self.epoch, *self.passed)), mark)
         return answer._replace(wrong=self.epoch.wrong, seen=self.epoch.seen, flags=flags)
 
     def _compile(self) -> None:

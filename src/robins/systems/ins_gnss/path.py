@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.spatial.transform import Rotation as SciRotation
 
 from robins.dataset import ImuTable
 from robins.filters import Belief
@@ -22,6 +23,7 @@ from robins.ins.increments import Increments, from_imu
 from robins.systems.ins_gnss.live_fixes import TOLD, WIDTH, some, table_of
 from robins.systems.ins_gnss.log import InsGnssSteps, blocks_of, first_belief, steps_of
 from robins.systems.ins_gnss.parameters import InsGnssReplay
+from robins.systems.ins_gnss.positions import attitudes
 from robins.systems.ins_gnss.recording import Log, believed_sigmas
 from robins.systems.ins_gnss.rest import WAYS_S, UsualIntervals, known_until
 from robins.systems.ins_gnss.start import REST_S, StartPoint, fast_fix, find_start
@@ -140,11 +142,9 @@ class InsGnssPath:
         p, rows = self._parameters, self._steps
         if not len(rows):
             return None
-        if rows[-1, 0] - rows[0, 0] > _MOST_START_S:
-            self._keep(len(rows) // 2)
+        if rows[-1, 0] - rows[min(2, len(rows) - 1), 0] > _MOST_START_S:
+            self._halve()
             rows = self._steps
-            self._field = self._field[self._field[:, 0] > rows[0, 0] - 1.0]
-            self.fixes = self.fixes[self.fixes[:, 0] > rows[0, 0]]
         tick = int(10.0 * rows[-1, 0])
         if tick == self._tick:
             return None  # ten times a second are enough
@@ -170,9 +170,25 @@ class InsGnssPath:
             return None
         if given and not found.sentence.startswith("levelled at rest") and waits < REST_S:
             return None
-        raw = rows[rows[:, 0] <= rows[0, 0] + _UNITS_S]
+        raw = rows[2:][: max(1, round(_UNITS_S / self._usual.sample_s))]
         refuse_units(*(raw[:, k : k + 3] / raw[:, 1:2] for k in (2, 5)))
         return float(log.gnss_s[found.fix]), found, first_belief(log, found, p)
+
+    def _halve(self) -> None:
+        """Drop the older half of the samples, but for how they turned.
+
+        A heading that is given is that at the end of the first increment, so this one stays, and
+        one increment of all that are dropped follows it.
+        """
+        begin, rows = len(self._steps) // 2, self._steps
+        gone, end_s = rows[1:begin], rows[begin - 1, 0]
+        q = attitudes(np.array([1.0, 0.0, 0.0, 0.0]), gone[:, 2:5])[-1]
+        turn = SciRotation.from_quat(q, scalar_first=True).as_rotvec()
+        whole = np.concatenate([[end_s, gone[:, 1].sum()], turn, gone[:, 5:].sum(axis=0)])
+        self._keep(begin)
+        self._steps = np.concatenate([rows[:1], whole[None], self._steps])
+        self._field = self._field[self._field[:, 0] > end_s - 1.0]
+        self.fixes = self.fixes[self.fixes[:, 0] > end_s]
 
     def _log(self) -> Log:
         """Increments and all fixes as a piece of a log."""
