@@ -34,6 +34,7 @@ from jaxtyping import Array, PyTree
 from robins.errors import require
 from robins.filters import OnlineFilter
 from robins.filters.machine import usual
+from robins.ins.frames import turned
 from robins.systems.ins_gnss.live_answers import (
     Navigation,
     answer_of,
@@ -169,8 +170,8 @@ class LiveInsGnss(Live):
             self.counts[f"imu_{why}"] += 1
             return self._answer(time, Flag.REFUSED)
         if self._C_bs is not None:
-            values = values @ self._C_bs.T
-            field = None if field is None else self._C_bs @ field
+            values = turned(self._C_bs, values)
+            field = None if field is None else turned(self._C_bs, field)
         self._path.push(np.array([time]), values.reshape(1, 6))
         if field is not None and not self.start and np.all(np.isfinite(field)):
             self._path.push_field(time, field)
