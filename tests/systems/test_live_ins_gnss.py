@@ -16,9 +16,8 @@ from robins.logs.ordering import rows_where
 from robins.results import ResultError
 from robins.systems import replaying
 from robins.systems.ins_gnss import SYSTEM, Drive, InsGnssReplay, LiveInsGnss, drive_dataset
-from robins.systems.ins_gnss.live_fixes import row_of
 from robins.systems.ins_gnss.log import contender, prepare, steps_of
-from robins.systems.ins_gnss.path import InsGnssPath
+from robins.systems.ins_gnss.path import InsGnssPath, row_of
 from robins.systems.ins_gnss.positions import heading_of
 from robins.systems.ins_gnss.recording import axes_of, in_body_axes, on_one_clock
 from robins.systems.ins_gnss.rest import UsualIntervals, usual_of

@@ -12,15 +12,15 @@ used as far as the latency of each stage reaches:
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation as SciRotation
 
-from robins.dataset import ImuTable
+from robins.dataset import GnssTable, ImuTable
 from robins.filters import Belief
 from robins.ins.blocks import epochs_between, reach_of_rate
 from robins.ins.increments import Increments, from_imu
-from robins.systems.ins_gnss.live_fixes import TOLD, WIDTH, some, table_of
 from robins.systems.ins_gnss.log import InsGnssSteps, blocks_of, first_belief, steps_of
 from robins.systems.ins_gnss.parameters import InsGnssReplay
 from robins.systems.ins_gnss.positions import attitudes
@@ -28,12 +28,16 @@ from robins.systems.ins_gnss.recording import Log, believed_sigmas
 from robins.systems.ins_gnss.rest import WAYS_S, UsualIntervals, known_until
 from robins.systems.ins_gnss.start import REST_S, StartPoint, fast_fix, find_start
 from robins.systems.parts import ImuBlock
-from robins.systems.streaming import refuse_units
+from robins.systems.streaming import LiveError, numbers, refuse_units
 
 _AHEAD_S = 10.0  # of the newest sample, by which a fix may be
 _COURSE_S = 30.0  # how long a course is waited for
 _UNITS_S, _MOST_START_S = 1.0, 600.0  # of samples: whose size tells their unit, for the start
 _CONTEXT = 3  # samples that an increment needs besides its last
+# Of a fix: time [s], latitude, longitude [rad], height [m], three sigmas [m], velocity [m/s], its
+# sigmas, quality; what is missing is NaN.
+WIDTH = 14
+TOLD = [1, 2, 3, 7, 8, 9]  # what a fix can say
 
 
 class InsGnssPath:
@@ -60,7 +64,7 @@ class InsGnssPath:
         self._steps = np.zeros((0, 8))  # end [s], dt, turn, velocity of each increment kept
         self._first = 0  # number of increments before these
         self._newest = np.zeros((0, 8))  # the last increment, as far as it is known
-        self.fixes = np.zeros((0, WIDTH))  # rows of `live_fixes`, by time
+        self.fixes = np.zeros((0, WIDTH))  # rows of `row_of`, by time
         self._field = np.zeros((0, 4))  # time [s] and field [T], until the start
         self._known, self._velocities = tuple(usual), False
         self.first_fix_s = math.inf
@@ -110,7 +114,7 @@ class InsGnssPath:
         """Reason why a fix is refused; "" for one that is taken.
 
         Args:
-            row: of `live_fixes`.
+            row: of `row_of`.
             oldest_s: s, of the oldest epoch that can be gone back to.
         """
         newest_s = self._newest[0, 0] if len(self._newest) else 0.0
@@ -124,7 +128,7 @@ class InsGnssPath:
         return "ahead" if row[0] > newest_s + _AHEAD_S else nothing
 
     def push_fix(self, row: np.ndarray) -> None:
-        """Take a fix, a row of `live_fixes`, in any order."""
+        """Take a fix, a row of `row_of`, in any order."""
         at = int(np.searchsorted(self.fixes[:, 0], row[0]))
         self.fixes = np.insert(self.fixes, at, row, axis=0)
         self._velocities |= bool(np.any(np.isfinite(row[7:10])))
@@ -265,3 +269,48 @@ class InsGnssPath:
     def _keep(self, begin: int) -> None:
         """Drop increments before a row."""
         self._steps, self._first = self._steps[begin:], self._first + begin
+
+
+def row_of(
+    time_s: float, place: Any, sigma_m: Any, v_n: Any, sigma_v: Any, quality: Any
+) -> np.ndarray:
+    """(14,) row of a fix.
+
+    Raises:
+        LiveError: a vector of another kind, a velocity without sigmas, angles that are no radians.
+    """
+    where, sigma = numbers("lat_rad, lon_rad, alt_m", place, 3), numbers("sigma_m", sigma_m, 3)
+    missing = np.full(3, np.nan)
+    velocity = missing if v_n is None else numbers("v_n", v_n, 3)
+    if v_n is not None and sigma_v is None:
+        raise LiveError("a velocity needs sigmas", "sigma_v", "give (3,) m/s")
+    spread = missing if sigma_v is None else numbers("sigma_v", sigma_v, 3)
+    if abs(where[0]) > np.pi / 2 or abs(where[1]) > 2.0 * np.pi:
+        what = f"latitude {where[0]:.4g} and longitude {where[1]:.4g} are no radians"
+        raise LiveError(what, "push_fix", "of degrees give np.radians")
+    # as of a log that was cleaned: a component whose sigma is none is missing
+    where = np.where(np.isfinite(where) & (sigma > 0.0), where, np.nan)
+    velocity = np.where(np.isfinite(velocity) & (spread > 0.0), velocity, np.nan)
+    sigma = np.where(sigma > 0.0, sigma, 1.0)
+    spread = np.where(spread > 0.0, spread, 1.0)
+    return np.array([time_s, *where, *sigma, *velocity, *spread, float(quality)])
+
+
+def table_of(rows: np.ndarray, origin_ns: int, velocities: bool) -> GnssTable:
+    """Rows (M, 14), whose times count from an origin, as a table with velocities or without."""
+    time_ns = np.round(rows[:, 0] * 1e9).astype(np.int64) + origin_ns
+    v, spread = (rows[:, 7:10], rows[:, 10:13]) if velocities else (None, None)
+    quality = rows[:, 13].astype(int)
+    return GnssTable(time_ns, rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4:7], v, spread, quality)
+
+
+def some(table: GnssTable, keep: np.ndarray) -> GnssTable:
+    """Some rows of a table of fixes."""
+    columns: dict[str, Any] = {
+        name: None if (a := getattr(table, name)) is None else a[keep]
+        for name in (
+            *("time_ns", "lat_rad", "lon_rad", "alt_m", "sigma_m", "v_n", "sigma_v"),
+            "quality",
+        )
+    }
+    return GnssTable(**columns)
