@@ -157,7 +157,7 @@ def test_numbers_that_differ_are_arguments_of_one_program():
 
 def test_a_program_that_is_replaced_leaves_its_notes_and_each_is_said_once():
     def measure(numbers, z):
-        """By JAX, as complex numbers have no place in a program, until the first one differs."""
+        """Sum by JAX, as complex numbers have no place in a program, until one differs."""
         known = not isinstance(numbers[0], jax.core.Tracer)
         return jnp.sum(jnp.abs(jnp.fft.fft(z))) if known else numbers[0] * jnp.sum(z)
 
