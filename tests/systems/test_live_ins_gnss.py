@@ -460,6 +460,26 @@ def test_a_magnetometer_that_is_refused_is_asked_ever_more_rarely(monkeypatch):
     assert standing(InsGnssReplay(), field_t=np.array([2e-5, 0.0, 4e-5])).sentence.count("magnet")
 
 
+def test_samples_that_a_log_is_cleaned_of_are_refused_as_they_come(live, log):
+    """Swapped, doubled, without a number, absurd, or lost; and fixes that swap places."""
+    rows = np.arange(len(log.imu))
+    rows[[600, 601]] = rows[[601, 600]]
+    rows = np.delete(rows, slice(690, 696))
+    rows = np.insert(rows, 720, rows[719])
+    gyro = log.imu.gyro[rows].copy()
+    gyro[650, 1], gyro[670, 2] = np.nan, 2e5
+    imu = replace(log.imu, time_ns=log.imu.time_ns[rows], gyro=gyro, accel=log.imu.accel[rows])
+    raw, late_s = replace(log, imu=imu), np.where(np.arange(len(log.gnss)) % 3 == 0, 0.72, 0.1)
+    comes = [(int(np.max(imu.time_ns[: k + 1])), 0, k) for k in range(len(imu))]
+    comes += [event for event in events(raw, late_s) if event[1]]
+    _, at = played(live, raw, sorted(comes))
+    cleaned = clean(raw)
+    names = ("imu_nan", "imu_absurd", "imu_backward", "imu_duplicate")
+    assert [live.counts[name] for name in names] == [1, 1, 1, 1]
+    assert [cleaned.counts[name] for name in names] == [1, 1, 1, 1]
+    compare(at, *epochs_of_replay(cleaned, InsGnssReplay(), "ekf"), 30)
+
+
 def test_a_long_gap_is_a_new_start(live, log):
     whole = events(log, np.full(len(log.gnss), 0.1))
     gone = log.imu.time_ns[0] + np.array([9.0, 11.5]) * 1e9

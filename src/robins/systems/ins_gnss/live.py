@@ -5,9 +5,10 @@ at once and a live object has not:
 
 - **Late fixes.** The state of the filter at each epoch of the last `longest_delay_s` is kept. A fix
   whose time has passed is used at its own time: the filter goes back to the epoch before it and
-  takes the samples and fixes since then again, so that the order of arrival changes nothing. An
-  older one is refused (`gnss_too_old`), one of the same time as another too (`gnss_duplicate`); one
-  that is newer than the newest sample waits.
+  takes the samples and fixes since then again, so that the order of arrival changes nothing; one of
+  before the start, as late as that, may change the start. An older one is refused
+  (`gnss_too_old`), one of the same time as another too (`gnss_duplicate`); one that is newer than
+  the newest sample waits.
 - **A look ahead of 10 ms**, or one and a half samples where these are rarer. The turn rate at an
   epoch is a mean about it, and the increment before the last sample is known with the next one. So
   the filter is that much behind, and the answer to a sample is its state carried on over what came
@@ -157,7 +158,9 @@ class LiveInsGnss(Live):
     """
 
     _parameters: ClassVar[type[Any]] = InsGnssReplay
-    _kept: ClassVar[tuple[str, ...]] = ("_past", "_counted", "_last_step", "start")
+    _kept: ClassVar[tuple[str, ...]] = (
+        "_past", "_counted", "_last_step", "start", "_begun_s",
+    )  # fmt: skip
     _parts: ClassVar[tuple[str, ...]] = ("_door", "_path")
 
     def __init__(
@@ -218,7 +221,7 @@ class LiveInsGnss(Live):
         self._states: list[Any] = []  # of the filter at them
         self._counted: list[Any] = []  # by epoch, what was counted there
         self._last_step: Any = None  # stamp, vector and sensors of the last step
-        self.start, self.epoch = "", None
+        self.start, self._begun_s, self.epoch = "", math.nan, None
         self.passed: list[Navigation] = []
         self._online: OnlineFilter | None = None
 
@@ -287,12 +290,21 @@ class LiveInsGnss(Live):
         self.passed, time = [], stamp(time_ns)
         place = lat_rad, lon_rad, alt_m
         row = row_of(self._path.seconds(time), place, sigma_m, v_n, sigma_v, quality)
-        if why := self._path.refused(row, self._past[0][0] if self._past else -math.inf):
+        oldest_s, is_first = -math.inf, False
+        if self._past:
+            oldest_s, is_first = self._past[0][0], self._past[0][0] == self._begun_s
+        if is_first:  # the start itself may have been another with this fix
+            newest_s = self._path.seconds(int(self._path.time_ns[-1]))
+            oldest_s = min(oldest_s, newest_s - self._delay_s)
+        if why := self._path.refused(row, oldest_s):
             self.counts[f"gnss_{why}"] += 1
         if why and not (why == "nan" and self._online is not None):  # which is an epoch then
             return self._answer(int([time, *self._path.time_ns][-1]), Flag.REFUSED)
         self._path.push_fix(row)
-        self._go_back(float(row[0]))
+        if is_first and row[0] <= self._begun_s:
+            self._go_back_to(0)
+        else:
+            self._go_back(float(row[0]))
         self._advance()
         return self._answer(int(self._path.time_ns[-1]), Flag.REFUSED if why else Flag(0))
 
@@ -321,7 +333,7 @@ class LiveInsGnss(Live):
         self._online = self._on(self._case(Case(belief, None, {}, {}, None)).start)
         self._past, self._states = [(begin_s, begin_s)], [self._online.state]
         self._counted = [[]]
-        self.start = start.sentence
+        self.start, self._begun_s = start.sentence, begin_s
         return True
 
     def _step(self, epoch: tuple[float, float], u: ImuBlock, y: PyTree, aux: PyTree) -> None:
@@ -363,13 +375,22 @@ class LiveInsGnss(Live):
             number, due = round((at_s - wanted_s) / longest_s), (time_s - wanted_s) / longest_s
             if at_s < time_s and (number == 0 or number < due - 1e-6):
                 keep = k + 1
-        if keep < len(self._past):
-            self.counts["steps_again"] += len(self._past) - keep
-            self.counts.subtract(chain(*self._counted[keep:]))
-            self.counts = +self.counts  # without what was counted in these alone
-            del self._past[keep:], self._states[keep:], self._counted[keep:]
-            assert self._online is not None
+        self._go_back_to(keep)
+
+    def _go_back_to(self, keep: int) -> None:
+        """Return to the last of so many epochs, or of none to before the start."""
+        if keep == len(self._past):
+            return
+        self.counts["steps_again"] += len(self._past) - max(keep, 1)
+        self.counts.subtract(chain(*self._counted[keep:]))
+        self.counts = +self.counts  # without what was counted in these alone
+        del self._past[keep:], self._states[keep:], self._counted[keep:]
+        assert self._online is not None
+        if keep:
             self._online.state = self._states[-1]
+        else:
+            self._online, self.start, self.epoch, self._last_step = None, "", None, None
+            self._path.seek_again()
 
     def _answer(self, time_ns: int, mark: Flag) -> Navigation:
         if self._online is None:

@@ -178,6 +178,10 @@ class InsGnssPath:
         refuse_units(*(raw[:, k : k + 3] / raw[:, 1:2] for k in (2, 5)))
         return float(log.gnss_s[found.fix]), found, first_belief(log, found, p)
 
+    def seek_again(self) -> None:
+        """Let the next `start` look, whenever the last one did."""
+        self._tick = 0
+
     def _halve(self) -> None:
         """Drop the older half of the samples, but for how they turned.
 
