@@ -155,6 +155,19 @@ def test_numbers_that_differ_are_arguments_of_one_program():
     assert len(traced) == 2
 
 
+def test_a_program_that_is_replaced_leaves_its_notes_and_each_is_said_once():
+    def measure(numbers, z):
+        """Sum by JAX, as complex numbers have no place in a program, until one differs."""
+        known = not isinstance(numbers[0], jax.core.Tracer)
+        return jnp.sum(jnp.abs(jnp.fft.fft(z))) if known else numbers[0] * jnp.sum(z)
+
+    many, z = ManyRuns(measure), spread(3, 1.0)
+    for x in (1.0, 2.0):
+        many([(np.float64(x),)], z)
+        (note,) = many.notes
+        assert "complex" in note
+
+
 def test_what_differs_does_so_by_its_bits_and_keys_come_back():
     def drawn(numbers, k):
         given, sign = numbers

@@ -10,14 +10,19 @@ from short_drive import DRIVE
 
 from robins import scenario
 from robins.filters import Code
+from robins.ins.frames import turned
 from robins.logs import clean, load_dataset
 from robins.logs.ordering import rows_where
 from robins.results import ResultError
 from robins.systems import replaying
 from robins.systems.ins_gnss import SYSTEM, Drive, InsGnssReplay, LiveInsGnss, drive_dataset
 from robins.systems.ins_gnss.log import contender, prepare, steps_of
-from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock
+from robins.systems.ins_gnss.path import InsGnssPath, row_of
+from robins.systems.ins_gnss.positions import heading_of
+from robins.systems.ins_gnss.recording import axes_of, in_body_axes, on_one_clock
+from robins.systems.ins_gnss.rest import UsualIntervals, usual_of
 from robins.systems.ins_gnss.robust import navigation
+from robins.systems.ins_gnss.start import find_start
 from robins.systems.streaming import Flag, LiveError
 
 RATE_HZ, FIX_HZ = 50.0, 2.0
@@ -82,18 +87,29 @@ def push(live, dataset, event):
     imu, g = dataset.imu, dataset.gnss
     if not fix:
         return live.push_imu(int(imu.time_ns[k]), imu.gyro[k], imu.accel[k])
+    time_ns, place, *others = row_of_fix(g, k)
+    return live.push_fix(time_ns, *place, *others)
+
+
+def row_of_fix(g, k):
+    """A fix as `push_fix` takes it, but for its place in one piece."""
     place = float(g.lat_rad[k]), float(g.lon_rad[k]), float(g.alt_m[k])
-    velocity = () if g.v_n is None else (g.v_n[k], g.sigma_v[k])
-    quality = {} if g.quality is None else {"quality": int(g.quality[k])}
-    return live.push_fix(int(g.time_ns[k]), *place, g.sigma_m[k], *velocity, **quality)
+    velocity = (None, None) if g.v_n is None else (g.v_n[k], g.sigma_v[k])
+    return (
+        int(g.time_ns[k]),
+        place,
+        g.sigma_m[k],
+        *velocity,
+        0 if g.quality is None else int(g.quality[k]),
+    )
 
 
 def played(live, dataset, all_events):
     """Answers to all, and what the filter said last of each epoch, by stamp."""
     at, step = {}, live._step
 
-    def heard(to):
-        step(to)
+    def heard(*of):
+        step(*of)
         at[live.epoch.time_ns] = vector(live.epoch)
 
     live._step = heard
@@ -170,10 +186,14 @@ def test_steps_have_the_bits_of_those_of_a_replay(live, log, parameters, begin_s
     parameters = parameters or InsGnssReplay()
 
     def noted(piece, used, begin_s, epochs, *others):
-        last[round(1e9 * epochs[0])] = steps_of(piece, used, begin_s, epochs, *others)
-        return last[round(1e9 * epochs[0])]
+        steps = steps_of(piece, used, begin_s, epochs, *others)
+        for k, second in enumerate(epochs):
+            last[round(1e9 * second)] = jax.tree_util.tree_map(
+                lambda a, k=k: np.asarray(a)[k], steps
+            )
+        return steps
 
-    monkeypatch.setattr("robins.systems.ins_gnss.live.steps_of", noted)
+    monkeypatch.setattr("robins.systems.ins_gnss.path.steps_of", noted)
     for event in events(log, np.random.default_rng(0).uniform(0.0, 0.9, len(log.gnss))):
         push(live, log, event)
     _, (piece,) = pieces_of(log, parameters)
@@ -187,10 +207,70 @@ def test_steps_have_the_bits_of_those_of_a_replay(live, log, parameters, begin_s
                 steps.u,
                 *({k: a[k] for k in b} for a, b in zip(steps[1:3], whole[1:], strict=False)),
             ]
-            one = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], tuple(mine))
-            jax.tree_util.tree_map(np.testing.assert_array_equal, one, of)
+            jax.tree_util.tree_map(np.testing.assert_array_equal, tuple(mine), of)
             found += 1
     assert found > 0.9 * len(piece.epoch_s)
+
+
+def chunked(dataset, parameters, size):
+    """Start and steps of a path whose samples come in chunks, each with the fixes up to its end."""
+    usual = usual_of(on_one_clock(dataset, parameters))
+    path, begun, made, imu = InsGnssPath(parameters, usual, 1.0), None, [], dataset.imu
+    arrived = 0
+    for at in range(0, len(imu), size):
+        rows = slice(at, at + size)
+        path.push(imu.time_ns[rows], np.hstack([imu.gyro[rows], imu.accel[rows]]))
+        while arrived < len(dataset.gnss) and dataset.gnss.time_ns[arrived] <= path.time_ns[-1]:
+            time_ns, *fix = row_of_fix(dataset.gnss, arrived)
+            path.push_fix(row_of(path.seconds(time_ns), *fix))
+            arrived += 1
+        if begun is None and (begun := path.start()):
+            epoch = begun[0], begun[0]
+        if begun and (epochs := path.due(*epoch)):
+            ends = np.array([edge_s for edge_s, _ in epochs])
+            made.append((ends, *path.steps(epoch[0], ends)[:3]))
+            epoch = epochs[-1]
+            path.forget(epoch[0])
+    return begun, jax.tree_util.tree_map(lambda *rows: np.concatenate(rows), *made)
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+@pytest.mark.parametrize("parameters", [InsGnssReplay(), HEADED], ids=["course", "heading given"])
+def test_chunks_of_any_size_give_the_bits_of_a_replay(log, velocities, parameters):
+    """Samples are missing, so is a fix, another has no height, one is far off; fixes jitter."""
+    late_ns = np.random.default_rng(1).integers(0, 90_000_000, len(log.gnss))
+    lat = log.gnss.lat_rad + np.radians(1.0) * (np.arange(len(log.gnss)) == 20)
+    alt = np.where(np.arange(len(log.gnss)) == 24, np.nan, log.gnss.alt_m)
+    gnss = replace(log.gnss, time_ns=log.gnss.time_ns + late_ns, lat_rad=lat, alt_m=alt)
+    if not velocities:
+        gnss = replace(gnss, v_n=None, sigma_v=None)
+    there = ~np.isin(np.arange(len(log.imu)), [*range(580, 590), 700])
+    gnss = rows_where(gnss, np.arange(len(gnss)) != 17)
+    log = replace(log, imu=rows_where(log.imu, there), gnss=gnss)
+    _, (piece,) = pieces_of(log, parameters)
+    world = piece.world
+    for size in (1, 7, 1000, len(log.imu)):
+        (begin_s, start, belief), found = chunked(log, parameters, size)
+        assert (begin_s, start.sentence) == (piece.begin_s, piece.start.sentence)
+        count = len(found[0])
+        assert count > len(piece.epoch_s) - 5
+        of = jax.tree_util.tree_map(
+            lambda a, n=count: np.asarray(a)[:n], (piece.epoch_s, world.u, world.y, world.aux)
+        )
+        for one, other in zip(found, of, strict=True):
+            one = {k: one[k] for k in other} if isinstance(other, dict) else one
+            jax.tree_util.tree_map(np.testing.assert_array_equal, one, other)
+        jax.tree_util.tree_map(np.testing.assert_array_equal, belief, world.start)
+
+
+def test_the_axes_of_the_vehicle_have_the_same_bits_sample_by_sample(log):
+    """A product of matrices rounds a row alone in another way than many."""
+    whole = in_body_axes(log, (0.1, -0.2, 0.3)).imu
+    C_bs = axes_of((0.1, -0.2, 0.3))
+    for k in range(0, len(log.imu), 7):
+        both = turned(C_bs, np.stack([log.imu.gyro[k], log.imu.accel[k]]))
+        np.testing.assert_array_equal(both, [whole.gyro[k], whole.accel[k]])
+    np.testing.assert_allclose(whole.gyro, log.imu.gyro @ C_bs.T, rtol=1e-13, atol=1e-16)
 
 
 def test_an_answer_is_the_state_carried_on_over_the_samples_since(live, log):
@@ -252,35 +332,10 @@ def test_an_outage_is_bridged_as_the_replay_does(live, log):
     compare(at, stamps, vectors, len(stamps) - 3)
 
 
-@pytest.mark.parametrize("velocities", [True, False])
-def test_nothing_is_compiled_once_it_has_started(live, log, velocities):
-    if not velocities:
-        log = replace(log, gnss=replace(log.gnss, v_n=None, sigma_v=None))
-        live = LiveInsGnss(HEADED, RATE_HZ, FIX_HZ, "ekf")
-    whole, compiled = events(log, np.full(len(log.gnss), 0.1)), []
-
-    def heard(event, seconds, **told):
-        if event == "/jax/core/compile/backend_compile_duration":
-            compiled.append(told["fun_name"])
-
-    begun = 420
-    jax.clear_caches()  # else what another test compiled would not be seen
-    answers, _ = played(live, log, whole[:begun])
-    assert not answers[-1].flags & Flag.STARTING
-    jax.monitoring.register_event_duration_secs_listener(heard)
-    try:
-        played(live, log, whole[begun:])
-        assert compiled == []
-        jax.jit(lambda x: x + 3.5)(1.0)
-        assert len(compiled) == 1  # it would have been heard
-    finally:
-        jax.monitoring.unregister_event_duration_listener(heard)
-
-
 def test_bad_fixes_and_samples_are_refused_and_counted(live, log):
     whole = events(log, np.full(len(log.gnss), 0.1))
     played(live, log, whole[:600])
-    t, k = live._raw_ns[-1], next(e[2] for e in whole[600:] if e[1])
+    t, k = int(live._path.time_ns[-1]), next(e[2] for e in whole[600:] if e[1])
     g = log.gnss
     place, sigma = (float(g.lat_rad[k]), float(g.lon_rad[k]), float(g.alt_m[k])), g.sigma_m[k]
     before = live.epoch
@@ -319,7 +374,9 @@ def test_a_fix_that_is_far_off_is_flagged_and_counted_once(live, log, late_s):
     late, flagged = np.full(count, 0.1), {}
     late[far] += late_s
     for event in events(log, late):
-        push(live, log, event)
+        answer = push(live, log, event)
+        if event[1:] == (1, far):
+            assert Flag.OUTLIER in answer.flags
         for epoch in live.passed:
             flagged[epoch.time_ns] = Flag.OUTLIER in epoch.flags
             if flagged[epoch.time_ns] and epoch.time_ns == int(log.gnss.time_ns[far]):
@@ -333,6 +390,67 @@ def test_a_fix_of_the_future_waits(live, log):
     stamps, vectors = epochs_of_replay(log, InsGnssReplay(), "ekf")
     compare(at, stamps, vectors, len(stamps) - 3)
     assert live.counts["steps_again"] == 0
+
+
+def standing(parameters, turn_s=0.0, field_t=None, fixes_s=0.0):
+    """Path of a unit at 50 Hz and its start, if it finds one; it turns by 30 deg/s from 1 s on.
+
+    The first of its fixes, which do not move, comes after a time.
+    """
+    path, noise = InsGnssPath(parameters, UsualIntervals(0.02, 0.5), 1.0), np.random.default_rng(0)
+    for k in range(600):
+        row = [0.0, 0.0, np.pi / 6.0 * (50 < k <= 50 * (1.0 + turn_s)), 0.0, 0.0, -9.8]
+        path.push(np.array([20_000_000 * k]), row + noise.normal(size=(1, 6)) * 1e-4)
+        if field_t is not None:
+            path.push_field(20_000_000 * k, field_t)
+        if k % 25 == 0 and 0.02 * k > fixes_s:
+            velocity = np.zeros(3), np.full(3, 0.05)
+            path.push_fix(row_of(0.02 * k - 0.1, (0.7, 0.1, 100.0), np.ones(3), *velocity, 1))
+        if found := path.start():
+            return found[1]
+    return None
+
+
+@pytest.mark.parametrize("most_s", [600.0, 6.0, 2.0])
+def test_a_given_heading_is_that_of_the_first_sample_also_where_it_is_dropped(monkeypatch, most_s):
+    monkeypatch.setattr("robins.systems.ins_gnss.path._MOST_START_S", most_s)
+    start = standing(HEADED, turn_s=3.0, fixes_s=9.0)
+    turned = heading_of(start.q_nb) - HEADED.start.known_heading
+    assert np.degrees(turned) == pytest.approx(90.0, abs=0.01)
+
+
+def test_a_magnetometer_that_is_refused_is_asked_ever_more_rarely(monkeypatch):
+    asked = []
+
+    def counted(*of):
+        asked.append(float(of[0].time_s[-1]))
+        return find_start(*of)
+
+    monkeypatch.setattr("robins.systems.ins_gnss.path.find_start", counted)
+    monkeypatch.setattr("robins.systems.ins_gnss.path._COURSE_S", 2.0)
+    assert standing(InsGnssReplay(), field_t=np.array([3e-4, 0.0, 0.0])) is None
+    assert 10 < len(asked) < 25  # of 98 times that the start is looked for
+    assert np.all(np.diff(asked)[-3:] > 0.7)
+
+
+def test_samples_that_a_log_is_cleaned_of_are_refused_as_they_come(live, log):
+    """Swapped, doubled, without a number, absurd, or lost; and fixes that swap places."""
+    rows = np.arange(len(log.imu))
+    rows[[600, 601]] = rows[[601, 600]]
+    rows = np.delete(rows, slice(690, 696))
+    rows = np.insert(rows, 720, rows[719])
+    gyro = log.imu.gyro[rows].copy()
+    gyro[650, 1], gyro[670, 2] = np.nan, 2e5
+    imu = replace(log.imu, time_ns=log.imu.time_ns[rows], gyro=gyro, accel=log.imu.accel[rows])
+    raw, late_s = replace(log, imu=imu), np.where(np.arange(len(log.gnss)) % 3 == 0, 0.72, 0.1)
+    comes = [(int(np.max(imu.time_ns[: k + 1])), 0, k) for k in range(len(imu))]
+    comes += [event for event in events(raw, late_s) if event[1]]
+    _, at = played(live, raw, sorted(comes))
+    cleaned = clean(raw)
+    names = ("imu_nan", "imu_absurd", "imu_backward", "imu_duplicate")
+    assert [live.counts[name] for name in names] == [1, 1, 1, 1]
+    assert [cleaned.counts[name] for name in names] == [1, 1, 1, 1]
+    compare(at, *epochs_of_replay(cleaned, InsGnssReplay(), "ekf"), 30)
 
 
 def test_a_long_gap_is_a_new_start(live, log):
@@ -363,3 +481,28 @@ def test_the_walk_has_the_epochs_of_its_replay(data_dir, name):
     _, at = played(live, log, events(log, np.full(len(log.gnss), 0.08)))
     stamps, vectors = epochs_of_replay(log, parameters, name)
     compare(at, stamps, vectors, len(stamps) - 3)
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+def test_nothing_is_compiled_once_it_has_started(live, log, velocities):
+    if not velocities:
+        log = replace(log, gnss=replace(log.gnss, v_n=None, sigma_v=None))
+        live = LiveInsGnss(HEADED, RATE_HZ, FIX_HZ, "ekf")
+    whole, compiled = events(log, np.full(len(log.gnss), 0.1)), []
+
+    def heard(event, seconds, **told):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(told["fun_name"])
+
+    begun = 420
+    jax.clear_caches()  # else what another test compiled would not be seen
+    answers, _ = played(live, log, whole[:begun])
+    assert not answers[-1].flags & Flag.STARTING
+    jax.monitoring.register_event_duration_secs_listener(heard)
+    try:
+        played(live, log, whole[begun:])
+        assert compiled == []
+        jax.jit(lambda x: x + 3.5)(1.0)
+        assert len(compiled) == 1  # it would have been heard
+    finally:
+        jax.monitoring.unregister_event_duration_listener(heard)

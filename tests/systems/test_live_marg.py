@@ -1,5 +1,6 @@
 """A live orientation is that of the causal replay, kept in a file, not upset by bad samples."""
 
+from copy import copy
 from dataclasses import replace
 
 import jax
@@ -295,6 +296,17 @@ def test_bad_samples_are_counted_and_leave_the_answers_as_if_they_were_not_there
     for reason in ("nan", "inf", "absurd", "duplicate", "ahead"):
         assert live.counts[f"imu_{reason}"] == 1 + clean.counts[f"imu_{reason}"], reason
     assert live.counts["imu_backward"] == 2
+
+
+def test_a_copy_does_not_hear_the_samples_of_its_original(live):
+    log = made_log(6.0)
+    played(live, log, slice(0, 250))
+    other = copy(live)
+    of_copy = played(other, log, slice(250, 300))
+    counts, of_original = dict(other.counts), played(live, log, slice(250, 300))
+    for one, another in zip(columns(of_copy), columns(of_original), strict=True):
+        np.testing.assert_array_equal(one, another)
+    assert dict(other.counts) == counts == dict(live.counts)
 
 
 def test_a_clock_that_was_set_is_a_new_start(live):

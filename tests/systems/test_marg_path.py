@@ -7,6 +7,7 @@ from marg_logs import hand, log_of
 from scipy.spatial.transform import Rotation
 from test_live_marg import PARAMETERS, RATE_HZ, made_log
 
+from robins.systems.marg.log import earth_field
 from robins.systems.marg.path import SamplePath, joined
 from robins.systems.marg.saturation import levels
 
@@ -73,3 +74,23 @@ def test_a_turn_over_a_gap_is_that_of_gravity_and_field_on_both_sides(seed, seen
     mean = steps.samples.dv[block, at] / steps.samples.dt_s[block, at]
     up_b = q_nb[first + 1].inv().apply([0.0, 0.0, -1.0])
     assert mean @ up_b > 9.81 * np.cos(np.radians(10.0))
+
+
+def test_a_field_is_calibrated_to_the_same_bits_alone_and_in_a_log():
+    """A product of matrices rounds a row alone in another way; the size decides by its bits."""
+    skewed = [[1.1, 0.02, -0.03], [0.01, 0.93, 0.04], [-0.02, 0.05, 1.02]]
+    unit = PARAMETERS.magnetometer.model_copy(
+        update={"matrix": skewed, "offset": (3e-6, -4e-6, 5e-6)}
+    )
+    raw = np.random.default_rng(0).normal(size=(1001, 3)) * 8e-5
+    raw[[3, 500], 1] = np.nan
+    whole = earth_field(raw, unit)
+    assert np.sum(whole[1]) == 2
+    assert 50 < np.sum(whole[2]) < 950
+    np.testing.assert_allclose(
+        whole[0][0], np.array(skewed) @ (raw[0] - np.array(unit.offset)), rtol=1e-14
+    )
+    for size in (1, 7, 1000):
+        parts = [earth_field(raw[at : at + size], unit) for at in range(0, len(raw), size)]
+        for one, other in zip(whole, zip(*parts, strict=True), strict=True):
+            np.testing.assert_array_equal(one, np.concatenate(other))

@@ -34,6 +34,7 @@ class ManyRuns:
         self._first: list[Any] = []  # leaves of the first point
         self._differ: list[int] = []  # those that are arguments
         self._staged: StagedFunction | None = None
+        self._refused: list[str] = []  # reasons of programs that others replaced
 
     def __call__(
         self,
@@ -73,9 +74,9 @@ class ManyRuns:
 
     @property
     def notes(self) -> list[str]:
-        """Parts that JAX computed, with the reason."""
-        refused = self._staged.refused if self._staged else []
-        return [f"a part stays with JAX, as {why}" for why in refused]
+        """Parts that JAX computed in any call, each reason once."""
+        refused = [*self._refused, *map(str, self._staged.refused if self._staged else [])]
+        return [f"a part stays with JAX, as {why}" for why in dict.fromkeys(refused)]
 
     def _that_differ(self, points: Sequence[Tree]) -> dict[int, np.ndarray]:
         """The leaves that are arguments, by number, each with a leading axis of points."""
@@ -85,7 +86,9 @@ class ManyRuns:
         differ = [k for k, some in enumerate(each) if not _are_equal(self._first[k], some)]
         if not set(differ) <= set(self._differ):
             self._differ = sorted({*differ, *self._differ})
-            self._staged = None
+            if self._staged is not None:
+                self._refused += map(str, self._staged.refused)
+                self._staged = None
         return {k: np.stack(list(map(np.asarray, each[k]))) for k in self._differ}
 
     def _traced(

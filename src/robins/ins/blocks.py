@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation as SciRotation
 
+from robins.ins.frames import turned
 from robins.ins.increments import Increments
 
 
@@ -123,7 +124,7 @@ def cut(
     late = before > 0.0
     if np.any(late):
         turn = SciRotation.from_rotvec(-before[late, None] * theta[parent[late]])
-        piece_dv[late] = _applied(turn, piece_dv[late])
+        piece_dv[late] = turned(turn.as_matrix(), piece_dv[late])
     block = np.searchsorted(epoch_s, ends - _SLACK_S)
     count = np.bincount(block, minlength=len(epoch_s))
     needed = int(count.max(initial=1))
@@ -195,7 +196,7 @@ def gained_in_window(
     if window_s <= 0.0:
         return gained, age
     sample = np.searchsorted(time_s, at_s - 1e-9)
-    turned = SciRotation.identity(len(at_s))  # from the axes of the sample to those at t
+    turn = SciRotation.identity(len(at_s))  # from the axes of the sample to those at t
     while True:
         inside = sample >= 0
         k = np.clip(sample, 0, len(time_s) - 1)
@@ -207,12 +208,7 @@ def gained_in_window(
         share = length / increments.dt[k]
         weight = 1.0 - (at_s - 0.5 * (begin + end)) / window_s
         # dv is in the axes at the start of its interval, so the turn over the interval comes first
-        turned = turned * SciRotation.from_rotvec(-share[:, None] * increments.theta[k])
-        gained += (weight * share)[:, None] * _applied(turned, increments.dv[k])
+        turn = turn * SciRotation.from_rotvec(-share[:, None] * increments.theta[k])
+        gained += (weight * share)[:, None] * turned(turn.as_matrix(), increments.dv[k])
         age += weight * length
         sample = sample - 1
-
-
-def _applied(turn: SciRotation, v: np.ndarray) -> np.ndarray:
-    """Turned vectors (N, 3), each with the same bits whatever N is."""
-    return np.sum(turn.as_matrix() * v[:, None, :], axis=-1)

@@ -43,6 +43,14 @@ def swap(v):
     return _turn_last(v[..., _ORDER])
 
 
+def turned(C: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) times a matrix (..., 3, 3), with the same bits alone and in any array.
+
+    A product of matrices rounds one row otherwise than many.
+    """
+    return np.sum(C * v[..., None, :], axis=-1)
+
+
 def swap_q(q):
     """A quaternion (..., 4) q_nb in the other convention, NED/FRD <-> ENU/RFU; exact."""
     return _turn_last(q[..., _ORDER_Q])

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from enum import IntFlag
 from functools import partial
 from typing import Any, ClassVar, TypeVar
@@ -64,7 +65,7 @@ class Flag(IntFlag):
     DISTURBED = 16  # the last look at the magnetometer was refused
     DOUBTFUL = 32  # states or innovations contradict what was assumed
     BEHIND = 64  # the filter waits for later samples; the gyros carry on
-    OUTLIER = 128  # the filter refused a measurement of its last step
+    OUTLIER = 128  # the filter refused a measurement of its last step, or of one for this answer
 
 
 class TimestampGate:
@@ -225,6 +226,10 @@ class Live:
     def __reduce__(self) -> tuple:
         """Pickle as it is saved: compiled code is compiled again."""
         return _made_again, (type(self), *self._all_known())
+
+    def __copy__(self: LiveT) -> LiveT:
+        """An object of its own: neither hears the samples of the other."""
+        return deepcopy(self)
 
     def _all_known(self) -> tuple[str, dict[str, Any]]:
         """Parameters as TOML, and all else."""

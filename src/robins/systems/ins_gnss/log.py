@@ -155,14 +155,29 @@ def steps_of(
         usual: intervals of samples and fixes.
     """
     p, increments = parameters, log.increments
-    width = usual_width(p.update.longest_block, usual.sample_s)
-    blocks = cut(increments, log.time_s, begin_s, epochs, least=width)
-    scale = replaying.noise_scale(blocks, increments.dt, p.update.gap_noise, usual.sample_s)
+    u = blocks_of(increments, log.time_s, begin_s, epochs, p, usual)
     rate = rate_about(increments, log.time_s, epochs, usual.sample_s)
     window_s = p.gnss.velocity_window
     y, aux = measured_fixes(log, used, epochs, rate, usual.fix_s if window_s is None else window_s)
     known, about = measured_rest(log, epochs, rate, p.aids, usual)
-    return InsGnssSteps(ImuBlock(blocks.increments, scale), y | known, aux | about, rate)
+    return InsGnssSteps(u, y | known, aux | about, rate)
+
+
+def blocks_of(
+    increments: Increments,
+    time_s: np.ndarray,
+    begin_s: float,
+    epochs: np.ndarray,
+    parameters: InsGnssReplay,
+    usual: UsualIntervals,
+    spare: int = 0,
+) -> ImuBlock:
+    """Blocks from epoch to epoch, with room for what the longest holds and so many more."""
+    p = parameters.update
+    width = usual_width(p.longest_block, usual.sample_s) + spare
+    blocks = cut(increments, time_s, begin_s, epochs, least=width)
+    scale = replaying.noise_scale(blocks, increments.dt, p.gap_noise, usual.sample_s)
+    return ImuBlock(blocks.increments, scale)
 
 
 def first_belief(log: Log, start: StartPoint, parameters: InsGnssReplay) -> Belief:

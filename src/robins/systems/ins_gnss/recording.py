@@ -10,7 +10,7 @@ import numpy as np
 
 from robins import rotation
 from robins.dataset import Dataset, GnssTable
-from robins.ins.frames import to_ned_frd
+from robins.ins.frames import to_ned_frd, turned
 from robins.ins.increments import Increments, from_imu, own_intervals
 from robins.systems.ins_gnss.parameters import InsGnssReplay, UnknownReceiver
 
@@ -63,11 +63,11 @@ def in_body_axes(dataset: Dataset, orientation: Sequence[float]) -> Dataset:
         return dataset
     C_bs = axes_of(orientation)
     imu = to_ned_frd(dataset.imu)
-    imu = replace(imu, gyro=imu.gyro @ C_bs.T, accel=imu.accel @ C_bs.T)
+    imu = replace(imu, gyro=turned(C_bs, imu.gyro), accel=turned(C_bs, imu.accel))
     mag = dataset.mag
     if mag is not None:
         mag = to_ned_frd(mag)
-        mag = replace(mag, field_t=mag.field_t @ C_bs.T)
+        mag = replace(mag, field_t=turned(C_bs, mag.field_t))
     return replace(dataset, imu=imu, mag=mag, mounted=True)
 
 

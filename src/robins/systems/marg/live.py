@@ -38,6 +38,7 @@ from robins.ins.increments import Increments
 from robins.linalg.scalars import product
 from robins.systems.marg import model, monitor
 from robins.systems.marg.filters import filter_of
+from robins.systems.marg.log import earth_field
 from robins.systems.marg.parameters import MargReplay
 from robins.systems.marg.path import MargSteps, SamplePath
 from robins.systems.marg.replay import stated_sigma
@@ -224,15 +225,15 @@ class LiveMarg(Live):
 
     def _read_field(self, field_t: Any) -> None:
         """Calibrate a reading and keep it, if it can be the field of the Earth."""
-        m = self.parameters.magnetometer
         if field_t is None or self.parameters.use_magnetometer == "never":
             return
         raw = numbers("field", field_t, 3)
-        if not np.all(np.isfinite(raw)):
+        found = earth_field(raw[None], self.parameters.magnetometer)
+        field, is_missing, is_implausible = (one[0] for one in found)
+        if is_missing:
             self.counts["field_missing"] += 1
             return
-        field = (raw - np.array(m.offset)) @ np.array(m.matrix).T
-        if m.least <= float(np.linalg.norm(field)) <= m.most:
+        if not is_implausible:
             self._field, self._far = field, []
             return
         self.counts["field_implausible"] += 1

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from robins.dataset import Dataset, ImuTable, MagTable
-from robins.ins.frames import to_ned_frd
+from robins.dataset import Dataset, ImuTable
+from robins.ins.frames import to_ned_frd, turned
 from robins.ins.increments import usual_interval
 from robins.systems.marg import model
 from robins.systems.marg.parameters import MargMagnetometer, MargReplay
@@ -30,20 +30,15 @@ class PreparedMargLog(LogPiece):
     counts: dict[str, int]
 
 
-def calibrated(
-    mag: MagTable, magnetometer: MargMagnetometer
-) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
-    """Time [ns] and field [T, FRD] of the readings that can be the field of the Earth; counts."""
-    table = to_ned_frd(mag)
-    finite = np.all(np.isfinite(table.field_t), axis=1)
-    field = (table.field_t - np.array(magnetometer.offset)) @ np.array(magnetometer.matrix).T
-    size = np.linalg.norm(np.where(finite[:, None], field, 0.0), axis=1)
-    able = finite & (size >= magnetometer.least) & (size <= magnetometer.most)
-    counts = {
-        "field_missing": int(np.sum(~finite)),
-        "field_implausible": int(np.sum(finite & ~able)),
-    }
-    return table.time_ns[able], field[able], counts
+def earth_field(
+    field_t: np.ndarray, magnetometer: MargMagnetometer
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Readings (M, 3) [T] calibrated, which of them miss a number, and which are implausible."""
+    missing = ~np.all(np.isfinite(field_t), axis=1)
+    field = turned(np.array(magnetometer.matrix), field_t - np.array(magnetometer.offset))
+    size = np.linalg.norm(np.where(missing[:, None], 0.0, field), axis=1)
+    able = (size >= magnetometer.least) & (size <= magnetometer.most)
+    return field, missing, ~missing & ~able
 
 
 def at_samples(time_ns: np.ndarray, field_ns: np.ndarray, field: np.ndarray) -> np.ndarray:
@@ -73,8 +68,11 @@ def prepare(dataset: Dataset, parameters: MargReplay) -> PreparedMargLog:
     time_ns, gyro = np.asarray(imu.time_ns), np.asarray(imu.gyro, float)
     field, found = np.full(gyro.shape, np.nan), {"field_missing": 0, "field_implausible": 0}
     if dataset.mag is not None and parameters.use_magnetometer != "never":
-        field_ns, readings, found = calibrated(dataset.mag, parameters.magnetometer)
-        field[1:] = at_samples(time_ns, field_ns, readings)
+        mag = to_ned_frd(dataset.mag)
+        readings, *none = earth_field(mag.field_t, parameters.magnetometer)
+        found = dict(zip(found, (int(np.sum(one)) for one in none), strict=True))
+        able = ~np.any(none, axis=0)
+        field[1:] = at_samples(time_ns, mag.time_ns[able], readings[able])
     dt = np.diff(time_ns) * 1e-9
     ends = levels(gyro, float(np.median(dt))) if imu.kind == "rate" else None
     path = SamplePath(parameters, usual_interval(dt), imu.kind, ends)

@@ -37,10 +37,9 @@ from robins.rotation import Rotation
 from robins.scenario import Quantity, default
 from robins.systems.ins_gnss import aboard as program
 from robins.systems.ins_gnss import model
-from robins.systems.ins_gnss.live import LiveInsGnss
-from robins.systems.ins_gnss.live_answers import Navigation
-from robins.systems.ins_gnss.live_fixes import some
+from robins.systems.ins_gnss.live import LiveInsGnss, Navigation
 from robins.systems.ins_gnss.parameters import Drive, Gnss, InsGnssReplay
+from robins.systems.ins_gnss.path import some
 from robins.systems.ins_gnss.recording import (
     Log,
     as_rates,

@@ -1,0 +1,320 @@
+"""Path from samples and fixes to steps of the filter, chunk by chunk, of a log that goes on.
+
+Increments, start, epochs and steps are those of a replay, made by the same functions of the part of
+the log that they look back at. Any chunks of the same samples give the same bits. Later samples are
+used as far as the latency of each stage reaches:
+
+- an increment is known with the next sample;
+- the turn rate at an epoch is a mean about it: `reach_of_rate`;
+- the start needs a fix that shows the course, or rest where the heading is given.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation as SciRotation
+
+from robins.dataset import GnssTable, ImuTable
+from robins.filters import Belief
+from robins.ins.blocks import epochs_between, reach_of_rate
+from robins.ins.increments import Increments, from_imu
+from robins.systems.ins_gnss.log import InsGnssSteps, blocks_of, first_belief, steps_of
+from robins.systems.ins_gnss.parameters import InsGnssReplay
+from robins.systems.ins_gnss.positions import attitudes
+from robins.systems.ins_gnss.recording import Log, believed_sigmas
+from robins.systems.ins_gnss.rest import WAYS_S, UsualIntervals, known_until
+from robins.systems.ins_gnss.start import REST_S, StartPoint, fast_fix, find_start
+from robins.systems.parts import ImuBlock
+from robins.systems.streaming import LiveError, numbers, refuse_units
+
+_AHEAD_S = 10.0  # of the newest sample, by which a fix may be
+_COURSE_S = 30.0  # how long a course is waited for
+_UNITS_S, _MOST_START_S = 1.0, 600.0  # of samples: whose size tells their unit, for the start
+_CONTEXT = 3  # samples that an increment needs besides its last
+# Of a fix: time [s], latitude, longitude [rad], height [m], three sigmas [m], velocity [m/s], its
+# sigmas, quality; what is missing is NaN.
+WIDTH = 14
+TOLD = [1, 2, 3, 7, 8, 9]  # what a fix can say
+
+
+class InsGnssPath:
+    """Samples and fixes to steps of the filter (see the module).
+
+    Attributes:
+        origin_ns: stamp of the first sample, at which the clock of the path begins.
+        time_ns: (M,) stamps of the last samples; none before the first.
+        first_fix_s: s, of the first whole fix.
+        reach_s: s, by which the steps are behind the samples.
+    """
+
+    def __init__(self, parameters: InsGnssReplay, usual: UsualIntervals, delay_s: float):
+        """Begin.
+
+        Args:
+            parameters: as of a replay.
+            usual: intervals of samples and fixes.
+            delay_s: s, by which a fix may be late: the part of the log before is forgotten.
+        """
+        self._parameters = p = parameters
+        self.origin_ns, self.time_ns = 0, np.zeros(0, np.int64)
+        self._raw = np.zeros((0, 6))  # the samples of these stamps
+        self._steps = np.zeros((0, 8))  # end [s], dt, turn, velocity of each increment kept
+        self._first = 0  # number of increments before these
+        self._newest = np.zeros((0, 8))  # the last increment, as far as it is known
+        self.fixes = np.zeros((0, WIDTH))  # rows of `row_of`, by time
+        self._field = np.zeros((0, 4))  # time [s] and field [T], until the start
+        self._known, self._velocities = tuple(usual), False
+        self.first_fix_s = math.inf
+        self._tick, self._ask_s = 0, 0.0  # tenth of a second of the last look for a start
+        self.reach_s = reach_of_rate(usual.sample_s)
+        # what has to be looked back at from the oldest epoch
+        self._settled = 2 * max(2, round(p.aids.window / usual.sample_s)) + 1  # samples
+        back = max(p.gnss.velocity_window or 0.0, 1.5, 4.0 * usual.fix_s)
+        settling_s = 2.0 * p.aids.window + 2.0 * usual.sample_s
+        self._back_s = delay_s + 2.0 * self.reach_s + back + settling_s
+
+    @property
+    def _usual(self) -> UsualIntervals:
+        return UsualIntervals(*self._known)
+
+    def seconds(self, time_ns: int) -> float:
+        """A stamp on the clock of the path [s]; NaN before the first sample."""
+        return (time_ns - self.origin_ns) * 1e-9 if len(self.time_ns) else math.nan
+
+    def push(self, time_ns: np.ndarray, rows: np.ndarray) -> None:
+        """Take samples.
+
+        Args:
+            time_ns: (M,) int64, rising.
+            rows: (M, 6) gyro [rad/s] and accel [m/s^2] in body axes.
+        """
+        if not len(self.time_ns):
+            self.origin_ns = int(time_ns[0])
+        final = self._first + len(self._steps)
+        self.time_ns = np.concatenate([self.time_ns[-_CONTEXT:], time_ns])
+        self._raw = np.concatenate([self._raw[-_CONTEXT:], rows])
+        if len(self._raw) < 2:
+            return
+        table = ImuTable(self.time_ns, self._raw[:, :3], self._raw[:, 3:], "rate")
+        made, end_ns = from_imu(table, self._usual.sample_s)
+        ends = (end_ns - self.origin_ns) * 1e-9
+        found = np.column_stack([ends, *(np.asarray(a, float) for a in made[:3])])
+        if len(self._raw) > _CONTEXT:  # else the next samples change them all
+            self._steps = np.concatenate([self._steps, found[1 if final else 0 : -1]])
+        self._newest = found[-1:]
+
+    def push_field(self, time_ns: int, field_b: np.ndarray) -> None:
+        """Take a reading (3,) [T] of a magnetometer, for the start."""
+        self._field = np.concatenate([self._field, [[self.seconds(time_ns), *field_b]]])
+
+    def refused(self, row: np.ndarray, oldest_s: float) -> str:
+        """Reason why a fix is refused; "" for one that is taken.
+
+        Args:
+            row: of `row_of`.
+            oldest_s: s, of the oldest epoch that can be gone back to.
+        """
+        newest_s = self._newest[0, 0] if len(self._newest) else 0.0
+        if math.isnan(row[0]) or row[0] <= 0.0:
+            return "too_old"  # before the first sample
+        if np.any(np.abs(self.fixes[:, 0] - row[0]) < 1e-9):
+            return "duplicate"
+        if row[0] <= oldest_s + 1e-9:
+            return "too_old"
+        nothing = "" if np.any(np.isfinite(row[TOLD])) else "nan"
+        return "ahead" if row[0] > newest_s + _AHEAD_S else nothing
+
+    def push_fix(self, row: np.ndarray) -> None:
+        """Take a fix, a row of `row_of`, in any order."""
+        at = int(np.searchsorted(self.fixes[:, 0], row[0]))
+        self.fixes = np.insert(self.fixes, at, row, axis=0)
+        self._velocities |= bool(np.any(np.isfinite(row[7:10])))
+        if np.all(np.isfinite(row[1:4])):
+            self.first_fix_s = min(self.first_fix_s, float(row[0]))
+
+    # --------------------------------------------------------------------------------- start
+
+    def start(self) -> tuple[float, StartPoint, Belief] | None:
+        """Time [s], start and belief where a replay of the log so far would begin; None: not yet.
+
+        Raises:
+            LiveError: the samples are of another unit.
+        """
+        p, rows = self._parameters, self._steps
+        if not len(rows):
+            return None
+        if rows[-1, 0] - rows[min(2, len(rows) - 1), 0] > _MOST_START_S:
+            self._halve()
+            rows = self._steps
+        tick = int(10.0 * rows[-1, 0])
+        if tick == self._tick:
+            return None  # ten times a second are enough
+        self._tick = tick
+        given, waits = p.start.known_heading is not None, rows[-1, 0] - self.first_fix_s
+        compass = len(self._field) > 0 and waits > _COURSE_S and rows[-1, 0] >= self._ask_s
+        log = self._log()
+        within = self.fixes[:, 0] <= rows[-1, 0] - self.reach_s
+        log = log._replace(
+            gnss=some(log.gnss, within),
+            **{
+                name: None if (a := getattr(log, name)) is None else a[within]
+                for name in ("gnss_s", "sigma_m", "v_n", "sigma_v", "withheld")
+            },
+        )
+        if not (given or compass) and fast_fix(log, p.start)[0] is None:
+            return None
+        try:
+            found = find_start(log, p.start, p.aids, self._usual, p.gnss)
+        except ValueError:
+            # not yet; a magnetometer that was refused is asked again after a tenth of the wait
+            self._ask_s = rows[-1, 0] + 0.1 * waits if compass else 0.0
+            return None
+        if given and not found.sentence.startswith("levelled at rest") and waits < REST_S:
+            return None
+        raw = rows[2:][: max(1, round(_UNITS_S / self._usual.sample_s))]
+        refuse_units(*(raw[:, k : k + 3] / raw[:, 1:2] for k in (2, 5)))
+        return float(log.gnss_s[found.fix]), found, first_belief(log, found, p)
+
+    def seek_again(self) -> None:
+        """Let the next `start` look, whenever the last one did."""
+        self._tick = 0
+
+    def _halve(self) -> None:
+        """Drop the older half of the samples, but for how they turned.
+
+        A heading that is given is that at the end of the first increment, so this one stays, and
+        one increment of all that are dropped follows it.
+        """
+        begin, rows = len(self._steps) // 2, self._steps
+        gone, end_s = rows[1:begin], rows[begin - 1, 0]
+        q = attitudes(np.array([1.0, 0.0, 0.0, 0.0]), gone[:, 2:5])[-1]
+        turn = SciRotation.from_quat(q, scalar_first=True).as_rotvec()
+        whole = np.concatenate([[end_s, gone[:, 1].sum()], turn, gone[:, 5:].sum(axis=0)])
+        self._keep(begin)
+        self._steps = np.concatenate([rows[:1], whole[None], self._steps])
+        self._field = self._field[self._field[:, 0] > end_s - 1.0]
+        self.fixes = self.fixes[self.fixes[:, 0] > end_s]
+
+    def _log(self) -> Log:
+        """Increments and all fixes as a piece of a log."""
+        rows, f, gnss = self._steps, self.fixes, self._parameters.gnss
+        table = table_of(f, self.origin_ns, self._velocities)
+        log = Log(
+            Increments(rows[:, 1], rows[:, 2:5], rows[:, 5:8]),
+            rows[:, 0],
+            table,
+            f[:, 0],
+            believed_sigmas(table, gnss)[0],
+            None,
+            None,
+            np.zeros(len(f), dtype=bool),
+            first=self._first,
+        )
+        if gnss.use_velocity:  # there or not, so that nothing is compiled when the first one comes
+            stated = table_of(f, self.origin_ns, velocities=True)
+            log = log._replace(v_n=f[:, 7:10], sigma_v=believed_sigmas(stated, gnss)[1])
+        if len(self._field):
+            return log._replace(field_s=self._field[:, 0], field_b=self._field[:, 1:])
+        return log
+
+    # --------------------------------------------------------------------------------- steps
+
+    def due(self, time_s: float, wanted_s: float) -> list[tuple[float, float]]:
+        """Epochs after one that later samples do not change, each as this one is stated.
+
+        Args:
+            time_s: s, of the epoch.
+            wanted_s: s, of the last fix, or start, up to there: blocks are counted from it.
+        """
+        known_s = self._steps[-1, 0] - self.reach_s if len(self._steps) else -math.inf
+        longest_s, fixes_s = self._parameters.update.longest_block, self.fixes[:, 0]
+        if known_s <= time_s:
+            return []
+        # one block beyond what is known, whose end is none
+        edges = epochs_between(wanted_s, known_s + longest_s, fixes_s, longest_s, even=False)
+        out = []
+        for edge_s in edges[(edges > time_s) & (edges <= known_s)].tolist():
+            wanted_s = edge_s if edge_s in fixes_s else wanted_s
+            out.append((edge_s, wanted_s))
+        return out
+
+    def steps(self, begin_s: float, epochs: np.ndarray) -> InsGnssSteps:
+        """Steps from an epoch to later ones (E,) [s] of `due`."""
+        log = self._log()
+        used = np.isin(log.gnss_s, epochs)
+        return steps_of(log, used, begin_s, epochs, self._parameters, self._usual)
+
+    def since(self, begin_s: float) -> ImuBlock:
+        """Block (1, K) from an epoch to the newest sample, as far as its increment is known."""
+        rows = self._steps[self._steps[:, 0] > begin_s - 2.0 * self._usual.sample_s]
+        final_s = rows[-1, 0] if len(rows) else begin_s
+        rows = np.concatenate([rows, self._newest[self._newest[:, 0] > final_s]])
+        inc, epochs = Increments(rows[:, 1], rows[:, 2:5], rows[:, 5:8]), rows[-1:, 0]
+        return blocks_of(inc, rows[:, 0], begin_s, epochs, self._parameters, self._usual, 8)
+
+    def forget(self, oldest_s: float) -> None:
+        """Drop, in large pieces, what no step from an epoch on looks back at."""
+        begin = oldest_s - self._back_s
+        if self._steps[0, 0] >= begin - self._back_s:
+            return
+        first = int(np.searchsorted(self._steps[:, 0], begin, side="right"))
+        since_s = float(self._steps[min(first + self._settled, len(self._steps) - 1), 0])
+        aids, usual = self._parameters.aids, self._usual
+        self._known = tuple(known_until(self._log(), aids, usual, since_s))
+        # a way over an outage begins at the last place before it
+        far = self.fixes[:, 0] <= begin - WAYS_S[-1] - 2.0 * max(1.0, usual.fix_s)
+        placed = np.flatnonzero(far & np.all(np.isfinite(self.fixes[:, 1:3]), axis=1))
+        self.fixes = self.fixes[placed[-1] if len(placed) else 0 :]
+        self._keep(first)
+
+    def _keep(self, begin: int) -> None:
+        """Drop increments before a row."""
+        self._steps, self._first = self._steps[begin:], self._first + begin
+
+
+def row_of(
+    time_s: float, place: Any, sigma_m: Any, v_n: Any, sigma_v: Any, quality: Any
+) -> np.ndarray:
+    """(14,) row of a fix.
+
+    Raises:
+        LiveError: a vector of another kind, a velocity without sigmas, angles that are no radians.
+    """
+    where, sigma = numbers("lat_rad, lon_rad, alt_m", place, 3), numbers("sigma_m", sigma_m, 3)
+    missing = np.full(3, np.nan)
+    velocity = missing if v_n is None else numbers("v_n", v_n, 3)
+    if v_n is not None and sigma_v is None:
+        raise LiveError("a velocity needs sigmas", "sigma_v", "give (3,) m/s")
+    spread = missing if sigma_v is None else numbers("sigma_v", sigma_v, 3)
+    if abs(where[0]) > np.pi / 2 or abs(where[1]) > 2.0 * np.pi:
+        what = f"latitude {where[0]:.4g} and longitude {where[1]:.4g} are no radians"
+        raise LiveError(what, "push_fix", "of degrees give np.radians")
+    # as of a log that was cleaned: a component whose sigma is none is missing
+    where = np.where(np.isfinite(where) & (sigma > 0.0), where, np.nan)
+    velocity = np.where(np.isfinite(velocity) & (spread > 0.0), velocity, np.nan)
+    sigma = np.where(sigma > 0.0, sigma, 1.0)
+    spread = np.where(spread > 0.0, spread, 1.0)
+    return np.array([time_s, *where, *sigma, *velocity, *spread, float(quality)])
+
+
+def table_of(rows: np.ndarray, origin_ns: int, velocities: bool) -> GnssTable:
+    """Rows (M, 14), whose times count from an origin, as a table with velocities or without."""
+    time_ns = np.round(rows[:, 0] * 1e9).astype(np.int64) + origin_ns
+    v, spread = (rows[:, 7:10], rows[:, 10:13]) if velocities else (None, None)
+    quality = rows[:, 13].astype(int)
+    return GnssTable(time_ns, rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4:7], v, spread, quality)
+
+
+def some(table: GnssTable, keep: np.ndarray) -> GnssTable:
+    """Some rows of a table of fixes."""
+    columns: dict[str, Any] = {
+        name: None if (a := getattr(table, name)) is None else a[keep]
+        for name in (
+            *("time_ns", "lat_rad", "lon_rad", "alt_m", "sigma_m", "v_n", "sigma_v"),
+            "quality",
+        )
+    }
+    return GnssTable(**columns)
