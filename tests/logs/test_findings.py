@@ -108,6 +108,15 @@ FILES = (
         "note velocity: 4 of 4 fixes state no sigma of velocity",
         made_binary.nmea(),
     ),
+    (
+        "height_assumed",
+        "warning: no fix states a height; 0 m is assumed, with a sigma of 1000 m",
+        b"".join(
+            made_binary.changed(x, f7="", f8="") if b"RMC" in x else x
+            for x in made_binary.nmea().splitlines(True)
+            if b"GGA" not in x
+        ),
+    ),
     ("clock_aligned", "note: stamps of the samples are put on GPS time", made_binary.ubx()),
     (
         "sensors_merged",
