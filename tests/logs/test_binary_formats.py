@@ -17,6 +17,7 @@ from robins import foreign
 from robins.dataset import GnssTable, ImuTable
 from robins.logs import LogError, load_dataset, open_log
 from robins.logs.merging import gps_clock, merged
+from robins.logs.rtcm import crc24q
 
 PLACE = {"rtol": 0, "atol": 1e-9}
 
@@ -240,6 +241,32 @@ def test_a_receiver_without_a_date_and_with_more_digits(tmp_path):
     found = [gnss.alt_m[0], *gnss.sigma_m[0]]
     np.testing.assert_allclose(np.array(found) * 1e3, [more.height, 14.1, 14.1, 21.0], rtol=1e-12)
     np.testing.assert_allclose(gnss.sigma_m[1], MADE.sigma)
+
+
+def test_a_sync_word_in_a_correction_is_no_message(tmp_path):
+    """Framed as the example of RTCM 10403.3, whose checksum the standard prints."""
+    example = bytes.fromhex("D300133ED7D30202980EDEEF34B4BD62AC0941986F33360B98")
+    assert crc24q(example[:-3]).to_bytes(3, "big") == example[-3:]
+
+    def correction(inside):
+        frame = b"\xd3" + len(inside).to_bytes(2, "big") + inside
+        return frame + crc24q(frame).to_bytes(3, "big")
+
+    for inside in (
+        b"\x3e\xd3\xb5\x62\x01\x07\x02\x00",
+        b"\xb5\x62\x01\x07\xff\xff",
+        b"\xb5\x62\xd3",
+    ):
+        whole = correction(inside)
+        parts = (made.ubx(inertial=False), whole, made.ubx(inertial=False), whole)
+        gnss, found = read(tmp_path, b"".join(parts))
+        assert (len(gnss), found) == (8, {})
+        whole = bytes([whole[0], whole[1], whole[2] ^ 1, *whole[3:]])  # no correction now
+        _, found = read(tmp_path, b"".join([*parts[:1], whole, *parts[2:]]))
+        assert found["damaged_frames"].value == 1
+    text = correction(b"\x40\x50$GPGGA,120000.00,4806,N*00")
+    gnss, found = read(tmp_path, made.nmea() + text)
+    assert (len(gnss), found.keys()) == (4, {"sigma_assumed"})
 
 
 # -------------------------------------------------------------------------------------------- NMEA

@@ -35,6 +35,7 @@ from robins.logs.findings import (
 )
 from robins.logs.fix_kinds import fixes, over_ground
 from robins.logs.opening import Bytes, map_file
+from robins.logs.rtcm import end_of_frame
 from robins.logs.text import Head
 from robins.units import to_si
 
@@ -154,7 +155,7 @@ def _epochs(file: str, data: Bytes, findings: list[Finding] | None) -> list[dict
                 raise ValueError
             found = _numbers(kind.decode(), body.decode("ascii").split(","))
         except (ValueError, IndexError):
-            wrong += 1
+            wrong += not end_of_frame(data, one.start())
             continue
         near = (epoch for epoch in epochs[:-4:-1] if epoch["time"] == found.get("time"))
         epoch = epochs[-1] if kind == b"VTG" and epochs else next(near, None)
