@@ -152,7 +152,9 @@ def test_every_finding_has_a_way_to_be_caused():
     for check in CHECKS:
         spoilt = {(row.code, row.severity) for row in ROWS if row.check == check.find.__name__}
         assert spoilt == outcomes(check.codes)
-    assert {(code, says.split()[0].strip(":")) for code, says, _ in FILES} == outcomes(OF_READERS)
+    alone = {(code, says.split()[0].strip(":")) for code, says, _ in FILES}
+    several = {("table_replaced", "note")}  # see test_log_registry
+    assert alone | several == outcomes(OF_READERS)
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.check}-{row.code}")

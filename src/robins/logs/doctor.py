@@ -96,6 +96,7 @@ OF_READERS = (
     ),
     FindingCode("height_assumed", "warning", "a receiver states no heights, as with RMC alone"),
     FindingCode("sensors_merged", "note", "gyros and accelerometers were recorded apart"),
+    FindingCode("table_replaced", "note", "a file of its own replaces what a recording holds"),
     FindingCode("clock_aligned", "note", "samples are put on GPS time by the arrival of the fixes"),
     FindingCode("velocity_taken", "note", "velocities of fixes come from a topic of their own"),
     FindingCode(

@@ -22,7 +22,7 @@ from robins import logs, scenario, systems
 from robins.ins.frames import to_ned_frd
 from robins.logs.batches import spread
 from robins.logs.findings import by_severity
-from robins.logs.loading import by_kind
+from robins.logs.loading import by_kind, without_replaced
 from robins.logs.mounting import turned
 from robins.logs.quiet import usual_step_s
 from robins.logs.tables import kind_of, tables_of
@@ -79,10 +79,9 @@ def examine(paths: Logs, columns: Sequence[str | os.PathLike[str]] = ()) -> LogE
     mounting = mounting_of(configuration)
     formats = logs.formats_of(files, columns)
     findings: list[logs.Finding] = []
-    opened = []
-    for path in files:
-        log = logs.open_log(path, formats.get(str(path)), findings)
-        opened.append(turned(log, mounting) if mounting else log)
+    read = [logs.open_log(path, formats.get(str(path)), findings) for path in files]
+    opened = without_replaced(read, findings)
+    opened = [turned(log, mounting) for log in opened] if mounting else opened
     tables = [_described(table) for log in opened for table in tables_of(log)]
     findings += logs.examine(opened)
     try:
