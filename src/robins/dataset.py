@@ -46,6 +46,7 @@ class GnssTable(_Rows):
     """Position and velocity fixes of a GNSS antenna; NaN where a component is missing.
 
     Velocities and sigmas are given along ``nav``; for ENU the components are east, north, up.
+    ``assumed_m`` and ``assumed_v`` mark sigmas that the log does not state; without, it states all.
     """
 
     time_ns: np.ndarray  # (M,) int64
@@ -59,6 +60,8 @@ class GnssTable(_Rows):
     nav: NavFrame = "NED"
     source: str = ""
     rows: np.ndarray | None = None
+    assumed_m: np.ndarray | None = None  # (M, 3) bool
+    assumed_v: np.ndarray | None = None  # (M, 3) bool
 
 
 @dataclass(frozen=True)

@@ -153,7 +153,7 @@ def _with_sigmas(gnss: GnssTable, findings: list[Finding]) -> GnssTable:
         name: np.where(np.isnan(one), getattr(filled, name), getattr(gnss, name))
         for name, one in blank.items()
     }
-    return dataclasses.replace(gnss, **kept)
+    return dataclasses.replace(filled, **kept)
 
 
 def clean_gnss(gnss: GnssTable) -> tuple[GnssTable, dict[str, int]]:

@@ -18,6 +18,7 @@ import math
 import os
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial, reduce
 from operator import xor
 
@@ -103,7 +104,7 @@ def fixes_of(
         )
         height = column("altitude")
     up = column("up")
-    if np.isnan(height).all():
+    if unknown := bool(np.isnan(height).all()):
         height, up = np.zeros(len(kept)), np.full(len(kept), _ANY_HEIGHT_M)
         finding_reporter(findings, "warning", "height_assumed", file, value=len(kept))(
             f"no fix states a height; 0 m is assumed, with a sigma of {_ANY_HEIGHT_M:g} m. Switch "
@@ -120,6 +121,9 @@ def fixes_of(
         np.zeros(len(kept), bool),
         findings,
     )
+    if unknown:
+        marks = np.zeros((len(kept), 3), bool) if table.assumed_m is None else table.assumed_m
+        table = replace(table, assumed_m=marks | [False, False, True])
     return table, column("at")
 
 

@@ -99,13 +99,14 @@ def checked(table: AnyTable) -> AnyTable:
     for field in ("quality", "rows"):
         if getattr(table, field, None) is not None:
             out[field] = _shaped(table, field, _integers(table, field, "give integers"), (n,))
-    if isinstance(table, AttitudeTable) and table.moving is not None:
-        moving = np.asarray(table.moving)
-        if moving.dtype.kind != "b":
-            raise refused(_name(table), field="moving")(
-                f"is {moving.dtype}, not bool", "give True and False"
-            )
-        out["moving"] = _shaped(table, "moving", moving, (n,))
+    for field, components in (("moving", 0), ("assumed_m", 3), ("assumed_v", 3)):
+        if (value := getattr(table, field, None)) is not None:
+            marks = np.asarray(value)
+            if marks.dtype.kind != "b":
+                raise refused(_name(table), field=field)(
+                    f"is {marks.dtype}, not bool", "give True and False"
+                )
+            out[field] = _shaped(table, field, marks, (n, components) if components else (n,))
     return dataclasses.replace(table, **out)
 
 
