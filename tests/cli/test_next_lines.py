@@ -75,7 +75,7 @@ def test_of_a_log_that_begins_in_motion_it_navigates(robins, tmp_path):
 
 
 def test_what_the_doctor_writes_is_in_the_line(robins, tmp_path):
-    """And is not where nothing could be written."""
+    """A file that could not be written is not named."""
     lines = {}
     for name, speed, status in (("rest", 0.0, 0), ("drive", 10.0, 2)):
         (tmp_path / f"{name}.mcap").write_bytes(bag(speed))

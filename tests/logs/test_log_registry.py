@@ -74,7 +74,7 @@ def test_files_of_one_recording_become_one_dataset(three):
 
 
 def test_a_file_of_fixes_replaces_those_of_a_recording(tmp_path):
-    """In any order, with a note; nothing is replaced where both are recordings."""
+    """Any order will do, a note reports it; of two recordings nothing is replaced."""
     log, better = tmp_path / "flight.BIN", tmp_path / "better.nmea"
     log.write_bytes(made_binary.dataflash(geoid=False))
     better.write_bytes(made_binary.nmea())
