@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from robins import scenario
+from robins.logs import unit_file
 from robins.logs.mounting import Mounting
 from robins.logs.unit_file import UnitProperties, find_unit, toml_of
 from robins.systems.ins_gnss import Drive, InsGnssReplay, drive_dataset
@@ -66,6 +67,17 @@ def test_an_offset_of_the_clock_and_a_window_of_the_velocities_are_told_apart(lo
     found = find_unit(log.imu, replace(gnss, time_ns=gnss.time_ns + round(late_s * 1e9)))
     assert (found.latency_s or 0.0) == pytest.approx(late_s, abs=0.04)
     assert found.velocity_window_s == (EPOCH_S if means else None)
+
+
+def test_what_does_not_lower_the_unexplained_share_is_not_written(log, monkeypatch):
+    """A wrong age of the velocities, and a right one."""
+    means = replace(log.gnss, v_n=_means(log).v_n)
+    for gnss, age_s, window_s in ((log.gnss, 0.125, None), (means, 0.125, EPOCH_S)):
+        monkeypatch.setattr(unit_file, "velocity_delay", lambda track, age_s=age_s: age_s)
+        monkeypatch.setattr(unit_file, "small_offset", lambda verdict: None)
+        found = find_unit(log.imu, gnss)
+        assert (found.velocity_window_s, found.left is None) == (window_s, window_s is None)
+    assert found.left[1] < found.left[0]
 
 
 @pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (180.0, 0.0, -90.0), (10.0, -20.0, 35.0)])

@@ -16,6 +16,7 @@ from robins import rotation
 from robins.dataset import GnssTable, ImuTable
 from robins.logs.checks_motion import in_body, small_offset
 from robins.logs.gnss_motion import track_of, velocity_delay
+from robins.logs.motion_fit import MotionFit
 from robins.logs.motion_models import ModelChoice, judge
 from robins.logs.quiet import ImuSignal, signal_of, windows_of
 
@@ -64,8 +65,9 @@ def find_unit(imu: ImuTable, gnss: GnssTable | None) -> UnitProperties:
     left = None
     if window is not None or lag is not None:
         plain = verdict if late is None else judge(imu, gnss, signal, track, late_s=0.0)
-        if plain is not None:
-            left = plain.nothing.left(plain.views), verdict.fit.left(verdict.views)
+        found = verdict.clocked if late is None or lag is not None else verdict.nothing
+        left = None if plain is None else _lowered(plain, verdict, found)
+        window, lag = (window, lag) if left else (None, None)
     return UnitProperties(
         orientation_deg=orientation,
         latency_s=None if lag is None else -lag,
@@ -73,6 +75,25 @@ def find_unit(imu: ImuTable, gnss: GnssTable | None) -> UnitProperties:
         left=left,
         **_noise(imu, gnss, C_bs),
     )
+
+
+def _lowered(
+    plain: ModelChoice, verdict: ModelChoice, found: MotionFit
+) -> tuple[float, float] | None:
+    """Share of the motion left unexplained without and with what was found of the clock.
+
+    None if the share does not fall by more than its own uncertainty, from the scatter of the
+    stretches: nothing is written that is not shown to be better.
+    """
+    before, after = plain.nothing.by_stretch(plain.views), found.by_stretch(verdict.views)
+    if len(before) == len(after):
+        gain = before - after
+        sigma = np.std(gain) / np.sqrt(max(len(gain) - 1, 1))
+    else:  # the shift moved a stretch beyond an end
+        sigma = np.hypot(*(np.std(x) / np.sqrt(max(len(x) - 1, 1)) for x in (before, after)))
+    if not np.mean(before) - np.mean(after) > sigma:
+        return None
+    return plain.nothing.left(plain.views), found.left(verdict.views)
 
 
 def _orientation(
