@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 from robins import scenario
-from robins.logs import unit_file
+from robins.logs import load_dataset, write_log
+from robins.logs import unit_file as written_by
 from robins.logs.mounting import Mounting
 from robins.logs.unit_file import UnitProperties, find_unit, toml_of
 from robins.systems.ins_gnss import Drive, InsGnssReplay, drive_dataset
+from robins.systems.ins_gnss.correlated_errors import with_correlated_share
+from robins.systems.ins_gnss.recording import on_one_clock
+from robins.workbench.doctor import unit_file
 
 TURNS = "".join(
     f'[[legs]]\ndo = "turn"\nangle = "{angle} deg"\nrate = "15 deg/s"\n'
@@ -73,8 +77,8 @@ def test_what_does_not_lower_the_unexplained_share_is_not_written(log, monkeypat
     """A wrong age of the velocities, and a right one."""
     means = replace(log.gnss, v_n=_means(log).v_n)
     for gnss, age_s, window_s in ((log.gnss, 0.125, None), (means, 0.125, EPOCH_S)):
-        monkeypatch.setattr(unit_file, "velocity_delay", lambda track, age_s=age_s: age_s)
-        monkeypatch.setattr(unit_file, "small_offset", lambda verdict: None)
+        monkeypatch.setattr(written_by, "velocity_delay", lambda track, age_s=age_s: age_s)
+        monkeypatch.setattr(written_by, "small_offset", lambda verdict: None)
         found = find_unit(log.imu, gnss)
         assert (found.velocity_window_s, found.left is None) == (window_s, window_s is None)
     assert found.left[1] < found.left[0]
@@ -94,12 +98,31 @@ def test_the_mounting_is_that_of_a_turned_unit(log, angles):
 
 
 def test_what_is_written_is_a_whole_configuration():
-    found = UnitProperties((180.0, 0.0, -90.0), 0.15, 0.25, (1e-4, 2e-4, 3e-4), None, (0.5, 0.02))
+    found = UnitProperties(
+        (180.0, 0.0, -90.0), 0.15, 0.25, (1e-4, 2e-4, 3e-4), None, (0.5, 0.02), 0.8
+    )
     parameters = scenario.parse(InsGnssReplay, toml_of(found, "drive"))
     assert np.degrees(parameters.imu.orientation) == pytest.approx((180.0, 0.0, -90.0))
     assert parameters.imu.gyro_noise == pytest.approx((1e-4, 2e-4, 3e-4), rel=5e-3)
     assert parameters.imu.accel_noise == InsGnssReplay().imu.accel_noise
+    assert parameters.gnss.lasting_share == 0.8
     assert parameters.gnss.latency == pytest.approx(0.15)
     assert parameters.gnss.velocity_window == pytest.approx(0.25)
     nothing = scenario.parse(InsGnssReplay, toml_of(UnitProperties(), "drive"))
     assert nothing == InsGnssReplay()
+
+
+def test_the_share_of_errors_that_last_is_that_of_the_replay(log, tmp_path):
+    """Positions that scatter by a tenth of their stated sigma; a unit of 0.02 m scatters by it."""
+    paths = [tmp_path / "imu.csv", tmp_path / "fixes.txt"]
+    write_log(paths[0], log.imu, "named-imu")
+    for factor in (1.0, 10.0):
+        gnss = replace(log.gnss, sigma_m=factor * log.gnss.sigma_m)
+        write_log(paths[1], gnss, "kfgins-gnss")
+        written = scenario.parse(InsGnssReplay, unit_file(paths))
+        read = load_dataset(paths)
+        found, notes = with_correlated_share(InsGnssReplay(), on_one_clock(read, InsGnssReplay()))
+        assert (written.gnss.lasting_share is None) == (notes == []) == (factor == 1.0)
+        if factor > 1.0:
+            assert written.gnss.lasting_share == pytest.approx(found.gnss.lasting_share, abs=1e-3)
+            assert written.gnss.lasting_share == pytest.approx(0.99, abs=5e-3)

@@ -36,6 +36,7 @@ class UnitProperties(NamedTuple):
     gyro_noise: tuple[float, float, float] | None = None  # rad/sqrt(s), vehicle's axes
     accel_noise: tuple[float, float, float] | None = None  # m/s/sqrt(s)
     left: tuple[float, float] | None = None  # unexplained share of the motion, before and with it
+    lasting_share: float | None = None  # of the variance of positions, as a replay finds it
 
 
 def find_unit(imu: ImuTable, gnss: GnssTable | None) -> UnitProperties:
@@ -171,6 +172,10 @@ def toml_of(found: UnitProperties, log: str) -> str:
         receiver.append(f'latency = "{found.latency_s:.3f} s"')
     if found.velocity_window_s is not None:
         receiver.append(f'velocity_window = "{found.velocity_window_s:.3g} s"')
+    if found.lasting_share is not None:
+        receiver.append(
+            f"lasting_share = {found.lasting_share:.3g}  # of the variance of positions"
+        )
     receiver.append('# lever_arm = ["0 m", "0 m", "0 m"]  # IMU to antenna; a log does not tell it')
     for name, rows in (("imu", unit), ("gnss", receiver)):
         lines += [f"[{name}]", *rows, ""] if rows else []

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robins import logs, scenario, systems
+from robins.dataset import Dataset
 from robins.ins.frames import to_ned_frd
 from robins.logs.batches import spread
 from robins.logs.findings import by_severity
@@ -111,6 +112,7 @@ def unit_file(
         )
     dataset = logs.load_dataset(files, formats=logs.formats_of(files, columns))
     found = find_unit(to_ned_frd(spread(dataset.imu)), dataset.gnss)
+    found = found._replace(lasting_share=_lasting_share(dataset))
     if not any(value is not None for value in found):
         raise InputError(
             "the log tells nothing of its unit: there is too little motion, and no rest",
@@ -118,6 +120,19 @@ def unit_file(
             "drive a figure of eight and stand for ten seconds.",
         )
     return toml_of(found, dataset.name)
+
+
+def _lasting_share(dataset: Dataset) -> float | None:
+    """Share of the variance of positions that a replay takes to last; None where it finds none."""
+    from robins.systems.ins_gnss import InsGnssReplay
+    from robins.systems.ins_gnss.correlated_errors import with_correlated_share
+    from robins.systems.ins_gnss.recording import on_one_clock
+
+    try:
+        log = on_one_clock(logs.clean(dataset), InsGnssReplay())
+    except ValueError:  # no fix, or none within the log: nothing is known of their errors
+        return None
+    return with_correlated_share(InsGnssReplay(), log)[0].gnss.lasting_share or None
 
 
 def _described(table: Any) -> dict[str, Any]:
