@@ -138,7 +138,7 @@ class Dataset:
     master: Trajectory | None = None  # another INS on the vehicle, to align the IMU to
     mag: MagTable | None = None
     attitude: AttitudeTable | None = None  # true attitude, where nothing else is known
-    odometry: OdometryTable | None = None  # speed of the wheels, from Python only
+    odometry: OdometryTable | None = None  # speed of the wheels
     counts: dict[str, int] = field(default_factory=dict)  # refused samples by reason
     findings: list[Finding] = field(default_factory=list)  # of the readers: what they left out
     time_unit_known: tuple[str, ...] = ()  # files that state the unit of their stamps

@@ -19,6 +19,7 @@ _KINDS = {
     "truth": "path",
     "mag": "magnetic field",
     "attitude": "true attitude",
+    "odometry": "wheel speeds",
 }
 
 

@@ -22,6 +22,7 @@ _WORDS = {
     "truth": "path",
     "mag": "magnetic field",
     "attitude": "attitudes",
+    "odometry": "wheel speeds",
 }
 _OF_FIXES = ("sigma_assumed", "height_above_geoid", "height_assumed", "undated")
 
