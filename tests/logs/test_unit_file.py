@@ -84,17 +84,33 @@ def test_what_does_not_lower_the_unexplained_share_is_not_written(log, monkeypat
     assert found.left[1] < found.left[0]
 
 
-@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (180.0, 0.0, -90.0), (10.0, -20.0, 35.0)])
+ANGLES = [(0.0, 0.0, 0.0), (180.0, 0.0, -90.0), (10.0, -20.0, 35.0), (0.0, -12.0, 0.0)]
+
+
+@pytest.mark.parametrize("angles", ANGLES)
 def test_the_mounting_is_that_of_a_turned_unit(log, angles):
     C_bs = Mounting(*angles).dcm_bs()
     imu = replace(log.imu, gyro=log.imu.gyro @ C_bs, accel=log.imu.accel @ C_bs)
     found = find_unit(imu, log.gnss)
     there = Mounting(*found.orientation_deg).dcm_bs()
     apart = np.degrees(np.arccos(np.clip((np.trace(there @ C_bs.T) - 1.0) / 2.0, -1.0, 1.0)))
-    assert apart < (1e-3 if 10.0 not in angles else 4.0)
+    right = not np.any(np.array(angles) % 90.0)
+    assert apart < (1e-3 if right else 4.0)
+    assert (found.rounded_deg is not None) == right
     # 20 s of rest: half a dozen means or more, each of a second
     np.testing.assert_allclose(np.degrees(found.gyro_noise), 0.006, rtol=0.6)
     np.testing.assert_allclose(found.accel_noise, 200e-6 * 9.80665, rtol=0.6)
+
+
+def test_slopes_and_trim_are_no_mounting(log):
+    """A unit that leans by 6 deg: the file states so, and that it was taken to be level."""
+    C_bs = Mounting(4.0, -4.5, 0.0).dcm_bs()
+    found = find_unit(
+        replace(log.imu, gyro=log.imu.gyro @ C_bs, accel=log.imu.accel @ C_bs), log.gnss
+    )
+    assert found.orientation_deg == (0.0, 0.0, 0.0)
+    assert found.rounded_deg == pytest.approx(6.0, abs=2.0)
+    assert f"# found {found.rounded_deg:.1f} deg from these, as slopes" in toml_of(found, "drive")
 
 
 def test_what_is_written_is_a_whole_configuration():
