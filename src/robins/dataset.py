@@ -46,6 +46,7 @@ class GnssTable(_Rows):
     """Position and velocity fixes of a GNSS antenna; NaN where a component is missing.
 
     Velocities and sigmas are given along ``nav``; for ENU the components are east, north, up.
+    ``assumed_m`` and ``assumed_v`` mark sigmas that the log does not state; without, it states all.
     """
 
     time_ns: np.ndarray  # (M,) int64
@@ -59,6 +60,8 @@ class GnssTable(_Rows):
     nav: NavFrame = "NED"
     source: str = ""
     rows: np.ndarray | None = None
+    assumed_m: np.ndarray | None = None  # (M, 3) bool
+    assumed_v: np.ndarray | None = None  # (M, 3) bool
 
 
 @dataclass(frozen=True)
@@ -135,7 +138,7 @@ class Dataset:
     master: Trajectory | None = None  # another INS on the vehicle, to align the IMU to
     mag: MagTable | None = None
     attitude: AttitudeTable | None = None  # true attitude, where nothing else is known
-    odometry: OdometryTable | None = None  # speed of the wheels, from Python only
+    odometry: OdometryTable | None = None  # speed of the wheels
     counts: dict[str, int] = field(default_factory=dict)  # refused samples by reason
     findings: list[Finding] = field(default_factory=list)  # of the readers: what they left out
     time_unit_known: tuple[str, ...] = ()  # files that state the unit of their stamps

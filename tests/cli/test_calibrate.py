@@ -116,6 +116,13 @@ def test_the_mounting_turns_what_is_found(robins, log, tmp_path):
         [json.loads(a.out)["filters"][axis]["offset_ut"] for axis in "xyz"] for a in (plain, askew)
     )
     np.testing.assert_allclose(turned, np.array(offset) * [1.0, -1.0, -1.0], rtol=1e-5)
+    parameters = SYSTEMS["marg"].replay_parameters
+    files = [(tmp_path / name / FILE).read_text() for name in "ab"]
+    mounts = [scenario.parse(parameters, text, ()).orientation for text in files]
+    assert mounts == [
+        (0.0, 0.0, 0.0),
+        scenario.parse(parameters, config.read_text(), ()).orientation,
+    ]
 
 
 def test_a_part_of_the_log_can_be_left_out(robins, tmp_path):

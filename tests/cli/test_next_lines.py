@@ -74,6 +74,20 @@ def test_of_a_log_that_begins_in_motion_it_navigates(robins, tmp_path):
     assert "[gnss] sigma" in told
 
 
+def test_what_the_doctor_writes_is_in_the_line(robins, tmp_path):
+    """A file that could not be written is not named."""
+    lines = {}
+    for name, speed, status in (("rest", 0.0, 0), ("drive", 10.0, 2)):
+        (tmp_path / f"{name}.mcap").write_bytes(bag(speed))
+        found = robins("doctor", f"{name}.mcap", "--write", f"{name}.toml")
+        assert found[0] == status
+        (lines[name],) = [one for one in found[1].splitlines() if one.startswith("Next:")]
+    assert lines["rest"] == "Next:   robins replay rest.mcap rest.toml"
+    assert 'system = "ins-gnss"' in (tmp_path / "rest.toml").read_text()
+    assert lines["drive"] == "Next:   robins replay drive.mcap"
+    assert "the log tells nothing of its unit" in found[2]
+
+
 def test_where_no_heading_is_known_the_mend_of_the_error_navigates(robins, tmp_path):
     (tmp_path / "rest.mcap").write_bytes(bag(speed=0.0))
     status, _, told = robins("replay", "rest.mcap")

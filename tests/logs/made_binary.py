@@ -6,6 +6,8 @@ Two seconds of samples at 20 Hz, four fixes at 2 Hz; `MADE` holds the numbers th
 import datetime
 import struct
 import tempfile
+from functools import reduce
+from operator import xor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -190,6 +192,25 @@ def nmea(utc=UTC, gst=True, talkers=("GN",), date=True):
                 kept = {"cogt": course, "sogn": moved["spd"]}
                 out.append(NMEAMessage(msgID="VTG", **one, **kept))
     return b"".join(one.serialize() for one in out)
+
+
+def as_gns(gga, modes="AA"):
+    """The same fix as a sentence GNS, written by its definition."""
+    f = gga.decode().split("*")[0].split(",")
+    return _sentence(["$GNGNS", *f[1:6], modes, f[7], f[8], f[9], f[11], "", ""])
+
+
+def changed(sentence, **fields):
+    """A sentence with other texts in some fields, such as f7; the last may be a new one."""
+    kept = [*sentence.decode().split("*")[0].split(","), ""]
+    for name, text in fields.items():
+        kept[int(name[1:])] = text
+    return _sentence(kept if kept[-1] else kept[:-1])
+
+
+def _sentence(fields):
+    body = ",".join(fields)[1:]
+    return f"${body}*{reduce(xor, body.encode()):02X}\r\n".encode()
 
 
 # ----------------------------------------------------------------------------------------- MAVLink

@@ -5,6 +5,7 @@ import shutil
 import sqlite3
 import struct
 import sys
+from dataclasses import replace
 from itertools import islice
 
 import made_binary as made
@@ -16,6 +17,7 @@ from robins import foreign
 from robins.dataset import GnssTable, ImuTable
 from robins.logs import LogError, load_dataset, open_log
 from robins.logs.merging import gps_clock, merged
+from robins.logs.rtcm import crc24q
 
 PLACE = {"rtol": 0, "atol": 1e-9}
 
@@ -241,6 +243,32 @@ def test_a_receiver_without_a_date_and_with_more_digits(tmp_path):
     np.testing.assert_allclose(gnss.sigma_m[1], MADE.sigma)
 
 
+def test_a_sync_word_in_a_correction_is_no_message(tmp_path):
+    """Framed as the example of RTCM 10403.3, whose checksum the standard prints."""
+    example = bytes.fromhex("D300133ED7D30202980EDEEF34B4BD62AC0941986F33360B98")
+    assert crc24q(example[:-3]).to_bytes(3, "big") == example[-3:]
+
+    def correction(inside):
+        frame = b"\xd3" + len(inside).to_bytes(2, "big") + inside
+        return frame + crc24q(frame).to_bytes(3, "big")
+
+    for inside in (
+        b"\x3e\xd3\xb5\x62\x01\x07\x02\x00",
+        b"\xb5\x62\x01\x07\xff\xff",
+        b"\xb5\x62\xd3",
+    ):
+        whole = correction(inside)
+        parts = (made.ubx(inertial=False), whole, made.ubx(inertial=False), whole)
+        gnss, found = read(tmp_path, b"".join(parts))
+        assert (len(gnss), found) == (8, {})
+        whole = bytes([whole[0], whole[1], whole[2] ^ 1, *whole[3:]])  # no correction now
+        _, found = read(tmp_path, b"".join([*parts[:1], whole, *parts[2:]]))
+        assert found["damaged_frames"].value == 1
+    text = correction(b"\x40\x50$GPGGA,120000.00,4806,N*00")
+    gnss, found = read(tmp_path, made.nmea() + text)
+    assert (len(gnss), found.keys()) == (4, {"sigma_assumed"})
+
+
 # -------------------------------------------------------------------------------------------- NMEA
 
 
@@ -277,15 +305,45 @@ def test_sentences_without_a_right_checksum_are_counted(tmp_path):
     lines = made.nmea().splitlines(True)
     wrong = lines[3].replace(b"48", b"47", 1)
     gnss, found = read(tmp_path, b"".join([*lines[:3], wrong, lines[4].split(b"*")[0], *lines[5:]]))
-    assert (len(gnss), found["damaged_frames"].value) == (3, 2)
+    assert (len(gnss), found["damaged_frames"].value) == (4, 2)  # one by its RMC
     gnss, found = read(tmp_path, b"".join(lines)[:-20])
     assert (len(gnss), "ends_early" in found) == (4, True)
     rest = [x for x in lines if b"GGA" not in x]
     gnss, _ = read(tmp_path, b"".join(rest))  # the place by RMC, without a height
     np.testing.assert_allclose(np.rad2deg(gnss.lat_rad), MADE.place[:, 0], **PLACE)
-    assert np.isnan(gnss.alt_m).all()
+    assert (gnss.alt_m.tolist(), gnss.sigma_m[:, 2].tolist()) == ([0.0] * 4, [1000.0] * 4)
     with pytest.raises(LogError, match="has no sentence GGA or RMC"):
         read(tmp_path, b"".join(x for x in rest if b"RMC" not in x))
+
+
+def test_epochs_without_a_sentence_gga_have_the_place_of_another(tmp_path):
+    """RMC at twice the rate of GGA, GNS for GGA, and modes of receivers that know no GGA."""
+    lines = made.nmea().splitlines(True)  # GGA, GST, RMC of each fix
+    gnss, found = read(tmp_path, b"".join(x for k, x in enumerate(lines) if k not in (0, 1, 6)))
+    assert found["other_kinds"].value == 2
+    assert "2 of 4 epochs have RMC and no GGA; their place is that of RMC" in str(
+        found["other_kinds"]
+    )
+    assert np.isnan(gnss.alt_m).tolist() == [True, False, True, False]
+    heights = np.where(np.isnan(gnss.alt_m), MADE.place[:, 2], gnss.alt_m)
+    sigma = np.where(np.isnan(gnss.alt_m)[:, None], [3.0, 3.0, 6.0], MADE.sigma)
+    sigma[2] = MADE.sigma  # stated by GST
+    np.testing.assert_array_equal(gnss.sigma_m, sigma)
+    assert_fixes(
+        replace(gnss, alt_m=heights, sigma_m=np.tile(MADE.sigma, (4, 1))), down=False, atol=2e-9
+    )
+    gns = [made.as_gns(x) if b"GGA" in x else x for x in lines]
+    gnss, found = read(tmp_path, b"".join(gns))
+    assert_fixes(gnss, down=False, atol=2e-9)
+    assert found.keys() == {"sigma_assumed"}
+    for modes, quality in (("NN", 0), ("AN", 5), ("AR", 1), ("DF", 2), ("DA", 4), ("EN", 0)):
+        gnss, found = read(tmp_path, b"".join(made.as_gns(x, modes) for x in lines if b"GGA" in x))
+        assert gnss.quality.tolist() == [quality] * 4
+        assert ("other_kinds" in found) == ("E" in modes)
+        rest = [made.changed(x, f12=modes[0]) for x in lines if b"RMC" in x]
+        gnss, _ = read(tmp_path, b"".join(rest))
+        assert gnss.quality.tolist() == [{"A": 5, "D": 4}.get(modes[0], 0)] * 4
+        assert np.isfinite(gnss.v_n[:, 0]).all() == (modes[0] in "AD")
 
 
 # ----------------------------------------------------------------------------- MAVLink, ArduPilot

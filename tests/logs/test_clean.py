@@ -317,9 +317,13 @@ def test_sigmas_that_are_never_positive_are_assumed_by_the_kind_of_fix(change, k
                 getattr(got.gnss, name)[quality == (1, 2, 5)[k], axis], expected
             )
     np.testing.assert_array_equal(getattr(got.gnss, kept), getattr(GNSS, kept))
+    marks = got.gnss.assumed_m if name == "sigma_m" else got.gnss.assumed_v
+    for k, axis in np.ndindex(len(assumed), len(assumed[0])):
+        assert (marks[quality == (1, 2, 5)[k], axis] == (assumed[k][axis] is not None)).all()
     assert [f.code for f in got.findings] == ["sigma_assumed"]
     assert refused(got.counts) == {}
     assert clean(got).findings == got.findings
+    np.testing.assert_array_equal(getattr(clean(got).gnss, f"assumed{name[5:]}"), marks)
 
 
 def test_a_fix_without_any_component_is_refused_whole():

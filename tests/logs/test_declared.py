@@ -10,7 +10,9 @@ from robins.logs import (
     Column,
     LogError,
     TextFormat,
+    clean,
     columns_from,
+    examine,
     formats_of,
     load_dataset,
     open_log,
@@ -345,3 +347,54 @@ def test_each_declaration_fits_one_file(own, tmp_path):
     with pytest.raises(LogError, match=r"own.toml: its columns fit none of the files"):
         formats_of([tmp_path / "image"], [declared])
     assert formats_of([log], []) == {}
+
+
+WHEELS = """
+wheel_speed = { name = "speed", unit = "km/h" }
+sigma_wheel_speed = { value = 0.1, unit = "m/s" }
+"""
+
+
+def test_the_speed_of_the_wheels_is_a_column(own, tmp_path):
+    """One file with the samples or one of its own: read, examined, cleaned, written."""
+    names, *rows = LOG.splitlines()
+    log = "\n".join([f"{names};speed", *(f"{row};{3.6 * k}" for k, row in enumerate(rows))])
+    declared, whole = own(TOML + WHEELS, log + "\n")
+    one = open_log(whole, columns_from(declared))
+    (tmp_path / "wheels.toml").write_text('[columns]\ntime = { name = "t", unit = "s" }' + WHEELS)
+    (tmp_path / "imu.toml").write_text(TOML)
+    own_file = tmp_path / "wheels.csv"
+    own_file.write_text("t,speed\n" + "".join(f"0.0{k}025,{3.6 * k}\n" for k in range(5)))
+    paths = [str(whole), str(own_file)]
+    formats = {
+        path: columns_from(tmp_path / f"{name}.toml")
+        for path, name in zip(paths, ("imu", "wheels"), strict=True)
+    }
+    several = load_dataset(paths, formats=formats)
+    for data in (one, several):
+        np.testing.assert_array_equal(data.odometry.time_ns, data.imu.time_ns)
+        np.testing.assert_allclose(data.odometry.speed_mps, np.arange(5.0))
+        np.testing.assert_allclose(data.odometry.sigma_speed, 0.1)
+    assert several.odometry.source == str(own_file)
+    spoilt = several.odometry.speed_mps.copy()
+    spoilt[2:4] = np.nan, 1e9
+    data = dataclasses.replace(
+        several, odometry=dataclasses.replace(several.odometry, speed_mps=spoilt)
+    )
+    got = clean(data)
+    assert got.odometry.speed_mps.tolist() == pytest.approx([0.0, 1.0, 4.0])
+    assert {k: n for k, n in got.counts.items() if "odom" in k and n} == {
+        "odometry_nan": 1,
+        "odometry_absurd": 1,
+    }
+    assert "absurd" in {f.code for f in examine(data) if f.file == str(own_file)}
+    both = WHEELS.replace("value = 0.1", 'name = "sigma"')
+    (tmp_path / "both.toml").write_text('[columns]\ntime = { name = "t", unit = "s" }' + both)
+    format = columns_from(tmp_path / "both.toml")
+    write_log(tmp_path / "again.csv", several.odometry, format)
+    again = open_log(tmp_path / "again.csv", format)
+    np.testing.assert_allclose(again.speed_mps, several.odometry.speed_mps, rtol=5e-16)
+    np.testing.assert_array_equal(again.sigma_speed, several.odometry.sigma_speed)
+    replaced = load_dataset(paths, formats=formats | {paths[0]: columns_from(declared)})
+    assert [f.code for f in replaced.findings] == ["table_replaced"]
+    assert replaced.odometry.source == str(own_file)

@@ -1,11 +1,13 @@
 from pathlib import Path
 
+import made_binary
 import numpy as np
 import pytest
 from log_samples import GNSS_IMU, PYINS_STEPS, SAMPLES
 
 from robins.logs import FORMATS, LogError, Mounting, load_dataset, open_log
 from robins.logs.registry import recognise
+from robins.workbench.doctor import examine
 
 
 def test_increments_and_recordings_that_began_mid_line_are_recognised_too(tmp_path):
@@ -69,6 +71,30 @@ def test_files_of_one_recording_become_one_dataset(three):
     plain = load_dataset(paths, name="mine")
     assert (plain.name, plain.lever_arm_b_m) == ("mine", None)
     np.testing.assert_array_equal(data.imu.gyro, plain.imu.gyro * [1, -1, -1])
+
+
+def test_a_file_of_fixes_replaces_those_of_a_recording(tmp_path):
+    """Any order will do, a note reports it; of two recordings nothing is replaced."""
+    log, better = tmp_path / "flight.BIN", tmp_path / "better.nmea"
+    log.write_bytes(made_binary.dataflash(geoid=False))
+    better.write_bytes(made_binary.nmea())
+    own = load_dataset([log])
+    assert "height_above_geoid" in {f.code for f in own.findings}
+    for paths in ([log, better], [better, log]):
+        data = load_dataset(paths)
+        np.testing.assert_array_equal(data.imu.time_ns, own.imu.time_ns)
+        np.testing.assert_array_equal(data.gnss.alt_m, open_log(better, findings=[]).alt_m)
+        assert (data.gnss.source, len(data.mag)) == (str(better), len(own.mag))
+        (note,) = [f for f in data.findings if f.code == "table_replaced"]
+        assert "flight.BIN: its GNSS fixes are not used; those of better.nmea" in note.sentence
+        assert "height_above_geoid" not in {f.code for f in data.findings}
+        found = examine(paths).findings
+        assert note in found
+        assert {f.file for f in found if f.code == "sigma_assumed"} == {str(better)}
+    again = tmp_path / "again.BIN"
+    again.write_bytes(log.read_bytes())
+    with pytest.raises(LogError, match="is a second file of the kind of"):
+        load_dataset([log, again])
 
 
 @pytest.mark.parametrize(

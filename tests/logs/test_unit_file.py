@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 
 from robins import scenario
+from robins.logs import load_dataset, write_log
+from robins.logs import unit_file as written_by
 from robins.logs.mounting import Mounting
 from robins.logs.unit_file import UnitProperties, find_unit, toml_of
 from robins.systems.ins_gnss import Drive, InsGnssReplay, drive_dataset
+from robins.systems.ins_gnss.correlated_errors import with_correlated_share
+from robins.systems.ins_gnss.recording import on_one_clock
+from robins.workbench.doctor import unit_file
 
 TURNS = "".join(
     f'[[legs]]\ndo = "turn"\nangle = "{angle} deg"\nrate = "15 deg/s"\n'
@@ -68,26 +73,72 @@ def test_an_offset_of_the_clock_and_a_window_of_the_velocities_are_told_apart(lo
     assert found.velocity_window_s == (EPOCH_S if means else None)
 
 
-@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (180.0, 0.0, -90.0), (10.0, -20.0, 35.0)])
+def test_what_does_not_lower_the_unexplained_share_is_not_written(log, monkeypatch):
+    """A wrong age of the velocities, and a right one."""
+    means = replace(log.gnss, v_n=_means(log).v_n)
+    for gnss, age_s, window_s in ((log.gnss, 0.125, None), (means, 0.125, EPOCH_S)):
+        monkeypatch.setattr(written_by, "velocity_delay", lambda track, age_s=age_s: age_s)
+        monkeypatch.setattr(written_by, "small_offset", lambda verdict: None)
+        found = find_unit(log.imu, gnss)
+        assert (found.velocity_window_s, found.left is None) == (window_s, window_s is None)
+    assert found.left[1] < found.left[0]
+
+
+ANGLES = [(0.0, 0.0, 0.0), (180.0, 0.0, -90.0), (10.0, -20.0, 35.0), (0.0, -12.0, 0.0)]
+
+
+@pytest.mark.parametrize("angles", ANGLES)
 def test_the_mounting_is_that_of_a_turned_unit(log, angles):
     C_bs = Mounting(*angles).dcm_bs()
     imu = replace(log.imu, gyro=log.imu.gyro @ C_bs, accel=log.imu.accel @ C_bs)
     found = find_unit(imu, log.gnss)
     there = Mounting(*found.orientation_deg).dcm_bs()
     apart = np.degrees(np.arccos(np.clip((np.trace(there @ C_bs.T) - 1.0) / 2.0, -1.0, 1.0)))
-    assert apart < (1e-3 if 10.0 not in angles else 4.0)
+    right = not np.any(np.array(angles) % 90.0)
+    assert apart < (1e-3 if right else 4.0)
+    assert (found.rounded_deg is not None) == right
     # 20 s of rest: half a dozen means or more, each of a second
     np.testing.assert_allclose(np.degrees(found.gyro_noise), 0.006, rtol=0.6)
     np.testing.assert_allclose(found.accel_noise, 200e-6 * 9.80665, rtol=0.6)
 
 
+def test_slopes_and_trim_are_no_mounting(log):
+    """A unit that leans by 6 deg: the file states so, and that it was taken to be level."""
+    C_bs = Mounting(4.0, -4.5, 0.0).dcm_bs()
+    found = find_unit(
+        replace(log.imu, gyro=log.imu.gyro @ C_bs, accel=log.imu.accel @ C_bs), log.gnss
+    )
+    assert found.orientation_deg == (0.0, 0.0, 0.0)
+    assert found.rounded_deg == pytest.approx(6.0, abs=2.0)
+    assert f"# found {found.rounded_deg:.1f} deg from these, as slopes" in toml_of(found, "drive")
+
+
 def test_what_is_written_is_a_whole_configuration():
-    found = UnitProperties((180.0, 0.0, -90.0), 0.15, 0.25, (1e-4, 2e-4, 3e-4), None, (0.5, 0.02))
+    found = UnitProperties(
+        (180.0, 0.0, -90.0), 0.15, 0.25, (1e-4, 2e-4, 3e-4), None, (0.5, 0.02), 0.8
+    )
     parameters = scenario.parse(InsGnssReplay, toml_of(found, "drive"))
     assert np.degrees(parameters.imu.orientation) == pytest.approx((180.0, 0.0, -90.0))
     assert parameters.imu.gyro_noise == pytest.approx((1e-4, 2e-4, 3e-4), rel=5e-3)
     assert parameters.imu.accel_noise == InsGnssReplay().imu.accel_noise
+    assert parameters.gnss.lasting_share == 0.8
     assert parameters.gnss.latency == pytest.approx(0.15)
     assert parameters.gnss.velocity_window == pytest.approx(0.25)
     nothing = scenario.parse(InsGnssReplay, toml_of(UnitProperties(), "drive"))
     assert nothing == InsGnssReplay()
+
+
+def test_the_share_of_errors_that_last_is_that_of_the_replay(log, tmp_path):
+    """Positions that scatter by a tenth of their stated sigma; a unit of 0.02 m scatters by it."""
+    paths = [tmp_path / "imu.csv", tmp_path / "fixes.txt"]
+    write_log(paths[0], log.imu, "named-imu")
+    for factor in (1.0, 10.0):
+        gnss = replace(log.gnss, sigma_m=factor * log.gnss.sigma_m)
+        write_log(paths[1], gnss, "kfgins-gnss")
+        written = scenario.parse(InsGnssReplay, unit_file(paths))
+        read = load_dataset(paths)
+        found, notes = with_correlated_share(InsGnssReplay(), on_one_clock(read, InsGnssReplay()))
+        assert (written.gnss.lasting_share is None) == (notes == []) == (factor == 1.0)
+        if factor > 1.0:
+            assert written.gnss.lasting_share == pytest.approx(found.gnss.lasting_share, abs=1e-3)
+            assert written.gnss.lasting_share == pytest.approx(0.99, abs=5e-3)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from short_drive import DRIVE
 
 from robins import scenario
-from robins.dataset import Dataset, Finding, GnssTable, ImuTable
+from robins.dataset import Dataset, GnssTable, ImuTable
 from robins.earth import Geodetic
 from robins.filters import Code
 from robins.ins.increments import Increments
@@ -179,31 +179,38 @@ def test_a_missing_component_of_a_velocity_comes_from_positions():
 @pytest.mark.parametrize(
     ("settings", "assumed", "sigmas"),
     [
-        ({}, "", [0.5, 1.5, 1.5, 0.5]),
-        ({}, "velocity", [0.5, 1.5, 1.5, 0.5]),
-        ({}, "place, velocity", [0.5, 0.5, 0.5, 0.5]),
-        ({"sigma": "2 m"}, "place", [2.0, 6.0, 6.0, 2.0]),
-        ({"sigma": "2 m", "sigma_factor": {}}, "", [2.0, 2.0, 2.0, 2.0]),
+        ({}, None, [0.5, 1.5, 1.5, 0.5]),
+        ({}, [False] * 4, [0.5, 1.5, 1.5, 0.5]),
+        ({}, [True] * 4, [0.5, 0.5, 0.5, 0.5]),
+        ({}, [False, False, True, False], [0.5, 1.5, 0.5, 0.5]),
+        ({"sigma": "2 m", "velocity_sigma": "2 m/s"}, [True] * 4, [2.0, 6.0, 6.0, 2.0]),
+        ({"sigma": "2 m", "velocity_sigma": "2 m/s", "sigma_factor": {}}, None, [2.0] * 4),
     ],
     ids=[
         "stated, by quality",
-        "stated, velocity assumed",
+        "all stated",
         "assumed, by quality already",
+        "one assumed",
         "given",
         "given, no factor",
     ],
 )
 def test_sigmas_are_stated_assumed_or_given(settings, assumed, sigmas):
-    time = np.arange(4) * 10**9
-    gnss = GnssTable(
-        time, *np.full((3, 4), 0.5), np.full((4, 3), 0.5), quality=np.array([1, 2, 5, 0])
-    )
+    """Each component of each fix by itself: marked are places east and velocities down."""
+    time, half = np.arange(4) * 10**9, np.full((4, 3), 0.5)
+    marks = {} if assumed is None else {
+        "assumed_m": np.outer(assumed, [False, True, False]),
+        "assumed_v": np.outer(assumed, [False, False, True]),
+    }  # fmt: skip
+    gnss = GnssTable(time, *half.T, half, half, half, np.array([1, 2, 5, 0]), **marks)
     imu = ImuTable(np.arange(400) * 10**7, np.zeros((400, 3)), np.zeros((400, 3)), "rate")
-    note = [Finding("note", "sigma_assumed", "f", assumed, 4, "f: 4 of 4 assumed.")] * bool(assumed)
-    log = on_one_clock(
-        Dataset("f", imu, gnss, findings=note), InsGnssReplay.model_validate({"gnss": settings})
-    )
-    np.testing.assert_allclose(log.sigma_m[:, 0], sigmas)
+    log = on_one_clock(Dataset("f", imu, gnss), InsGnssReplay.model_validate({"gnss": settings}))
+    np.testing.assert_allclose(log.sigma_m[:, 1], sigmas)
+    np.testing.assert_allclose(log.sigma_v[:, 2], sigmas)
+    stated = [2.0, 6.0, 6.0, 2.0] if "sigma" in settings else [0.5, 1.5, 1.5, 0.5]
+    stated = [2.0] * 4 if "sigma_factor" in settings else stated
+    np.testing.assert_allclose(log.sigma_m[:, [0, 2]].T, [stated] * 2)
+    np.testing.assert_allclose(log.sigma_v[:, :2].T, [stated] * 2)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import click
 
 from robins.cli.frame import ExitStatus, only_json
 from robins.cli.printing import print_data
+from robins.errors import RobinsError
 
 _COLOURS = {"error": "red", "warning": "yellow", "note": "cyan"}
 _KINDS = {
@@ -18,6 +19,7 @@ _KINDS = {
     "truth": "path",
     "mag": "magnetic field",
     "attitude": "true attitude",
+    "odometry": "wheel speeds",
 }
 
 
@@ -40,10 +42,16 @@ def judge(
         from robins.workbench.doctor import unit_file
 
         found = examine(paths, columns)
-    print_data(found.data if as_json else None, _text(found, paths, columns), as_json)
-    if write is not None:  # after the findings, which explain why nothing may be found
-        with only_json(as_json):
-            write.write_text(unit_file(paths, columns))
+        given, failure = list(paths), None
+        try:
+            if write is not None:
+                write.write_text(unit_file(paths, columns))
+                given += [write] * any(table["kind"] == "gnss" for table in found.tables)
+        except (RobinsError, OSError) as error:
+            failure = error
+    print_data(found.data if as_json else None, _text(found, given, columns), as_json)
+    if failure is not None:  # after the findings, which explain why nothing may be found
+        raise failure
     return ExitStatus.BAD_INPUT if found.counts["error"] else ExitStatus.DONE
 
 

@@ -63,7 +63,10 @@ def _turn_last(v):
 
 
 _COLUMNS: dict[str, dict[str, Callable[[np.ndarray], np.ndarray]]] = {  # by the side that turns
-    "nav": {"v_n": swap, "sigma_m": lambda s: s[..., _ORDER], "sigma_v": lambda s: s[..., _ORDER]},
+    "nav": {
+        "v_n": swap,
+        **dict.fromkeys(("sigma_m", "sigma_v", "assumed_m", "assumed_v"), lambda s: s[..., _ORDER]),
+    },
     "body": {"gyro": swap, "accel": swap, "field_t": swap, "omega_ib_b": swap},
 }
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from robins.dataset import AttitudeTable, GnssTable, ImuTable, MagTable, Trajectory
+from robins.dataset import AttitudeTable, GnssTable, ImuTable, MagTable, OdometryTable, Trajectory
 from robins.gps_time import GPS_EPOCH_S
 from robins.logs.batches import batches_of, resolution_ns, spread
 from robins.logs.findings import Finding
@@ -40,6 +40,7 @@ _WHY_GAPS = {
     GnssTable: "The receiver had no solution there; the run goes on by inertia alone",
     MagTable: "The logger lost data; heading is held by the gyros meanwhile",
     AttitudeTable: "Nothing is compared there",
+    OdometryTable: "The wheels tell nothing there",
 }
 _LEAP = 18.0  # s between UTC and GPS time since 2017
 _BLIP = 3  # refused samples that count as a slip, not as a clock set anew

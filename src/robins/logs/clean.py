@@ -19,7 +19,15 @@ from typing import Any
 
 import numpy as np
 
-from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
+from robins.dataset import (
+    AttitudeTable,
+    Dataset,
+    GnssTable,
+    ImuTable,
+    MagTable,
+    OdometryTable,
+    Trajectory,
+)
 from robins.errors import require_kind
 from robins.ins.plausible import ACCEL_LIMIT, GYRO_LIMIT
 from robins.logs.batches import spread, spread_counts, spread_like
@@ -47,8 +55,8 @@ def clean(dataset: Dataset) -> Dataset:
     Counts, in samples, begin with the table's name: ``imu_nan``, ``imu_inf``, ``imu_absurd`` (a
     magnitude no vehicle has), ``imu_duplicate``, ``imu_backward`` and ``imu_ahead`` (time stamps
     out of order); ``gnss_...`` likewise and ``gnss_sigma`` (zero or negative); ``truth_...``,
-    ``master_...``, ``mag_...``, ``attitude_...``. Rows that were given a time of their own within a
-    batch are kept and counted as ``imu_spread``, where there are any.
+    ``master_...``, ``mag_...``, ``attitude_...``, ``odometry_...``. Rows that were given a time
+    of their own within a batch are kept and counted as ``imu_spread``, where there are any.
     Counts already in the dataset are added to.
 
     A fix that lacks a component keeps the others: the component becomes NaN, its sigma, if that was
@@ -153,7 +161,7 @@ def _with_sigmas(gnss: GnssTable, findings: list[Finding]) -> GnssTable:
         name: np.where(np.isnan(one), getattr(filled, name), getattr(gnss, name))
         for name, one in blank.items()
     }
-    return dataclasses.replace(gnss, **kept)
+    return dataclasses.replace(filled, **kept)
 
 
 def clean_gnss(gnss: GnssTable) -> tuple[GnssTable, dict[str, int]]:
@@ -258,10 +266,26 @@ def clean_attitude(attitude: AttitudeTable) -> tuple[AttitudeTable, dict[str, in
     return rows_where(dataclasses.replace(attitude, q_nb=q_nb), keep), counts
 
 
+def clean_odometry(odometry: OdometryTable) -> tuple[OdometryTable, dict[str, int]]:
+    """Clean one table of wheel speeds: rows with a speed and a positive sigma.
+
+    Raises:
+        LogError: arrays that are no table.
+    """
+    odometry = checked(odometry)
+    sigma = odometry.sigma_speed
+    limit = np.array([SPEED_LIMIT, SIGMA_LIMIT])
+    have, bad = _whole_rows(np.stack([odometry.speed_mps, sigma], axis=-1), limit)
+    bad["sigma"] = have & (sigma <= 0.0)
+    keep, counts = refusals("odometry", odometry.time_ns, have & (sigma > 0.0), bad)
+    return rows_where(odometry, keep), counts
+
+
 _CLEANERS: dict[str, Callable[[Any], tuple[Any, dict[str, int]]]] = {
     "gnss": clean_gnss,
     "truth": clean_truth,
     "master": clean_master,
     "mag": clean_mag,
     "attitude": clean_attitude,
+    "odometry": clean_odometry,
 }

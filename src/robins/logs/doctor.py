@@ -94,7 +94,9 @@ OF_READERS = (
     FindingCode(
         "sigma_assumed", "note", "a receiver states no sigmas; those of its kind of fix are used"
     ),
+    FindingCode("height_assumed", "warning", "a receiver states no heights, as with RMC alone"),
     FindingCode("sensors_merged", "note", "gyros and accelerometers were recorded apart"),
+    FindingCode("table_replaced", "note", "a file of its own replaces what a recording holds"),
     FindingCode("clock_aligned", "note", "samples are put on GPS time by the arrival of the fixes"),
     FindingCode("velocity_taken", "note", "velocities of fixes come from a topic of their own"),
     FindingCode(

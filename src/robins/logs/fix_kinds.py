@@ -84,6 +84,7 @@ def with_usual_sigmas(
 ) -> GnssTable:
     """The same fixes, with the usual sigmas of their kind where none is stated, and a note.
 
+    The table marks which these are (``assumed_m``, ``assumed_v``), beside those marked before.
     The `where` of the note is "place", "velocity" or both: the sigmas that are assumed.
 
     Vertical sigmas are twice the horizontal ones. What is missing itself gets no sigma.
@@ -93,12 +94,12 @@ def with_usual_sigmas(
     shape = np.array([1.0, 1.0, 2.0])
     lacking = np.isnan(table.sigma_m) & np.isfinite(table.lat_rad)[:, None] & places
     sigma_m = np.where(lacking, usual[:, :1] * shape, table.sigma_m)
-    sigma_v, count = table.sigma_v, lacking.any(axis=1)
+    sigma_v, count, assumed_v = table.sigma_v, lacking.any(axis=1), table.assumed_v
     assumed = ["place"] if count.any() else []
     if table.v_n is not None and sigma_v is not None:
         unstated = np.isnan(sigma_v) & np.isfinite(table.v_n)
         sigma_v = np.where(unstated, usual[:, 1:] * shape, sigma_v)
-        count = count | unstated.any(axis=1)
+        count, assumed_v = count | unstated.any(axis=1), _either(unstated, assumed_v)
         assumed += ["velocity"] if unstated.any() else []
     if count.any():
         value, usually = int(count.sum()), "; ".join(_ASSUMED[one] for one in assumed)
@@ -108,4 +109,10 @@ def with_usual_sigmas(
         )
         where = ", ".join(assumed)
         report(findings, Finding("note", "sigma_assumed", table.source, where, value, sentence))
-    return dataclasses.replace(table, sigma_m=sigma_m, sigma_v=sigma_v)
+    marks = {"assumed_m": _either(lacking, table.assumed_m), "assumed_v": assumed_v}
+    return dataclasses.replace(table, sigma_m=sigma_m, sigma_v=sigma_v, **marks)
+
+
+def _either(one: np.ndarray, other: np.ndarray | None) -> np.ndarray | None:
+    marks = one if other is None else one | other
+    return marks if marks.any() else None

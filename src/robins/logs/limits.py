@@ -6,7 +6,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from robins.dataset import AttitudeTable, GnssTable, ImuTable, MagTable, Trajectory
+from robins.dataset import (
+    AttitudeTable,
+    GnssTable,
+    ImuTable,
+    MagTable,
+    OdometryTable,
+    Trajectory,
+)
 from robins.ins.plausible import ACCEL_LIMIT, GYRO_LIMIT
 from robins.logs.findings import Finding
 from robins.logs.quiet import warning
@@ -36,6 +43,7 @@ _LIMITS: dict[type, dict[str, float]] = {
     GnssTable: _PLACE | {"sigma_m": SIGMA_LIMIT, "sigma_v": SIGMA_LIMIT},
     Trajectory: _PATH | {"q_nb": QUATERNION_LIMIT, "omega_ib_b": GYRO_LIMIT},
     MagTable: {"field_t": FIELD_LIMIT_T},
+    OdometryTable: {"speed_mps": SPEED_LIMIT},
     AttitudeTable: {},  # its quaternions have a check of their length
 }
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from robins.dataset import Dataset, ImuTable, Trajectory
-from robins.logs.findings import Finding, LogError
+from robins.logs.findings import Finding, LogError, finding_reporter
 from robins.logs.merging import are_halves, merged
 from robins.logs.mounting import Mounting, turned
 from robins.logs.registry import matching_formats, open_log
@@ -16,6 +17,14 @@ from robins.logs.tables import Table, kind_of, tables_of
 from robins.logs.text_format import TextFormat
 
 Formats = Mapping[str, str | TextFormat]
+_WORDS = {
+    "gnss": "GNSS fixes",
+    "truth": "path",
+    "mag": "magnetic field",
+    "attitude": "attitudes",
+    "odometry": "wheel speeds",
+}
+_OF_FIXES = ("sigma_assumed", "height_above_geoid", "height_assumed", "undated")
 
 
 def load_dataset(
@@ -29,8 +38,8 @@ def load_dataset(
 
     Args:
         paths: one, or several in any order; one IMU table in all, or one with rates and one with
-            specific forces, and at most one of each other kind. A path in a file of its own is the
-            truth.
+            specific forces, and at most one of each other kind; a file of its own replaces what a
+            recording has of its kind. A path in a file of its own is the truth.
         name: of the dataset; by default the name of the file with the IMU.
         mounting: turns the sensor's axes to forward-right-down and says where the antenna is.
         formats: path -> its format, for files that are not recognised by content.
@@ -48,6 +57,7 @@ def load_dataset(
         raise LogError(given, "a format is given, but not the file", "check its path")
     findings: list[Finding] = []
     opened = [open_log(path, (formats or {}).get(path), findings) for path in paths]
+    opened = without_replaced(opened, findings)
     known = [file for one in opened if isinstance(one, Dataset) for file in one.time_unit_known]
     held: dict[str, Any] = by_kind(paths, opened, findings)
     if "imu" not in held:
@@ -60,6 +70,33 @@ def load_dataset(
         time_unit_known=tuple(known),
     )
     return turned(dataset, mounting)
+
+
+def without_replaced(
+    opened: Iterable[Table | Dataset], findings: list[Finding]
+) -> list[Table | Dataset]:
+    """Contents of files, of a recording without the tables for which there is a file of its own.
+
+    Args:
+        opened: contents of the files.
+        findings: receives a note for each such table; those about the replaced fixes are dropped.
+    """
+    opened = list(opened)
+    own = {kind_of(one): one for one in opened if not isinstance(one, Dataset)}
+    for number, one in enumerate(opened):
+        if not isinstance(one, Dataset):
+            continue
+        replaced = [kind for kind in _WORDS if kind in own and getattr(one, kind) is not None]
+        for kind in replaced:
+            file = getattr(one, kind).source
+            if kind == "gnss":
+                findings[:] = [f for f in findings if (f.file, f.code in _OF_FIXES) != (file, True)]
+            finding_reporter(findings, "note", "table_replaced", file, value=len(own[kind]))(
+                f"its {_WORDS[kind]} are not used; those of {Path(own[kind].source).name}, a file "
+                "of their own, replace them."
+            )
+        opened[number] = dataclasses.replace(one, **dict.fromkeys(replaced))
+    return opened
 
 
 def by_kind(

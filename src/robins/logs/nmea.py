@@ -1,8 +1,9 @@
 """Sentences of NMEA 0183 that a receiver wrote, whatever else stands between them.
 
-- ``GGA``: fixes; the height above the ellipsoid is the altitude plus the separation of the geoid.
-  Where a fix lacks that, all heights are altitudes above the geoid, with a warning.
-- ``RMC``, else ``VTG``: velocity over ground; there is none down. Without GGA also the place.
+- ``GGA``, else ``GNS``: fixes; the height above the ellipsoid is the altitude plus the separation
+  of the geoid. Where a fix lacks that, all heights are altitudes above the geoid, with a warning.
+- ``RMC``, else ``VTG``: velocity over ground; there is none down. An epoch without GGA and GNS has
+  the place of its RMC, without a height; where all lack one, it is assumed, with a warning.
 - ``GST``: sigmas of the place. Others are the usual ones of the kind of a fix, see `fix_kinds`.
 - ``RMC`` and ``ZDA``: the date. Stamps are UTC and become GPS time.
 
@@ -17,7 +18,8 @@ import math
 import os
 import re
 from collections.abc import Iterator
-from functools import reduce
+from dataclasses import replace
+from functools import partial, reduce
 from operator import xor
 
 import numpy as np
@@ -34,17 +36,20 @@ from robins.logs.findings import (
 )
 from robins.logs.fix_kinds import fixes, over_ground
 from robins.logs.opening import Bytes, map_file
+from robins.logs.rtcm import end_of_frame
 from robins.logs.text import Head
 from robins.units import to_si
 
 _BEGINS = re.compile(rb"(^|[\r\n])[^$\r\n]{0,60}\$[A-Z]{4,6}\d*,[^*$\r\n]*\*[0-9A-Fa-f]{2}")
 _SENTENCE = re.compile(
-    rb"\$([A-Z]{2})(GGA|RMC|VTG|GST|ZDA),([^*$\r\n]{0,200})(?:\*([0-9A-Fa-f]{2}))?"
+    rb"\$([A-Z]{2})(GGA|GNS|RMC|VTG|GST|ZDA),([^*$\r\n]{0,200})(?:\*([0-9A-Fa-f]{2}))?"
 )
 _CLOCK = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d(?:\.\d*)?|60(?:\.\d*)?)", re.ASCII)
 _DAY_NS, _EPOCH = 86_400_000_000_000, datetime.date(1970, 1, 1).toordinal()
-_KIND = {"1": 5.0, "2": 4.0, "3": 5.0, "4": 1.0, "5": 2.0, "8": 5.0}  # of GGA -> Q
+_KIND = {1: 5, 2: 4, 3: 5, 4: 1, 5: 2, 8: 5}  # quality of GGA -> that of RTKLIB
+_MODES = {"R": 4, "F": 5, "D": 2, "P": 3, "A": 1, "S": 8, "E": 6, "M": 7}  # best first -> of GGA
 _NO_FIX = {6: "estimated by dead reckoning", 7: "entered by hand"}
+_ANY_HEIGHT_M = 1000.0  # sigma of a height that nothing states, so that INS can do without
 _SLOW = 0.05  # m/s, below which receivers leave out the course
 
 
@@ -72,8 +77,7 @@ def fixes_of(
     """Fixes, and where in the bytes the first sentence of each lies; errors as `read_nmea`."""
     epochs = _epochs(file, data, findings)
     days = _days(file, epochs, findings)
-    end = "1" if any("lat1" in epoch for epoch in epochs) else "2"
-    kept = [k for k, epoch in enumerate(epochs) if f"lat{end}" in epoch]
+    kept = [k for k, epoch in enumerate(epochs) if "lat1" in epoch or "lat2" in epoch]
     if not kept:
         cause = "has no sentence GGA or RMC with a right checksum"
         raise LogError(file, cause, "switch on GGA, RMC and GST in the receiver")
@@ -81,8 +85,14 @@ def fixes_of(
     def column(name: str) -> np.ndarray:
         return np.array([epochs[k].get(name, math.nan) for k in kept])
 
+    def of_place(name: str) -> np.ndarray:
+        """A number of GGA or GNS, in an epoch without these of RMC."""
+        return np.where(np.isin(kept, without), column(f"{name}2"), column(f"{name}1"))
+
+    without = [k for k in kept if "lat1" not in epochs[k]]
+    quality = of_place("quality")
+    _report_kinds(file, quality, len(without), findings)
     utc_ns = np.array([days[k] * _DAY_NS + int(epochs[k]["time"]) for k in kept], np.int64)
-    _report_unread(file, epochs, findings) if end == "1" else None
     stated = np.isfinite(column("speed"))
     speed, course = (np.where(stated, column(x), column(f"{x}1")) for x in ("speed", "course"))
     speed = to_si(speed, "kn")
@@ -93,33 +103,44 @@ def fixes_of(
             findings, file, "Set the receiver to state the separation of the geoid in GGA."
         )
         height = column("altitude")
+    up = column("up")
+    if unknown := bool(np.isnan(height).all()):
+        height, up = np.zeros(len(kept)), np.full(len(kept), _ANY_HEIGHT_M)
+        finding_reporter(findings, "warning", "height_assumed", file, value=len(kept))(
+            f"no fix states a height; 0 m is assumed, with a sigma of {_ANY_HEIGHT_M:g} m. Switch "
+            "on GGA for heights."
+        )
     table = fixes(
         file,
         gps_of(utc_ns) if days[0] >= 0 else utc_ns + _DAY_NS,
-        (column(f"lat{end}"), column(f"lon{end}"), height),
-        (column("north"), column("east"), column("up")),
+        (of_place("lat"), of_place("lon"), height),
+        (column("north"), column("east"), up),
         over_ground(speed, course),
         nothing,
-        column(f"kind{end}"),
+        np.array([_KIND.get(int(one), 0) for one in quality]),
         np.zeros(len(kept), bool),
         findings,
     )
+    if unknown:
+        marks = np.zeros((len(kept), 3), bool) if table.assumed_m is None else table.assumed_m
+        table = replace(table, assumed_m=marks | [False, False, True])
     return table, column("at")
 
 
-def _report_unread(
-    file: str, epochs: list[dict[str, float]], findings: list[Finding] | None
+def _report_kinds(
+    file: str, quality: np.ndarray, without: int, findings: list[Finding] | None
 ) -> None:
-    """Report places that are in RMC only, and qualities of GGA that count as no fix."""
-    if count := sum("lat2" in epoch and "lat1" not in epoch for epoch in epochs):
-        finding_reporter(findings, "note", "other_kinds", file, value=count)(
-            f"{count} of {len(epochs)} epochs have RMC and no GGA; they are left out. Switch on "
-            "GGA at the rate of RMC, or switch off GGA to read the places of RMC."
+    """Report places that RMC alone states beside others, and qualities that count as no fix."""
+    reporter = partial(finding_reporter, findings, "note", "other_kinds", file)
+    if 0 < without < len(quality):
+        reporter(value=without)(
+            f"{without} of {len(quality)} epochs have RMC and no GGA; their place is that of RMC, "
+            "which states no height. Switch on GGA at the rate of RMC for heights."
         )
-    for quality, what in _NO_FIX.items():
-        if count := sum(epoch.get("quality") == quality for epoch in epochs):
-            finding_reporter(findings, "note", "other_kinds", file, value=count)(
-                f"{count} sentences GGA have the quality {quality} ({what}); they count as no fix."
+    for number, what in _NO_FIX.items():
+        if count := int((quality == number).sum()):
+            reporter(value=count)(
+                f"{count} sentences GGA have the quality {number} ({what}); they count as no fix."
             )
 
 
@@ -138,7 +159,7 @@ def _epochs(file: str, data: Bytes, findings: list[Finding] | None) -> list[dict
                 raise ValueError
             found = _numbers(kind.decode(), body.decode("ascii").split(","))
         except (ValueError, IndexError):
-            wrong += 1
+            wrong += not end_of_frame(data, one.start())
             continue
         near = (epoch for epoch in epochs[:-4:-1] if epoch["time"] == found.get("time"))
         epoch = epochs[-1] if kind == b"VTG" and epochs else next(near, None)
@@ -178,6 +199,11 @@ def _in_order(data: Bytes) -> Iterator[re.Match[bytes]]:
         held.clear()
 
 
+def _quality(modes: str) -> float:
+    """Quality of GGA of the letters of GNS or RMC, a letter a constellation; the best counts."""
+    return float(next((quality for letter, quality in _MODES.items() if letter in modes), 0))
+
+
 def _numbers(kind: str, fields: list[str]) -> dict[str, float]:
     """Numbers of a sentence by name.
 
@@ -202,15 +228,17 @@ def _numbers(kind: str, fields: list[str]) -> dict[str, float]:
         raise ValueError
     minutes = 60 * int(clock[1]) + int(clock[2])
     found: dict[str, float] = {"time": 6e10 * minutes + round(float(clock[3]) * 1e9)}
-    if kind == "GGA":
-        found |= {"kind1": _KIND.get(fields[5], 0.0), "height": number(8) + number(10)}
-        found |= {"altitude": number(8), "quality": float(fields[5] or 0)}
+    if kind in ("GGA", "GNS"):
+        found["quality1"] = float(fields[5] or 0) if kind == "GGA" else _quality(fields[5])
+        found |= {"altitude": number(8), "height": number(8) + number(10 if kind == "GGA" else 9)}
         return found | {"lat1": degrees(1), "lon1": degrees(3)}
     if kind == "GST":
         return found | {"north": number(5), "east": number(6), "up": number(7)}
     if kind == "RMC":
         valid, date = fields[1] == "A", fields[8]
-        found |= {"lat2": degrees(2), "lon2": degrees(4), "kind2": 5.0 if valid else 0.0}
+        mode = "".join(fields[11:12]) or "A"  # stated since NMEA 2.3
+        found["quality2"] = _quality(mode) if valid else 0.0
+        found |= {"lat2": degrees(2), "lon2": degrees(4)}
         found |= {"speed": number(6), "course": number(7)} if valid else {}
         century = "19" if date[4:5] > "7" else "20"
         day = [date[:2], date[2:4], century + date[4:]] if date else [""]

@@ -60,6 +60,9 @@ GROUPS: dict[str, QuantityGroup] = {
     "quality": QuantityGroup({"quality": "ratio"}, "1 fixed, 2 float, 5 single, as RTKLIB counts"),
     "euler": QuantityGroup(dict.fromkeys(("roll", "pitch", "heading"), "angle"), "of the vehicle"),
     "quaternion": QuantityGroup(_parts("q", "w x y z", "ratio"), "turns body into navigation axes"),
+    "wheels": QuantityGroup(
+        dict.fromkeys(("wheel_speed", "sigma_wheel_speed"), "speed"), "forward speed by the wheels"
+    ),
     "omega": QuantityGroup(_parts("omega", _XYZ, "angle rate"), "turn rate against inertial space"),
 }
 """Every group by its name."""
@@ -78,6 +81,7 @@ TABLES: dict[str, TableRecipe] = {
         ("velocity", "omega"),
     ),
     "attitude": TableRecipe("attitude", (("quaternion",), ("euler",))),
+    "odometry": TableRecipe("speed of the wheels", (("wheels",),)),
 }
 """Every table by its kind."""
 
@@ -113,6 +117,7 @@ def tables_of_groups(groups: set[str]) -> tuple[str, ...]:
         "gnss": placed and not turned,
         "trajectory": placed and turned,
         "attitude": turned and not placed,
+        "odometry": groups & {"wheels"},
     }
     return tuple(kind for kind in TABLES if has[kind])
 

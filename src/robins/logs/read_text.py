@@ -20,6 +20,7 @@ from robins.dataset import (
     ImuTable,
     MagTable,
     NavFrame,
+    OdometryTable,
     Trajectory,
 )
 from robins.ins.frames import swap, swap_q
@@ -344,7 +345,19 @@ def _path(read: TextContents, origin: Origin | None) -> Trajectory:
     )
 
 
-_MAKERS = {"imu": _imu, "mag": _mag, "gnss": _gnss, "attitude": _attitude}
+def _odometry(read: TextContents) -> OdometryTable:
+    speed, sigma = (read.values[q] for q in parts("wheels"))
+    unknown = np.full(len(speed), np.nan)
+    return OdometryTable(read.time_ns, speed, unknown, sigma, unknown, **read.origin)
+
+
+_MAKERS = {
+    "imu": _imu,
+    "mag": _mag,
+    "gnss": _gnss,
+    "attitude": _attitude,
+    "odometry": _odometry,
+}
 
 
 def _quaternions(read: TextContents) -> np.ndarray:

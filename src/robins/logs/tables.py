@@ -11,11 +11,19 @@ from typing import TypeVar
 
 import numpy as np
 
-from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
+from robins.dataset import (
+    AttitudeTable,
+    Dataset,
+    GnssTable,
+    ImuTable,
+    MagTable,
+    OdometryTable,
+    Trajectory,
+)
 from robins.logs.findings import Finding, LogError, finding_reporter, refused
 from robins.logs.timebase import LIMIT_NS
 
-Table = ImuTable | GnssTable | Trajectory | MagTable | AttitudeTable
+Table = ImuTable | GnssTable | Trajectory | MagTable | AttitudeTable | OdometryTable
 
 KINDS: dict[type, str] = {
     ImuTable: "imu",
@@ -23,6 +31,7 @@ KINDS: dict[type, str] = {
     Trajectory: "truth",
     MagTable: "mag",
     AttitudeTable: "attitude",
+    OdometryTable: "odometry",
 }
 """The field of a `Dataset` in which a table lies; a path that is no truth is its ``master``."""
 
@@ -61,6 +70,7 @@ _FLOATS: dict[type, dict[str, int]] = {
     Trajectory: _PLACE | {"v_n": 3, "q_nb": 4, "omega_ib_b": 3},
     MagTable: {"field_t": 3},
     AttitudeTable: {"q_nb": 4},
+    OdometryTable: dict.fromkeys(("speed_mps", "yaw_rate", "sigma_speed", "sigma_yaw"), 0),
 }
 _OPTIONAL = {(GnssTable, "v_n"), (GnssTable, "sigma_v"), (Trajectory, "omega_ib_b")}
 
@@ -99,13 +109,14 @@ def checked(table: AnyTable) -> AnyTable:
     for field in ("quality", "rows"):
         if getattr(table, field, None) is not None:
             out[field] = _shaped(table, field, _integers(table, field, "give integers"), (n,))
-    if isinstance(table, AttitudeTable) and table.moving is not None:
-        moving = np.asarray(table.moving)
-        if moving.dtype.kind != "b":
-            raise refused(_name(table), field="moving")(
-                f"is {moving.dtype}, not bool", "give True and False"
-            )
-        out["moving"] = _shaped(table, "moving", moving, (n,))
+    for field, components in (("moving", 0), ("assumed_m", 3), ("assumed_v", 3)):
+        if (value := getattr(table, field, None)) is not None:
+            marks = np.asarray(value)
+            if marks.dtype.kind != "b":
+                raise refused(_name(table), field=field)(
+                    f"is {marks.dtype}, not bool", "give True and False"
+                )
+            out[field] = _shaped(table, field, marks, (n, components) if components else (n,))
     return dataclasses.replace(table, **out)
 
 

@@ -34,6 +34,7 @@ from robins.logs.fix_kinds import fixes
 from robins.logs.merging import gps_clock, merged
 from robins.logs.nmea import fixes_of
 from robins.logs.opening import Bytes, foreign, map_file, read_beginning
+from robins.logs.rtcm import end_of_frame
 from robins.logs.tables import Table
 from robins.logs.text import Head
 from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS
@@ -124,13 +125,16 @@ def _frames(file: str, data: Bytes, findings: list[Finding] | None) -> Frames:
         head = data[at : at + _HEAD.size].ljust(_HEAD.size, b"\xff")
         _, group, number, size = _HEAD.unpack(head)
         end = at + _HEAD.size + size
-        if end + 2 > len(data):
-            open_at = at if open_at < 0 else open_at
-        elif _end(data, at):
+        if _end(data, at):
             found.get(group << 8 | number, []).append((at + 6, size))
             wrong, open_at = wrong + (open_at >= 0), -1
             at = data.find(_SYNC, end + 2)
             continue
+        if after := end_of_frame(data, at):
+            at = data.find(_SYNC, after)
+            continue
+        if end + 2 > len(data):
+            open_at = at if open_at < 0 else open_at
         else:
             wrong += 1
         at = data.find(_SYNC, at + 2)

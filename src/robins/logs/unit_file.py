@@ -16,12 +16,13 @@ from robins import rotation
 from robins.dataset import GnssTable, ImuTable
 from robins.logs.checks_motion import in_body, small_offset
 from robins.logs.gnss_motion import track_of, velocity_delay
+from robins.logs.motion_fit import MotionFit
 from robins.logs.motion_models import ModelChoice, judge
 from robins.logs.quiet import ImuSignal, signal_of, windows_of
 
 _STRAIGHT = 0.85  # mean of the directions of travel, below which there is no forward
 _LEAST = 20  # directions of travel
-_RIGHT_DEG = 3.0  # angles this near to right angles are right angles
+_RIGHT_DEG = 10.0  # from right angles: slopes, trim and biases of sound drives look like less
 _RESTS = 5  # pairs of seconds at rest, for the noise
 _LATE_S = 0.03
 
@@ -35,6 +36,8 @@ class UnitProperties(NamedTuple):
     gyro_noise: tuple[float, float, float] | None = None  # rad/sqrt(s), vehicle's axes
     accel_noise: tuple[float, float, float] | None = None  # m/s/sqrt(s)
     left: tuple[float, float] | None = None  # unexplained share of the motion, before and with it
+    lasting_share: float | None = None  # of the variance of positions, as a replay finds it
+    rounded_deg: float | None = None  # angle from what was found to the right angles taken for it
 
 
 def find_unit(imu: ImuTable, gnss: GnssTable | None) -> UnitProperties:
@@ -60,14 +63,16 @@ def find_unit(imu: ImuTable, gnss: GnssTable | None) -> UnitProperties:
     # The positions did not tell how old velocities are: half an epoch is no offset of a clock.
     if late is None and lag is not None and 0.3 * epoch < -lag < 0.7 * epoch:
         window, lag = epoch, None
-    orientation, C_bs = _orientation(signal, verdict)
+    orientation, rounded_deg, C_bs = _orientation(signal, verdict)
     left = None
     if window is not None or lag is not None:
         plain = verdict if late is None else judge(imu, gnss, signal, track, late_s=0.0)
-        if plain is not None:
-            left = plain.nothing.left(plain.views), verdict.fit.left(verdict.views)
+        found = verdict.clocked if late is None or lag is not None else verdict.nothing
+        left = None if plain is None else _lowered(plain, verdict, found)
+        window, lag = (window, lag) if left else (None, None)
     return UnitProperties(
         orientation_deg=orientation,
+        rounded_deg=rounded_deg,
         latency_s=None if lag is None else -lag,
         velocity_window_s=window,
         left=left,
@@ -75,30 +80,49 @@ def find_unit(imu: ImuTable, gnss: GnssTable | None) -> UnitProperties:
     )
 
 
+def _lowered(
+    plain: ModelChoice, verdict: ModelChoice, found: MotionFit
+) -> tuple[float, float] | None:
+    """Share of the motion left unexplained without and with what was found of the clock.
+
+    None if the share does not fall by more than its own uncertainty, from the scatter of the
+    stretches: nothing is written that is not shown to be better.
+    """
+    before, after = plain.nothing.by_stretch(plain.views), found.by_stretch(verdict.views)
+    if len(before) == len(after):
+        gain = before - after
+        sigma = np.std(gain) / np.sqrt(max(len(gain) - 1, 1))
+    else:  # the shift moved a stretch beyond an end
+        sigma = np.hypot(*(np.std(x) / np.sqrt(max(len(x) - 1, 1)) for x in (before, after)))
+    if not np.mean(before) - np.mean(after) > sigma:
+        return None
+    return plain.nothing.left(plain.views), found.left(verdict.views)
+
+
 def _orientation(
     signal: ImuSignal, verdict: ModelChoice
-) -> tuple[tuple[float, float, float] | None, np.ndarray | None]:
-    """Roll, pitch, yaw [deg] of the vehicle seen from the sensor, and C_bs."""
+) -> tuple[tuple[float, float, float] | None, float | None, np.ndarray | None]:
+    """Roll, pitch, yaw [deg] of the vehicle seen from the sensor, how far rounded, and C_bs."""
     v_b = in_body(verdict)
     if len(v_b) < _LEAST:
-        return None, None
+        return None, None, None
     windows = windows_of(signal)
     down = -np.mean(windows.accel[windows.calm], axis=0)
     down /= np.linalg.norm(down)
     ahead = v_b / np.linalg.norm(v_b, axis=1, keepdims=True)
     if np.linalg.norm(np.mean(ahead, axis=0)) < _STRAIGHT:
-        return None, None
+        return None, None, None
     forward = np.mean(ahead, axis=0)
     forward -= down * (down @ forward)
     forward /= np.linalg.norm(forward)
     C_bs = np.stack([forward, np.cross(down, forward), down])
     whole = np.round(C_bs)
     turned = np.rad2deg(np.arccos(np.clip((np.trace(C_bs @ whole.T) - 1.0) / 2.0, -1.0, 1.0)))
-    if abs(np.linalg.det(whole) - 1.0) < 1e-9 and turned < _RIGHT_DEG:
-        C_bs = whole
+    right = abs(np.linalg.det(whole) - 1.0) < 1e-9 and turned < _RIGHT_DEG
+    C_bs = whole if right else C_bs
     angles = rotation.to_euler(rotation.from_dcm(jnp.asarray(C_bs.T)))
     roll, pitch, yaw = (float(np.round(np.rad2deg(float(a)), 1)) + 0.0 for a in angles)
-    return (roll, pitch, yaw), C_bs
+    return (roll, pitch, yaw), float(turned) if right else None, C_bs
 
 
 def _noise(imu: ImuTable, gnss: GnssTable | None, C_bs: np.ndarray | None) -> dict:
@@ -141,6 +165,8 @@ def toml_of(found: UnitProperties, log: str) -> str:
     unit, receiver = [], []
     if found.orientation_deg is not None:
         unit.append(f"orientation = {_list(found.orientation_deg, 'deg', '.1f')}")
+    if found.rounded_deg is not None:
+        unit.insert(0, f"# found {found.rounded_deg:.1f} deg from these, as slopes or trim explain")
     if found.gyro_noise is not None:
         noise = np.rad2deg(found.gyro_noise)
         unit.append(f"gyro_noise = {_list(noise, 'deg/s/sqrt(Hz)', '.3g')}")
@@ -150,6 +176,10 @@ def toml_of(found: UnitProperties, log: str) -> str:
         receiver.append(f'latency = "{found.latency_s:.3f} s"')
     if found.velocity_window_s is not None:
         receiver.append(f'velocity_window = "{found.velocity_window_s:.3g} s"')
+    if found.lasting_share is not None:
+        receiver.append(
+            f"lasting_share = {found.lasting_share:.3g}  # of the variance of positions"
+        )
     receiver.append('# lever_arm = ["0 m", "0 m", "0 m"]  # IMU to antenna; a log does not tell it')
     for name, rows in (("imu", unit), ("gnss", receiver)):
         lines += [f"[{name}]", *rows, ""] if rows else []

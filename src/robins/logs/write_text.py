@@ -12,7 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins import rotation
-from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
+from robins.dataset import (
+    AttitudeTable,
+    Dataset,
+    GnssTable,
+    ImuTable,
+    MagTable,
+    OdometryTable,
+    Trajectory,
+)
 from robins.ins.frames import swap
 from robins.logs.findings import LogError, refused
 from robins.logs.mounting import Origin, to_local
@@ -124,6 +132,8 @@ def _values(format: TextFormat, table: Any, origin: Origin | None) -> Values:
             "sigma_v": table.sigma_v,
             "quality": quality,
         }
+    elif isinstance(table, OdometryTable):
+        groups = {"wheels": np.stack([table.speed_mps, table.sigma_speed], axis=-1)}
     elif isinstance(table, AttitudeTable):
         groups = _turned(format, table.q_nb, table.nav)
     else:

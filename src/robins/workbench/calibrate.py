@@ -22,7 +22,7 @@ from robins.ins.magnetometer_calibration import Calibration, calibrated
 from robins.ins.magnetometer_calibration import calibrate as fitted
 from robins.logs import formats_of, open_log
 from robins.logs.clean import clean_mag
-from robins.logs.mounting import turned
+from robins.logs.mounting import Mounting, turned
 from robins.logs.tables import tables_of
 from robins.results import Outcome, Progress, array, ignore_progress, variable
 from robins.units import parse
@@ -136,13 +136,16 @@ def advice(found: Calibration) -> list[str]:
     return notes
 
 
-def as_toml(found: Calibration, source: str) -> str:
-    """A configuration for `robins replay`."""
+def as_toml(found: Calibration, source: str, mounting: Mounting | None) -> str:
+    """A configuration for `robins replay`, with the mounting in whose axes the numbers are."""
     offset = ", ".join(f'"{value:.4f} uT"' for value in found.offset_t * _UT)
     rows = ", ".join(f"[{', '.join(f'{x:.6f}' for x in row)}]" for row in found.matrix)
+    angles = () if mounting is None else (mounting.roll_deg, mounting.pitch_deg, mounting.yaw_deg)
+    mount = ", ".join(f'"{angle:.9g} deg"' for angle in angles)
+    mount = f"orientation = [{mount}]\n" if any(angles) else ""
     return (
         f"# Hard and soft iron, forward-right-down, of {source}\n"
-        'system = "marg"\n\n'
+        f'system = "marg"\n{mount}\n'
         "[magnetometer]\n"
         f"offset = [{offset}]\n"
         f"matrix = [{rows}]\n"
@@ -224,7 +227,7 @@ def calibrate(
     begin_s = 0.0 if begin is None else parse(begin, "time")
     end_s = np.inf if end is None else parse(end, "time")
     progress(0.1, "reading")
-    files = parted(log)[0]
+    files, configuration = parted(log)
     first, shown = files[0], typed(files, columns)
     given = samples(log, begin_s, end_s, columns)
     progress(0.5, "fitting the ellipsoid")
@@ -234,7 +237,7 @@ def calibrate(
         solution_of(given, found),
         metrics_of(found),
         counts=given.counts,
-        files={FILE: as_toml(found, first.name).encode()},
+        files={FILE: as_toml(found, first.name, mounting_of(configuration)).encode()},
         notes=given.notes + advice(found),
         scenario=f"calibrate/{first.name.split('.')[0]}",
         last_lines=[

@@ -19,10 +19,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robins import logs, scenario, systems
+from robins.dataset import Dataset
 from robins.ins.frames import to_ned_frd
 from robins.logs.batches import spread
 from robins.logs.findings import by_severity
-from robins.logs.loading import by_kind
+from robins.logs.loading import by_kind, without_replaced
 from robins.logs.mounting import turned
 from robins.logs.quiet import usual_step_s
 from robins.logs.tables import kind_of, tables_of
@@ -79,10 +80,9 @@ def examine(paths: Logs, columns: Sequence[str | os.PathLike[str]] = ()) -> LogE
     mounting = mounting_of(configuration)
     formats = logs.formats_of(files, columns)
     findings: list[logs.Finding] = []
-    opened = []
-    for path in files:
-        log = logs.open_log(path, formats.get(str(path)), findings)
-        opened.append(turned(log, mounting) if mounting else log)
+    read = [logs.open_log(path, formats.get(str(path)), findings) for path in files]
+    opened = without_replaced(read, findings)
+    opened = [turned(log, mounting) for log in opened] if mounting else opened
     tables = [_described(table) for log in opened for table in tables_of(log)]
     findings += logs.examine(opened)
     try:
@@ -112,6 +112,7 @@ def unit_file(
         )
     dataset = logs.load_dataset(files, formats=logs.formats_of(files, columns))
     found = find_unit(to_ned_frd(spread(dataset.imu)), dataset.gnss)
+    found = found._replace(lasting_share=_lasting_share(dataset))
     if not any(value is not None for value in found):
         raise InputError(
             "the log tells nothing of its unit: there is too little motion, and no rest",
@@ -119,6 +120,19 @@ def unit_file(
             "drive a figure of eight and stand for ten seconds.",
         )
     return toml_of(found, dataset.name)
+
+
+def _lasting_share(dataset: Dataset) -> float | None:
+    """Share of the variance of positions that a replay takes to last; None where it finds none."""
+    from robins.systems.ins_gnss import InsGnssReplay
+    from robins.systems.ins_gnss.correlated_errors import with_correlated_share
+    from robins.systems.ins_gnss.recording import on_one_clock
+
+    try:
+        log = on_one_clock(logs.clean(dataset), InsGnssReplay())
+    except ValueError:  # no fix, or none within the log: nothing is known of their errors
+        return None
+    return with_correlated_share(InsGnssReplay(), log)[0].gnss.lasting_share or None
 
 
 def _described(table: Any) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -79,32 +79,33 @@ def axes_of(orientation: Sequence[float]) -> np.ndarray:
 
 
 def believed_sigmas(
-    gnss: GnssTable, parameters: UnknownReceiver, assumed: Collection[str] = ()
+    gnss: GnssTable, parameters: UnknownReceiver
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """(M, 3) m and m/s, sigmas of fixes as the filter shall believe them; None where not used.
 
     Args:
-        gnss: with sigmas.
-        parameters: of the receiver; its own sigmas stand in the place of those of the log.
-        assumed: "place" or "velocity" where its sigma is that of a kind of fix; factors by quality
-            apply only to sigmas that the receiver states or that the parameters give.
+        gnss: with sigmas; factors by quality apply only to those that the receiver states, not to
+            those marked as assumed, which are those of a kind of fix.
+        parameters: of the receiver; its own sigmas stand in the place of those of the log, and
+            factors by quality apply to them.
     """
     g, factor = parameters, np.ones(len(gnss))
     if gnss.quality is not None:
         for quality, value in g.sigma_factor.items():
             factor[gnss.quality == int(quality)] = value
 
-    def of(kind: str, sigma: np.ndarray, own: tuple[float, ...] | None, least: float) -> np.ndarray:
+    def of(
+        sigma: np.ndarray, assumed: np.ndarray | None, own: tuple[float, ...] | None, least: float
+    ) -> np.ndarray:
         if own is not None:
-            sigma = np.tile(own, (len(sigma), 1))
-        elif kind in assumed:
-            return np.maximum(sigma, least)
-        return np.maximum(sigma * factor[:, None], least)
+            sigma, assumed = np.tile(own, (len(sigma), 1)), None
+        stated = True if assumed is None else ~assumed
+        return np.maximum(np.where(stated, sigma * factor[:, None], sigma), least)
 
     sigma_v = gnss.sigma_v if g.use_velocity else None
     if sigma_v is not None:
-        sigma_v = of("velocity", sigma_v, g.velocity_sigma, g.least_velocity_sigma)
-    return of("place", gnss.sigma_m, g.sigma, g.least_sigma), sigma_v
+        sigma_v = of(sigma_v, gnss.assumed_v, g.velocity_sigma, g.least_velocity_sigma)
+    return of(gnss.sigma_m, gnss.assumed_m, g.sigma, g.least_sigma), sigma_v
 
 
 def on_one_clock(dataset: Dataset, parameters: InsGnssReplay) -> Log:
@@ -127,8 +128,7 @@ def on_one_clock(dataset: Dataset, parameters: InsGnssReplay) -> Log:
             f"no GNSS fix lies within the IMU log: the IMU spans 0 to {time_s[-1]:.1f} s, the "
             f"fixes {gnss_s[0]:.1f} to {gnss_s[-1]:.1f} s; do both use the same time scale?"
         )
-    notes = (one.where for one in dataset.findings if one.code == "sigma_assumed")
-    sigma_m, sigma_v = believed_sigmas(gnss, g, ", ".join(notes))
+    sigma_m, sigma_v = believed_sigmas(gnss, g)
     return Log(
         Increments(*(np.asarray(a, dtype=float) for a in increments[:3])),
         time_s,
