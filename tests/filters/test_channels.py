@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import posterior, times
+from interpreted import run
 from jax.tree_util import Partial
 from two_sensors import CHANNELS, SYSTEMS, N, Y, by_sensor, model_of
 
@@ -23,7 +24,6 @@ from robins.filters import (
     Sensor,
     kalman,
     rts_smoother,
-    run,
     unscented,
 )
 from robins.filters.composite.channels import channel

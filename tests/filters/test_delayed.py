@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import times
+from interpreted import run
 from jax.tree_util import Partial
 
 from robins.filters import (
@@ -19,7 +20,6 @@ from robins.filters import (
     Sensor,
     kalman,
     normalised,
-    run,
 )
 from robins.filters.composite.delayed import DelayedMeasurement, delayed
 from robins.filters.rules import gate

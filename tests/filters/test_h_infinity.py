@@ -15,8 +15,9 @@ from dense_h_infinity import (
     least_gamma,
 )
 from dense_kalman import SPLIT_W, kalman_filter, random_system, simulate, split
+from interpreted import run
 
-from robins.filters import Belief, Code, OnlineFilter, kalman, run
+from robins.filters import Belief, Code, OnlineFilter, kalman
 from robins.filters.composite.imm import imm
 from robins.filters.rules import gate
 from robins.filters.rules.h_infinity import Infeasible, h_infinity, with_gamma

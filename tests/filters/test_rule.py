@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import kalman_filter, random_system, simulate
+from interpreted import run
 
 from robins.filters import (
     Belief,
@@ -15,7 +16,6 @@ from robins.filters import (
     Sensor,
     kalman,
     normalised,
-    run,
     taylor,
     unscented,
 )

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import run as run_filter
 from scipy import stats
 from scipy.spatial.transform import Rotation as SciRotation
 from simulated_pair import recorded
 
 from robins import logs, scenario
-from robins.filters import run as run_filter
 from robins.manifold import local
 from robins.results.solution import check
 from robins.systems import replaying
