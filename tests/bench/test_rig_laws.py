@@ -42,7 +42,7 @@ class Row(NamedTuple):
 
 TABLE = {
     "airship": Row(
-        f'bench = "airship"\nflies = "airship/s1"\nfilter = "cukf-soft"\nseconds = "20 s"\n'
+        f'bench = "airship"\nflies = "airship/s1"\nfilter = "ekf"\nseconds = "20 s"\n'
         f"set = {['duration=60 s', *SPANS]}\n",
         {"error_position", "sigma_position"},
         ("navigation",),
