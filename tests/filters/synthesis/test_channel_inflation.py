@@ -5,10 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from interpreted import run
 
 from robins import manifold
-from robins.filters import Belief, Model, Motion, Sensor, kalman, taylor, unscented
+from robins.filters import Belief, Model, Motion, Sensor, kalman, run, taylor, unscented
 from robins.filters.rules import channel_inflation
 from robins.filters.synthesis import current_form, kalman_gain, riccati
 from robins.rotation import Rotation
