@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from interpreted import run
 from scipy.optimize import least_squares, minimize
 
 from robins.earth import OMEGA_E
-from robins.filters import Belief, Model, Motion, Sensor, kalman, rts_smoother
+from robins.filters import Belief, Model, Motion, Sensor, kalman, rts_smoother, run
 from robins.manifold import local, retract
 from robins.systems.gnss import model
 from robins.systems.gnss.filters import contender
