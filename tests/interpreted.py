@@ -9,11 +9,11 @@ gradients, compiled code) take `robins.filters.run` itself.
 import jax
 import jax.numpy as jnp
 
-from robins import filters
+from robins.filters import run as by_default
 
 
 def run(*given, **named):
     """`robins.filters.run` by the interpreter; by JAX where it transforms what is given."""
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((given, named))):
-        return filters.run(*given, **named)
-    return jax.tree.map(jnp.asarray, filters.run(*given, machine="vm", **named))
+        return by_default(*given, **named)
+    return jax.tree.map(jnp.asarray, by_default(*given, machine="vm", **named))
