@@ -22,6 +22,7 @@ import meter
 import pytest
 import records
 import tiers
+from sketching import sketch
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -159,16 +160,8 @@ def own_configuration(tmp_path_factory):
 
 @pytest.fixture
 def sketched(monkeypatch):
-    """Pictures of few dots: that they are drawn counts here, not how they look or fit."""
-    from matplotlib.figure import Figure
-
-    finer = Figure.set_dpi
-
-    def coarser(figure, dpi):
-        figure.set_layout_engine("none")  # takes longer than the drawing
-        finer(figure, min(dpi, 25))
-
-    monkeypatch.setattr(Figure, "set_dpi", coarser)
+    """Pictures of few dots."""
+    sketch(monkeypatch)
 
 
 @pytest.fixture(scope="session")

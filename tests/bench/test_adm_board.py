@@ -152,6 +152,7 @@ def test_it_compiles_as_c_plus_plus_too(program):
     assert built.returncode == 0, built.stderr
 
 
+@pytest.mark.usefixtures("sketched")
 def test_from_a_design_to_a_board_in_three_commands(tmp_path, capsys):
     """docs/from-design-to-board.md: exported and built, flown and recorded, heard again."""
     of = ["satellite/s1", "--filter", FLAGSHIP, *(f"--set={one}" for one in SETTINGS)]
@@ -185,6 +186,7 @@ def test_what_is_no_part_of_a_rig_is_not_built(tmp_path, capsys):
     assert not (tmp_path / "c").exists()
 
 
+@pytest.mark.usefixtures("sketched")
 def test_the_satellite_flies_with_it_over_a_cable(program, tmp_path, capsys, monkeypatch):
     on_threads(monkeypatch)  # the other parts
     common = ["bench", "up", "satellite/s1", "--seconds", "20", "--json"]

@@ -18,6 +18,7 @@ STEPS = 10 * SECONDS
 STAR_ARCSEC = 10.0  # noise of the star sensor, across its axis
 
 
+@pytest.mark.usefixtures("sketched")
 def test_a_board_takes_the_place_of_the_gyro(tmp_path, capsys, monkeypatch):
     on_threads(monkeypatch)  # the other parts
     for name, text in firmware(WIRE).items():

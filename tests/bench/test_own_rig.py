@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from flights import ran_of
 from mcap.reader import make_reader
+from sketching import sketch
 
 from robins import bench
 from robins.bench.recording import read_record
@@ -38,7 +39,9 @@ def series(tmp_path_factory):
     """A run by two processes, with a page's eye on it."""
     where = tmp_path_factory.mktemp("pendulum")
     outcome = bench_up(RIG, record=where / "record.mcap", seconds=6.0)
-    return outcome, publish(outcome, where / "out").path
+    with pytest.MonkeyPatch.context() as patch:
+        sketch(patch)
+        return outcome, publish(outcome, where / "out").path
 
 
 def test_it_flies_by_the_document_alone(series):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from flights import series
 from short_drive import DRIVE
+from sketching import sketch
 from stations import on_threads
 
 from robins.bench.evaluation import RunResult
@@ -42,7 +43,7 @@ class Row(NamedTuple):
 
 TABLE = {
     "airship": Row(
-        f'bench = "airship"\nflies = "airship/s1"\nfilter = "cukf-soft"\nseconds = "20 s"\n'
+        f'bench = "airship"\nflies = "airship/s1"\nfilter = "ekf"\nseconds = "20 s"\n'
         f"set = {['duration=60 s', *SPANS]}\n",
         {"error_position", "sigma_position"},
         ("navigation",),
@@ -98,10 +99,12 @@ def fly(tmp_path_factory):
 
         with pytest.MonkeyPatch.context() as patch:
             on_threads(patch)
+            sketch(patch)
             patch.setattr(outcome, "in_one_program", see)
             done = bench_up(str(scenario), record=folder / "record.mcap")
+            published = publish(done, folder / "out").path
         flight, result, inside = seen[0]
-        return Done(flight.rig, result, inside, done, publish(done, folder / "out").path)
+        return Done(flight.rig, result, inside, done, published)
 
     return now
 

@@ -225,6 +225,7 @@ def test_each_block_has_the_index_of_its_own_instrument(found):
         assert np.all((low <= value) & (value <= high))
 
 
+@pytest.mark.usefixtures("sketched")
 def test_what_is_told_of_it(found, tmp_path):
     assert any("unused: changes no error" in one for one in found.warnings)
     assert not any("noise" in one and "changes no" in one for one in found.warnings)
@@ -286,6 +287,7 @@ def test_the_greatest_share_stands_first(found):
 # ------------------------------------------------------------------------------- warnings
 
 
+@pytest.mark.usefixtures("sketched")
 def test_beliefs_that_follow_the_world_and_runs_that_diverge_are_told(tmp_path):
     vary, told = [LEFT, "begin=1 m to 3 m", "explode=0 m to 1 m"], []
     found = sensitivity(

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import run
 from scipy.stats import multivariate_normal
 
-from robins.filters import Belief, Model, Motion, Sensor, adaptive, kalman, run
+from robins.filters import Belief, Model, Motion, Sensor, adaptive, kalman
 from robins.filters.composite.adaptive import excited, scale_changes
 from robins.filters.composite.bank import EVERY, stationary, transitions
 from robins.filters.linearise import Transition

@@ -3,9 +3,10 @@
 import numpy as np
 from dense_h_infinity import compensated, greatest, h_infinity_filter
 from dense_kalman import random_system, simulate
+from interpreted import run
 from two_sensors import by_sensor, split
 
-from robins.filters import kalman, run
+from robins.filters import kalman
 from robins.filters.rules.adaptive_h_infinity import adaptive_h_infinity
 
 T = 30

@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import random_system, simulate
+from interpreted import run
 from rule_table import START as PRIOR
 from rule_table import seen
 from two_sensors import ROWS, by_sensor, split
 
-from robins.filters import Code, Model, Rule, kalman, run
+from robins.filters import Code, Model, Rule, kalman
 from robins.filters.rules.gate import gate
 from robins.filters.rules.sage_husa import sage_husa
 from robins.filters.rules.variational_bayes import variational_bayes

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import run
 
-from robins.filters import Belief, Model, Motion, Sensor, kalman, run
+from robins.filters import Belief, Model, Motion, Sensor, kalman
 from robins.filters.rules.innovation_fading import innovation_fading
 from robins.filters.rules.sage_husa import sage_husa
 from robins.filters.rules.variational_bayes import variational_bayes

@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import run
 from jax.tree_util import Partial
 from two_sensors import SYSTEMS, N, Y, by_sensor, model_of
 
@@ -24,7 +25,6 @@ from robins.filters import (
     guarded,
     imm,
     kalman,
-    run,
 )
 from robins.filters.rules import gate, only
 from robins.filters.values import Numbers, value

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import random_system, simulate
+from interpreted import run
 
-from robins.filters import Belief, Model, Motion, Sensor, kalman, run
+from robins.filters import Belief, Model, Motion, Sensor, kalman
 from robins.filters.analysis.bound import covariance_bound, used_sensors
 from robins.filters.analysis.observability import (
     NOTHING,

@@ -5,6 +5,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import run
 
 from robins import linalg
 from robins.filters import (
@@ -14,7 +15,6 @@ from robins.filters import (
     Sensor,
     kalman,
     rts_smoother,
-    run,
     sigma_points,
     sigma_weights,
     taylor,

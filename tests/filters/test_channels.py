@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import posterior, times
+from interpreted import run
 from jax.tree_util import Partial
 from two_sensors import CHANNELS, SYSTEMS, N, Y, by_sensor, model_of
 
@@ -23,7 +24,6 @@ from robins.filters import (
     Sensor,
     kalman,
     rts_smoother,
-    run,
     unscented,
 )
 from robins.filters.composite.channels import channel
@@ -90,7 +90,7 @@ def test_robust_unscented_locals_through_a_turn():
     silent = np.asarray(got.steps.info["compass"].notes["federated.silent"])
     np.testing.assert_array_equal(silent, np.arange(20) == 12)
 
-    live = OnlineFilter(one, model, start)
+    live = OnlineFilter(one, model, start, "vm")
     for k in range(20):
         live.predict()
         live.update(Angle(y["compass"].rad[k]), "compass")
@@ -196,7 +196,7 @@ def test_infinite_information_is_refused_with_what_to_do():
     exact = Sensor(Partial(times, jnp.array(S.H[2:])), jnp.zeros(1), 1, "b")
     model = Model(MODEL.motion, (MODEL.sensors[0], exact))
     one = distributed(CHANNELS)
-    live = OnlineFilter(one, model, START)
+    live = OnlineFilter(one, model, START, "vm")
     before = live.predict().belief
     with pytest.raises(ValueError, match=r"channel 'b' was singular in 1 steps.*some noise"):
         live.update([1.0], "b")

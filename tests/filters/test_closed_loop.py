@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import run
 
 from robins.filters import (
     Belief,
@@ -17,7 +18,6 @@ from robins.filters import (
     Sensor,
     adaptive,
     kalman,
-    run,
     run_closed,
 )
 from robins.filters.rules import Infeasible, constant_gain, gate, h_infinity, with_gains

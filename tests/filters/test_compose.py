@@ -3,9 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import run
 from rule_table import RULES, SILENT, START, SYSTEM, M, line
 
-from robins.filters import Model, Sensor, kalman, run, taylor, unscented
+from robins.filters import Model, Sensor, kalman, taylor, unscented
 
 # The model of the table, seen a little curved.
 CURVED = Sensor(lambda x, aux: SYSTEM.H @ x + 0.01 * x[:M] ** 2, jnp.array(SYSTEM.W), M)

@@ -4,9 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import kalman_filter, random_system, simulate, times
+from interpreted import run
 from jax.tree_util import Partial
 
-from robins.filters import Belief, Model, Motion, Sensor, cubature, kalman, run, taylor
+from robins.filters import Belief, Model, Motion, Sensor, cubature, kalman, taylor
 from robins.filters.rules import gate
 from robins.filters.rules.consider import consider
 from robins.rotation import Rotation

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import scipy.signal
 from dense_kalman import System
+from interpreted import run
 from scipy import stats
 
 from robins import manifold
-from robins.filters import Belief, kalman, run
+from robins.filters import Belief, kalman
 from robins.filters.analysis.consistency import (
     anees,
     grand_mean_nis,

@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import random_system, simulate
+from interpreted import run
 from scipy import optimize, stats
 from scipy.linalg import null_space
 from two_sensors import by_sensor, split
 
 from robins import manifold
-from robins.filters import Belief, Code, kalman, run, taylor, unscented
+from robins.filters import Belief, Code, kalman, taylor, unscented
 from robins.filters.limits.constrain import constrain
 from robins.filters.rules.equality import equality
 from robins.manifold import Angle

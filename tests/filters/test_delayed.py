@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import times
+from interpreted import run
 from jax.tree_util import Partial
 
 from robins.filters import (
@@ -19,7 +20,6 @@ from robins.filters import (
     Sensor,
     kalman,
     normalised,
-    run,
 )
 from robins.filters.composite.delayed import DelayedMeasurement, delayed
 from robins.filters.rules import gate
@@ -223,7 +223,7 @@ def in_time(value):
 
 def streamed(filter_, *events) -> OnlineFilter:
     """A filter fed with predictions (None) and measurements (sensor, value)."""
-    live = OnlineFilter(filter_, LINEAR, BEGIN)
+    live = OnlineFilter(filter_, LINEAR, BEGIN, "vm")
     for event in events:
         if event is None:
             live.predict()
@@ -306,7 +306,7 @@ def test_older_than_the_start_is_too_old():
 def test_an_earlier_reading_that_makes_a_later_one_impossible_is_told():
     still = Motion(LINEAR.motion.step, jnp.zeros(2))
     exact = (replace(sensor, noise=0.0 * sensor.noise) for sensor in LINEAR.sensors)
-    live = OnlineFilter(BACK, Model(still, tuple(exact)), BEGIN)
+    live = OnlineFilter(BACK, Model(still, tuple(exact)), BEGIN, "vm")
     live.predict()
     assert int(live.update(in_time(np.zeros(2)), "b").code) == Code.DONE
     # From 1 the way to 0 would take a rate, and the rate was found to be 0.

@@ -5,9 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import System, random_system, simulate
+from in_lanes import each
+from interpreted import run
 from scipy import optimize, signal, stats
 
-from robins.filters import Belief, Code, Model, Motion, Observation, Sensor, kalman, run, unscented
+from robins.filters import Belief, Code, Model, Motion, Observation, Sensor, kalman, unscented
 from robins.filters.rules._fading import chance_levels
 from robins.filters.rules._robust import MOST, scale_to_quantile
 from robins.filters.rules.discriminator import PUBLISHED, DiscriminatorVerdict, discriminator
@@ -164,7 +166,7 @@ def test_a_right_model_is_doubted_no_more_often_in_a_run_than_stated():
     def doubted(**given):
         one = kalman(rules=[discriminator(probability=1, **given)])
         start = Belief.of(jnp.zeros(1), np.array([[1e-4]]))
-        notes = jax.jit(jax.vmap(lambda z: run(one, model, start, z).steps.info["y"].notes))(y)
+        notes = each(lambda z: run(one, model, start, z).steps.info["y"].notes)(y)
         factor = np.asarray(notes["discriminator.lambda"])
         return np.mean(np.any(factor > 1.0, axis=1))
 

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import kalman_filter, random_system, simulate, times
+from interpreted import run
 from jax.tree_util import Partial
 from rule_table import START as PRIOR
 from rule_table import seen
@@ -18,7 +19,6 @@ from robins.filters import (
     StepWarning,
     kalman,
     rts_smoother,
-    run,
     unscented,
 )
 from robins.filters.rules.fading_memory import fading_memory, per_step

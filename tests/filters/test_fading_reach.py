@@ -3,8 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import run
 
-from robins.filters import Belief, Code, Model, Motion, Sensor, kalman, run
+from robins.filters import Belief, Code, Model, Motion, Sensor, kalman
 from robins.filters.rules.innovation_fading import innovation_fading
 
 STEPS = 60

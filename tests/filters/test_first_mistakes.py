@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import run
 
-from robins.filters import Belief, Model, Motion, Sensor, cubature, kalman, run, taylor, unscented
+from robins.filters import Belief, Model, Motion, Sensor, cubature, kalman, taylor, unscented
 from robins.filters.rules import gate, huber
 from robins.manifold import Angle
 

@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import random_system, simulate
+from interpreted import run
 from scipy import stats
 from two_sensors import by_sensor, split
 
-from robins.filters import Belief, Code, Model, Motion, Sensor, kalman, run, taylor, unscented
+from robins.filters import Belief, Code, Model, Motion, Sensor, kalman, taylor, unscented
 from robins.filters.rules.gate import gate
 from robins.manifold import Angle
 

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_lanes import each
+from interpreted import run
 
 from robins.filters import (
     Belief,
@@ -19,7 +21,6 @@ from robins.filters import (
     distributed,
     guarded,
     kalman,
-    run,
 )
 from robins.filters.rules import gate, igg3
 from robins.manifold import Angle
@@ -79,20 +80,20 @@ SEEN = 16  # runs that are filtered, of all
 START = Belief.of(np.zeros(4), P0)
 
 
-@jax.jit
+@each
+def _both(given):
+    sigma, y, z = given
+    got = run(ONE, model(sigma), START, {"sar": y, "wind": z}).steps
+    plain, bold = (
+        run(PLAIN, model(sigma), START, {"sar": y, "wind": one}).steps.posterior
+        for one in (jnp.full_like(z, jnp.nan), z)
+    )
+    return got.posterior, plain, bold, got.info
+
+
 def both(sigma, wind):
     """Beliefs of the guarded filter and of its parts, and what it notes of each update."""
-
-    def one(y, z):
-        def part(z):
-            return run(PLAIN, model(sigma), START, {"sar": y, "wind": z}).steps.posterior
-
-        got = run(ONE, model(sigma), START, {"sar": y, "wind": z}).steps
-        parts = jax.vmap(part)(jnp.stack([jnp.full_like(z, jnp.nan), z]))
-        plain, bold = (jax.tree.map(lambda a, i=i: a[i], parts) for i in range(2))
-        return got.posterior, plain, bold, got.info
-
-    return jax.vmap(one)(SAR[:SEEN], wind[:SEEN])
+    return _both((np.full(SEEN, sigma), SAR[:SEEN], wind[:SEEN]))
 
 
 def mean_error(found, part):

@@ -15,8 +15,9 @@ from dense_h_infinity import (
     least_gamma,
 )
 from dense_kalman import SPLIT_W, kalman_filter, random_system, simulate, split
+from interpreted import run
 
-from robins.filters import Belief, Code, OnlineFilter, kalman, run
+from robins.filters import Belief, Code, OnlineFilter, kalman
 from robins.filters.composite.imm import imm
 from robins.filters.rules import gate
 from robins.filters.rules.h_infinity import Infeasible, h_infinity, with_gamma
@@ -258,7 +259,7 @@ def test_where_nothing_can_be_raised_the_codes_say_it(least):
 
 def test_a_stream_is_refused_when_the_step_is_closed(least):
     broken, _ = first_broken(0.97 * least)
-    live = OnlineFilter(at(0.97 * least), MODEL, START)
+    live = OnlineFilter(at(0.97 * least), MODEL, START, "vm")
     for row in Y[: broken + 1]:
         live.predict()
         live.update(row)
@@ -267,7 +268,7 @@ def test_a_stream_is_refused_when_the_step_is_closed(least):
     assert caught.value.gamma_min is None
     with pytest.raises(Infeasible, match=f"at step {broken}"):
         live.predict()
-    other = OnlineFilter(at(2.0 * least), MODEL, live.state)
+    other = OnlineFilter(at(2.0 * least), MODEL, live.state, "vm")
     assert int(other.predict().code) == Code.DONE
 
 

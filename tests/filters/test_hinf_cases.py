@@ -5,10 +5,11 @@ from functools import cache, partial
 import jax
 import numpy as np
 import pytest
+from interpreted import run
 from test_cases import cases, check, given
 
 from robins import linalg
-from robins.filters import Belief, Code, Model, Motion, Sensor, kalman, run
+from robins.filters import Belief, Code, Model, Motion, Sensor, kalman
 from robins.filters.analysis.worst_case import existence_margin, steady_h_infinity
 from robins.filters.rules.h_infinity import Infeasible, h_infinity, with_gamma
 

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import times
+from in_lanes import each
+from interpreted import run
 from jax.tree_util import Partial
 from scipy.spatial.transform import Rotation as Turn
 from scipy.stats import multivariate_normal
@@ -21,7 +23,6 @@ from robins.filters import (
     Sensor,
     StepWarning,
     kalman,
-    run,
     unscented,
 )
 from robins.filters.composite.imm import imm, mode
@@ -111,7 +112,7 @@ def dense_imm(y, change, first):
 @pytest.fixture(scope="module")
 def solution():
     y = np.stack([*(series(seed) for seed in range(3)), np.full((T, 2), np.nan)])
-    return y, jax.jit(jax.vmap(lambda y: run(IMM, MODEL, START, y)))(y)
+    return y, each(lambda y: run(IMM, MODEL, START, y))(y)
 
 
 @pytest.mark.parametrize("k", range(3))

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import random_system, simulate
+from interpreted import run
 from scipy import stats
 
-from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
+from robins.filters import Belief, Model, Motion, Sensor, kalman, unscented
 from robins.filters.limits.interval import clip, truncate, truncated_moments
 from robins.filters.rules.inequality import inequality
 from robins.manifold import Angle

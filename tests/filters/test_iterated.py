@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import random_system, simulate
+from interpreted import run
 from scipy import optimize
 
 from robins import manifold
-from robins.filters import Belief, Sensor, cubature, kalman, run, unscented
+from robins.filters import Belief, Sensor, cubature, kalman, unscented
 from robins.filters.iterated import iterated
 from robins.filters.rules import gate
 from robins.manifold import Angle

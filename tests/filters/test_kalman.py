@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import System, kalman_filter, random_system, simulate, stacked
+from interpreted import run
 from jax.tree_util import Partial
 from scipy.stats import multivariate_normal
 
@@ -21,7 +22,6 @@ from robins.filters import (
     StepWarning,
     cubature,
     kalman,
-    run,
     taylor,
     unscented,
 )

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import run
 from jax.tree_util import Partial
 
 from robins import manifold
@@ -18,7 +19,6 @@ from robins.filters import (
     Motion,
     Sensor,
     kalman,
-    run,
     sigma_weights,
     taylor,
     unscented,

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import times
+from interpreted import run
 from jax.tree_util import Partial
 from scipy import stats
 from two_sensors import CHANNELS, ROWS, SYSTEMS, Y, added, by_sensor, corrected
@@ -21,7 +22,6 @@ from robins.filters import (
     federated,
     guarded,
     kalman,
-    run,
 )
 from robins.filters.rules import gate
 

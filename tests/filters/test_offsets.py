@@ -3,11 +3,12 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import run
 from jax.tree_util import Partial
 from scipy.stats import multivariate_normal
 
 from robins import linalg
-from robins.filters import Belief, Model, Motion, Sensor, adaptive, imm, kalman, run
+from robins.filters import Belief, Model, Motion, Sensor, adaptive, imm, kalman
 from robins.filters.composite import offsets
 from robins.filters.composite.adaptive import scale_changes
 from robins.filters.composite.bank import stationary

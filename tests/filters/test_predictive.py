@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import System
+from interpreted import run
 from scipy import stats
 
-from robins.filters import Belief, kalman, run
+from robins.filters import Belief, kalman
 from robins.filters.analysis import predictive
 from robins.filters.analysis.predictive import OUTLIERS, WIDER, predicted, scale, scored
 from robins.filters.observation import Normalised

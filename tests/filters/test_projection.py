@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import random_system, simulate, times
+from interpreted import run
 from jax.tree_util import Partial
 
 from robins.filters import (
@@ -18,7 +19,6 @@ from robins.filters import (
     channel,
     distributed,
     kalman,
-    run,
     taylor,
     unscented,
 )

@@ -3,10 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import run
 from jax.tree_util import Partial
 
 from robins import linalg
-from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
+from robins.filters import Belief, Model, Motion, Sensor, kalman, unscented
 from robins.manifold import Angle
 
 N, M = 3, 2

@@ -9,10 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import random_system, simulate
+from in_lanes import each
+from interpreted import run
 from jax.tree_util import Partial
 from scipy import optimize, stats
 
-from robins.filters import Belief, Code, Model, Motion, Sensor, kalman, run
+from robins.filters import Belief, Code, Model, Motion, Sensor, kalman
 from robins.filters.rules import (
     correntropy,
     discriminator,
@@ -272,7 +274,7 @@ def rmse(*rules):
         return run(one, PLANE, STILL, y, keep=lambda step: step.posterior.mean[:2]).steps
 
     every = FAULTY.reshape(-1, LONG, 2)
-    found = np.asarray(jax.jit(jax.vmap(means))(every)).reshape(FAULTY.shape)
+    found = np.asarray(each(means)(every)).reshape(FAULTY.shape)
     return np.sqrt(np.mean(np.sum((found - TRUTH) ** 2, axis=-1)[:, :, 10:], axis=(1, 2)))
 
 

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import random_system, simulate
+from interpreted import run
 from jax.tree_util import Partial
 from scipy import stats
 
-from robins.filters import Belief, Code, Model, Motion, Sensor, kalman, run, unscented
+from robins.filters import Belief, Code, Model, Motion, Sensor, kalman, unscented
 
 N, M = 4, 3
 EKF, UKF = kalman(), kalman(unscented())

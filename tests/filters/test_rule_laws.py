@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_lanes import each
+from interpreted import run
 from rule_table import (
     ABSURD,
     ACTING,
@@ -44,7 +46,6 @@ from robins.filters import (
     OnlineFilter,
     Sensor,
     kalman,
-    run,
     taylor,
     unscented,
 )
@@ -67,9 +68,10 @@ DATA = jnp.stack([Y, Y, Y, np.where(np.arange(T)[:, None] == 3, np.nan, Y)])
 
 @cache
 def batch(name):
-    """Runs of a filter of the table, one for each of `SCALES` and `DATA`, in one program."""
+    """Runs of a filter of the table, one for each of `SCALES` and `DATA`."""
     one = kalman(rules=FILTERS[name])
-    return jax.jit(jax.vmap(lambda scale, y: run(one, line(scale), START, y)))(SCALES, DATA)
+    found = [run(one, line(scale), START, y) for scale, y in zip(SCALES, DATA, strict=True)]
+    return jax.tree.map(lambda *rows: np.stack(rows), *found)
 
 
 def ran(name):
@@ -165,6 +167,13 @@ def test_a_stream_is_a_run_of_a_batch_and_what_is_not_measured_moves_nothing(nam
 
 
 @EACH
+def test_a_batch_is_its_runs_one_by_one(name):
+    one = kalman(rules=FILTERS[name])
+    got = jax.jit(jax.vmap(lambda scale, y: run(one, line(scale), START, y)))(SCALES, DATA)
+    equal((got.steps, got.final), (batch(name).steps, batch(name).final), rtol=1e-8, atol=1e-9)
+
+
+@EACH
 def test_sigma_points_in_josephs_form_on_a_circle_say_what_derivatives_on_a_line_do(name):
     want = ran(name)
     got = run(kalman(unscented(), FILTERS[name], "joseph"), CIRCLE, FACING, AROUND)
@@ -240,15 +249,19 @@ def test_what_a_rule_cannot_do_and_what_has_no_weight_reach_the_tally():
         Motion(lambda x, u: x, jnp.zeros(2)), (Sensor(lambda x, aux: x[1:], jnp.ones(1), 1, "y"),)
     )
 
-    @jax.jit
-    def found():
-        def one(rule, sigma, y, _):
-            start = Belief(jnp.zeros(2), jnp.diag(jnp.asarray(sigma, float)))
-            return run(kalman(rules=[rule]), model, start, jnp.full((1, 1), y))
+    def one(rule, sigma, y):
+        start = Belief(jnp.zeros(2), jnp.diag(sigma))
+        return run(kalman(rules=[rule]), model, start, y[None, None])
 
-        return {name: one(*row) for name, row in FAILING.items()}
+    @each
+    def found(given):
+        return {name: one(FAILING[name][0], *row) for name, row in given.items()}
 
-    for name, got in found().items():
+    given = {
+        name: (np.array([sigma], float), np.array([y], float))
+        for name, (_, sigma, y, _) in FAILING.items()
+    }
+    for name, got in jax.tree.map(lambda x: x[0], found(given)).items():
         *_, y, code = FAILING[name]
         assert got.tally.counts("y") == {code: 1}, name
         lost = code == Code.CONTRADICTED
@@ -277,20 +290,14 @@ def test_a_jump_of_the_state_is_followed_and_a_burst_is_not():
     )
     start = Belief.of(np.zeros(2), np.eye(2))
 
-    @jax.jit
-    def found():
-        def one(filter_, patience):
-            burst = 1e6 * ((step >= AT) & (step < AT + patience))
-            data = jnp.asarray(y + np.vstack([jumped, burst]))[..., None]
+    def keep(step):
+        return step.posterior.mean[0], step.posterior.sigma[0], step.info["y"].expected[0]
 
-            def keep(step):
-                return step.posterior.mean[0], step.posterior.sigma[0], step.info["y"].expected[0]
-
-            return jax.vmap(lambda one: run(filter_, model, start, one, keep=keep).steps)(data)
-
-        return {name: one(*row) for name, row in RETURNING.items()}
-
-    for name, (mean, sigma, expected) in found().items():
+    for name, (filter_, patience) in RETURNING.items():
+        burst = 1e6 * ((step >= AT) & (step < AT + patience))
+        data = (y + np.vstack([jumped, burst]))[..., None]
+        through = each(lambda one, f=filter_: run(f, model, start, one, keep=keep).steps)
+        mean, sigma, expected = through(data)
         # what the innovation is compared with is not what a rule makes of it
         first = np.asarray(expected[:2, AT])
         np.testing.assert_allclose(first, expected[:2, AT - 1], rtol=0.05, err_msg=name)

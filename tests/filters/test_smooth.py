@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import posterior, random_system
+from interpreted import run
 
 from robins import manifold
 from robins.filters import (
@@ -18,7 +19,6 @@ from robins.filters import (
     StepWarning,
     kalman,
     rts_smoother,
-    run,
     unscented,
 )
 from robins.filters.analysis.consistency import nees

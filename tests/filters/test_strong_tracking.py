@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import System, kalman_filter, random_system, simulate
+from interpreted import run
 from test_cases import cases, check, given, linear
 
-from robins.filters import Model, Rule, Sensor, kalman, run, taylor
+from robins.filters import Model, Rule, Sensor, kalman, taylor
 from robins.filters.kalman import Form
 from robins.filters.rules.strong_tracking import strong_tracking
 

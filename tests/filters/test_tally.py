@@ -6,6 +6,7 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import run
 
 from robins import linalg
 from robins.filters import (
@@ -26,7 +27,6 @@ from robins.filters import (
     imm,
     kalman,
     particle,
-    run,
     whiteness,
 )
 from robins.filters.composite.delayed import DelayedMeasurement

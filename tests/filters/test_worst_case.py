@@ -9,8 +9,9 @@ import pytest
 from attitude_matching import in_unit, run_with
 from dense_h_infinity import greatest, h_infinity_filter, least_gamma
 from dense_kalman import SPLIT_W, random_system, simulate, split
+from interpreted import run
 
-from robins.filters import Belief, Model, Motion, Sensor, checks, kalman, run, unscented
+from robins.filters import Belief, Model, Motion, Sensor, checks, kalman, unscented
 from robins.filters.analysis.worst_case import (
     SensorChannel,
     error_operator,

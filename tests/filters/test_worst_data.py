@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_lanes import each
 from jax.tree_util import Partial
 from test_compose import RULES
 from test_robustness import SENSOR, N, extremes, given, turn
@@ -51,15 +52,15 @@ def judged(step):
 def test_many_steps_of_the_worst(names, steps):
     one = kalman(rules=[HARD[name] for name in names])
 
-    @jax.jit
-    @jax.vmap
-    def go(F, G, H, W, y, factor):
+    @each
+    def go(rows):
+        F, G, H, W, y, factor = rows
         model = Model(Motion(Partial(turn, F), given), (SENSOR,))
         start = Belief(jnp.zeros(N), factor)
         solution = run(one, model, start, y, G, {"y": (H, W)}, keep=judged)
         return solution.steps, solution.final
 
-    (whole, moved, code), final = go(*worst(steps))
+    (whole, moved, code), final = go(worst(steps))
     # Symmetric and positive semidefinite it is by its form, S S', while S is finite.
     assert np.all(whole)
     taken = {Code.DONE, Code.MISSING, Code.PARTLY_MISSING, Code.REFUSED}

@@ -1,15 +1,13 @@
 """A linear system with two sensors, and what a dense centralised filter makes of it."""
 
-from functools import partial
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 from dense_kalman import System, times
+from interpreted import run
 from jax.tree_util import Partial
 
 from robins import linalg
-from robins.filters import Belief, Model, Motion, Sensor, run
+from robins.filters import Belief, Model, Motion, Sensor
 from robins.filters.composite.channels import channel
 
 N, SEEDS, STEPS = 4, 5, 200
@@ -60,7 +58,6 @@ def by_sensor(y):
     return {k: y[..., r] for k, r in ROWS.items()}
 
 
-@partial(jax.jit, static_argnums=0)
 def answer(filter_, parts, start, y):
     """Posteriors of a run; the log-likelihoods of a and b are not looked at here."""
     solution = run(filter_, model_of(*parts), start, by_sensor(y), keep=lambda s: s.posterior)

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interpreted import run
 from scipy.spatial.transform import Rotation
 
-from robins.filters import Code, run
+from robins.filters import Code
 from robins.systems.marg import MargReplay, filter_of, model, model_of, prepare
 from robins.systems.marg.aboard import (
     COUNTED_S,

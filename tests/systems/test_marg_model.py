@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_lanes import each
 from scipy import stats
 from scipy.spatial.transform import Rotation as SciRotation
 
@@ -216,9 +217,9 @@ def test_errors_are_as_large_as_the_filter_says():
     seen = np.arange(steps) % 10 == 9
     rows = draw(runs, DIM), draw(runs, steps, DIM), draw(runs, steps, 6), draw(runs, steps, 3)
 
-    @jax.jit
-    @jax.vmap
-    def nees(first, walk, travel_noise, field_noise):
+    @each
+    def nees(drawn):
+        first, walk, travel_noise, field_noise = drawn
         x = manifold.retract(start.mean, sigma * first)
 
         def world(x, row):
@@ -245,6 +246,6 @@ def test_errors_are_as_large_as_the_filter_says():
         white = jax.scipy.linalg.solve_triangular(end.factor, error, lower=True)
         return white @ white
 
-    total = float(jnp.sum(nees(*rows)))
+    total = float(jnp.sum(nees(rows)))
     low, high = stats.chi2.ppf([0.001, 0.999], runs * DIM)
     assert low < total < high

@@ -18,6 +18,7 @@ from robins.systems.marg.path import MeasurementPace, as_means
 
 GAIN = 0.01 * np.array([[0.6, -0.4, 0.2], [0.3, -0.7, 0.5], [-0.2, 0.4, 0.5]])
 PARAMETERS = MargReplay()
+CAUSAL = ("marg",)
 
 
 def noisy(seed=0, **wrong):
@@ -46,7 +47,7 @@ def finite(outcome):
 def test_static_attitude_is_that_of_gravity_and_field():
     turn = Rotation.from_euler("ZYX", [2.0, -0.4, 0.7])
     still = log_of(Rotation.concatenate([turn] * 6001), np.zeros((6001, 3)))
-    found = replay(still, PARAMETERS)
+    found = replay(still, PARAMETERS, CAUSAL)
     np.testing.assert_allclose(
         found.solution["estimate_euler"].values,
         np.broadcast_to([0.7, -0.4, 2.0], found.solution["estimate_euler"].shape),
@@ -59,7 +60,7 @@ def test_static_attitude_is_that_of_gravity_and_field():
 def test_constant_turning_is_carried_by_the_gyros():
     time = np.arange(6001) / RATE_HZ
     turn = Rotation.from_rotvec(np.outer(time, [0.0, 0.0, 0.7]))
-    found = replay(log_of(turn, np.zeros((6001, 3))), PARAMETERS)
+    found = replay(log_of(turn, np.zeros((6001, 3))), PARAMETERS, CAUSAL)
     heading = np.unwrap(found.solution["estimate_euler"].sel(filter="marg").values[:, 2])
     np.testing.assert_allclose(heading, 0.7 * found.solution["time"].values, atol=2e-4)
 
@@ -112,7 +113,7 @@ def test_orientation_of_the_sensor_does_not_matter(moved):
             ),
         ),
     )
-    found = replay(turned, PARAMETERS).metrics["marg"]
+    found = replay(turned, PARAMETERS, CAUSAL).metrics["marg"]
     assert found["total_rmse_deg"] == pytest.approx(
         outcome.metrics["marg"]["total_rmse_deg"], rel=1e-4
     )
@@ -122,7 +123,7 @@ def test_an_attached_magnet_is_refused_and_a_field_that_stays_is_taken_up(moved)
     log, _ = moved
     seconds = log.mag.time_ns * 1e-9
     stuck = log.mag.field_t + np.where((seconds > 20.0)[:, None], [3e-5, -2e-5, 1e-5], 0.0)
-    found = finite(replay(with_field(log, stuck), PARAMETERS))
+    found = finite(replay(with_field(log, stuck), PARAMETERS, CAUSAL))
     assert found.metrics["marg"]["refused_magnetometer"] > 20
     assert found.metrics["marg"]["total_rmse_deg"] < 3.0
     assert np.any(found.solution["magnetic_disturbance"].sel(filter="marg").values)
@@ -130,7 +131,7 @@ def test_an_attached_magnet_is_refused_and_a_field_that_stays_is_taken_up(moved)
     q = Rotation.from_quat(np.roll(log.attitude.q_nb, -1, axis=1))
     other = q.inv().apply([0.0, 3e-5, 2e-5])
     moved_on = np.where((seconds > 12.0)[:, None], other, log.mag.field_t)
-    new = finite(replay(with_field(log, moved_on), PARAMETERS)).solution.sel(filter="marg")
+    new = finite(replay(with_field(log, moved_on), PARAMETERS, CAUSAL)).solution.sel(filter="marg")
     time = new["time"].values
     disturbed = new["magnetic_disturbance"].values[time < 30.0]
     assert np.sum(disturbed) >= 18
@@ -150,7 +151,9 @@ def test_always_undisturbed_never(moved):
     use = lambda how: PARAMETERS.model_copy(update={"use_magnetometer": how})  # noqa: E731
     late = (log.mag.time_ns > 10e9)[:, None]
     wrong = with_field(log, log.mag.field_t + np.where(late, [4e-5, 0.0, 0.0], 0.0))
-    found = {how: replay(wrong, use(how)).metrics["marg"] for how in ("always", "undisturbed")}
+    found = {
+        how: replay(wrong, use(how), CAUSAL).metrics["marg"] for how in ("always", "undisturbed")
+    }
     assert found["always"]["refused_magnetometer"] == 0
     assert found["always"]["nis_magnetometer"] > 10.0
     assert found["undisturbed"]["refused_magnetometer"] > 40
@@ -180,13 +183,13 @@ def test_bad_input_leaves_the_state_finite_and_is_counted(moved, fault):
         assert found.metrics["marg"]["total_rmse_deg"] < 4.0
     elif fault in ("zero field", "no field"):
         field[1000:] = 0.0 if fault == "zero field" else np.nan
-        found = finite(replay(with_field(log, field), PARAMETERS))
+        found = finite(replay(with_field(log, field), PARAMETERS, CAUSAL))
         kind = "field_implausible" if fault == "zero field" else "field_missing"
         assert found.counts[kind] == len(field) - 1000
         assert "nis_magnetometer" in found.metrics["marg"] or fault == "no field"
     elif fault == "free fall":
         accel[hurt] = 0.0
-        found = finite(replay(with_imu(log, accel=accel), PARAMETERS))
+        found = finite(replay(with_imu(log, accel=accel), PARAMETERS, CAUSAL))
         assert found.counts["blocks_in_free_fall"] == 30
         assert found.metrics["marg"]["inclination_rmse_deg"] < 3.0
     elif fault == "drop-out":
@@ -199,7 +202,7 @@ def test_bad_input_leaves_the_state_finite_and_is_counted(moved, fault):
         assert after > 3.0 * before
     else:
         gyro[hurt, 2] = np.radians(2000.0)
-        found = finite(replay(with_imu(log, gyro=gyro), PARAMETERS))
+        found = finite(replay(with_imu(log, gyro=gyro), PARAMETERS, CAUSAL))
         assert found.counts["imu_saturated"] == 300
     assert any(sentence.startswith("At rest for") for sentence in found.notes)
 
@@ -208,7 +211,7 @@ def test_a_start_without_gravity_or_rest_says_so(moved):
     log, _ = moved
     accel = log.imu.accel.copy()
     accel[:400] = 0.0
-    found = finite(replay(with_imu(log, accel=accel), PARAMETERS))
+    found = finite(replay(with_imu(log, accel=accel), PARAMETERS, CAUSAL))
     assert "the tilt is hardly known" in found.notes[0]
     middle = slice(2000, None)
     part = replace(
@@ -233,7 +236,7 @@ def test_a_log_without_truth_or_magnetometer_has_no_errors_but_consistency(moved
 
 def test_a_causal_replay_alone_gives_the_same(moved):
     log, outcome = moved
-    alone = finite(replay(log, PARAMETERS, ("marg",)))
+    alone = finite(replay(log, PARAMETERS, CAUSAL))
     both = outcome.solution["sigma_attitude"].sel(filter="marg").values
     np.testing.assert_allclose(alone.solution["sigma_attitude"].values[0], both, rtol=1e-9)
 

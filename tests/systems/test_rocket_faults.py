@@ -6,9 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_lanes import each
 from scipy.spatial.transform import Rotation as Turn
 
 from robins import scenario
+from robins.campaign.machine import first_run, first_worlds
 from robins.filters import Belief, Code, OnlineFilter, run
 from robins.filters.rules.discriminator import DiscriminatorVerdict
 from robins.rotation import Rotation
@@ -52,7 +54,7 @@ def found(c, worlds):
         it = c.case(world)
         return run(c.filter, c.model, it.start, it.y, it.u, it.aux, keep=seen_of).steps
 
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(worlds))
+    return jax.tree.map(np.asarray, each(one)(worlds))
 
 
 def same(a, b):
@@ -97,7 +99,7 @@ IMPOSSIBLE = ("nan", "one axis", "inf", "-inf", "zero", "denormal", "weak", "str
 @pytest.fixture(scope="module", name="flight")
 def of_the_field():
     problem = FIELD_VECTOR.problem(parsed(FieldVector, "b4"), ("gate", "discriminator"), 0)
-    world = jax.jit(problem.simulate)(0)
+    world = first_run(first_worlds(problem, 1))
     good = np.array(world.readings[FIELD])
     field_n = np.array(problem.context["field_n"])
     unit = good[AT] * np.linalg.norm(field_n[AT]) / np.linalg.norm(good[AT])
@@ -115,7 +117,7 @@ def of_the_field():
     up, way = direction_of(field_n[0])
     along = (f'body.elevation="{up} deg"', f'body.azimuth="{way} deg"', 'body.cone="0 deg"')
     spinning = FIELD_VECTOR.problem(parsed(FieldVector, "b4", *along), (), 0)
-    worlds.append(jax.jit(spinning.simulate)(0))
+    worlds.append(first_run(first_worlds(spinning, 1)))
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *worlds)
     gated = found(problem.contenders["gate"], stacked)
     return Flight(problem, world, cases, gated, spinning, worlds[-1])
@@ -276,7 +278,7 @@ def of_lost_sensors():
     """The two filters that are one, with each sensor lost for 7 s, and with both."""
     names = ("ukf", "federated-root")
     problem = MAGNETIC_ATTITUDE.problem(parsed(MagneticAttitude, "a8"), names, 0)
-    world = jax.jit(problem.simulate)(0)
+    world = first_run(first_worlds(problem, 1))
 
     def without(*lost):
         read = dict(world.readings)

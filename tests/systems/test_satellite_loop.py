@@ -5,11 +5,12 @@ import sys
 import jax
 import numpy as np
 import pytest
+from interpreted import run
 from satellite_runs import ARCSEC, flown, parsed, problem
 
 from robins.campaign import worlds
 from robins.campaign.bound import bound
-from robins.filters import run, run_closed
+from robins.filters import run_closed
 from robins.scenario import ScenarioError
 from robins.systems.satellite import SYSTEM
 from robins.systems.satellite.design import axis_design

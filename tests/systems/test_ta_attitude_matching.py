@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from interpreted import run
 from scipy.spatial.transform import Rotation as R
 
 from robins import rotation, scenario
-from robins.filters import kalman, run
+from robins.filters import kalman
 from robins.filters.rules.h_infinity import h_infinity, with_gamma
 from robins.sim.flexure import Flexure
 from robins.systems import transfer_alignment

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from in_lanes import each
+from interpreted import run
 
 import robins.systems
 from robins import rotation, scenario
-from robins.filters import run
 from robins.results import summary
 from robins.scenario import ScenarioError
 from robins.systems.judgement import claim_judge

@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from in_lanes import each
+from interpreted import run as run_filter
 from scipy import stats
 from scipy.spatial.transform import Rotation as SciRotation
 from simulated_pair import recorded
 
 from robins import logs, scenario
-from robins.filters import run as run_filter
 from robins.manifold import local
 from robins.results.solution import check
 from robins.systems import replaying
@@ -86,7 +87,7 @@ def read_back(dataset, folder):
 
 def simulated(count):
     course = lay_out(PAIR)
-    several = jax.jit(jax.vmap(lambda k: simulate_pair(PAIR, course, 3, k)))(jnp.arange(count))
+    several = each(lambda k: simulate_pair(PAIR, course, 3, k))(np.arange(count))
     return [jax.tree.map(lambda x, k=k: np.asarray(x[k]), several) for k in range(count)]
 
 

@@ -21,6 +21,7 @@ def an_outcome(seed=0, **more):
     return Outcome(solution, {"kf": {"rms_m": 0.5}}, scenario="a", seed=seed, **more)
 
 
+@pytest.mark.usefixtures("sketched")
 def test_the_folder_holds_all_of_an_outcome(tmp_path):
     (tmp_path / "record").write_bytes(b"heard")
     outcome = an_outcome(
@@ -43,6 +44,7 @@ def test_the_folder_holds_all_of_an_outcome(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["out"]  # the record was moved in
 
 
+@pytest.mark.usefixtures("sketched")
 def test_an_outcome_without_arrays_is_one(tmp_path):
     result = workbench.publish(Outcome(scenario="a"), tmp_path / "out")
     assert (result.solution, result.summary["filters"]) == (None, {})
@@ -59,6 +61,7 @@ def test_a_folder_is_refused_before_anything_is_computed(tmp_path):
 
 
 @pytest.mark.parametrize("error", [None, KeyError("x"), KeyboardInterrupt()])
+@pytest.mark.usefixtures("sketched")
 def test_without_an_outcome_the_earlier_result_stays(tmp_path, error):
     workbench.publish(an_outcome(seed=1), tmp_path / "out")
     caught = None
@@ -74,6 +77,7 @@ def test_without_an_outcome_the_earlier_result_stays(tmp_path, error):
 
 
 @pytest.mark.parametrize("where", ["figures", "commit"])
+@pytest.mark.usefixtures("sketched")
 def test_numbers_that_cannot_be_written_are_kept(tmp_path, monkeypatch, where):
     def fail(*_):
         raise OSError(28, "No space left on device")

@@ -98,6 +98,7 @@ def test_each_point_is_the_campaign_of_its_values(tmp_path):
     )
 
 
+@pytest.mark.usefixtures("sketched")
 def test_two_parameters_make_a_map_and_more_runs_go_on(tmp_path):
     two = [SIGMAS, "outlier_share=0,0.2"]
     asked = {"vary": two, "filters": ("kf",), "settings": SHORT}

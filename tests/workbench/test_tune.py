@@ -21,6 +21,7 @@ BALLOON = f"{Path(__file__).parents[2]}/docs/examples/balloon.py:study"
 SHORT = ["duration=60 s", "outlier_share=0"]
 
 
+@pytest.mark.usefixtures("sketched")
 def test_a_wrong_sensor_is_found_out(tmp_path):
     found = tune([BALLOON], vary=["barometer=30 m"], filter_name="kf", settings=SHORT)
     before, after = found.metrics["kf as written"], found.metrics["kf tuned"]

@@ -216,15 +216,16 @@ class HInfinity(Rule):
         last step too, from which nothing has been predicted.
         """
         missed = int(final.events) - before
+        # Arrays are NumPy's in a stream in C and from the interpreter.
+        first, weighted = jnp.asarray(final.weighted_first), jnp.asarray(final.weighted)
         if missed > 0 and before == 0:
-            return int(final.first), jnp.asarray(final.weighted_first)  # NumPy in a stream in C
+            return int(final.first), first
         if missed > 0:  # the first was another filter's; after a missed step all are missed
-            return int(final.steps) - 1 - missed, final.weighted
+            return int(final.steps) - 1 - missed, weighted
         if not whole or not final.measured:
             return None
-        n = final.weighted.shape[1]
-        exists = inflated(jnp.eye(n), self.inverse * final.weighted)[1]
-        return None if exists else (int(final.steps) - 1, final.weighted)
+        exists = inflated(jnp.eye(weighted.shape[1]), self.inverse * weighted)[1]
+        return None if exists else (int(final.steps) - 1, weighted)
 
     @property
     def reports(self) -> bool:
