@@ -103,6 +103,21 @@ def _positive(file: str, lines: _Lines, name: str, variances: np.ndarray) -> np.
     return np.sqrt(variances)
 
 
+def _odometry(file: str, lines: _Lines) -> OdometryTable:
+    name = "odom3"
+    v = _finite(file, lines, name)
+    sigma = _positive(file, lines, name, v[:, [6, 11]])
+    return OdometryTable(
+        time_ns=_times(file, lines, name),
+        speed_mps=v[:, 0],
+        yaw_rate=-v[:, 5],  # about down; the file's z is up
+        sigma_speed=sigma[:, 0],
+        sigma_yaw=sigma[:, 1],
+        source=file,
+        rows=np.asarray(lines.rows),
+    )
+
+
 def read_librsf(
     path: str | os.PathLike[str], findings: list[Finding] | None = None
 ) -> dict[str, RangeTable | OdometryTable | PlaceTable]:
@@ -136,19 +151,8 @@ def read_librsf(
             source=file,
             rows=np.asarray(lines.rows),
         )
-    lines = kinds["odom3"]
-    if lines.rows:
-        v, name = _finite(file, lines, "odom3"), "odom3"
-        sigma = _positive(file, lines, name, v[:, [6, 11]])
-        out["odometry"] = OdometryTable(
-            time_ns=_times(file, lines, name),
-            speed_mps=v[:, 0],
-            yaw_rate=-v[:, 5],  # about down; the file's z is up
-            sigma_speed=sigma[:, 0],
-            sigma_yaw=sigma[:, 1],
-            source=file,
-            rows=np.asarray(lines.rows),
-        )
+    if (lines := kinds["odom3"]).rows:
+        out["odometry"] = _odometry(file, lines)
     lines = kinds["point3"]
     if lines.rows:
         time_ns, v = _times(file, lines, "point3"), _finite(file, lines, "point3")

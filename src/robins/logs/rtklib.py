@@ -86,12 +86,7 @@ def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = N
                 "they are left out. Heading will be found from the positions alone; set "
                 "out-outvel = on."
             )
-    if any("/geodetic" in line for line in head.lines if line.startswith("%")):
-        finding_reporter(findings, "warning", "height_above_geoid", file, "header", "geodetic")(
-            "heights are above the geoid, and robins takes them as above the WGS-84 "
-            "ellipsoid. Differences of height stay right; gravity errs by 3e-6 m/s^2 per "
-            "metre. Set out-height = ellipsoidal in RTKLIB."
-        )
+    _report_geoid(file, head, findings)
     quality = column("Q")
     return GnssTable(
         time_ns=_times(file, columns.texts, columns.rows, calendar, utc),
@@ -105,6 +100,15 @@ def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = N
         source=file,
         rows=columns.rows,
     )
+
+
+def _report_geoid(file: str, head: Head, findings: list[Finding] | None) -> None:
+    if any("/geodetic" in line for line in head.lines if line.startswith("%")):
+        finding_reporter(findings, "warning", "height_above_geoid", file, "header", "geodetic")(
+            "heights are above the geoid, and robins takes them as above the WGS-84 "
+            "ellipsoid. Differences of height stay right; gravity errs by 3e-6 m/s^2 per "
+            "metre. Set out-height = ellipsoidal in RTKLIB."
+        )
 
 
 def _header(head: Head) -> tuple[list[str], bool]:

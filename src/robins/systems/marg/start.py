@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -127,13 +128,14 @@ def turn_across(
     first, last = (initial_alignment(*side, parameters) for side in (before, after))
     start, end = (SciRotation.from_quat(np.roll(one.q_nb, -1)) for one in (first, last))
     start = start * _turned(before[0].theta)[-1]
-    spread = np.hypot(*(max(one.tilt_rad, one.heading_rad) for one in (first, last)))
+    each = [max(one.tilt_rad, one.heading_rad) for one in (first, last)]
+    spread = math.hypot(*each)
     if not (np.any(first.field_t) and np.any(last.field_t)):
         _, _, z, w = (start * SciRotation.from_rotvec(bridge) * end.inv()).as_quat()
         end = SciRotation.from_rotvec([0.0, 0.0, 2.0 * np.arctan2(z, w)]) * end
-        spread = np.inf
+        spread = math.inf
     up_b = start.inv().apply([0.0, 0.0, -1.0])
-    return (start.inv() * end).as_rotvec(), up_b, float(spread)
+    return (start.inv() * end).as_rotvec(), up_b, spread
 
 
 def _turned(theta: np.ndarray) -> SciRotation:
