@@ -10,7 +10,6 @@ from short_drive import DRIVE
 
 from robins import scenario
 from robins.filters import Code
-from robins.ins.frames import turned
 from robins.logs import clean, load_dataset
 from robins.logs.ordering import rows_where
 from robins.results import ResultError
@@ -19,7 +18,7 @@ from robins.systems.ins_gnss import SYSTEM, Drive, InsGnssReplay, LiveInsGnss, d
 from robins.systems.ins_gnss.log import contender, prepare, steps_of
 from robins.systems.ins_gnss.path import InsGnssPath, row_of
 from robins.systems.ins_gnss.positions import heading_of
-from robins.systems.ins_gnss.recording import axes_of, in_body_axes, on_one_clock
+from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock
 from robins.systems.ins_gnss.rest import UsualIntervals, usual_of
 from robins.systems.ins_gnss.robust import navigation
 from robins.systems.ins_gnss.start import find_start
@@ -261,16 +260,6 @@ def test_chunks_of_any_size_give_the_bits_of_a_replay(log, velocities, parameter
             one = {k: one[k] for k in other} if isinstance(other, dict) else one
             jax.tree_util.tree_map(np.testing.assert_array_equal, one, other)
         jax.tree_util.tree_map(np.testing.assert_array_equal, belief, world.start)
-
-
-def test_the_axes_of_the_vehicle_have_the_same_bits_sample_by_sample(log):
-    """A product of matrices rounds a row alone in another way than many."""
-    whole = in_body_axes(log, (0.1, -0.2, 0.3)).imu
-    C_bs = axes_of((0.1, -0.2, 0.3))
-    for k in range(0, len(log.imu), 7):
-        both = turned(C_bs, np.stack([log.imu.gyro[k], log.imu.accel[k]]))
-        np.testing.assert_array_equal(both, [whole.gyro[k], whole.accel[k]])
-    np.testing.assert_allclose(whole.gyro, log.imu.gyro @ C_bs.T, rtol=1e-13, atol=1e-16)
 
 
 def test_an_answer_is_the_state_carried_on_over_the_samples_since(live, log):

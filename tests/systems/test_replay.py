@@ -14,6 +14,7 @@ from robins import logs, scenario
 from robins.dataset import Dataset
 from robins.earth import Geodetic, earth_rate_n
 from robins.ins.blocks import gained_in_window
+from robins.ins.frames import turned
 from robins.ins.state import InsState
 from robins.program import BuildError
 from robins.rotation import Rotation as Attitude
@@ -21,7 +22,7 @@ from robins.systems import ins_gnss
 from robins.systems.ins_gnss import SYSTEM, Drive, InsGnssReplay, drive_dataset
 from robins.systems.ins_gnss import replay as replay_log
 from robins.systems.ins_gnss.model import Mount, read_position
-from robins.systems.ins_gnss.recording import on_one_clock
+from robins.systems.ins_gnss.recording import axes_of, in_body_axes, on_one_clock
 from robins.workbench import replay as replay_files
 
 DRIVE = """
@@ -316,6 +317,16 @@ def test_a_run_as_a_log_has_the_noise_of_the_campaign(drive, log):
         np.asarray(case.y["gnss_position"].lat)[here], log.gnss.lat_rad, rtol=0, atol=1e-15
     )
     assert isinstance(log, Dataset)
+
+
+def test_the_axes_of_the_vehicle_have_the_same_bits_sample_by_sample(log):
+    """A product of matrices rounds a row alone in another way than many."""
+    whole = in_body_axes(log, (0.1, -0.2, 0.3)).imu
+    C_bs = axes_of((0.1, -0.2, 0.3))
+    for k in range(0, len(log.imu), 7):
+        both = turned(C_bs, np.stack([log.imu.gyro[k], log.imu.accel[k]]))
+        np.testing.assert_array_equal(both, [whole.gyro[k], whole.accel[k]])
+    np.testing.assert_allclose(whole.gyro, log.imu.gyro @ C_bs.T, rtol=1e-13, atol=1e-16)
 
 
 def test_a_late_fix_is_of_where_the_antenna_was():

@@ -155,15 +155,7 @@ class InsGnssPath:
         self._tick = tick
         given, waits = p.start.known_heading is not None, rows[-1, 0] - self.first_fix_s
         compass = len(self._field) > 0 and waits > _COURSE_S and rows[-1, 0] >= self._ask_s
-        log = self._log()
-        within = self.fixes[:, 0] <= rows[-1, 0] - self.reach_s
-        log = log._replace(
-            gnss=some(log.gnss, within),
-            **{
-                name: None if (a := getattr(log, name)) is None else a[within]
-                for name in ("gnss_s", "sigma_m", "v_n", "sigma_v", "withheld")
-            },
-        )
+        log = self._log(rows[-1, 0] - self.reach_s)
         if not (given or compass) and fast_fix(log, p.start)[0] is None:
             return None
         try:
@@ -198,9 +190,10 @@ class InsGnssPath:
         self._field = self._field[self._field[:, 0] > end_s - 1.0]
         self.fixes = self.fixes[self.fixes[:, 0] > end_s]
 
-    def _log(self) -> Log:
-        """Increments and all fixes as a piece of a log."""
+    def _log(self, until_s: float = math.inf) -> Log:
+        """Increments, and fixes up to a time, as a piece of a log."""
         rows, f, gnss = self._steps, self.fixes, self._parameters.gnss
+        f = f[f[:, 0] <= until_s]
         table = table_of(f, self.origin_ns, self._velocities)
         log = Log(
             Increments(rows[:, 1], rows[:, 2:5], rows[:, 5:8]),
@@ -306,15 +299,3 @@ def table_of(rows: np.ndarray, origin_ns: int, velocities: bool) -> GnssTable:
     v, spread = (rows[:, 7:10], rows[:, 10:13]) if velocities else (None, None)
     quality = rows[:, 13].astype(int)
     return GnssTable(time_ns, rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4:7], v, spread, quality)
-
-
-def some(table: GnssTable, keep: np.ndarray) -> GnssTable:
-    """Some rows of a table of fixes."""
-    columns: dict[str, Any] = {
-        name: None if (a := getattr(table, name)) is None else a[keep]
-        for name in (
-            *("time_ns", "lat_rad", "lon_rad", "alt_m", "sigma_m", "v_n", "sigma_v"),
-            "quality",
-        )
-    }
-    return GnssTable(**columns)

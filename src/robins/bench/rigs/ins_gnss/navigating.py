@@ -32,6 +32,7 @@ from robins.earth import Geodetic
 from robins.ins.blocks import rate_about
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsState
+from robins.logs.ordering import rows_where
 from robins.ros import Message
 from robins.rotation import Rotation
 from robins.scenario import Quantity, default
@@ -39,7 +40,6 @@ from robins.systems.ins_gnss import aboard as program
 from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.live import LiveInsGnss, Navigation
 from robins.systems.ins_gnss.parameters import Drive, Gnss, InsGnssReplay
-from robins.systems.ins_gnss.path import some
 from robins.systems.ins_gnss.recording import (
     Log,
     as_rates,
@@ -283,7 +283,7 @@ def judge(flight: LoadedRun, result: RunResult) -> RunFigures:
     if config.dataset is not None:
         log = on_one_clock(in_body_axes(config.dataset, config.given.imu.orientation), config.given)
         metrics, flew = against_fixes(config, log, series), log.gnss_s <= series.time_s[-1]
-        flown_by = log._replace(gnss=some(log.gnss, flew), gnss_s=log.gnss_s[flew])
+        flown_by = log._replace(gnss=rows_where(log.gnss, flew), gnss_s=log.gnss_s[flew])
         arrays |= fix_arrays(flown_by)
     if config.dataset is not None and config.dataset.truth is not None:
         error = against_truth(config.dataset.truth, series)
