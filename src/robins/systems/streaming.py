@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from enum import IntFlag
 from functools import partial
@@ -250,6 +250,8 @@ def _made_again(cls: type[LiveT], parameters: str, state: Mapping[str, Any]) -> 
     """The object of which this is known."""
     given = cls._parameters.model_validate(_tuples(mapping_of(parameters)))
     made = cls(given, **state["made_with"])
+    _compare(cls.__name__, cls._kept, state["own"])
+    _compare(cls.__name__, cls._parts, state["parts"])
     made.counts.update(state["counts"])
     for name, value in state["own"].items():
         setattr(made, name, value)
@@ -269,8 +271,15 @@ def _state_of(part: Part) -> dict[str, Any]:
     }
 
 
+def _compare(what: str, own: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse a state with other attributes, which another robins wrote."""
+    if differ := sorted({*own} ^ {*known}):
+        raise ValueError(f"{what} differs in {', '.join(differ)}")
+
+
 def _go_on(part: Part, known: Mapping[str, Any]) -> None:
     """Set what `_state_of` found."""
+    _compare(type(part).__name__, _state_of(part), known)
     for name, value in known.items():
         if _is_part(getattr(part, name)):
             _go_on(getattr(part, name), value)
