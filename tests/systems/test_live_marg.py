@@ -344,3 +344,11 @@ def test_a_recorded_trial_has_the_answers_of_its_replay(data_dir):
     heard = (flags & STARTING) == 0
     assert np.mean(heard) > 0.9
     assert np.max(apart(q[heard], of[heard])) < 1e-9
+
+
+def test_a_state_with_other_attributes_is_refused(live):
+    """As of another robins: what it lacks would stay as it is at the begin."""
+    made, (cls, parameters, state) = live.__reduce__()
+    del state["parts"]["_path"]["_side"]
+    with pytest.raises(ValueError, match="SamplePath differs in _side"):
+        made(cls, parameters, state)

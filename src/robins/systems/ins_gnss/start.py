@@ -67,12 +67,7 @@ def fast_fix(log: Log, start: InsGnssStart) -> tuple[int | None, bool, str]:
 
 
 def _compass(
-    log: Log,
-    q_nb: np.ndarray,
-    when_s: float,
-    place: tuple[float, float, float],
-    time_ns: int,
-    otherwise: str,
+    log: Log, q_nb: np.ndarray, when_s: float, fix: int, otherwise: str
 ) -> tuple[float, str]:
     """Heading [rad] by the magnetometer over the second before a time, and a sentence.
 
@@ -82,8 +77,7 @@ def _compass(
         log: with a magnetometer.
         q_nb: (4,) levelled, at heading zero.
         when_s: the time.
-        place: latitude, longitude [rad], height [m].
-        time_ns: of a fix.
+        fix: number of one near by.
         otherwise: why there is no other heading.
 
     Raises:
@@ -92,6 +86,9 @@ def _compass(
     assert log.field_s is not None
     assert log.field_b is not None
     near = np.abs(log.field_s - when_s) <= 1.0
+    g = log.gnss
+    time_ns = int(g.time_ns[fix])
+    place = float(g.lat_rad[fix]), float(g.lon_rad[fix]), float(g.alt_m[fix])
     year = min(max(decimal_year(time_ns), 2020.0), 2030.0)
     year = year if decimal_year(time_ns) > 2000.0 else 2025.0
     earth = elements(field_n(wmm_for(year), *place, year))
@@ -151,16 +148,16 @@ def find_start(
         sentence += f", heading given as {np.degrees(start.known_heading):.1f} deg"
         at, begin_s = 0, begin_s if tilt == start.tilt else float(log.gnss_s[some])
     elif fast is None:
-        place = float(g.lat_rad[some]), float(g.lon_rad[some]), float(g.alt_m[some])
-        heading, source = _compass(log, q_nb, begin_s, place, int(g.time_ns[some]), unknown)
+        heading, source = _compass(log, q_nb, begin_s, some, unknown)
         q_nb = with_heading(q_nb, heading)
         sentence += f", {source}"
     else:
         q_nb, at, begin_s = _carried(log, q_nb, at, last, bias), last, float(log.gnss_s[fast])
     if fast is not None and not by_way and g.v_n is not None:
-        heading = float(np.arctan2(g.v_n[fast, 1], g.v_n[fast, 0]))
+        north, east = g.v_n[fast, :2].tolist()
+        heading = float(np.arctan2(east, north))
         q_nb = with_heading(q_nb, heading)
-        sentence += _course(heading, begin_s, float(np.hypot(*g.v_n[fast, :2])), "")
+        sentence += _course(heading, begin_s, float(np.hypot(north, east)), "")
     later = whole[log.gnss_s[whole] >= begin_s - 1e-6]
     if len(later) == 0:
         raise ValueError(f"no whole GNSS fix after the attitude is known, at {begin_s:.1f} s")
@@ -171,9 +168,8 @@ def find_start(
             q_nb = _carried(log, q_nb, at, _row(log, first), bias)
         return found._replace(q_nb=q_nb, v_n=log.v_n[first])
     later = later[log.gnss_s[later] <= log.gnss_s[first] + WAYS_S[-1]]
-    stands = np.zeros(len(later), bool)
-    if not by_way:
-        stands = at_rest(log, aids, usual, log.gnss_s[later])[0]
+    none = np.zeros(len(later), bool)
+    stands = none if by_way else at_rest(log, aids, usual, log.gnss_s[later])[0]
     return _by_positions(log, found, at, later, stands, start, gnss, by_way)
 
 
