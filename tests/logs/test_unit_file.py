@@ -102,6 +102,14 @@ def test_the_mounting_is_that_of_a_turned_unit(log, angles):
     np.testing.assert_allclose(found.accel_noise, 200e-6 * 9.80665, rtol=0.6)
 
 
+def test_seconds_in_which_a_vehicle_sets_off_are_no_noise(log):
+    """Two of twenty seconds of rest turn by 0.5 deg/s, which is 80 sigma of their means."""
+    gyro = log.imu.gyro.copy()
+    gyro[800:900] += np.radians(0.5)
+    found = find_unit(replace(log.imu, gyro=gyro), log.gnss)
+    np.testing.assert_allclose(np.degrees(found.gyro_noise), 0.006, rtol=0.6)
+
+
 def test_slopes_and_trim_are_no_mounting(log):
     """A unit that leans by 6 deg: the file states so, and that it was taken to be level."""
     C_bs = Mounting(4.0, -4.5, 0.0).dcm_bs()

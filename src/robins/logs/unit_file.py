@@ -25,6 +25,7 @@ _LEAST = 20  # directions of travel
 _RIGHT_DEG = 10.0  # from right angles: slopes, trim and biases of sound drives look like less
 _RESTS = 5  # pairs of seconds at rest, for the noise
 _LATE_S = 0.03
+_MEDIAN = 0.4549  # of the square of a normal variable of unit variance
 
 
 class UnitProperties(NamedTuple):
@@ -126,7 +127,10 @@ def _orientation(
 
 
 def _noise(imu: ImuTable, gnss: GnssTable | None, C_bs: np.ndarray | None) -> dict:
-    """Random walks by means over a second at rest: half the mean square of their differences."""
+    """Random walks by means over a second at rest: half the mean square of their differences.
+
+    The median tells it, so that the seconds in which the vehicle sets off do not count.
+    """
     signal = signal_of(imu)
     if signal is None:
         return {}
@@ -145,7 +149,8 @@ def _noise(imu: ImuTable, gnss: GnssTable | None, C_bs: np.ndarray | None) -> di
     out = {}
     for name, means in (("gyro_noise", windows.gyro), ("accel_noise", windows.accel)):
         means = means if C_bs is None else means @ C_bs.T
-        spread = np.sqrt(0.5 * np.mean(np.diff(means, axis=0)[both] ** 2, axis=0) * length)
+        squares = np.median(np.diff(means, axis=0)[both] ** 2, axis=0) / _MEDIAN
+        spread = np.sqrt(0.5 * squares * length)
         out[name] = tuple(float(x) for x in spread)
     return out
 
