@@ -132,6 +132,9 @@ def test_what_is_written_is_a_whole_configuration():
     assert parameters.gnss.lasting_share == 0.8
     assert parameters.gnss.latency == pytest.approx(0.15)
     assert parameters.gnss.velocity_window == pytest.approx(0.25)
+    noisy = toml_of(found, "drive", {"gyro_noise": (2.5e-4,) * 3})  # one axis is above it
+    assert "\ngyro_noise = [" in noisy
+    assert "\n# gyro_noise = [" in toml_of(found, "drive", {"gyro_noise": (3.5e-4,) * 3})
     nothing = scenario.parse(InsGnssReplay, toml_of(UnitProperties(), "drive"))
     assert nothing == InsGnssReplay()
 
@@ -144,6 +147,8 @@ def test_the_share_of_errors_that_last_is_that_of_the_replay(log, tmp_path):
         gnss = replace(log.gnss, sigma_m=factor * log.gnss.sigma_m)
         write_log(paths[1], gnss, "kfgins-gnss")
         written = scenario.parse(InsGnssReplay, unit_file(paths))
+        assert written.imu.gyro_noise == InsGnssReplay().imu.gyro_noise  # less at rest
+        assert "# gyro_noise = [" in unit_file(paths)
         read = load_dataset(paths)
         found, notes = with_correlated_share(InsGnssReplay(), on_one_clock(read, InsGnssReplay()))
         assert (written.gnss.lasting_share is None) == (notes == []) == (factor == 1.0)

@@ -7,6 +7,7 @@ tell them apart. Where they cannot, the window alone is taken, for it is the mor
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -155,12 +156,16 @@ def _noise(imu: ImuTable, gnss: GnssTable | None, C_bs: np.ndarray | None) -> di
     return out
 
 
-def toml_of(found: UnitProperties, log: str) -> str:
+def toml_of(
+    found: UnitProperties, log: str, usual: Mapping[str, tuple[float, ...]] | None = None
+) -> str:
     """A configuration of `robins replay` with what was found; the rest is the default.
 
     Args:
         found: by `find_unit`.
         log: name of the log, for the first line.
+        usual: noise that a replay takes, by its name; less at rest is a comment, for in motion
+            errors of scale and axes add to it.
     """
     lines = [f"# Found by `robins doctor` in {log}; what is not here is the default.", ""]
     if found.left is not None:
@@ -172,11 +177,15 @@ def toml_of(found: UnitProperties, log: str) -> str:
         unit.append(f"orientation = {_list(found.orientation_deg, 'deg', '.1f')}")
     if found.rounded_deg is not None:
         unit.insert(0, f"# found {found.rounded_deg:.1f} deg from these, as slopes or trim explain")
-    if found.gyro_noise is not None:
-        noise = np.rad2deg(found.gyro_noise)
-        unit.append(f"gyro_noise = {_list(noise, 'deg/s/sqrt(Hz)', '.3g')}")
-    if found.accel_noise is not None:
-        unit.append(f"accel_noise = {_list(found.accel_noise, 'm/s^2/sqrt(Hz)', '.3g')}")
+    for name, symbol, factor in (
+        ("gyro_noise", "deg/s/sqrt(Hz)", 180.0 / np.pi),
+        ("accel_noise", "m/s^2/sqrt(Hz)", 1.0),
+    ):
+        noise = getattr(found, name)
+        if noise is not None:
+            small = np.max(noise) <= np.min((usual or {}).get(name, 0.0))
+            values = _list(factor * np.array(noise), symbol, ".3g")
+            unit.append(f"# {name} = {values} at rest" if small else f"{name} = {values}")
     if found.latency_s is not None:
         receiver.append(f'latency = "{found.latency_s:.3f} s"')
     if found.velocity_window_s is not None:
