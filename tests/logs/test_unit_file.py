@@ -102,6 +102,14 @@ def test_the_mounting_is_that_of_a_turned_unit(log, angles):
     np.testing.assert_allclose(found.accel_noise, 200e-6 * 9.80665, rtol=0.6)
 
 
+def test_seconds_in_which_a_vehicle_sets_off_are_no_noise(log):
+    """Two of twenty seconds of rest turn by 0.5 deg/s, which is 80 sigma of their means."""
+    gyro = log.imu.gyro.copy()
+    gyro[800:900] += np.radians(0.5)
+    found = find_unit(replace(log.imu, gyro=gyro), log.gnss)
+    np.testing.assert_allclose(np.degrees(found.gyro_noise), 0.006, rtol=0.6)
+
+
 def test_slopes_and_trim_are_no_mounting(log):
     """A unit that leans by 6 deg: the file states so, and that it was taken to be level."""
     C_bs = Mounting(4.0, -4.5, 0.0).dcm_bs()
@@ -124,6 +132,9 @@ def test_what_is_written_is_a_whole_configuration():
     assert parameters.gnss.lasting_share == 0.8
     assert parameters.gnss.latency == pytest.approx(0.15)
     assert parameters.gnss.velocity_window == pytest.approx(0.25)
+    noisy = toml_of(found, "drive", {"gyro_noise": (2.5e-4,) * 3})  # one axis is above it
+    assert "\ngyro_noise = [" in noisy
+    assert "\n# gyro_noise = [" in toml_of(found, "drive", {"gyro_noise": (3.5e-4,) * 3})
     nothing = scenario.parse(InsGnssReplay, toml_of(UnitProperties(), "drive"))
     assert nothing == InsGnssReplay()
 
@@ -136,6 +147,8 @@ def test_the_share_of_errors_that_last_is_that_of_the_replay(log, tmp_path):
         gnss = replace(log.gnss, sigma_m=factor * log.gnss.sigma_m)
         write_log(paths[1], gnss, "kfgins-gnss")
         written = scenario.parse(InsGnssReplay, unit_file(paths))
+        assert written.imu.gyro_noise == InsGnssReplay().imu.gyro_noise  # less at rest
+        assert "# gyro_noise = [" in unit_file(paths)
         read = load_dataset(paths)
         found, notes = with_correlated_share(InsGnssReplay(), on_one_clock(read, InsGnssReplay()))
         assert (written.gnss.lasting_share is None) == (notes == []) == (factor == 1.0)

@@ -7,6 +7,7 @@ tell them apart. Where they cannot, the window alone is taken, for it is the mor
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -25,6 +26,7 @@ _LEAST = 20  # directions of travel
 _RIGHT_DEG = 10.0  # from right angles: slopes, trim and biases of sound drives look like less
 _RESTS = 5  # pairs of seconds at rest, for the noise
 _LATE_S = 0.03
+_MEDIAN = 0.4549  # of the square of a normal variable of unit variance
 
 
 class UnitProperties(NamedTuple):
@@ -126,7 +128,10 @@ def _orientation(
 
 
 def _noise(imu: ImuTable, gnss: GnssTable | None, C_bs: np.ndarray | None) -> dict:
-    """Random walks by means over a second at rest: half the mean square of their differences."""
+    """Random walks by means over a second at rest: half the mean square of their differences.
+
+    The median tells it, so that the seconds in which the vehicle sets off do not count.
+    """
     signal = signal_of(imu)
     if signal is None:
         return {}
@@ -145,17 +150,22 @@ def _noise(imu: ImuTable, gnss: GnssTable | None, C_bs: np.ndarray | None) -> di
     out = {}
     for name, means in (("gyro_noise", windows.gyro), ("accel_noise", windows.accel)):
         means = means if C_bs is None else means @ C_bs.T
-        spread = np.sqrt(0.5 * np.mean(np.diff(means, axis=0)[both] ** 2, axis=0) * length)
+        squares = np.median(np.diff(means, axis=0)[both] ** 2, axis=0) / _MEDIAN
+        spread = np.sqrt(0.5 * squares * length)
         out[name] = tuple(float(x) for x in spread)
     return out
 
 
-def toml_of(found: UnitProperties, log: str) -> str:
+def toml_of(
+    found: UnitProperties, log: str, usual: Mapping[str, tuple[float, ...]] | None = None
+) -> str:
     """A configuration of `robins replay` with what was found; the rest is the default.
 
     Args:
         found: by `find_unit`.
         log: name of the log, for the first line.
+        usual: noise that a replay takes, by its name; less at rest is a comment, for in motion
+            errors of scale and axes add to it.
     """
     lines = [f"# Found by `robins doctor` in {log}; what is not here is the default.", ""]
     if found.left is not None:
@@ -167,11 +177,15 @@ def toml_of(found: UnitProperties, log: str) -> str:
         unit.append(f"orientation = {_list(found.orientation_deg, 'deg', '.1f')}")
     if found.rounded_deg is not None:
         unit.insert(0, f"# found {found.rounded_deg:.1f} deg from these, as slopes or trim explain")
-    if found.gyro_noise is not None:
-        noise = np.rad2deg(found.gyro_noise)
-        unit.append(f"gyro_noise = {_list(noise, 'deg/s/sqrt(Hz)', '.3g')}")
-    if found.accel_noise is not None:
-        unit.append(f"accel_noise = {_list(found.accel_noise, 'm/s^2/sqrt(Hz)', '.3g')}")
+    for name, symbol, factor in (
+        ("gyro_noise", "deg/s/sqrt(Hz)", 180.0 / np.pi),
+        ("accel_noise", "m/s^2/sqrt(Hz)", 1.0),
+    ):
+        noise = getattr(found, name)
+        if noise is not None:
+            small = np.max(noise) <= np.min((usual or {}).get(name, 0.0))
+            values = _list(factor * np.array(noise), symbol, ".3g")
+            unit.append(f"# {name} = {values} at rest" if small else f"{name} = {values}")
     if found.latency_s is not None:
         receiver.append(f'latency = "{found.latency_s:.3f} s"')
     if found.velocity_window_s is not None:

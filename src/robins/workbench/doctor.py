@@ -105,6 +105,8 @@ def unit_file(
         InputError: there is a configuration among them, or nothing was found.
         robins.logs.LogError: a file cannot be read.
     """
+    from robins.systems.ins_gnss import InsGnssReplay  # JAX, which the findings do not wait for
+
     files, configuration = parted(paths)
     if configuration is not None:
         raise InputError(
@@ -119,7 +121,9 @@ def unit_file(
             dataset.name,
             "drive a figure of eight and stand for ten seconds.",
         )
-    return toml_of(found, dataset.name)
+    usual = InsGnssReplay().imu
+    noise = {"gyro_noise": usual.gyro_noise, "accel_noise": usual.accel_noise}
+    return toml_of(found, dataset.name, noise)
 
 
 def _lasting_share(dataset: Dataset) -> float | None:
