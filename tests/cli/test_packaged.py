@@ -22,6 +22,7 @@ from bench.stations import on_threads
 from shown_files import write_files
 
 from robins import results, scenario
+from robins.bench.rigs.satellite import config
 from robins.campaign.monte_carlo import _each, _records, contender
 from robins.cli import ExitStatus, app, main
 from robins.program import BuildError
@@ -372,10 +373,21 @@ def test_every_command_is_shown():
     assert len(SHOWN) > 40
 
 
+def interpreted(prepare, setup, given):
+    """The config of a satellite on the bench, of parts that compile nothing."""
+    made = prepare(setup, given)
+    on_host = setup.filter == "mixed-lmi-step"  # no program
+    return made if on_host else made._replace(machine="vm")
+
+
 @pytest.fixture
 def computes(folder, sketched, unchecked, monkeypatch, capsys):
-    """Run a command line to its end; programs of boards are built, parts of a bench are threads."""
+    """Run a command line to its end; programs of boards are built, parts of a bench are threads.
+
+    Those of the satellite are interpreted where they can be.
+    """
     monkeypatch.setenv("CFLAGS", "-std=c99 -O0")
+    monkeypatch.setattr(config, "prepare", partial(interpreted, config.prepare))
 
     def to_the_end(words):
         monkeypatch.chdir(folder)

@@ -5,11 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import times
-from interpreted import run
 from jax.tree_util import Partial
 from scipy import integrate, stats
 
-from robins.filters import Belief, Code, Model, Motion, OnlineFilter, Sensor, kalman
+from robins.filters import Belief, Code, Model, Motion, OnlineFilter, Sensor, kalman, run
 from robins.filters.composite.particle import ParticleCloud, _systematic, particle, reseed
 from robins.filters.values import content
 from robins.manifold import Angle

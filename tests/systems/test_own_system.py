@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sketching import sketch
 
 from robins import results
 from robins.cli import main
@@ -32,7 +33,9 @@ def modules_as_before(monkeypatch):
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
     out = tmp_path_factory.mktemp("own") / "balloon"
-    assert main(["run", f"{EXAMPLE}:study", "--runs", "40", "--out", str(out)]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        sketch(patch)
+        assert main(["run", f"{EXAMPLE}:study", "--runs", "40", "--out", str(out)]) == 0
     return results.read(out)
 
 

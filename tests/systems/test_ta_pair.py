@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from in_lanes import each
 from scipy.spatial.transform import Rotation as SciRotation
 
 from robins import scenario
@@ -85,14 +84,13 @@ def parsed(text, *settings, cls=PairParameters):
     return scenario.parse(cls, text, settings)
 
 
-def simulator(pair, course, what=lambda run: run):
-    """Some part of many runs, from their numbers; what is not asked for is not computed."""
-    batch = each(lambda i: what(simulate_pair(pair, course, 3, i)))
-    return lambda numbers: jax.device_put(batch(np.asarray(numbers)))
+def compiled(pair, course, what=lambda run: run):
+    """Some part of many runs, from their numbers; what is not asked for is not compiled."""
+    return jax.jit(jax.vmap(lambda i: what(simulate_pair(pair, course, 3, i))))
 
 
 def many(pair, course, what, runs=RUNS):
-    return simulator(pair, course, what)(jnp.arange(runs))
+    return compiled(pair, course, what)(jnp.arange(runs))
 
 
 def records(run):
@@ -113,7 +111,7 @@ def disturbed():
     """Straight and level, every sensor error and disturbance on, a stiff structure."""
     pair = parsed(LEVEL + SENSORS, *DISTURBED)
     course = lay_out(pair)
-    simulate = simulator(pair, course)
+    simulate = compiled(pair, course)
     return pair, course, simulate(jnp.arange(RUNS)), simulate
 
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from in_lanes import each
 from simulated_pair import pair_dataset, recorded
 
 from robins import logs, scenario
@@ -63,8 +62,7 @@ PAIR = parameters()
 def simulated():
     """Runs of the pair by their number."""
     course = lay_out(PAIR)
-    one = each(lambda k: simulate_pair(PAIR, course, 5, k))
-    return lambda k: jax.device_put(jax.tree.map(lambda x: x[0], one(np.array([k]))))
+    return jax.jit(lambda k: simulate_pair(PAIR, course, 5, k))
 
 
 @pytest.fixture(scope="module")
