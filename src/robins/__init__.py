@@ -70,8 +70,17 @@ FRONT_DOOR = {
 __all__ = [*FRONT_DOOR]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
+def _at(place: str) -> Callable:
+    """The object at "module:attribute"."""
+    module, _, attribute = place.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
 def __getattr__(name: str) -> Callable:
-    return importlib.import_module("robins.errors").lazy(__name__, FRONT_DOOR)(name)
+    if name not in FRONT_DOOR:
+        return _at("robins.errors:moved")(__name__)(name)
+    found = globals()[name] = _at(FRONT_DOOR[name])
+    return found
 
 
 def __dir__() -> list[str]:

@@ -347,7 +347,7 @@ def test_a_recorded_trial_has_the_answers_of_its_replay(data_dir):
 
 
 def test_a_state_with_other_attributes_is_refused(live):
-    """As of another robins: what it lacks would stay as it is at the begin."""
+    """Attributes that it lacks would stay as they are at the begin."""
     made, (cls, parameters, state) = live.__reduce__()
     del state["parts"]["_path"]["_side"]
     with pytest.raises(ValueError, match="SamplePath differs in _side"):
