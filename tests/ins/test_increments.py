@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 from composed import composed
 from numpy.polynomial.legendre import leggauss
-from pyins import strapdown
 from scipy.spatial.transform import Rotation
 
 from robins.dataset import ImuTable
@@ -113,6 +112,8 @@ def test_constant_rate_and_force_in_closed_form():
 
 
 def test_two_sample_coning_and_sculling_are_those_of_pyins():
+    from pyins import strapdown  # with Numba
+
     n = 400
     g, a = rng.normal(0, 0.01, (n, 3)), rng.normal(0, 0.1, (n, 3))
     time_ns = np.arange(n, dtype=np.int64) * 10_000_000

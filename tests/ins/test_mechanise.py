@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from pyins import strapdown
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation as SciRotation
 
@@ -152,6 +151,8 @@ def test_against_pyins_on_the_same_increments():
     At sea level and for ten seconds the first hardly counts; the second falls with the interval, so
     halving that must close half of what is left.
     """
+    from pyins import strapdown  # with Numba
+
     apart = []
     for dt in (0.01, 0.005):
         n = round(10.0 / dt)

@@ -4,11 +4,8 @@ import io
 
 import numpy as np
 import pandas as pd
-import pyins.sim
-import pyins.strapdown
 import pytest
 from made_pair import attitudes
-from pyins import transform
 
 from robins.dataset import ImuTable, Trajectory
 from robins.logs import LogError, Origin, open_log, write_log
@@ -117,10 +114,12 @@ def test_kfgins_stamps_of_no_week_are_kept(tmp_path):
 
 
 def test_pyins_reads_what_we_write(tmp_path):
+    from pyins import strapdown  # with Numba
+
     path = tmp_path / "imu.csv"
     write_log(path, RATES, "pyins-imu")
     frame = pd.read_csv(path, index_col="time")
-    increments = pyins.strapdown.compute_increments_from_imu(frame, "rate")
+    increments = strapdown.compute_increments_from_imu(frame, "rate")
     # One sample interval: the mean of its two rates, but for coning of second order in dt.
     mean = 0.5 * (RATES.gyro[1:] + RATES.gyro[:-1]) * 5.000001e-3
     theta = increments[["theta_x", "theta_y", "theta_z"]].to_numpy()
@@ -128,7 +127,9 @@ def test_pyins_reads_what_we_write(tmp_path):
 
 
 def test_we_read_what_pyins_makes(tmp_path):
-    trajectory, imu = pyins.sim.generate_sine_velocity_motion(
+    from pyins import sim, transform  # with Numba
+
+    trajectory, imu = sim.generate_sine_velocity_motion(
         0.1, 3.0, [50.0, 60.0, 100.0], [1.0, -1.0, 0.5]
     )
     for name, frame in (("trajectory", trajectory), ("imu", imu)):
@@ -207,6 +208,8 @@ def test_a_quaternion_in_another_order_is_refused(tmp_path):
 
 
 def test_tum_is_local_metres_with_the_scalar_last(tmp_path):
+    from pyins import transform
+
     truth, angles = path_over_hills()
     path = tmp_path / "truth.tum"
     write_log(path, truth, "tum")

@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 from made_logs import rows_of, velocity_ned, with_gnss, with_imu
-from pyins import transform
 from scipy.spatial.transform import Rotation
 
 from robins.logs import motion, motion_fit
@@ -120,6 +119,8 @@ def about_z(degrees):
 
 
 def test_metres_against_pyins(drive):
+    from pyins import transform  # with Numba
+
     track = track_of(drive.gnss)
     lla = np.column_stack(
         [np.rad2deg(drive.gnss.lat_rad), np.rad2deg(drive.gnss.lon_rad), drive.gnss.alt_m]

@@ -3,7 +3,6 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pyins import sim as pyins_sim
 from scipy.spatial.transform import Rotation as SciRotation
 
 from robins.earth import OMEGA_E, Geodetic, dcm_en, ecef_from_geodetic, gravity_n
@@ -161,6 +160,8 @@ def test_attitude_at_waypoints_may_be_given():
 
 
 def test_sine_motion_is_that_of_pyins():
+    from pyins import sim as pyins_sim  # with Numba
+
     seconds = 60.0
     theirs, _ = pyins_sim.generate_sine_velocity_motion(
         0.01, seconds + 0.005, [55.0, 37.0, 150.0], [10.0, 10.0, 10.0], 60.0, 30.0
