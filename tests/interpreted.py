@@ -1,9 +1,9 @@
 """Runs of filters by the interpreter of programs, which compiles nothing.
 
-Most of what a test of a filter costs is its compilation by JAX, two to five times what the rest of
-it costs. A law of a filter is one of its equations, whichever machine carries them out; that the
-machines agree is a law of its own, in tests/program. Tests of what JAX makes of a filter (batches,
-gradients, compiled code) take `robins.filters.run` itself.
+Most of what a test of a filter costs is its compilation by JAX. A law of a filter is one of its
+equations, whichever machine carries them out; that the machines agree is a law of its own, in
+tests/program. Tests of what JAX makes of a filter (batches, gradients, compiled code) take
+`robins.filters.run` itself.
 """
 
 import jax

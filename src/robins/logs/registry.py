@@ -161,7 +161,7 @@ FORMATS: tuple[Format, ...] = (
     Format(
         "nmea",
         ("gnss",),
-        "NMEA 0183: sentences GGA, RMC, VTG, GST, ZDA of any receiver",
+        "NMEA 0183: sentences GGA, GNS, RMC, VTG, GST, ZDA of any receiver",
         lambda head: nmea.is_nmea(head) and not ubx.is_ubx(head),
         nmea.read_nmea,
         binary=True,

@@ -37,7 +37,7 @@ _CONTEXT = 3  # samples that an increment needs besides its last
 # Of a fix: time [s], latitude, longitude [rad], height [m], three sigmas [m], velocity [m/s], its
 # sigmas, quality; what is missing is NaN.
 WIDTH = 14
-TOLD = [1, 2, 3, 7, 8, 9]  # what a fix can say
+MEASURED = [1, 2, 3, 7, 8, 9]  # components of a fix that a filter uses
 
 
 class InsGnssPath:
@@ -124,7 +124,7 @@ class InsGnssPath:
             return "duplicate"
         if row[0] <= oldest_s + 1e-9:
             return "too_old"
-        nothing = "" if np.any(np.isfinite(row[TOLD])) else "nan"
+        nothing = "" if np.any(np.isfinite(row[MEASURED])) else "nan"
         return "ahead" if row[0] > newest_s + _AHEAD_S else nothing
 
     def push_fix(self, row: np.ndarray) -> None:

@@ -240,7 +240,7 @@ class SamplePath:
         return self._steps(samples, *lost)
 
     def _lost(self, begin: int, end: int) -> np.ndarray:
-        """Numbers of samples before gaps that are not bridged, of those before `begin` to `end`."""
+        """Last samples before gaps too long to bridge, between `begin - 1` and `end - 1`."""
         p = self._parameters.update
         dt = np.diff(self.time_ns[max(begin - 1, 0) : end]) * 1e-9
         lost = (dt > p.gap * self._usual_s) & (p.gap_rate * dt > _LOST_RAD)
@@ -250,9 +250,9 @@ class SamplePath:
         self, at: int, made: Increments, field: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, float] | None:
         """Turn over the gap after a sample, as of `turn_across`; None with no sample on a side."""
-        ends = [*self._lost(0, at + 1), *self._lost(at + 2, len(self.time_ns))]
-        first = max([at - self._side, *(k + 1 for k in ends if k < at)])
-        last = min([at + 1 + self._side, len(self.time_ns) - 1, *(k for k in ends if k > at)])
+        low, high = max(at - self._side, 0), min(at + 1 + self._side, len(self.time_ns) - 1)
+        first = max([low, *(self._lost(low + 1, at + 1) + 1)])
+        last = min([high, *self._lost(at + 2, high + 1)])
         if not first < at < at + 1 < last:
             return None
         before, after = (

@@ -122,7 +122,7 @@ def turn_across(
         parameters: of the start.
 
     Returns:
-        Rotation vector (3,) [rad], direction of up at the begin of the gap (3,), both in body axes
+        Rotation vector (3,) [rad], direction of up at the start of the gap (3,), both in body axes
         there, and the spread of the turn [rad]; infinite where its heading is not known.
     """
     first, last = (initial_alignment(*side, parameters) for side in (before, after))
