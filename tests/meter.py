@@ -8,6 +8,7 @@ campaigns simulate (`counting.py`).
 import hashlib
 import json
 import os
+import resource
 import sys
 import time
 from collections import Counter
@@ -55,11 +56,12 @@ class Meter:
             the machine of the ceilings.
         modules: imported when all tests are collected.
         spent_s: processor seconds of all workers, with what they did between tests.
+        peak: most memory of a worker [MiB], and the test that reached it.
     """
 
     def __init__(self) -> None:
         self.rows: dict[str, dict[str, Counter]] = {}
-        self.modules, self.spent_s, self.peak_mib = 0, 0.0, 0
+        self.modules, self.spent_s, self.peak = 0, 0.0, (0, "")
         self.gathered = False  # from workers
         self.counts, self.loop_s = Counts(every=False), reference()
 
@@ -77,20 +79,20 @@ class Meter:
         row = self.rows.setdefault(file, {}).setdefault(name.partition("[")[0], Counter())
         row.update({k: self.counts[k] - before[k] for k in KINDS})
         row["seconds"] += (processor_s() - spent) * REFERENCE_S / self.loop_s
+        peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+        if peak_mib > self.peak[0]:
+            self.peak = peak_mib, item.nodeid
         return done
 
     @pytest.hookimpl(trylast=True)
     def pytest_sessionfinish(self, session):
         """Hand the rows of a worker to the controller."""
-        import resource
-
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
         if not self.gathered:
-            self.spent_s, self.peak_mib = processor_s(), peak
+            self.spent_s = processor_s()
         if hasattr(session.config, "workeroutput"):
             rows = {f: {t: dict(c) for t, c in tests.items()} for f, tests in self.rows.items()}
             session.config.workeroutput["meter"] = rows
-            session.config.workeroutput["totals"] = self.modules, self.spent_s, self.peak_mib
+            session.config.workeroutput["totals"] = self.modules, self.spent_s, self.peak
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_testnodedown(self, node, error):
@@ -98,9 +100,9 @@ class Meter:
         for file, tests in getattr(node, "workeroutput", {}).get("meter", {}).items():
             for name, counts in tests.items():
                 self.rows.setdefault(file, {}).setdefault(name, Counter()).update(counts)
-        modules, spent, peak = getattr(node, "workeroutput", {}).get("totals", (0, 0.0, 0))
+        modules, spent, peak = getattr(node, "workeroutput", {}).get("totals", (0, 0.0, (0, "")))
         self.gathered, self.modules = True, max(self.modules, modules)
-        self.spent_s, self.peak_mib = self.spent_s + spent, max(self.peak_mib, peak)
+        self.spent_s, self.peak = self.spent_s + spent, max(self.peak, tuple(peak))
 
 
 def processor_s() -> float:

@@ -69,7 +69,7 @@ class Records:
         counts = ", ".join(f"{sums[kind]} {kind}" for kind in budget.COUNTS)
         terminalreporter.write_line(
             f"{self.meter.spent_s:.0f} s of processor, {counts}; {self.meter.modules} modules at "
-            f"collection; a worker takes {self.meter.peak_mib} MiB at most."
+            f"collection; a worker takes {self.meter.peak[0]} MiB at most, in {self.meter.peak[1]}."
         )
         for line in self.passed():
             terminalreporter.write_line(f"Budget (tests/budget.py): {line}", red=True)
@@ -90,7 +90,7 @@ def record(measured: meter.Meter, whole: bool) -> dict:
         row["tests"] = {t: s for t, s in dear.items() if s >= budget.LEAST_S}
         kept[file] = meter.sealed(row)
     if whole:
-        before = {"modules": measured.modules, "peak_mib": measured.peak_mib}
+        before = {"modules": measured.modules, "peak_mib": measured.peak[0]}
     return before | {"files": dict(sorted(kept.items()))}
 
 
