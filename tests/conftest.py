@@ -18,6 +18,7 @@ from pathlib import Path
 import checking
 import hypothesis
 import jax
+import jaxtyping
 import meter
 import pytest
 import records
@@ -174,3 +175,12 @@ def data_dir() -> Path:
 def cases_dir() -> Path:
     """Reference numbers for filters: ROBINS_CASES, else ../shared/cases beside the repository."""
     return outside("ROBINS_CASES", "cases")
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """As users run it: arguments are compared with annotations in the tests of each function.
+
+    A traced program calls some of them a million times.
+    """
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)

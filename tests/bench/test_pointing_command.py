@@ -30,6 +30,7 @@ from robins.workbench import bench_replay
 LOOP = "duration=130 s", "counted_from=10 s"
 DEG = np.pi / 180.0
 NONE = np.full(4, np.nan)
+pytestmark = pytest.mark.usefixtures("unchecked")  # 1300 steps of seven parts
 
 
 def rotation(q_ib: Any) -> Rotation:

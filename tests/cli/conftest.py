@@ -5,7 +5,6 @@ from collections import namedtuple
 from dataclasses import replace
 from pathlib import Path
 
-import jaxtyping
 import pytest
 
 from robins import report, results
@@ -15,15 +14,6 @@ from robins.systems.judgement import Claim
 from robins.workbench import publishing
 
 Answer = namedtuple("Answer", "status out err")
-
-
-@pytest.fixture
-def unchecked(monkeypatch):
-    """As users run it: arguments are compared with annotations in the tests of each function.
-
-    A traced program calls some of them a million times.
-    """
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture

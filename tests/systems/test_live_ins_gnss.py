@@ -35,6 +35,9 @@ def as_rates(dataset):
     return type(dataset)(dataset.name, table, dataset.gnss)
 
 
+pytestmark = pytest.mark.usefixtures("unchecked")  # thousands of samples, one by one
+
+
 @pytest.fixture(scope="module")
 def log():
     return as_rates(drive_dataset(scenario.parse(Drive, DRIVE), seed=4))

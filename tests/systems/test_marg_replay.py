@@ -29,6 +29,9 @@ def noisy(seed=0, **wrong):
     )  # fmt: skip
 
 
+pytestmark = pytest.mark.usefixtures("unchecked")  # long runs, traced again for each filter
+
+
 @pytest.fixture(scope="module")
 def moved():
     """A log of a hand with gyro errors, and what a replay makes of it."""
