@@ -51,7 +51,7 @@ class RocketGyro(Parameters):
     drift: q.RateSize = default("5 deg/h")
     drift_time: q.Duration = default("300 s")
     scale_factor: Annotated[float, Quantity("ratio", least="0")] = default("0 ppm")
-    # of the attitude that the gyro is integrated to, where that is what is read of it
+    # white noise of the integrated attitude, where the gyro reads that
     attitude_noise: q.Spread = default("0.5 deg")
     lost: tuple[Span, ...] = ()
 
@@ -88,7 +88,7 @@ class RocketMagnetometer(Parameters):
 
 
 class RocketStart(Parameters):
-    """Start of the estimate: its error, and its believed sigma."""
+    """Start of the estimate: its error, and its assumed sigma."""
 
     attitude_error: q.Angles = default("0 deg")
     attitude: q.Spread = default("2 deg")
