@@ -228,7 +228,7 @@ _STYLES = {"seen": "green", "hardly seen": "yellow", "not seen": "red", "known":
 
 
 def table(solution: xr.Dataset, at: Sequence[int]) -> Group:
-    """The rows as something rich can print; `sentences` list what is least observable."""
+    """The rows as a rich renderable; `sentences` list the least observable directions."""
     time = np.asarray(solution["time"], float)
     made = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     made.add_column("sigma at best", no_wrap=True)

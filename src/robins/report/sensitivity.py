@@ -259,7 +259,7 @@ def sentences(solution: xr.Dataset, laws: Sequence[str]) -> list[str]:
 
 
 def doubts(solution: xr.Dataset, follow: Sequence[bool]) -> list[str]:
-    """Warnings on indices that are undefined or must not be read as such.
+    """Warnings on missing indices, on those that include the filter's start, and on unsure ranks.
 
     Args:
         solution: as of `robins.campaign.sensitivity.labelled`.

@@ -31,7 +31,7 @@ def observe_air(
         key: of the run, `Component.AIR_DATA` of `robins.sim.random.stream`.
         v_air_b: (E, 3) true velocity through the air, body axes.
         sigma_m_s: standard deviation, a number or one for each axis.
-        present: (E,) bool, whether there is a sample; NaN where not.
+        present: (E,) bool, True where there is a sample; NaN elsewhere.
 
     Raises:
         ValueError: shapes that do not fit together, or a negative sigma.
@@ -88,7 +88,7 @@ def observe_height(
         key: of the run, `Component.BAROMETER` of `robins.sim.random.stream`.
         height_m: (E,) true height.
         sigma_m: standard deviation of the white noise.
-        present: (E,) bool, whether there is a sample; NaN where not.
+        present: (E,) bool, True where there is a sample; NaN elsewhere.
         bias_sigma_m: standard deviation of the bias.
         bias_tau_s: its correlation time; infinity: constant over the run.
         step_s: between epochs; needed where the bias is not constant.

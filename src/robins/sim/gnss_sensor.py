@@ -30,7 +30,7 @@ from robins.ins.imu_errors import checked_pytree
 from robins.rotation import rotate
 from robins.sim import _given
 
-# What is drawn at a fix is part of the file format, as `robins.sim.random.Component` is.
+# The draws at a fix are part of the file format, as `robins.sim.random.Component` is.
 _NORMALS, _CHANCES = 0, 1  # streams folded into the key of the receiver
 
 

@@ -55,7 +55,7 @@ def observe_field(
         q_nb: (E, 4) true attitude, scalar first.
         field_n: (E, 3) or (3,) true field [T] in navigation axes.
         sigma_t: of white noise [T]: a number, (3,) one for each axis, or (E,) one for each epoch.
-        present: (E,) bool, whether there is a sample; NaN where not.
+        present: (E,) bool, True where there is a sample; NaN elsewhere.
         turn: (E, 3) rad, navigation axes, see `field_bursts`: the field is rotated by the length of
             the vector, about its component perpendicular to the field.
         added_n_t: (E, 3) or (3,) field [T] added in navigation axes.
@@ -118,7 +118,7 @@ def observe_magnetic_attitude(
         euler_rad: (E, 3) true roll, pitch, heading.
         sigma_rad: standard deviation, a number or one for each angle.
         disturbance_rad: (E, 3) added, e.g. of `angle_bursts`.
-        present: (E,) bool, whether there is a sample; NaN where not. None: always.
+        present: (E,) bool, True where there is a sample; NaN elsewhere. None: always.
 
     Raises:
         ValueError: shapes that do not fit together, or a negative sigma.

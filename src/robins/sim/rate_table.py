@@ -82,7 +82,7 @@ def step(
 ) -> tuple[TableState, Float[Array, "4"]]:
     """The state a step later, and its attitude q_ib.
 
-    Exact for a command that stays the same over the step; the attitude to the fourth order in
+    Exact for a constant command over the step; the attitude to the fourth order in
     ``dt_s`` where the direction of the rate changes.
 
     Args:

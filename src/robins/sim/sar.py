@@ -61,7 +61,7 @@ def observe_sar(
         key: of the run, `Component.SAR` of `robins.sim.random.stream`.
         position: (E,) true positions, not at a pole.
         heading_rad: (E,) true heading.
-        present: (E,) bool, whether there is a fix.
+        present: (E,) bool, True where there is a fix.
 
     Raises:
         ValueError: shapes that do not fit together, a negative sigma, factor or offset, or a share

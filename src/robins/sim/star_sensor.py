@@ -359,7 +359,7 @@ def observe_euler(
         key: of the run, `Component.STAR_SENSOR` of `robins.sim.random.stream`.
         q_nb: (E, 4) true attitude, scalar first.
         sigma_rad: standard deviation, a number or one each for pitch, roll, heading.
-        present: (E,) bool, whether there is a sample; NaN where not.
+        present: (E,) bool, True where there is a sample; NaN elsewhere.
 
     Raises:
         ValueError: shapes that do not fit together, or a negative sigma.

@@ -159,14 +159,14 @@ def _diagonal(a: Array, b: Array) -> Array:
     return jnp.block([[a, corner], [jnp.zeros((b.shape[0], a.shape[1])), b]])
 
 
-# ------------------------------------------------------------------------- what a filter believes
+# ----------------------------------------------------------------------- assumptions of a filter
 
 
 ENU_OF_NED = np.kron(np.eye(3), swap(np.eye(3)))  # (9, 9) of attitude, velocity, position
 
 
 class States(NamedTuple):
-    """The states of a filter: their motion model, initial sigmas, and truth in a run."""
+    """The states of a filter: their motion model, their construction, and initial sigmas."""
 
     motion: Callable[[Airship, AirshipCourse], Motion]
     # navigation, biases of gyros and accelerometers, error of the wind -> state

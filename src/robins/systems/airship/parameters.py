@@ -135,9 +135,9 @@ class AirshipStart(Parameters):
 
 
 class BelievedNoise(Parameters):
-    """Noise of the inertial unit that filters of nine states believe, for want of bias states.
+    """Noise of the inertial unit assumed by filters of nine states, for want of bias states.
 
-    The product believes the noise of the inertial unit, times `accel_noise_factor` where the hull
+    The product assumes the noise of the inertial unit, times `accel_noise_factor` where the hull
     bends or the unit sits off the centre.
     """
 

@@ -179,7 +179,7 @@ def contender(given: Airship, course: AirshipCourse, name: str) -> Contender:
     )
 
 
-# ------------------------------------------------------------------------------ what is reported
+# ----------------------------------------------------------------------------------------- report
 
 BLOCKS = (
     StateBlock("attitude", slice(0, 3), "rad", "arcsec", "ENU", ENU),

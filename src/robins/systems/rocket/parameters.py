@@ -76,7 +76,7 @@ class MagneticDisturbance(Parameters):
 class RocketMagnetometer(Parameters):
     """White noise and disturbances, as angles.
 
-    In "field-vector" hard iron is what a calibration left over, and an axis saturates at full
+    In "field-vector" hard iron is the residual after calibration, and an axis saturates at full
     scale.
     """
 
@@ -128,7 +128,7 @@ class RocketFlight(Scenario):
 
 
 class RocketAssumptions(Parameters):
-    """Motion as the filters believe it: the paper's equation is wrong by some per cent."""
+    """Motion assumed by the filters: the paper's equation with an error of some per cent."""
 
     error: Annotated[float, Quantity("ratio")] = default("0 %")  # of the coefficients
     wrong: Literal["rates", "all"] = "all"  # only e1, e2, e3, or the kinematic rows too

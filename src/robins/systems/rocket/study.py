@@ -186,7 +186,7 @@ def angle_sigma(given: MagneticAttitude) -> Array:
 
 
 def angle_model(given: MagneticAttitude, course: RocketCourse, chosen: AngleFilter) -> Model:
-    """Motion and sensors that a filter believes."""
+    """Motion and sensors assumed by a filter."""
     b, T, white = given.believed, given.step, given.gyro.white
     sensors, _ = sensors_of(given, course, chosen.sensors)
     if not chosen.raw:
@@ -257,7 +257,7 @@ FIELD_FILTERS: dict[str, FieldFilter] = {
 
 
 def field_model(given: FieldVector, course: RocketCourse, chosen: FieldFilter) -> Model:
-    """Motion and sensor that a filter believes."""
+    """Motion and sensor assumed by a filter."""
     g, T = given.gyro, given.step
     # random walk in a step equivalent to a drift of correlation time tau
     walk = g.drift * math.sqrt(2.0 * T / g.drift_time)

@@ -47,7 +47,7 @@ class QuaternionState(NamedTuple):
 
 
 class GyroNoiseModel(NamedTuple):
-    """Believed noise of the gyro, for a sample of length T."""
+    """Assumed noise of the gyro, for a sample of length T."""
 
     step_s: Array  # ()
     factor: Array  # (6, 6) of Q, attitude and bias

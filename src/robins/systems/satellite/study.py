@@ -1,6 +1,6 @@
 """The study "attitude-loop": each filter with its assumptions in the loop, and claims.
 
-Claims are the patent's, and those of robins, which are marked.
+Claims are the patent's, and those of robins, marked "(ours)".
 """
 
 from __future__ import annotations

@@ -113,7 +113,7 @@ def simulate(
     # (1): the slave's mounting, and its attitude relative to the master's
     seat = rotation.multiply(c.q_nominal, rotation.from_rotvec(mu))
     q_ns = rotation.multiply(c.q_nm, rotation.multiply(rotation.from_rotvec(angle), seat))
-    # C(k+1) = exp(-omega_in dt) C(k) exp(theta), solved for what ideal gyros report
+    # C(k+1) = exp(-omega_in dt) C(k) exp(theta), solved for the increments of ideal gyros
     unturned = rotation.multiply(c.turned_n, q_ns[1:])
     theta = rotation.to_rotvec(rotation.multiply(rotation.conjugate(q_ns[:-1]), unturned))
     noise = jax.random.normal(key(Component.IMU), theta.shape)
