@@ -3,8 +3,8 @@
 - `wgs84`: constants and functions of the WGS-84 ellipsoid; `Geodetic`, latitude, longitude and
   height with `retract` and `local` in metres.
 - `magnetic`: the field of the WMM2020 and WMM2025 (import it by its name).
-- `atmosphere`: the standard atmosphere of 1976 (import it by its name).
-- `stars`: a catalogue, and the stars near a direction (import it by its name).
+- `atmosphere`: the U.S. Standard Atmosphere 1976 (import it by its name).
+- `stars`: star catalogues, and the stars near a direction (import it by its name).
 """
 
 from robins.earth.wgs84 import (

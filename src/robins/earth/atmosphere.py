@@ -1,4 +1,4 @@
-"""The U.S. Standard Atmosphere 1976 up to 86 km: temperature and pressure of a height.
+"""The U.S. Standard Atmosphere 1976 up to 86 km: temperature and pressure against height.
 
 Seven layers in which the temperature is linear in the geopotential height H:
 
@@ -17,11 +17,11 @@ import math
 
 from robins.errors import require
 
-G0 = 9.80665  # m/s^2, and so one metre of geopotential height is 9.80665 m^2/s^2
-R_OVER_M = 8314.32 / 28.9644  # J/(kg K), of dry air with the gas constant of 1976
-RADIUS_M = 6356766.0  # of the Earth, for geopotential heights
+G0 = 9.80665  # m/s^2; one metre of geopotential height is 9.80665 m^2/s^2
+R_OVER_M = 8314.32 / 28.9644  # J/(kg K), dry air, with the gas constant of the 1976 standard
+RADIUS_M = 6356766.0  # effective Earth radius of the standard, for geopotential heights
 P0_PA = 101325.0
-LOW_M, HIGH_M = -5000.0, 86000.0  # of the standard's tables
+LOW_M, HIGH_M = -5000.0, 86000.0  # range of the standard's tables
 
 # H_b [m], T_b [K], L [K/m] of each layer from the ground up.
 _TABLE = (
@@ -36,7 +36,7 @@ _TABLE = (
 
 
 def _fall(base: tuple[float, float, float], geopotential_m: float) -> float:
-    """P / P_b at a height in the layer of a base."""
+    """P / P_b at a geopotential height in the layer that begins at a base (H_b, T_b, L)."""
     base_m, base_k, lapse = base
     if lapse == 0.0:
         return math.exp(-G0 * (geopotential_m - base_m) / (R_OVER_M * base_k))
@@ -83,10 +83,10 @@ def pressure_Pa(alt_m: float) -> float:
 
 
 def pressure_altitude_m(pressure: float) -> float:
-    """Height above mean sea level [m] at which the standard has a pressure [Pa].
+    """Height above mean sea level [m] at which the standard atmosphere has a pressure [Pa].
 
     Raises:
-        ValueError: the standard has this pressure nowhere between -5 km and 86 km.
+        ValueError: the pressure is not one of the standard's between -5 km and 86 km.
     """
     low, high = pressure_Pa(HIGH_M), pressure_Pa(LOW_M)
     require(low <= pressure <= high, f"a pressure lies in [{low:.3g}, {high:.6g}] Pa", pressure)

@@ -1,4 +1,4 @@
-"""The Earth's magnetic field: spherical-harmonic models such as the WMM, many points at once.
+"""The Earth's magnetic field: spherical-harmonic models such as the WMM, vectorised.
 
 The field is minus the gradient of ``V = a sum_n (a/r)^(n+1) sum_m (g_nm cos m lon + h_nm sin m lon)
 P_nm`` with Schmidt's quasi-normal functions P_nm of the sine of the geocentric latitude, a = 6371.2
@@ -9,8 +9,9 @@ polynomial. Nothing is divided by the cosine of the latitude, so field and gradi
 everywhere, poles included; north at a pole is along the meridian of the longitude given.
 
 A model holds from its epoch for five years and from 1 km below to 850 km above the ellipsoid.
-`field_along` refuses other dates and heights; `field_n`, for compiled code, cannot look at them.
-What a model leaves out, crust and currents above, is 130 to 160 nT (one sigma) at the ground.
+`field_along` refuses other dates and heights; `field_n`, for compiled code, cannot check them.
+The fields of the crust and of ionospheric and magnetospheric currents are not modelled: 130 to
+160 nT (one sigma) at the ground.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from robins.errors import RobinsError
 
 RADIUS_M = 6371200.0  # a, the reference radius of WMM and IGRF
 LIFE_YEARS = 5.0
-LOWEST_M, HIGHEST_M = -1e3, 850e3  # where a model claims to hold
+LOWEST_M, HIGHEST_M = -1e3, 850e3  # heights for which a model is valid
 _NT = 1e-9
 
 
@@ -59,14 +60,14 @@ class MagneticModel:
 
     @property
     def life(self) -> tuple[float, float]:
-        """First and last decimal year it is meant for."""
+        """First and last decimal year for which the model is valid."""
         return self.epoch, self.epoch + LIFE_YEARS
 
 
 class Elements(NamedTuple):
-    """A field in the elements of compasses and dip needles."""
+    """Magnetic elements of a field: declination, inclination and intensities."""
 
-    declination_rad: Array  # of its horizontal part, clockwise from true north
+    declination_rad: Array  # of the horizontal component, clockwise from true north
     inclination_rad: Array  # below the horizon
     horizontal_t: Array
     total_t: Array
@@ -92,10 +93,10 @@ def _shipped(year: int) -> MagneticModel:
 
 
 def wmm_for(decimal_year: float) -> MagneticModel:
-    """The World Magnetic Model in whose life the date lies.
+    """The World Magnetic Model that is valid at the date.
 
     Raises:
-        MagneticModelError: there is none here; `read_cof` reads the file of another.
+        MagneticModelError: none of those included; `read_cof` reads the file of another.
     """
     for year in (2025, 2020):
         model = _shipped(year)
@@ -112,7 +113,7 @@ def decimal_year(when: date | datetime | np.datetime64 | int) -> float:
     """The date as a year and its fraction, 2027.5 in the first days of July 2027.
 
     Args:
-        when: a day (its beginning), a moment (UTC if it names no zone), or Unix time [ns].
+        when: a day (its beginning), a time (UTC if it has no time zone), or Unix time [ns].
     """
     if isinstance(when, int | np.integer):
         when = np.datetime64(int(when), "ns")
@@ -131,7 +132,7 @@ def read_cof(path: str | Path) -> MagneticModel:
     """Read a coefficient file of the WMM's text form: epoch and name, then ``n m g h g' h'`` [nT].
 
     Raises:
-        MagneticModelError: not such a file; names the line.
+        MagneticModelError: the file is not of this form; the message names the line.
     """
     lines = Path(path).read_text("ascii", errors="replace").splitlines()
     head = lines[0].split() if lines else []
@@ -168,7 +169,7 @@ def read_cof(path: str | Path) -> MagneticModel:
     table = np.zeros((4, degree + 1, degree + 1))
     for place, values in rows.items():
         table[(slice(None), *place)] = np.asarray(values) * _NT
-    table.flags.writeable = False  # one copy is handed to everyone
+    table.flags.writeable = False  # one copy is shared by all callers
     return MagneticModel(*table, name=name, epoch=epoch)
 
 
@@ -182,9 +183,9 @@ def field_n(
     alt_m: ArrayLike,
     decimal_year: ArrayLike,
 ) -> Float[Array, "*b 3"]:
-    """Field [T] in north, east, down at geodetic places and dates, which broadcast.
+    """Field [T] in north, east, down at geodetic positions and dates, which broadcast.
 
-    For use under `jit`, `vmap` and `grad`: dates and heights outside the model's life are not
+    For use under `jit`, `vmap` and `grad`: dates and heights outside the model's validity are not
     refused here but in `field_along`. Differentiable everywhere but at the Earth's centre.
     """
     years = jnp.asarray(decimal_year, float) - model.epoch
@@ -194,7 +195,7 @@ def field_n(
 def elements(field_n: ArrayLike) -> Elements:
     """Declination, inclination, horizontal and total intensity of fields (..., 3) [T] in NED.
 
-    A field straight up or down has no declination: there it is zero and its gradient not finite.
+    A vertical field has no declination: it is zero there, and its gradient is not finite.
     """
     (b,) = _floats(field_n)
     horizontal = jnp.hypot(b[..., 0], b[..., 1])
@@ -217,9 +218,9 @@ def field_along(
 ) -> np.ndarray:
     """Field [T] in north, east, down at each of many places, date and height checked.
 
-    With ``time_s`` the places are a path: the model is evaluated at samples some ``knot_s`` apart
-    and, in Earth-fixed axes, in which it is smooth at the poles too, joined by straight lines. At
-    orbital speed and knots of 1 s that errs by less than 0.2 nT, at 10 s by less than 15 nT.
+    With ``time_s`` the places are a path: the model is evaluated at samples about ``knot_s`` apart
+    and interpolated linearly in Earth-fixed axes, in which it is smooth at the poles too. The
+    error at orbital speed is below 0.2 nT with knots of 1 s and below 15 nT with knots of 10 s.
 
     Args:
         model: of the main field, e.g. ``wmm_for(decimal_year)``.
@@ -227,8 +228,8 @@ def field_along(
         lon_rad: longitude, east.
         alt_m: height above the ellipsoid.
         decimal_year: the date, see `decimal_year`.
-        time_s: (N,) increasing times of a path of N places; None: every place by itself.
-        knot_s: greatest time between evaluations, where the samples are as dense.
+        time_s: (N,) increasing times of a path of N places [s]; None: evaluate at every place.
+        knot_s: greatest time between evaluations [s], where the samples are as dense.
 
     Raises:
         MagneticModelError: a date or height outside the model's life, a latitude beyond 90 deg, a
@@ -268,7 +269,7 @@ def _refuse_outside(name: str, value: np.ndarray, low: float, high: float, why: 
 
 
 def _knots(time: np.ndarray, knot_s: float) -> np.ndarray:
-    """Indices of samples no further apart than knot_s, or neighbours; the first and the last."""
+    """Indices of samples at most knot_s apart (or adjacent), the first and the last included."""
     if not knot_s > 0.0:
         raise MagneticModelError(f"knot_s must be a positive number of seconds, got {knot_s}")
     # The last sample before each multiple of knot_s, and the first after it, bound every gap.
@@ -307,7 +308,7 @@ def _earth_fixed(model: MagneticModel, lat, lon, alt, years) -> Array:
     years = years.reshape(-1)[None]
     r = jnp.sqrt(jnp.sum(r_e * r_e, 0))
     x, y, z = r_e / r[None]
-    # Behind the barrier XLA keeps the sums, else it would sum over degrees once more for each use.
+    # Without the barrier XLA would repeat the sums over degrees for each use.
     sums = _sums_over_degree(model, z[None], (RADIUS_M / r)[None], years)
     sums = jax.lax.optimization_barrier(sums)
     cos, sin, weighted_cos, weighted_sin, slope_cos, slope_sin = sums
@@ -356,7 +357,7 @@ def _sums_over_degree(model: MagneticModel, z, ratio, years) -> list[Array]:
 def _recursion(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Tables (degree, order, 1) of ``Q_nm = first z Q_(n-1)m - second Q_(n-2)m + diagonal``.
 
-    Q_mm does not depend on z and is the diagonal, zero elsewhere: it starts the column of its m.
+    ``diagonal`` holds Q_mm, which does not depend on z and starts the column of order m.
     """
     n, m = np.meshgrid(np.arange(degree + 1.0), np.arange(degree + 1.0), indexing="ij")
     below = m < n

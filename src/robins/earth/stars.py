@@ -4,11 +4,11 @@ Directions are unit vectors in inertial axes (ICRS: z to the celestial pole, x t
 zero), as seen from the barycentre of the solar system: neither parallax nor aberration is in them.
 Stars come brightest first, so the stars to a magnitude are the first of those to a fainter one.
 
-`index_stars` cuts the sky into cells that know their stars, so that those near a direction are
-found at once. The sky is the surface of a cube, each face of n by n cells of equal angles. Each
-cell lists every star within a reach of any point in it, so whichever way a camera looks, the stars
-in its field are among those of one cell, and the list has the same length for all. That is what
-compiled code can search inside a loop.
+`index_stars` divides the sky into cells with lists of stars, so that those near a direction are
+found at once. The sky is projected on a cube, each face of n by n cells of equal angles. The list
+of a cell has every star within a reach of any point in it, so the stars in a camera's field are
+always among those of one cell, and all lists have the same length: compiled code can search them
+inside a loop.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from robins.errors import require
 
 # N(<m) = 10^(SLOPE m + START): a fit of the Hipparcos catalogue to magnitude 6.
 _SLOPE, _START = 0.4888, 0.7261
-_FAINTEST = 12.0  # where a synthetic sky would have four million stars
+_FAINTEST = 12.0  # magnitude; a synthetic sky to it has four million stars
 
-_EPOCH = 1991.25  # of the Hipparcos catalogue, Julian years
-_COLUMNS = {  # first and last byte, from one (van Leeuwen 2007, catalogue I/311, file hip2.dat)
+_EPOCH = 1991.25  # epoch of the Hipparcos catalogue, Julian years
+_COLUMNS = {  # first and last byte, counted from one (van Leeuwen 2007, catalogue I/311, hip2.dat)
     "hip": (1, 6),
     "ra_rad": (16, 28),
     "dec_rad": (30, 42),
@@ -38,7 +38,7 @@ _COLUMNS = {  # first and last byte, from one (van Leeuwen 2007, catalogue I/311
     "pm_dec_mas": (61, 68),
     "hp_mag": (130, 136),
 }
-_ROW = 277  # bytes with the end of the line
+_ROW = 277  # bytes, line end included
 _MAS = np.pi / 648e6  # rad
 
 
@@ -53,13 +53,13 @@ class Stars(NamedTuple):
 def synthetic(limit: float = 6.0, seed: int = 0) -> Stars:
     """A sky of stars uniform over the sphere, with as many to each magnitude as the real one has.
 
-    There are N(<m) = 10^(0.4888 m + 0.7261) stars brighter than m, to a whole star: 480, 1479, 4559
-    to magnitudes 4, 5, 6. A fainter limit adds stars and leaves those there are. The real sky has
+    There are N(<m) = 10^(0.4888 m + 0.7261) stars brighter than m, rounded: 480, 1479, 4559 to
+    magnitudes 4, 5, 6. A fainter limit adds stars and leaves the others unchanged. The real sky has
     more of them near the Milky Way, and double stars, for which see `hipparcos`.
 
     Args:
-        limit: magnitude of the faintest.
-        seed: of the sky.
+        limit: magnitude of the faintest star.
+        seed: seed of the random sky.
 
     Raises:
         ValueError: a limit that leaves no star or is fainter than magnitude 12; a negative seed.
@@ -83,11 +83,11 @@ def hipparcos(limit: float = 6.0, epoch_year: float = 2025.0) -> Stars:
     the epoch is along a straight line in space, without radial velocity.
 
     Args:
-        limit: magnitude Hp of the faintest.
-        epoch_year: date of the directions, Julian year.
+        limit: magnitude Hp of the faintest star.
+        epoch_year: epoch of the directions, Julian year.
 
     Raises:
-        ModuleNotFoundError: the package is not there.
+        ModuleNotFoundError: the package is not installed.
         ValueError: a limit that leaves no star; an epoch outside 1800 to 2200; a damaged file.
     """
     _checked_limit(limit, -1.0, 15.0)
@@ -133,7 +133,7 @@ def _read(path: Path, limit: float) -> dict[str, np.ndarray]:
 
 
 def _checked_limit(limit: float, low: float, high: float) -> None:
-    if not low <= limit <= high:  # NaN is not either
+    if not low <= limit <= high:  # refuses NaN too
         raise ValueError(f"limit must be a magnitude from {low:g} to {high:g}, got {limit}")
 
 
@@ -156,7 +156,7 @@ def index_stars(stars: Stars, reach_rad: float) -> StarIndex:
 
     Args:
         stars: the catalogue.
-        reach_rad: of a list, half the field of view of a camera or more [rad].
+        reach_rad: reach of a cell's list [rad], at least half the field of view of the camera.
 
     Raises:
         ValueError: a reach not above zero or over 45 deg; no star; directions not of unit length.
@@ -176,7 +176,7 @@ def index_stars(stars: Stars, reach_rad: float) -> StarIndex:
     n = int(min(_MOST_CELLS, np.ceil(np.pi / reach)))
     corners = _cube_points(np.arange(n + 1.0), n)  # (6, n + 1, n + 1, 3)
     middles = _cube_points(np.arange(n) + 0.5, n).reshape(-1, 3)
-    # A cell is a convex polygon on the sphere: none of it is farther from its middle than a corner.
+    # A cell is a convex polygon on the sphere: its farthest point from the middle is a corner.
     four = np.stack([corners[:, i : i + n, j : j + n] for i in (0, 1) for j in (0, 1)], 3)
     nearest = np.einsum("cki,ci->ck", four.reshape(-1, 4, 3), middles).min(1)
     angle = np.arccos(nearest) + reach + _ROUNDING
@@ -194,10 +194,10 @@ def index_stars(stars: Stars, reach_rad: float) -> StarIndex:
 
 
 def near(index: StarIndex, direction_i: Float[Array, "3"]) -> Int[Array, "k"]:
-    """Stars, by their place in the catalogue, among which are all within reach of a direction.
+    """Catalogue indices of a set of stars that includes all within reach of a direction.
 
     Args:
-        index: of the catalogue.
+        index: the index, from `index_stars`.
         direction_i: unit vector, inertial axes.
 
     Returns:

@@ -63,7 +63,7 @@ def _alternating(x, coefficients):
 _Q0 = _q(_EP2)
 _DEEPEST = 5.3e6  # m from the centre, some 1060 km deep at the poles
 _FARTHEST = 1e100  # m, whose square is finite
-_LOWEST = -1e6  # m, height; nearer to the centre the ellipsoids of gravity have no sense
+_LOWEST = -1e6  # m, height; the confocal ellipsoids of gravity degenerate near the centre
 _POLAR = 1e-9  # cosine of a latitude 6 mm from a pole
 
 
@@ -106,13 +106,13 @@ def geodetic_from_ecef(r_e: ArrayLike) -> tuple[Array, Array, Array]:
     """Latitude [rad], longitude [rad] in [-pi, pi] and height [m] of an Earth-fixed position [m].
 
     Bowring (1976): the parametric latitude is improved a fixed two times, each of which squares the
-    error (3e-3 rad at the start in the worst case), so what is left is rounding for every height
-    above -1000 km. It is carried as sine and cosine, which keeps the poles regular. The height is
-    that of Bowring (1985), stationary in latitude. The gradient is finite off the polar axis.
+    error (3e-3 rad at the start in the worst case), so only rounding is left for every height
+    above -1000 km. It is kept as sine and cosine, so the poles are regular. The height is that of
+    Bowring (1985), stationary in latitude. The gradient is finite off the polar axis.
 
     Raises:
-        ValueError: a position is deeper than that, as the centre of the Earth is, or one in
-            kilometres, or it is infinite; not in compiled code, where the centre gives NaN.
+        ValueError: a position is deeper than that (the Earth's centre, or kilometres given for
+            metres) or infinite; not in compiled code, where the centre gives NaN.
     """
     (r,) = _floats(r_e)
     if not isinstance(r, Tracer):
@@ -195,8 +195,8 @@ def gravity_n(lat_rad: ArrayLike, alt_m: ArrayLike) -> Float[Real, "*b 3"]:
     inward = (GM + bulge - spin_sq * u * p * p) * per_v_sq
     poleward = spin_sq * (A_M**2 * q_ratio * per_v_sq - 1.0)
 
-    # The two components along the confocal axes, turned to the axis and the equator plane; written
-    # without the square root of v_sq and with few divisions, for this runs at every IMU sample.
+    # The two components along the confocal axes, rotated to the polar axis and the equator plane;
+    # no square root of v_sq and few divisions, because this runs at every IMU sample.
     across = -p * (inward * u + poleward * sin_sq * v_sq) / spread
     axial = -z * (inward * v_sq * per_u - poleward * p * p) / spread
     north = axial * cos_lat - across * sin_lat
@@ -225,8 +225,8 @@ def transport_rate_n(lat_rad: ArrayLike, alt_m: ArrayLike, v_n: ArrayLike) -> Fl
     North-east-down; Groves (2013), eq. 5.44.
 
     Raises:
-        ValueError: a latitude is that of a pole, where north is not defined, a height below
-            -1000 km, or v_n has not three components; in compiled code only the last.
+        ValueError: a latitude is that of a pole, where north is not defined; a height is below
+            -1000 km; v_n does not have three components (the only check in compiled code).
     """
     lat, alt, v = _floats(lat_rad, alt_m, v_n)
     require(v.shape[-1:] == (3,), "v_n has 3 components along its last axis", v.shape)
@@ -250,7 +250,7 @@ class Geodetic:
 
     Tangent vectors are metres north, east, down, taken with the curvature radii at the point the
     step begins. `local` is the exact inverse of `retract`, also across the 180 deg meridian; the
-    longitude stays in [-pi, pi). East is not defined at the poles, so neither are these two there.
+    longitude stays in [-pi, pi). Neither is defined at the poles, where there is no east.
     """
 
     lat: Any  # (...) array, rad
@@ -266,7 +266,7 @@ class Geodetic:
 
     @classmethod
     def from_degrees(cls, lat_deg, lon_deg, alt_m) -> Geodetic:
-        """From latitude and longitude in degrees, height in metres; not for use under `jit`.
+        """Make from latitude and longitude [deg] and height [m]; not for use under `jit`.
 
         Raises:
             ValueError: a latitude is beyond 90 deg, or a number is not finite.
@@ -285,7 +285,7 @@ class Geodetic:
 
     @classmethod
     def from_ecef(cls, r_e) -> Geodetic:
-        """From an Earth-fixed position [m]."""
+        """Make from an Earth-fixed position [m]."""
         lat, lon, alt = geodetic_from_ecef(jnp.asarray(r_e, float))
         return cls(lat, wrap(lon), alt)
 

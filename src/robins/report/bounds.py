@@ -1,4 +1,4 @@
-"""The covariance bound: as a line among filters, and as tables and figures of its own."""
+"""The covariance bound: a line in the figures of filters, and tables and figures of its own."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from robins.report.numbers import show, words
 from robins.report.style import Picture
 from robins.results import find
 
-# What the sensors may leave of a component that they see, and that they hardly see: of its sigma at
-# the start, process noise aside, and of what its sigma would be at the end with no sensor.
+# Greatest remaining sigma of a component that is "seen" and "hardly seen", as a share of its
+# initial sigma (without process noise) and of its sigma at the end without sensors.
 SEEN, HARDLY = 0.5, 0.95
 _LOOK = {"color": style.TRUTH, "linestyle": (0, (4, 2)), "linewidth": 0.8}
 _NONE = {"color": style.GREY, "linestyle": (0, (1, 1)), "linewidth": 0.8}
-_BEYOND = 30.0  # a line this many times above the bound with all sensors leaves the figure
-_COLUMNS = 500  # of the map of information
-_FULL = 10.0  # bits; a thousandth of the prior and less is one colour
+_BEYOND = 30.0  # lines above this multiple of the bound with all sensors are cut off
+_COLUMNS = 500  # columns of the information map
+_FULL = 10.0  # bits at the end of the colour scale, a thousandth of the prior
 
 
 class BoundLine(NamedTuple):
@@ -73,7 +73,7 @@ def blocks(solution: xr.Dataset) -> list[str]:
 
 
 def sensors(solution: xr.Dataset) -> list[str]:
-    """Sensors whose worth is shown; of an only one it is that of all."""
+    """Sensors whose contribution is shown; none if there is only one."""
     names = series.coordinate(solution, "sensor")
     return names if len(names) > 1 else []
 
@@ -109,7 +109,7 @@ def sigmas(solution: xr.Dataset, block: str) -> Picture:
 
 
 def _scale(axes: Axes, every: np.ndarray, without: np.ndarray, unaided: np.ndarray) -> None:
-    """A logarithmic axis of one decade or more that what diverges does not set."""
+    """Logarithmic axis of one decade or more, whose scale ignores diverging lines."""
     close = np.concatenate([every, without.ravel()])
     both = np.concatenate([close, unaided])
     low = float(np.min(both[both > 0.0], initial=np.inf))
@@ -169,7 +169,7 @@ def epochs(solution: xr.Dataset, times_s: Sequence[float] = ()) -> list[int]:
 
 
 def metrics(solution: xr.Dataset) -> dict[str, list[float]]:
-    """The bound at the end by block, as metrics of a summary, whose names end in their unit."""
+    """Final bound by block, as metrics of a summary, whose names end in their unit."""
     out = {}
     for block in blocks(solution):
         found = line(solution, block)
@@ -228,7 +228,7 @@ _STYLES = {"seen": "green", "hardly seen": "yellow", "not seen": "red", "known":
 
 
 def table(solution: xr.Dataset, at: Sequence[int]) -> Group:
-    """The rows as something rich can print; `sentences` list what is least observable."""
+    """The rows as a rich renderable; `sentences` list the least observable directions."""
     time = np.asarray(solution["time"], float)
     made = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     made.add_column("sigma at best", no_wrap=True)

@@ -43,7 +43,7 @@ def comparison(summary: Mapping[str, Any]) -> Picture | None:
     rows = -(-len(found) // columns)
     figure, grid = style.new_figure(rows, columns, 0.5 + rows * (0.5 + 0.24 * len(filters)))
     engine: Any = figure.get_layout_engine()
-    engine.set(wspace=0.07, hspace=0.06)  # else the last number of one touches the first of another
+    engine.set(wspace=0.07, hspace=0.06)  # otherwise tick labels of adjacent axes touch
     places, uncertain = range(len(filters)), False
     for axes, (name, values) in zip(grid.flat, found.items(), strict=False):
         chances = [Probability.read(of.get(name)) for of in summary["filters"].values()]
@@ -82,7 +82,7 @@ def comparison(summary: Mapping[str, Any]) -> Picture | None:
 
 
 _ROLES = ("trade_off_h2", "trade_off_hinf", "kalman_h2", "kalman_hinf")
-# The forms of one family share a colour: what is retuned is dashed.
+# Variants of a method share a colour; retuned ones are dashed.
 _LOOKS: dict[str, dict[str, Any]] = {
     "riccati": {"color": style.colour(0), "marker": "o", "markersize": 6.5, "zorder": 4},
     "closed-form": {"color": style.colour(3), "marker": "x", "linestyle": ":", "zorder": 5},
@@ -98,7 +98,7 @@ _LEAST = {"color": style.GREY, "linewidth": 0.9, "linestyle": (0, (1, 2))}
 
 @style.styled
 def trade_off(solution: xr.Dataset) -> Picture:
-    """A line for each method through its designs, and how far each is from the best for a gamma."""
+    """A line for each method through its designs, and their distance from the best for a gamma."""
     h2, hinf, kalman_h2, kalman_hinf = (find(solution, role)[""] for role in _ROLES)
     gamma = series.x_of(h2, 1)
     value, reached = np.asarray(h2.values, float), np.asarray(hinf.values, float)

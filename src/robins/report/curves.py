@@ -1,7 +1,6 @@
 """Curves over time: errors in their envelopes, estimates, campaign statistics, height.
 
-Curves of shares are among them: runs within a limit, and how much of its gamma a worst-case filter
-has used.
+Two show shares: runs within a limit, and the local bound of an H-infinity filter over its gamma.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from robins.report.updates import quantile
 from robins.results import find
 from robins.results.probability import LEVEL, interval
 
-# rule: its local bound, and what that must stay below
+# rule: its local bound, and the upper limit of that
 _WORST_CASE = {"h_infinity": "gamma", "adaptive_h_infinity": "xi"}
 
 
@@ -62,7 +61,7 @@ def _used(solution: xr.Dataset) -> xr.DataArray | None:
 
 @style.styled
 def worst_case(solution: xr.Dataset) -> Picture | None:
-    """Distance of each H-infinity filter from not existing, over time; None if there is none."""
+    """Existence margin of each H-infinity filter over time; None if there is none."""
     ratio = _used(solution)
     if ratio is None:
         return None
@@ -108,13 +107,13 @@ def bound_note(solution: xr.Dataset) -> str:
 
 _START = 0.2  # of the time axis
 _BEYOND = 4.0  # a stated sigma this many times any error does not set the scale
-_STEEP = 3.0  # a start this much higher than all that follows is cut off, with a remark
+_STEEP = 3.0  # a start this many times higher than the rest is cut off, with a remark
 
 
 def _limit(axes: Axes, x: np.ndarray, lines: list[np.ndarray], centred: bool = True) -> bool:
     """Scale to the time after the start if the start is far higher; True if that cuts it off.
 
-    Only a start is cut: what goes off later is what the figure is for.
+    Only the start is cut off: a later divergence must stay visible.
     """
     if x.size == 0:
         return False
@@ -139,7 +138,7 @@ def _limit(axes: Axes, x: np.ndarray, lines: list[np.ndarray], centred: bool = T
 
 
 def _in_scale(lines: list[np.ndarray], errors: np.ndarray) -> list[np.ndarray]:
-    """The lines that the scale must hold: what a filter states may be beyond all errors."""
+    """Lines that the scale must include: a stated sigma far above all errors is not among them."""
     most = _BEYOND * np.abs(errors[np.isfinite(errors)]).max(initial=0.0)
 
     def usual(line: np.ndarray) -> float:
@@ -151,7 +150,7 @@ def _in_scale(lines: list[np.ndarray], errors: np.ndarray) -> list[np.ndarray]:
 
 
 def _top(lines: list[np.ndarray]) -> float:
-    """Half the height of axes that hold the lines, where they are finite."""
+    """Half the height of axes that include the finite values of the lines."""
     values = np.abs(np.stack(lines))
     return 1.25 * float(values[np.isfinite(values)].max(initial=0.0)) or 1.0
 
@@ -235,7 +234,7 @@ def estimates(solution: xr.Dataset, block: str, role: str = "estimate") -> Pictu
         for i in range(len(filters)):
             y = _broken(found.values[i, :, k], turn)
             clock.plot(axes, found.x, y, **style.filter_look(i))
-            # About an angle that turns, an envelope would be drawn across the wrap.
+            # The envelope of a wrapping angle would be drawn across the wrap.
             if sigma is not None and turn is None:
                 _envelope(axes, sigma, i, k, clock, len(filters), centre=y)
         if turn is None and sigma is not None:
@@ -256,7 +255,7 @@ def values(solution: xr.Dataset, name: str) -> Picture:
 
 
 def _broken(y: np.ndarray, turn: float | None) -> np.ndarray:
-    """The same with gaps where an angle wraps, so that no line is drawn across the figure."""
+    """Values with gaps where an angle wraps, so that no line is drawn across the figure."""
     if turn is None:
         return y
     y = y.copy()
@@ -265,7 +264,7 @@ def _broken(y: np.ndarray, turn: float | None) -> np.ndarray:
 
 
 def _window(axes: Axes, values: np.ndarray, reach: np.ndarray) -> None:
-    """Limits that hold the estimates, and of the envelope what it usually needs."""
+    """Axis limits that include the estimates and the usual extent of the envelope."""
     if not np.isfinite(values).any() or not np.isfinite(reach).any():
         return
     usual = np.nanpercentile(reach, 70.0)

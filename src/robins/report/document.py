@@ -1,4 +1,4 @@
-"""The report: one HTML file that needs nothing else, read on a screen, in the dark, on paper."""
+"""The report: one self-contained HTML file, for screen (light and dark) and print."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LIMIT = 500_000  # bytes of the whole page
 
 _SIGNS = {"reproduced": "✓", "partly": "≈", "not": "✗", "undecided": "?"}
 _LOCKED = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-_LONGEST_SCENARIO = 40_000  # characters shown; the manifest has all of it
+_LONGEST_SCENARIO = 40_000  # characters shown; the manifest has the whole
 
 
 class ReportOrigin(NamedTuple):
@@ -35,7 +35,7 @@ def page(
     origin: ReportOrigin,
     limit: int = LIMIT,
 ) -> str:
-    """The report as HTML of at most `limit` bytes; pictures give way where there are too many."""
+    """The report as HTML of at most `limit` bytes; pictures are made coarser or left out to fit."""
     text = _page(summary, _figures([]), origin)
     room = limit - len(text.encode()) - sum(len(_frame(d.picture).encode()) for d in drawn)
     return _page(summary, _figures(embed(drawn, max(room, 0))), origin)
@@ -149,7 +149,7 @@ def _claims(claims: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _frame(picture: Picture) -> str:
-    """Everything around a picture but its source."""
+    """HTML of a picture without its source."""
     return _figure(Embedded(picture, "", 99999, 99999)) + "\n" + " " * 80
 
 

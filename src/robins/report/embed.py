@@ -1,4 +1,4 @@
-"""Pictures inside a page: the smaller of SVG and PNG, and all of them within a limit."""
+"""Pictures embedded in a page: the smaller of SVG and PNG, together within a size limit."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from robins.report.style import Picture, styled
 DPI = 160  # 1.3 dots per pixel of the page: sharp on a screen, enough for paper
 PAGE_DPI = 120  # one dot a pixel of the page
 _FEW = 8  # pictures; more would not all fit into a page in the best form
-# Share of the dots, colours and effort (of zlib) of a PNG, from the best to the least that can
-# still be read, and the size that is expected of it, by that of the first; 22 figures differ by
-# 0.03. The last effort gains an eighth of the bytes in six times the time.
+# Share of the dots, number of colours and zlib level of a PNG, from the best to the coarsest that
+# is still legible, and its expected size relative to the first (22 figures differ by 0.03). The
+# highest level saves an eighth of the bytes in six times the time.
 _LADDER = (
     (1.0, 64, 6, 1.0),
     (1.0, 20, 9, 0.72),
@@ -28,13 +28,13 @@ _LADDER = (
     (0.5625, 20, 9, 0.34),
     (0.47, 12, 9, 0.25),
 )
-_SLACK = 0.9  # of the room; where less is filled, too much was expected
+_SLACK = 0.9  # of the limit; a page below it was expected too large
 _SIMPLE = 1000  # points; a drawing with more is never smaller than its dots
 _NUMBER = re.compile(rb"-?\d+\.\d{3,}")
 
 
 class RenderedPicture(NamedTuple):
-    """A picture and its dots, drawn once for all uses."""
+    """A picture and its pixels, drawn once for all uses."""
 
     picture: Picture
     dots: Image.Image
@@ -67,7 +67,7 @@ def dpi_for(pictures: int) -> int:
 
 @styled
 def draw(picture: Picture, dpi: int = DPI) -> RenderedPicture:
-    """Draw a picture; its layout stays as it is from here on."""
+    """Draw a picture and freeze its layout."""
     picture.figure.set_dpi(dpi)
     canvas: Any = picture.figure.canvas
     canvas.draw()
@@ -79,7 +79,7 @@ def draw(picture: Picture, dpi: int = DPI) -> RenderedPicture:
 
 
 def shrunk(image: Image.Image, share: float) -> Image.Image:
-    """An image of fewer dots, each the mean of those it stands for."""
+    """An image of fewer pixels, each the mean of those it replaces."""
     if share == 1.0:
         return image
     size = (round(image.width * share), round(image.height * share))
@@ -98,7 +98,7 @@ def packed(image: Image.Image, colours: int, effort: int = 9) -> bytes:
     found, count = np.unique(dots, return_counts=True)
     rgb = np.stack([found >> 16, found >> 8 & 255, found & 255], axis=1)
     palette, nearest = _palette(rgb, count, colours)
-    of_colour = np.zeros(1 << 24, np.uint8)  # of which few pages are touched
+    of_colour = np.zeros(1 << 24, np.uint8)  # few of its memory pages are used
     of_colour[found] = nearest
     indexed = Image.fromarray(of_colour[dots])
     indexed.putpalette(palette.astype(np.uint8).tobytes())
@@ -106,11 +106,11 @@ def packed(image: Image.Image, colours: int, effort: int = 9) -> bytes:
 
 
 def _palette(rgb: np.ndarray, count: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Colours of a palette, all of them exact, and for each given colour the nearest of them.
+    """Colours of a palette, each one exact, and for each given colour the nearest of them.
 
-    Taken one by one, each time the colour that is worst served, weighted by how often it occurs:
-    a thin line in a colour of its own counts as much as a large area in a shade of another's.
-    Palettes made by averaging would fade tints and let rare lines change colour.
+    Chosen one by one, each time the colour of the largest error weighted by its frequency, so a
+    thin line of a distinct colour counts as much as a large area of a slightly different shade.
+    Palettes made by averaging would fade tints and change the colour of rare lines.
     """
     chosen = [int(np.argmax(count))]
     error = np.full(len(rgb), np.iinfo(np.int64).max)
@@ -140,7 +140,7 @@ def _points(figure: Figure) -> int:
     count = 0
     for axes in figure.axes:
         for line in axes.lines:
-            # Each marker is an element of its own, as long as three points.
+            # Each marker is a separate element, as long as three points.
             each = 3 if line.get_marker() not in ("None", "") else 1
             count += each * np.size(line.get_xdata())
         count += sum(np.size(p.vertices) // 2 for c in axes.collections for p in c.get_paths())
@@ -161,8 +161,8 @@ class _PictureForms:
     """The forms of one picture, each made only when it is needed.
 
     Attributes:
-        source: its form.
-        rung: its place on the ladder.
+        source: the current form.
+        rung: its place on the ladder of forms, from fine to coarse.
     """
 
     def __init__(self, drawn: RenderedPicture):
@@ -227,7 +227,7 @@ def _refine(choices: Sequence[_PictureForms], limit: int) -> None:
 def embed(drawn: Sequence[RenderedPicture], limit: int) -> list[Embedded]:
     """Sources for the pictures, together at most `limit` characters.
 
-    The largest is made coarser until all fit; only what is coarse already is left out.
+    The largest is made coarser until all fit; pictures are left out only in their coarsest form.
     """
     choices = [_PictureForms(one) for one in drawn]
     for choice, rung in zip(choices, _steps([c.size for c in choices], limit), strict=True):

@@ -1,4 +1,4 @@
-"""The figures of a page, one row each, in their order: what is drawn, of arrays of which roles."""
+"""Table of the figures of a page in order: drawing function and roles of the arrays it uses."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from robins.results import find
 
 
 class Figure(NamedTuple):
-    """A picture, or one for each thing that has an array of the first role."""
+    """A picture, or one for each block or sensor that has an array of the first role."""
 
-    draw: Callable[..., Picture | None]  # of a solution; with `each` of a solution and of what
-    roles: str  # that it shows, between blanks; it is drawn where there is the first
+    draw: Callable[..., Picture | None]  # takes a solution; with `each` also a block or sensor
+    roles: str  # shown, separated by blanks; drawn where the first exists
     each: bool = False
-    when: Callable[[xr.Dataset, str], bool] | None = None  # not always, but if this holds
+    when: Callable[[xr.Dataset, str], bool] | None = None  # further condition
 
     def of(self, solution: xr.Dataset, only: Sequence[str] = ()) -> Iterator[tuple[str, ...]]:
-        """Arguments of each drawing after the solution, or of those in `only`."""
+        """Arguments after the solution of each drawing, or of those in `only`."""
         found = find(solution, self.roles.split()[0])
         if not self.each:
             named = not only or getattr(self.draw, "__name__", "") in only
@@ -48,12 +48,12 @@ class Figure(NamedTuple):
 
 
 def _scatters(solution: xr.Dataset, block: str) -> bool:
-    """The RMS of one run is the error itself, without its sign."""
+    """True for several runs: the RMS of one run is only the absolute error."""
     return find(solution, "rms")[block].attrs.get("runs", 2) != 1
 
 
 def _tells_more(solution: xr.Dataset, block: str) -> bool:
-    """True if an estimate shows more than its error: where it should settle on a value."""
+    """True if an estimate shows more than its error, as one that should converge to a constant."""
     return block not in find(solution, "error") or "bias" in block or "scale" in block
 
 
@@ -94,7 +94,7 @@ def drawings(
 ) -> list[Callable[[], Picture | None]]:
     """Functions that draw, in the order of the page; the comparison of a summary comes last.
 
-    In `only` are the names of some, which are those of their arrays, or else of their functions.
+    `only` selects by name: that of the array, or else of the function.
     """
     found: list[Callable[[], Picture | None]] = []
     if solution is not None:

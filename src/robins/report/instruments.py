@@ -1,4 +1,4 @@
-"""Instruments: Allan deviation with the noises fitted to it, magnetic field as calibrated."""
+"""Instruments: Allan deviation with the fitted noise terms, calibrated magnetic field."""
 
 from __future__ import annotations
 
@@ -68,14 +68,14 @@ def allan(solution: xr.Dataset, sensor: str) -> Picture:
 
 
 def _fit_limits(axes: Axes, values: list[np.ndarray], low, high) -> None:
-    """Limits by the measured curve: the slopes of processes that do not matter run out below."""
+    """Axis limits from the measured curve; slopes of negligible processes may leave them below."""
     shown = np.concatenate([*values, *(b.ravel() for b in (low, high) if b is not None)])
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
     if shown.size:
         axes.set_ylim(0.6 * shown.min(), 1.5 * shown.max())
 
 
-_DOTS = 3000  # of a cloud; more only make it darker
+_DOTS = 3000  # points of a cloud; more only make it darker
 _PLANES = ((0, 1), (0, 2), (1, 2))
 _NAMES = ("measured", "calibrated")
 _LOOKS = ({"color": style.colour(1)}, {"color": style.colour(0)})

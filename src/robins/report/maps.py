@@ -13,11 +13,11 @@ from robins.report import series, style
 from robins.report.style import Picture
 from robins.results import find
 
-# WGS-84, for a map; robins.earth, which computes with it, is not this room's business.
+# WGS-84, for a map; this room does not import robins.earth.
 _A, _E2 = 6378137.0, 6.69437999014e-3
-_WRAPPED_M = 1e6  # two samples further apart than this are not one line
+_WRAPPED_M = 1e6  # no line between two samples further apart than this
 
-# Quality of a fix as RTKLIB numbers it; marker, size and colour by what it is worth.
+# Quality of a fix as numbered by RTKLIB; marker, size and colour by its accuracy.
 _RTKLIB = {1: "fix", 2: "float", 3: "SBAS", 4: "DGPS", 5: "single", 6: "PPP"}
 _MARKS = (
     (".", 3.0, "#8A8A8A"),
@@ -28,16 +28,16 @@ _MARKS = (
 
 
 class Path(NamedTuple):
-    """Places on the map, metres."""
+    """Positions on the map [m]."""
 
     north: np.ndarray
     east: np.ndarray
 
 
 def metres(lat_rad: np.ndarray, lon_rad: np.ndarray, origin: tuple[float, float]) -> Path:
-    """Places on a map about an origin (latitude, longitude): arcs of meridian and parallel.
+    """Map positions [m] about an origin (latitude, longitude): arcs of meridian and parallel.
 
-    The difference in longitude is folded first, so a track may cross 180 degrees.
+    The difference in longitude is wrapped first, so a track may cross 180 degrees.
     """
     lat0, lon0 = origin
     root = math.sqrt(1.0 - _E2 * math.sin(lat0) ** 2)
@@ -49,7 +49,7 @@ def metres(lat_rad: np.ndarray, lon_rad: np.ndarray, origin: tuple[float, float]
 
 
 def paths(solution: xr.Dataset) -> dict[str, Path]:
-    """Places of "track" (filter, time), "reference" and "gnss", all on the same map."""
+    """Positions of "track" (filter, time), "reference" and "gnss", all on the same map."""
     held = {role: find(solution, role) for role in ("track", "reference", "gnss")}
     pairs = (("north_m", "east_m"), ("lat_rad", "lon_rad"))
     pair = next((pair for pair in pairs if held["track"].keys() >= {*pair}), None)
@@ -71,7 +71,7 @@ def paths(solution: xr.Dataset) -> dict[str, Path]:
 
 
 def unwrapped(path: Path) -> Path:
-    """The same with a gap wherever it jumps around the globe."""
+    """Path with a gap wherever it jumps around the globe."""
     north, east = path.north.copy(), path.east.copy()
     jump = np.hypot(np.diff(north), np.diff(east)) > _WRAPPED_M
     gap = np.concatenate([[False], jump])
@@ -100,7 +100,7 @@ def track(solution: xr.Dataset) -> Picture | None:
         keys.append(style.key("reference", **look))
     tracks = [Path(*pair) for pair in zip(*places["track"], strict=True)]
     outage = series.outage(solution)
-    # Marked on the way really taken, where that is known at the same times.
+    # Marked on the reference track, where that is known at the same times.
     candidates = [p for p in (places.get("reference"), tracks[0]) if p is not None]
     marked = [p for p in candidates if outage and len(p.north) == len(outage[1])]
     if outage is not None and marked:
@@ -121,7 +121,7 @@ def track(solution: xr.Dataset) -> Picture | None:
 
 
 def _draw(axes: Axes, path: Path, scale: float, **look) -> None:
-    # Thinned along both coordinates over the sample number, which keeps every corner of the way.
+    # Thinned along both coordinates over the sample number, which keeps every corner of the track.
     number = np.arange(len(path.north)) * 1.0
     _, north, east = series.thin(number, path.north * scale, path.east * scale, points=4000)
     axes.plot(east, north, **look)
@@ -166,7 +166,7 @@ def _ends(axes: Axes, path: Path, scale: float) -> list:
 
 
 def _window(places: list[Path]) -> tuple[tuple[float, float, float, float], float]:
-    """Limits west, east, south, north with room for everything, and height over width of them."""
+    """Limits west, east, south, north with room for everything, and their aspect ratio."""
     parts = [np.stack([p.east.ravel(), p.north.ravel()]) for p in places]
     points = np.concatenate(parts, axis=1)
     points = points[:, np.isfinite(points).all(axis=0)]
@@ -175,7 +175,7 @@ def _window(places: list[Path]) -> tuple[tuple[float, float, float, float], floa
     margin = 0.06 * span
     width, tall = east - west + 2 * margin, north - south + 2 * margin
     aspect = min(max(tall / width, 0.42), 0.95)
-    # Grow the shorter side, so that metres are equally long both ways without cutting anything.
+    # Grow the shorter side, for equal scales on both axes without cutting anything.
     width, tall = max(width, tall / aspect), max(tall, width * aspect)
     x, y = (west + east) / 2, (south + north) / 2
     return (x - width / 2, x + width / 2, y - tall / 2, y + tall / 2), aspect

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from robins.results import Probability
 
-# What the unit at the end of a metric's name is made of, and how that is printed.
+# Parts of the unit at the end of a metric's name, and their printed form.
 _PARTS = {
     **{u: u for u in ("deg", "arcmin", "arcsec", "rad", "mrad", "m", "km", "cm", "mm", "s", "ms")},
     **{u: u for u in ("h", "mg")},
@@ -21,7 +21,7 @@ _PARTS = {
 }
 _PART = "|".join(sorted(_PARTS, key=len, reverse=True))
 _UNIT = re.compile(rf"_((?:{_PART})(?:_per_(?:{_PART}))*)$")
-_FEW = 4  # numbers of a list that are all shown
+_FEW = 4  # longest list whose numbers are all shown
 _CAPITALS = {
     *("rms", "rmse", "nis", "nees", "anees", "gnss", "imu", "rts", "ins", "cep"),
     *("kf", "ekf", "mekf", "ukf", "sar", "rtk", "2d", "3d", "nhc", "zupt", "lmi"),
@@ -44,7 +44,7 @@ class Label(NamedTuple):
 
 
 def label(metric: str) -> Label:
-    """Words and unit of a metric's name; of a share the unit at its end is that of its limit."""
+    """Words and unit of a metric's name; for a share, the unit at its end is that of its limit."""
     unit = None if "share" in metric.split("_") else _UNIT.search(metric)
     text = words(metric[: unit.start()] if unit else metric) or metric
     texts = "/".join(_PARTS[part] for part in unit[1].split("_per_")) if unit else ""
@@ -52,13 +52,13 @@ def label(metric: str) -> Label:
 
 
 def words(name: str) -> str:
-    """A name of a program as words: ``gnss_position`` is "GNSS position"."""
+    """An identifier as words: ``gnss_position`` is "GNSS position"."""
     split = (word for word in name.split("_") if word)
     return " ".join(_WORDS.get(w, w.upper() if w in _CAPITALS else w) for w in split)
 
 
 def show(value: Any) -> str:
-    """A number to four significant digits; lists are joined; nothing is an en dash."""
+    """A number to four significant digits; lists are joined; None is an en dash."""
     if value is None:
         return "–"
     if (probability := Probability.read(value)) is not None:
@@ -89,7 +89,7 @@ def _many(values: Sequence[Any]) -> str:
 
 
 def _probability(found: Probability) -> str:
-    """A share with its interval, to as many digits as that leaves to it."""
+    """A share with its interval, to as many digits as that justifies."""
     digits = max(2, 1 - math.floor(math.log10(found.high - found.low)))
     texts = (f"{x:.{digits}f}".rstrip("0").rstrip(".") for x in found[:3])
     return "{} ({} to {})".format(*texts)
@@ -137,7 +137,7 @@ def marked(values: Values, metric: str) -> str:
 
 
 def state_of(verdict: str) -> str:
-    """The verdict of a claim that has the colour of the sentence on a replay; "" for none."""
+    """The claim verdict whose colour the sentence on a replay has; "" for none."""
     return next((state for begin, state in _STATES.items() if verdict.startswith(begin)), "")
 
 

@@ -20,7 +20,7 @@ def percentiles(solution: xr.Dataset, block: str) -> Picture:
     label = f"length of the error [{data.unit}]" if data.unit else "length of the error"
     figure, axes, clock = series.single_axes(solution, data.x, label, 3.2)
     low, middle, high, highest = range(4)
-    # No logarithm has what is zero or infinite: a line ends where a percentile diverged.
+    # Zero and infinity have no logarithm: a line ends where a percentile diverged.
     lengths = np.where(np.isfinite(data.values) & (data.values > 0.0), data.values, np.nan)
     for i, of in enumerate(lengths):
         clock.plot(axes, data.x, of[:, middle], **style.filter_look(i))

@@ -1,4 +1,4 @@
-"""Sobol indices: figures, tables and sentences on the variance that each parameter adds."""
+"""Sobol indices: figures, tables and sentences on the variance due to each parameter."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from robins.results import find
 
 _COLUMNS = 3  # blocks side by side
 _ORDERS = {"first": "first order: alone", "total": "total: with others"}
-_SLICES, _FEW = 10, 8  # of the means over a parameter: how many, and points in each at least
-_WIDE = 0.2  # width of a bound from which on an order is doubted
-_NOTHING = 1e-12  # total index of a parameter that does nothing
+_SLICES, _FEW = 10, 8  # means over a parameter: number of slices, and least points in each
+_WIDE = 0.2  # width of a confidence interval above which the ranking is doubted
+_NOTHING = 1e-12  # greatest total index of a parameter without effect
 _THICK = 0.36  # of a bar; two of them to a parameter
 
 
@@ -214,7 +214,7 @@ def csv(solution: xr.Dataset, laws: Sequence[str]) -> bytes:
 
 
 def points(solution: xr.Dataset, drawn: Sequence[np.ndarray]) -> bytes:
-    """Samples A and B, which are independent, with the RMS of each.
+    """The independent samples A and B, with the RMS of each point.
 
     Args:
         solution: as of `robins.campaign.sensitivity.labelled`.
@@ -232,7 +232,7 @@ def points(solution: xr.Dataset, drawn: Sequence[np.ndarray]) -> bytes:
 
 
 def sentences(solution: xr.Dataset, laws: Sequence[str]) -> list[str]:
-    """Notes on how the indices were found, and on what they mean; arguments as of `csv`."""
+    """Notes on the computation and the meaning of the indices; arguments as of `csv`."""
     about = next(iter(find(solution, "sobol_first").values())).attrs
     name, samples, runs = about["of_filter"], int(about["samples"]), int(about["runs"])
     names = series.coordinate(solution, "parameter")
@@ -259,11 +259,11 @@ def sentences(solution: xr.Dataset, laws: Sequence[str]) -> list[str]:
 
 
 def doubts(solution: xr.Dataset, follow: Sequence[bool]) -> list[str]:
-    """Warnings where an index is none, or is not what its name says.
+    """Warnings on missing indices, on those that include the filter's start, and on unsure ranks.
 
     Args:
         solution: as of `robins.campaign.sensitivity.labelled`.
-        follow: of each parameter, True if the belief at the start follows it.
+        follow: for each parameter, True if the filter's initial belief follows it.
     """
     names, blocks = series.coordinate(solution, "parameter"), find(solution, "sobol_total")
     name = next(iter(find(solution, "sobol_first").values())).attrs["of_filter"]

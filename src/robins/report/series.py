@@ -13,7 +13,7 @@ from robins import units
 from robins.report import style
 from robins.results import find
 
-_POINTS = 1200  # of a line; more than a figure has pixels
+_POINTS = 1200  # points of a line; more than a figure has pixels
 
 
 class TimeUnit(NamedTuple):
@@ -23,7 +23,7 @@ class TimeUnit(NamedTuple):
     label: str
 
     def plot(self, axes: Axes, x: np.ndarray, y: np.ndarray, **look: Any) -> None:
-        """Draw a line over time [s], of no more points than can be seen."""
+        """Draw a line over time [s], thinned to the resolution of the figure."""
         axes.plot(*thin(x / self.seconds, y), **look)
 
     def shade(self, axes: Axes, solution: xr.Dataset) -> None:
@@ -43,13 +43,13 @@ class Series(NamedTuple):
 
     @property
     def frame(self) -> str:
-        """A sentence on it, for the end of a caption; empty where there is none."""
+        """Sentence on the frame, for the end of a caption; empty where there is none."""
         frame = self.attrs.get("frame", "")
         return f" Frame: {frame}." if frame else ""
 
 
 def one(solution: xr.Dataset, role: str, of: str = "") -> xr.DataArray | None:
-    """The array of something in a role, or None."""
+    """The array of a role and, if given, of a block or sensor; None if there is none."""
     return find(solution, role).get(of)
 
 
@@ -64,7 +64,7 @@ def shown(array: xr.DataArray) -> tuple[np.ndarray, str]:
 
 
 def get(solution: xr.Dataset, role: str, of: str = "") -> Series | None:
-    """The same, over filters, time and perhaps axes, in the unit of figures."""
+    """The array of a role as a `Series`, in the unit of figures; None if there is none."""
     array = one(solution, role, of)
     if array is None:
         return None
@@ -75,7 +75,7 @@ def get(solution: xr.Dataset, role: str, of: str = "") -> Series | None:
 
 
 def x_of(array: xr.DataArray, place: int) -> np.ndarray:
-    """Coordinate along the dimension at that place; numbers from 0 where there is none."""
+    """Coordinate along the dimension of that index; numbers from 0 where there is none."""
     dim = array.dims[place]
     found = array.coords.get(dim)
     return np.arange(array.shape[place]) * 1.0 if found is None else np.asarray(found, float)
@@ -120,7 +120,7 @@ def stacked(
 ) -> tuple[Figure, np.ndarray, TimeUnit]:
     """A figure of one pair of axes over time for each component, outages shaded.
 
-    So many more pairs stand below. Components of several units state their own.
+    ``more`` pairs are added below. Components of different units state their own.
     """
     rows = len(axes) + more
     figure, grid = style.new_figure(rows, 1, 0.9 + 1.35 * rows, sharex=True)
@@ -136,7 +136,7 @@ def stacked(
 
 
 def outage(solution: xr.Dataset) -> tuple[np.ndarray, np.ndarray] | None:
-    """Times and mask of withheld aids; None where there are none."""
+    """Times and mask of withheld aiding; None where there is none."""
     array = one(solution, "outage")
     if array is None or not np.any(array.values):
         return None
@@ -146,7 +146,7 @@ def outage(solution: xr.Dataset) -> tuple[np.ndarray, np.ndarray] | None:
 def thin(x: np.ndarray, *ys: np.ndarray, points: int = _POINTS) -> tuple[np.ndarray, ...]:
     """Fewer points of lines that share their x, without losing an extreme of any of them.
 
-    The line is cut into bins; of each bin the points stay where a line is lowest and highest.
+    The lines are cut into bins; the points of the minimum and maximum in each bin are kept.
     """
     n = len(x)
     if n <= points:
@@ -170,7 +170,7 @@ def thin(x: np.ndarray, *ys: np.ndarray, points: int = _POINTS) -> tuple[np.ndar
 
 
 def sample(x: np.ndarray, y: np.ndarray, points: int = 4000) -> tuple[np.ndarray, np.ndarray]:
-    """Fewer points of a cloud: evenly many everywhere, and every one that lies far out."""
+    """Fewer points of a cloud: evenly thinned, with all outlying ones kept."""
     if len(x) <= points:
         return x, y
     keep = np.zeros(len(x), bool)

@@ -24,8 +24,8 @@ WIDTH = 7.2  # inches; at 9 points the text of a figure is as large as that of t
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LINES = ("-", "--", "-.", (0, (1, 1)))
 TINTED = 4  # filters whose tints can be distinguished
-_ROWS = 2  # of a legend that every figure has room for
-_REMARK = 100  # characters of small words in a line
+_ROWS = 2  # rows of a legend that fit every figure
+_REMARK = 100  # characters in a line of a remark
 TRUTH = "#222222"
 GREY = "#6B6B6B"
 OUTAGE = "#FBE9B0"
@@ -60,16 +60,16 @@ _SETTINGS = {
 
 
 class Picture(NamedTuple):
-    """A figure with what is printed around it."""
+    """A figure with its name, title and caption."""
 
     name: str  # of its file
     title: str
-    caption: str  # what to look for in it
+    caption: str  # reading aid for the figure
     figure: Figure
 
 
 def styled(draw: Callable) -> Callable:
-    """Decorator: draw in the style of robins, whatever the user's settings, and restore those."""
+    """Decorator: draw in the style of robins, then restore the user's settings."""
 
     @wraps(draw)
     def drawn(*args: Any, **kwargs: Any) -> Any:
@@ -125,7 +125,7 @@ def outage_key() -> Patch:
 
 
 def remark(axes: Axes, text: str) -> None:
-    """Small grey words above the axes; what takes several lines makes the figure taller."""
+    """Small grey text above the axes; several lines make the figure taller."""
     lines = textwrap.wrap(text, _REMARK, break_on_hyphens=False)
     axes.set_title("\n".join(lines), fontsize=8.5, color=GREY)
     figure = axes.get_figure(root=True)
@@ -147,7 +147,7 @@ def legend(figure: Figure, keys: Sequence[Any]) -> None:
         fits = (n for n in range(len(keys), 0, -1) if _width(widths, n) < WIDTH - 0.3)
         columns = next(fits, 1)
     rows = -(-len(keys) // columns)
-    columns = -(-len(keys) // rows)  # no last row of one
+    columns = -(-len(keys) // rows)  # avoids a last row of one entry
     if rows > _ROWS:
         width, height = figure.get_size_inches()
         figure.set_size_inches(width, height + 0.19 * (rows - _ROWS))

@@ -1,4 +1,4 @@
-"""Probability that each instrument, or the motion, is wrong, as a bank of hypotheses states it."""
+"""Fault probability of each instrument and of the motion model, from a bank of hypotheses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from robins.report.style import Picture
 
 @style.styled
 def suspects(solution: xr.Dataset) -> Picture | None:
-    """Probability by suspect over time; None if no filter states one."""
+    """Fault probability by suspect over time; None if no filter states one."""
     first, mean = (series.get(solution, role) for role in ("wrong", "mean_wrong"))
     true = series.one(solution, "truly_wrong")
     assert first is not None

@@ -14,7 +14,7 @@ from robins.report.numbers import words
 from robins.report.style import Picture
 
 _COLUMNS = 3
-_DECADE = 8.0  # times the least error: from there on the colours are logarithmic
+_DECADE = 8.0  # ratio of greatest to least error from which the colours are logarithmic
 
 
 def two_keys(solution: xr.Dataset, block: str) -> bool:
@@ -28,7 +28,7 @@ def one_key(solution: xr.Dataset, block: str) -> bool:
 
 
 def _axis(solution: xr.Dataset, dim: str) -> tuple[np.ndarray, list[str], str]:
-    """Places along a parameter, what stands there, and its label; texts stand side by side."""
+    """Positions along a parameter axis, tick labels, and axis label; texts are evenly spaced."""
     about = solution[dim].attrs
     unit = about.get("units", "1")
     label = about["long_name"] + ("" if unit == "1" else f" [{unit}]")
@@ -44,7 +44,7 @@ def _unit(block: str, unit: str) -> str:
 
 @style.styled
 def curves(solution: xr.Dataset, block: str) -> Picture:
-    """RMS error of each filter over a parameter, within 95 % bounds, and what it states."""
+    """RMS error of each filter over a parameter, with 95 % bounds, and its stated sigma."""
     arrays = (series.one(solution, f"sweep_{k}", block) for k in ("rms", "low", "high", "stated"))
     (rms, unit), (low, _), (high, _), (stated, _) = (
         series.shown(one) for one in arrays if one is not None
@@ -82,7 +82,7 @@ def curves(solution: xr.Dataset, block: str) -> Picture:
 
 @style.styled
 def maps(solution: xr.Dataset, block: str) -> Picture:
-    """RMS error of each filter over two parameters; the number stands in each field."""
+    """RMS error of each filter over two parameters, printed in each cell."""
     array = series.one(solution, "sweep_rms", block)
     assert array is not None
     rms, unit = series.shown(array)
@@ -126,7 +126,7 @@ def maps(solution: xr.Dataset, block: str) -> Picture:
             axes.tick_params(labelbottom=True)
     if image is not None:
         bar = figure.colorbar(image, ax=grid, label=_unit(block, unit), shrink=0.9, pad=0.02)
-        if wide:  # else the numbers between powers of ten are written as products
+        if wide:  # otherwise labels between powers of ten are written as products
             ticks = np.geomspace(low, high, 5).tolist()
             bar.set_ticks(ticks, labels=[f"{x:.3g}" for x in ticks])
             bar.minorticks_off()

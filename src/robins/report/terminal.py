@@ -16,9 +16,9 @@ _COLOURS = {"reproduced": "green", "partly": "yellow", "not": "red", "undecided"
 
 
 def table(summary: Mapping[str, Any], width: int = 100) -> Group:
-    """Metrics by filter, claims with verdicts and refused samples, as something rich can print.
+    """Metrics by filter, claims with verdicts and refused samples, as a rich renderable.
 
-    Filters that do not fit side by side into so many columns come in tables of their own.
+    Filters that do not fit side by side into ``width`` columns are shown in further tables.
     """
     parts: list[Any] = []
     filters = summary["filters"]
@@ -58,7 +58,7 @@ def table(summary: Mapping[str, Any], width: int = 100) -> Group:
 
 
 def _groups(cells: Mapping[str, Sequence[str]], room: int) -> list[list[str]]:
-    """Filters whose columns fit into the room, one at least in each group."""
+    """Groups of filters whose columns fit into the width, at least one in each group."""
     groups: list[list[str]] = []
     left = 0
     for name, column in cells.items():

@@ -1,4 +1,4 @@
-"""Figures of tuning: factors with their intervals, and the parts held out before and after."""
+"""Figures of tuning: factors with their intervals, and objectives of the held-out parts."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Innovations in their three-sigma bounds, and consistency statistics in their bands.
 
-The bands are those in which the statistics lie if a filter knows its own accuracy.
+The bands are those of the statistics of a consistent filter.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ def inside(values: np.ndarray, limits: Band) -> np.ndarray:
     return np.where(count > 0, hits.sum(axis=1) / np.maximum(count, 1), np.nan)
 
 
-_FAR = 10.0  # an innovation this much larger than most bends the axis
-_STEEP = 15.0  # a statistic this far above its band is shown on a logarithmic axis
+_FAR = 10.0  # ratio of an innovation to most others from which the axis is compressed
+_STEEP = 15.0  # ratio of a statistic to its band from which the axis is logarithmic
 
 
 @style.styled
@@ -135,14 +135,14 @@ def _refused(solution: xr.Dataset, sensor: str, shape: tuple[int, int]) -> np.nd
 
 
 def _compress(axes: Axes, values: list[np.ndarray]) -> None:
-    """Bend the scale if a few updates, those after an outage or gross errors, are far larger."""
+    """Compress the scale if a few updates, after an outage or gross errors, are far larger."""
     known = np.concatenate([v[np.isfinite(v)] for v in values]) if values else np.zeros(0)
     if known.size == 0:
         return
     usual, most = np.percentile(known, 90.0), known.max()
     if usual > 0.0 and most > _FAR * usual:
         near, far = _round_up(1.3 * usual), _round_up(most)
-        # Near zero, where nearly all of them are, gets about two thirds of the height.
+        # The range near zero, with nearly all of them, gets about two thirds of the height.
         axes.set_yscale("symlog", linthresh=near, linscale=2.0 * np.log10(far / near))
         ticks = [-far, -near, 0.0, near, far]
         axes.set_yticks(ticks, [f"{tick:g}".replace("-", "−") for tick in ticks])
@@ -181,16 +181,16 @@ def _points(axes: Axes, x: np.ndarray, y: np.ndarray, i: int) -> None:
 
 
 def _is_smooth(array: xr.DataArray) -> bool:
-    """The mean of many runs is a line; one run is a cloud."""
+    """True for the mean of many runs, drawn as a line; one run is drawn as points."""
     return array.attrs.get("runs", 1) > 1
 
 
 def _statistic(
     axes: Axes, array: xr.DataArray, limits: Band | None, filters: list[str], clock: series.TimeUnit
 ) -> str:
-    """Draw a statistic of each filter over its band; return how much of it lies inside."""
+    """Draw a statistic of each filter over its band; return the share inside."""
     values, x = np.asarray(array, float), series.x_of(array, 1) / clock.seconds
-    if limits is not None:  # without a degree of freedom nothing was used, and zero has no meaning
+    if limits is not None:  # no degrees of freedom: nothing was used, and a zero is meaningless
         values = np.where(np.isfinite(limits.high), values, np.nan)
     joined = _is_smooth(array)
     for i in range(len(filters)):

@@ -1,20 +1,20 @@
 """Simulation: motions over the Earth and the outputs of sensors along them.
 
-- `trajectory`: smooth motions from waypoints, velocity or a sine; that of another point.
+- `trajectory`: smooth motions from waypoints, velocities or a sine; motion of a lever-arm point.
 - `commands`: smooth motions from manoeuvres (import the manoeuvres by their module).
-- `flexure`: structure that swings and bends between two inertial units.
-- `manoeuvres`: smooth motions of an aircraft that banks, a ship in the sea, a rough road.
+- `flexure`: vibration and bending of the structure between two inertial units.
+- `manoeuvres`: smooth motions of a banking aircraft, a ship in waves, a vehicle on a rough road.
 - `disturbance`: heavy tails, outliers, steps of noise and drift (import it by its name).
 - `ideal_imu`: an IMU without errors, and the inversion of the mechanisation.
 - `imu_sensor`, `gnss_sensor`: an IMU and a receiver with errors.
 - `wind`: gusts, and a vehicle carried by them; Dryden and von Karman spectra.
 - `air_data`, `sar`: sensors of an airship.
 - `ballistic`, `free_body`: a rocket after burnout, its trajectory and its attitude.
-- `gyro`, `magnetometer`: its sensors.
+- `gyro`, `magnetometer`: the rocket's sensors.
 - `spacecraft`, `orbit`: a rigid body with wheels and magnetorquers, and its environment.
 - `attitude_reference`, `attitude_control`: target attitude, and the control law that tracks it.
-- `rate_table`: a table that turns a gyro on the ground.
-- `star_sensor`, also `gyro`: sensors of a spacecraft that turns as commanded.
+- `rate_table`: a three-axis rate table that turns a gyro on the ground.
+- `star_sensor`, also `gyro`: sensors of a spacecraft under attitude control.
 - `random`: streams of random numbers by seed, run and component; Gauss-Markov processes.
 """
 

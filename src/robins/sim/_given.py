@@ -1,4 +1,4 @@
-"""Checks of the inputs of a simulated sensor, as far as known before the run is compiled."""
+"""Checks of a simulated sensor's inputs, where their values are known before compilation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Listed = Number | Sequence[Number] | Sequence[Sequence[Number]]  # an array, or 
 
 
 def known(*values: PyTree) -> bool:
-    """True if these are numbers by now, and not placeholders of `jit`, `vmap` or `grad`."""
+    """True if all are concrete numbers, not tracers of `jit`, `vmap` or `grad`."""
     return not any(isinstance(x, Tracer) for x in jax.tree_util.tree_leaves(values))
 
 
@@ -33,15 +33,15 @@ def number(
     above: bool = False,
     endless: bool = False,
 ) -> None:
-    """Refuse what is not a number, or an array of numbers, from low to high.
+    """Refuse anything but a number, or an array of numbers, from low to high.
 
     Args:
-        name: for the message.
-        value: a traced one passes, for it has no value yet.
-        low: the least value.
-        high: the greatest.
-        above: low itself is refused too.
-        endless: infinity is a value.
+        name: of the argument, for the message.
+        value: the number or array; a traced one passes, for it has no value yet.
+        low: least value.
+        high: greatest value.
+        above: refuse low itself too.
+        endless: accept infinity.
 
     Raises:
         ValueError: the value is out of its range or not a number.
@@ -61,7 +61,7 @@ def vector(name: str, value: Listed, width: int, **bounds: Any) -> jax.Array:
     """A number or ``width`` of them, checked as `number` does, as a vector.
 
     Raises:
-        ValueError: another shape, or a value out of its range.
+        ValueError: the shape is wrong, or a value is out of range.
     """
     x = jnp.asarray(value, float)
     if x.shape not in ((), (width,)):
@@ -74,17 +74,17 @@ def count_of(name: str, value: int) -> int:
     """A number of samples, at least one.
 
     Raises:
-        ValueError: fewer.
+        ValueError: it is less than one.
     """
     require(value >= 1, f"{name} is {value}; at least one is wanted")
     return value
 
 
 def rows(name: str, value: Listed, *shape: int) -> jax.Array:
-    """An array of the shape that the other arguments call for.
+    """An array of the shape that the other arguments imply.
 
     Raises:
-        ValueError: another shape.
+        ValueError: the shape is another.
     """
     x = jnp.asarray(value, float)
     require(x.shape == shape, f"{name} must have shape {shape}", x.shape)
@@ -95,7 +95,7 @@ def unit_quaternion(name: str, value: Listed) -> jax.Array:
     """A quaternion (4,) of unit length to 1e-3, normalised.
 
     Raises:
-        ValueError: it is not.
+        ValueError: the shape or the length is wrong.
     """
     q = rows(name, value, 4)
     number(f"{name} must be a unit quaternion: its length", jnp.sqrt(q @ q), 0.999, 1.001)
@@ -103,7 +103,7 @@ def unit_quaternion(name: str, value: Listed) -> jax.Array:
 
 
 def presence(present: Listed) -> jax.Array:
-    """Presence of a sample at each epoch, (E,) bool.
+    """Check the (E,) bool mask of the epochs at which there is a sample.
 
     Raises:
         ValueError: not a list, or an empty one.

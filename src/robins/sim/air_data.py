@@ -1,8 +1,8 @@
-"""Air data: velocity through the air along three axes, the error of what is taken for the wind, and
-barometric height with white noise and a bias that is constant or drifts slowly.
+"""Air data: velocity through the air along three axes, the error of a wind estimate, and barometric
+height with white noise and a bias that is constant or drifts slowly.
 
-Velocity and wind are drawn with unit deviation and scaled, so another sigma leaves the numbers as
-they were, and from streams of their own, so both may have the same key.
+Velocity and wind are drawn with unit deviation and then scaled, so another sigma draws the same
+numbers; each has its own stream, so both may have the same key.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def observe_air(
         key: of the run, `Component.AIR_DATA` of `robins.sim.random.stream`.
         v_air_b: (E, 3) true velocity through the air, body axes.
         sigma_m_s: standard deviation, a number or one for each axis.
-        present: (E,) bool, whether there is a sample; NaN where not.
+        present: (E,) bool, True where there is a sample; NaN elsewhere.
 
     Raises:
         ValueError: shapes that do not fit together, or a negative sigma.
@@ -47,15 +47,15 @@ def observe_air(
 def wind_estimate_error(
     key: Array, count: int, step_s: Number, sigma_m_s: _given.Listed, tau_s: _given.Listed
 ) -> Float[Array, "{count} 2"]:
-    """Error of an estimate of the wind, true less estimated or the reverse, for it has no sign.
+    """Error of a wind estimate (E, 2) [m/s], symmetric, so of either sign convention.
 
     A first-order Gauss-Markov process on each of north and east, in its steady state from the first
     sample on and exact at any step.
 
     Args:
         key: of the run, `Component.AIR_DATA` of `robins.sim.random.stream`.
-        count: samples, at 0, step, 2 step ...
-        step_s: between samples.
+        count: E, samples at 0, step, 2 step ...
+        step_s: time between samples [s].
         sigma_m_s: standard deviation, a number or (2,).
         tau_s: correlation time; infinity: constant over the run.
 
@@ -88,7 +88,7 @@ def observe_height(
         key: of the run, `Component.BAROMETER` of `robins.sim.random.stream`.
         height_m: (E,) true height.
         sigma_m: standard deviation of the white noise.
-        present: (E,) bool, whether there is a sample; NaN where not.
+        present: (E,) bool, True where there is a sample; NaN elsewhere.
         bias_sigma_m: standard deviation of the bias.
         bias_tau_s: its correlation time; infinity: constant over the run.
         step_s: between epochs; needed where the bias is not constant.
@@ -106,7 +106,7 @@ def observe_height(
     if step_s is None:
         if not (_given.known(bias_tau_s) and math.isinf(bias_tau_s)):
             raise ValueError(f"bias_tau_s = {bias_tau_s} wants step_s, the time between epochs")
-        step_s = 1.0  # of no consequence to a constant
+        step_s = 1.0  # not used by a constant bias
     white = jax.random.normal(jax.random.fold_in(key, _WHITE), (count,))
     bias = gauss_markov(jax.random.fold_in(key, _BIAS), count, 1, step_s, bias_tau_s)[:, 0]
     measured = height + sigma_m * white + bias_sigma_m * bias

@@ -1,18 +1,18 @@
-"""Attitude control by wheels, and the unloading of their momentum by magnetorquers.
+"""Attitude control by reaction wheels, and their desaturation by magnetorquers.
 
 The control law is quaternion feedback with the known torques fed forward (Wie 2008, "Space Vehicle
 Dynamics and Control", sec. 7.3). With theta_e the rotation vector of q_ref^-1 q, and w_e the rate
-against the reference,
+relative to the reference,
 
     u = J (alpha_r - wn^2 theta_e - 2 zeta wn w_e) + w x (J w + W h),
 
-everything in body axes, where alpha_r is the derivative of the reference's rate as the body sees
-it. If all of it is known, an error about one axis obeys theta'' + 2 zeta wn theta' + wn^2 theta = 0
+everything in body axes, where alpha_r is the derivative of the reference's rate taken in body axes.
+With exact knowledge, an error about one axis obeys theta'' + 2 zeta wn theta' + wn^2 theta = 0
 exactly, however the reference moves.
 
-The wheels give what is left after the magnetorquers, ``tau = pinv(W) (u - m x B)``, the least in
-norm; the magnetorquers are given ``m = k (h x B)/B^2``, whose torque is -k times the part of the
-wheels' momentum h across the field (Wertz 1978, sec. 19.3): the wheels pass h to the Earth.
+The wheels supply the torque that the magnetorquers do not, ``tau = pinv(W) (u - m x B)``, of least
+norm; the magnetorquers' command is ``m = k (h x B)/B^2``, whose torque is -k times the component of
+the wheels' momentum h across the field (Wertz 1978, sec. 19.3).
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from robins.linalg import scalars as u
 from robins.rotation import conjugate, multiply, rotate, to_rotvec
 from robins.sim import _given
 
-_ENOUGH = 1e-6  # determinant of W W' of unit axes that span space
+_ENOUGH = 1e-6  # least determinant of W W' for unit axes that span space
 
 
 class Controller(NamedTuple):
-    """Plant model and gains of the controller; `controller` makes one of checked numbers."""
+    """Plant model and gains of the controller; made and checked by `controller`."""
 
     inertia_b: Any  # (3, 3) kg m2
     wn: Any  # rad/s, natural frequency of the attitude loop
@@ -44,7 +44,7 @@ class Controller(NamedTuple):
 def controller(
     inertia_b: _given.Listed, wn: float = 0.12, zeta: float = 0.9, desaturation_k: float = 2e-3
 ) -> Controller:
-    """A controller of checked numbers.
+    """Make a `Controller` after checking its numbers.
 
     Raises:
         ValueError: an inertia that is not of shape (3, 3) and finite, or a gain that is negative.
@@ -67,19 +67,19 @@ def torque(
     alpha_ref_b: Float[Array, "3"],
     wheel_momentum_b: Float[Array, "3"],
 ) -> Float[Array, "3"]:
-    """The torque [N m] wanted on the body, body axes.
+    """Commanded torque on the body [N m], body axes.
 
     Args:
         controller: gains and inertia.
         q_est: estimated attitude, body to inertial.
         omega_est_b: estimated omega_ib_b [rad/s].
-        q_ref: wanted attitude.
-        omega_ref_b: wanted rate, in the wanted body axes.
-        alpha_ref_b: its derivative, in the wanted body axes.
+        q_ref: reference attitude, body to inertial.
+        omega_ref_b: reference rate [rad/s], in the reference body axes.
+        alpha_ref_b: its derivative [rad/s^2], in the reference body axes.
         wheel_momentum_b: W h, from the speeds of the wheels [N m s].
     """
     J, wn = controller.inertia_b, controller.wn
-    error = multiply(conjugate(q_ref), q_est)  # from the body axes to the wanted ones
+    error = multiply(conjugate(q_ref), q_est)  # from the body axes to those of the reference
     back = conjugate(error)
     omega_ref = rotate(back, omega_ref_b)
     omega_error = omega_est_b - omega_ref
@@ -90,7 +90,7 @@ def torque(
 
 
 def allocate(pinv: Float[Array, "w 3"], torque_b: Float[Array, "3"]) -> Float[Array, "w"]:
-    """Torques of the wheels [N m] that make up ``torque_b``, what the magnetorquers leave."""
+    """Wheel torques [N m] that sum to ``torque_b``, the torque not given by magnetorquers."""
     return _times(pinv, torque_b)
 
 
@@ -101,17 +101,17 @@ def allocate_within(
     wheel_h: Float[Array, "w"],
     momentum_limit: Float[Array, "w"],
 ) -> Float[Array, "w"]:
-    """`allocate`, where the other wheels take over from a wheel that is full.
+    """`allocate`, with the share of saturated wheels redistributed to the others.
 
-    So long as they give torque about three axes; if not, the plain allocation stands, and what a
-    full wheel cannot give is missing.
+    If the others do not span three axes, the plain allocation stands, and the torque of the
+    saturated wheel is missing.
 
     Args:
         wheel_axes_b: (3, W) unit columns.
         pinv: (W, 3) of `allocation_matrix`; a wheel with a row of zeros is not used.
-        torque_b: torque wanted on the body [N m].
+        torque_b: commanded torque on the body [N m].
         wheel_h: (W,) momenta of the wheels along their axes [N m s].
-        momentum_limit: (W,) most of it, either way.
+        momentum_limit: (W,) greatest momentum, either way [N m s].
     """
     plain = allocate(pinv, torque_b)
     full = jnp.abs(wheel_h) >= momentum_limit * (1.0 - 1e-9)
@@ -132,14 +132,14 @@ def allocate_within(
 
 
 def allocation_matrix(wheel_axes_b: _given.Listed, works: _given.Listed = 1.0) -> np.ndarray:
-    """The matrix (W, 3) that shares a torque among the wheels that work, least in norm.
+    """Least-norm allocation matrix (W, 3) of a body torque to the wheels that work.
 
     Args:
         wheel_axes_b: (3, W) unit columns.
-        works: (W,) 1, or 0 for a wheel that is lost and is given nothing.
+        works: (W,) 1, or 0 for a failed wheel, which is given no torque.
 
     Raises:
-        ValueError: what works does not turn the body about three independent axes.
+        ValueError: the working wheels do not span three independent axes.
     """
     axes = np.asarray(wheel_axes_b, float)
     if axes.ndim != 2 or axes.shape[0] != 3:
@@ -153,7 +153,7 @@ def allocation_matrix(wheel_axes_b: _given.Listed, works: _given.Listed = 1.0) -
             f"wheels {working} of {axes.shape[1]} give torque about {rank} independent axes, and "
             "three are needed: a body with fewer cannot be held by wheels alone"
         )
-    return np.linalg.pinv(left) * there[:, None]  # exactly nothing for a lost wheel
+    return np.linalg.pinv(left) * there[:, None]  # exactly zero for a failed wheel
 
 
 def desaturation_dipole(
@@ -162,16 +162,16 @@ def desaturation_dipole(
     field_b_t: Float[Array, "3"],
     limit_a_m2: Float[Array, "3"],
 ) -> Float[Array, "3"]:
-    """Dipole [A m2] whose torque takes from the wheels their momentum across the field.
+    """Dipole [A m2], body axes, whose torque removes the wheels' momentum across the field.
 
-    Past a limit all of it is scaled, so that the torque stays opposite to the momentum. None in no
-    field.
+    Beyond a limit the whole vector is scaled, so that the torque stays opposite to the momentum.
+    Zero where there is no field.
 
     Args:
-        k: rate of the unloading [1/s].
+        k: desaturation gain [1/s].
         momentum_b: W h, momentum of the wheels in body axes [N m s].
-        field_b_t: magnetic field in body axes.
-        limit_a_m2: most dipole of each axis.
+        field_b_t: magnetic field [T], body axes.
+        limit_a_m2: (3,) greatest dipole of each axis [A m2].
     """
     size = jnp.sum(field_b_t * field_b_t)
     there = size > 0.0

@@ -25,15 +25,15 @@ from robins.sim.orbit import OrbitStates
 
 
 class Reference(NamedTuple):
-    """The attitude wanted at each epoch."""
+    """Reference attitude, rate and angular acceleration at each epoch."""
 
-    q_ib: Any  # (E, 4) wanted body to inertial, scalar first, without jumps of sign
-    omega_b: Any  # (E, 3) rate against inertial [rad/s], in the wanted body axes
-    alpha_b: Any  # (E, 3) its derivative [rad/s^2], in the wanted body axes
+    q_ib: Any  # (E, 4) reference body to inertial, scalar first, without jumps of sign
+    omega_b: Any  # (E, 3) rate relative to inertial [rad/s], in the reference body axes
+    alpha_b: Any  # (E, 3) its derivative [rad/s^2], in the reference body axes
 
 
 def nadir(orbit: OrbitStates) -> Reference:
-    """Towards the Earth's centre: x forward, y against the orbit's normal, z down.
+    """Nadir-pointing reference: x forward, y against the orbit normal, z to the Earth's centre.
 
     The rate is that of any two-body orbit, -|r x v|/r^2 about y.
     """
@@ -57,7 +57,7 @@ def _nadir(r, v) -> Reference:
 
 
 def inertial(q_ib: _given.Listed, time_s: Numbers) -> Reference:
-    """One attitude at all times.
+    """Inertially fixed reference: one attitude at all times.
 
     Raises:
         ValueError: not a unit quaternion.
@@ -82,15 +82,15 @@ def slews(
     the polynomial 10 s^3 - 15 s^4 + 6 s^5, s = t/fade_in up to 1.
 
     Args:
-        base: what they are on top of.
+        base: reference to which the turns are added.
         amplitude_rad: (3,) or one number.
         period_s: (3,) or one number, positive.
         time_s: (E,) times of the epochs of the base.
         phase_rad: (3,) or one number.
-        fade_in_s: how long they take to grow; 0: they are there at once, with their rates.
+        fade_in_s: duration of the fade-in; 0: full amplitude and rate from the first epoch.
 
     Raises:
-        ValueError: a number out of its range, or times that do not fit the base.
+        ValueError: a number is out of range, or the times do not fit the base.
     """
     amplitude = _given.vector("amplitude_rad", amplitude_rad, 3)
     period = _given.vector("period_s", period_s, 3, low=0.0, above=True)
@@ -117,9 +117,9 @@ def _slewing(base: Reference, amplitude, period, time, phase, fade_in_s: float) 
 
 
 PEAK_RATE = 15.0 / 8.0
-"""Greatest rate of a rest-to-rest turn, times its length, over its angle; half-way."""
+"""Peak rate of a rest-to-rest turn, at half-way, times its duration, over its angle."""
 PEAK_ACCELERATION = 10.0 / 3.0**0.5
-"""Greatest acceleration of it, times its length squared, over its angle."""
+"""Its peak acceleration times its duration squared, over its angle."""
 
 
 @jax.jit
@@ -130,20 +130,20 @@ def handover_reference(
     length_s: Number,
     time_s: Array,
 ) -> Reference:
-    """Reference with the way to it from another: a turn about one axis, from rest to rest.
+    """Reference with the transition to it from another: a turn about one axis, rest to rest.
 
-    The turn dies away by 1 - s, s the polynomial 10 x^3 - 15 x^4 + 6 x^5, x = t/length (an
+    The turn decays by 1 - s, s the polynomial 10 x^3 - 15 x^4 + 6 x^5, x = t/length (an
     eigenaxis slew, Wie 2008, sec. 7.3, by the quintic of Craig 2005, "Introduction to Robotics",
-    sec. 7.3). The rate at the beginning goes on as a second turn, about the axis of that
-    rate, by length (x - 6 x^3 + 8 x^4 - 3 x^5), whose rate begins with 1 and which ends with
-    nothing. So attitude and rate go on without a jump, and from the end on the base is left.
+    sec. 7.3). The initial relative rate is absorbed by a second turn about its axis, by
+    length (x - 6 x^3 + 8 x^4 - 3 x^5) times the rate, whose slope is 1 at the start and which is
+    zero at the end. So attitude and rate are continuous, and after the transition the base is left.
 
     Args:
-        base: the reference to come to, E epochs.
+        base: the reference to reach, E epochs.
         turn_rad: (3,) rotation vector from it to the other one, at time 0.
-        rate_rad_s: (3,) rate of the other one against it then, in the axes of the other one.
-        length_s: of the way; above 0.
-        time_s: (E,) since its beginning.
+        rate_rad_s: (3,) rate of the other one relative to it then, in the axes of the other one.
+        length_s: duration of the transition [s], positive.
+        time_s: (E,) time since its beginning [s].
     """
     t = time_s[:, None]
     s, s1, s2 = _from_rest_to_rest(t, length_s)
@@ -163,7 +163,7 @@ def _fade_in(t: Array, length_s: float) -> tuple[Number, Number, Number]:
 
 
 def _from_rest_to_rest(t: Array, length_s: Number) -> tuple[Array, Array, Array]:
-    """Rise from 0 to 1 within a length of time, with two derivatives that are 0 at both ends."""
+    """Rise from 0 to 1 over a duration, its first two derivatives 0 at both ends."""
     x = jnp.clip(t / length_s, 0.0, 1.0)
     return (
         x**3 * (10.0 - 15.0 * x + 6.0 * x**2),
@@ -185,7 +185,7 @@ def _turned(base: Reference, angle: Array, rate: Array, acceleration: Array) -> 
 
 
 def _without_jumps(q: Float[Array, "epochs 4"]) -> Float[Array, "epochs 4"]:
-    """Each quaternion of the sign that is nearer to the one before."""
+    """Quaternions with the signs that keep each one closest to its predecessor."""
     jumps: Bool[Array, " steps"] = jnp.sum(q[1:] * q[:-1], -1) < 0.0
     sign = jnp.cumprod(jnp.where(jumps, -1.0, 1.0))
     return jnp.concatenate([q[:1], sign[:, None] * q[1:]])

@@ -1,11 +1,11 @@
-"""Free flight above the air: a Kepler orbit that leaves a place of the Earth and comes down again.
+"""Free flight above the atmosphere: a Kepler orbit from a launch site back to the Earth.
 
 Only the central attraction acts. The oblateness of the Earth, left out, shifts a flight of ten
 minutes by some kilometres, which turns the geomagnetic field by hundredths of a degree.
 
 Frames: i is inertial, its axes are those of the Earth-fixed frame at t = 0; "launch" is the
-north-east-down frame of the place of launch as it stood at t = 0, so inertial too; "local" is
-north, east, down at the place that the Earth has below the vehicle at t.
+north-east-down frame of the launch site as it stood at t = 0, so inertial too; "local" is
+north, east, down at the point of the rotating Earth below the vehicle at t.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from robins.earth.wgs84 import GM, OMEGA_E, dcm_en, ecef_from_geodetic, geodetic
 from robins.rotation import conjugate, from_dcm, from_rotvec, multiply, normalise, rotate
 from robins.sim import _given
 
-_ROUNDS = 30  # of the solution of Kepler's equation, each at least a bisection in effect
+_ROUNDS = 30  # iterations of Kepler's equation, each at least as good as a bisection
 
 
 class BallisticPath(NamedTuple):
@@ -32,7 +32,7 @@ class BallisticPath(NamedTuple):
     r_i_m: Any  # (E, 3) m, inertial
     v_i_m_s: Any  # (E, 3) m/s, inertial
     lat_rad: Any  # (E,) geodetic latitude
-    lon_rad: Any  # (E,) longitude over the Earth, that has turned meanwhile, in [-pi, pi]
+    lon_rad: Any  # (E,) longitude on the rotating Earth, in [-pi, pi]
     alt_m: Any  # (E,) m above the ellipsoid
     q_local: Any  # (E, 4) q_{launch<-local}: local north-east-down to launch north-east-down
 
@@ -46,7 +46,7 @@ def ballistic(
     azimuth_rad: _given.Listed,
     time_s: _given.Listed,
 ) -> BallisticPath:
-    """Fly freely from a place with a velocity that is given relative to inertial space.
+    """Ballistic flight from a launch site with a given inertial velocity.
 
     Lagrange's coefficients of the change of eccentric anomaly, which solves Kepler's equation in
     the form that begins at any point of the orbit (Battin 1999, section 4.3); a vertical flight is
@@ -63,8 +63,8 @@ def ballistic(
         time_s: (E,) s since launch.
 
     Raises:
-        ValueError: a number out of range, a speed that leaves the Earth for ever, a time before
-            the launch, or one after the vehicle has fallen back to the radius of the launch.
+        ValueError: a number out of range, a speed at or above escape speed, a time before the
+            launch, or one after the vehicle has fallen back to the radius of the launch.
     """
     time = jnp.asarray(time_s, float)
     if time.ndim != 1 or len(time) < 1:
@@ -86,7 +86,7 @@ def ballistic(
 
 @jax.jit
 def _path(lat, lon, alt, speed, elevation, azimuth, time) -> tuple[BallisticPath, Array, Array]:
-    """The flight, and inertial position and velocity it begins with."""
+    """The flight, and its initial inertial position [m] and velocity [m/s]."""
     c_il = dcm_en(lat, lon)
     r0 = ecef_from_geodetic(lat, lon, alt)
     v0 = c_il @ _velocity(speed, elevation, azimuth)
@@ -100,7 +100,7 @@ def _path(lat, lon, alt, speed, elevation, azimuth, time) -> tuple[BallisticPath
 
 
 def _velocity(speed, elevation, azimuth) -> Float[Array, "3"]:
-    """North, east, down [m/s]."""
+    """Velocity of a speed, elevation and azimuth: north, east, down [m/s]."""
     level = speed * jnp.cos(elevation)
     rest = (level * jnp.cos(azimuth), level * jnp.sin(azimuth), -speed * jnp.sin(elevation))
     return jnp.stack(rest)
@@ -114,13 +114,13 @@ def _orbit(r0: Float[Array, "3"], v0: Float[Array, "3"]) -> tuple[Array, Array, 
 
 
 def _fly(r0, v0, time):
-    """Inertial position and velocity at the times, (E, 3) each."""
+    """Inertial position [m] and velocity [m/s] at the times, (E, 3) each."""
     r_start, a, e_sin = _orbit(r0, v0)
     e_cos = 1.0 - r_start / a
     mean = jnp.sqrt(GM / a**3) * time
 
     # While the vehicle is above the radius of the launch the mean anomaly grows with the eccentric
-    # one at a slope from r0/a to 1 + e, which encloses the root; Newton's step is held in there.
+    # one at a slope from r0/a to 1 + e, which brackets the root; Newton's step is clipped to it.
     least = mean / (1.0 + jnp.sqrt(e_cos**2 + e_sin**2))
     most = mean * a / r_start
 

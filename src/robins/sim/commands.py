@@ -26,7 +26,7 @@ _STILL = 0.5  # m/s; a height is not changed below this ground speed
 
 
 class Manoeuvre(NamedTuple):
-    """One manoeuvre: what has changed by its end, and a wave on top."""
+    """One manoeuvre: the changes reached at its end, and a wave on top."""
 
     duration_s: float
     speed_mps: float | None = None  # ground speed at the end; None: as before
@@ -91,15 +91,15 @@ def from_commands(
     vehicle: Vehicle = "ground",
     knots_hz: float = 20.0,
 ) -> MotionProfile:
-    """The motion that follows commands, from a place, heading and ground speed.
+    """Motion that follows commands from an initial position, heading and ground speed.
 
     Args:
-        start: where.
-        commands: what, in order.
-        heading_rad: at the start, clockwise from north.
-        speed_mps: over the ground, at the start.
-        vehicle: who moves.
-        knots_hz: of the splines; ten a period of the fastest wave are enough.
+        start: initial position.
+        commands: the manoeuvres, in order.
+        heading_rad: initial heading, clockwise from north.
+        speed_mps: initial ground speed.
+        vehicle: kind of vehicle; an aircraft banks.
+        knots_hz: knot rate of the splines; ten a period of the fastest wave are enough.
 
     Raises:
         ValueError: a duration or period that is not positive, a negative speed, a change of height
@@ -115,7 +115,7 @@ def from_commands(
     total = float(sum(c.duration_s for c in commands))
     t = np.linspace(0.0, total, max(int(np.ceil(total * knots_hz)), 8) + 1)
     speed, heading = np.full_like(t, speed_mps), np.full_like(t, heading_rad)
-    rate = np.zeros_like(t)  # of height
+    rate = np.zeros_like(t)  # vertical rate [m/s]
     begin, before = 0.0, speed_mps
     for k, c in enumerate(commands):
         done, done_rate = _ramp((t - begin) / c.duration_s, c.ease)
@@ -152,7 +152,7 @@ def _ramp(u, ease):
     risen = area(rise) + np.maximum(u - ease, 0.0)
     fallen = area(fall) + np.maximum(u - 1.0, 0.0)
     top = 1.0 / (1.0 - ease)
-    # Rounding must not overshoot: a speed of -1e-15 m/s points backwards.
+    # Rounding must not overshoot: a speed of -1e-15 m/s would reverse the heading.
     return np.clip(top * (risen - fallen), 0.0, 1.0), top * (_smooth(rise) - _smooth(fall))
 
 

@@ -42,7 +42,7 @@ def student_t(key: Array, shape: Sequence[int], dof: float) -> Float[Array, "...
     """Student-t noise scaled to unit standard deviation.
 
     Raises:
-        ValueError: no more than two degrees of freedom, where there is no variance.
+        ValueError: two degrees of freedom or fewer, for which the variance is infinite.
     """
     require(dof > 2.0, f"dof is {dof}; Student's t has a variance only above 2")
     return jax.random.t(key, float(dof), tuple(shape)) * (1.0 - 2.0 / dof) ** 0.5
@@ -62,10 +62,10 @@ def drift_step(
     """A bias that appears at a time: its value at the end of each interval, and its integral.
 
     Args:
-        begin_s: start of each interval.
-        dt_s: its length.
-        at_s: when the bias appears; it is there at that instant.
-        size: of the bias.
+        begin_s: (n,) start of each interval [s].
+        dt_s: (n,) its length [s].
+        at_s: time from which the bias acts, that instant included [s].
+        size: (3,) the bias.
     """
     end = begin_s + dt_s
     present = jnp.where(end >= at_s, 1.0, 0.0)

@@ -1,16 +1,16 @@
-"""Structure between two inertial units: a wing that swings, and bends under load.
+"""Flexure between two inertial units: a wing that vibrates, and bends under load.
 
-Three small angles lambda of the slave's seat against the master's. Each axis swings by itself as a
-damped oscillator driven by noise (second-order Gauss-Markov),
+Three small angles lambda of the slave's mounting relative to the master's. Each axis is an
+independent damped oscillator driven by noise (second-order Gauss-Markov),
 
     l'' + 2 zeta wn l' + wn^2 l = q,      wn = 2.146 / tau
 
 the model of transfer alignment since Kain & Cloutier (1989), there with zeta = 1, where its
 correlation falls to 1/e at tau. Its stationary covariance is sigma^2 diag(1, wn^2) for every zeta.
-Bending is quasi-static: so many radians for each g of load above the one of level flight.
+Bending is quasi-static: radians per g of load factor above one, that of level flight.
 
-An angle that is white from sample to sample (flutter too fast to follow) has no rate a gyro could
-feel; it belongs to the noise of the attitude that is compared, not here.
+An angle that is white from sample to sample (flutter above the sampling rate) has no rate that a
+gyro could sense; it belongs in the noise of the attitude matching, not here.
 """
 
 from __future__ import annotations
@@ -70,10 +70,10 @@ def simulate_flexure(
 ) -> tuple[Array, Array]:
     """Angles and their rates at 0, dt, ... count dt; pure, for any number of runs under `vmap`.
 
-    The swing starts in its stationary state.
+    The vibration starts in its stationary state.
 
     Args:
-        model: of the structure.
+        model: the structure.
         key: of the run, from `robins.sim.random.stream`.
         dt_s: step [s].
         count: number of steps.
@@ -83,7 +83,7 @@ def simulate_flexure(
         (count + 1, 3) rad and (count + 1, 3) rad/s.
 
     Raises:
-        ValueError: a size, time or damping that cannot be, or a load factor of another length.
+        ValueError: no step, degrees of freedom of 2 or fewer, or a load factor of another length.
     """
     _check(model, count, load_factor)
     sigma, tau, bending = (jnp.asarray(x, float) for x in (model[0], model[1], model[4]))

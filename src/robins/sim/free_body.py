@@ -5,10 +5,10 @@ omega_ib_b = (p, q, r) obey
 
     p' = -e2 p,    q' = e1 p r - e3 q,    r' = -e1 p q - e3 r,    each with white torque added,
 
-with e1 = 1 - Ix/It. In axes d that turn about x_b at -e1 p against the body, the coupling is gone:
-q and r only decay and diffuse there, and omega_id_d = (p Ix/It, q_d, r_d) is the angular momentum
-over It. So p with its integral, then q_d and r_d with theirs, are drawn from what they are jointly
-distributed as at the end of a step, whatever its length, and the attitude turns by
+with e1 = 1 - Ix/It. In axes d that turn about x_b at -e1 p relative to the body, the coupling
+vanishes: q and r only decay and diffuse there, and omega_id_d = (p Ix/It, q_d, r_d) is the angular
+momentum over It. So p with its integral, then q_d and r_d with theirs, are drawn from their joint
+distribution at the end of a step, whatever its length, and the attitude turns by
 
     exp(int omega_id_d dt) exp(x_b e1 int p dt).
 
@@ -44,8 +44,8 @@ def free_body(
     """Attitude and rates at 0, dt, 2 dt ...; pure JAX, so it maps over keys.
 
     The rates have their exact distribution at any step. So has the attitude without torque, but
-    for terms of the fifth order in dt that vanish with e2 - e3. Of the torque, the part of the
-    attitude that the ends of a step leave open is drawn to leading order, as a turn of
+    for terms of the fifth order in dt that vanish with e2 - e3. With torque, the attitude within a
+    step given the rates at both its ends is drawn to leading order, as a turn of
     ``torque_noise sqrt(dt^3/12)``. The normal numbers do not depend on step, body or torque.
 
     Args:
@@ -54,7 +54,7 @@ def free_body(
         q0_nb: (4,) attitude at 0, body to an inertial frame n, scalar first.
         omega0_b: (3,) rates at 0 [rad/s], body axes.
         dt_s: step [s].
-        steps: how many.
+        steps: number of steps.
         torque_noise: white torque over inertia, one sigma [rad/s/sqrt(s)], the same on each axis.
 
     Returns:
@@ -75,7 +75,7 @@ def free_body(
 
     rate = jnp.stack([e2, e3, e3])
     fade = jnp.exp(-rate * dt)
-    # The integral of a decaying process, its ends known, is its mean end times this times dt.
+    # Given both ends, the integral of a decaying process is their mean times this times dt.
     between = 2.0 * _mean_decay(rate * dt) / (1.0 + fade) * dt
     spread = noise * jnp.sqrt(dt * _mean_decay(2.0 * rate * dt))
     bridge = noise * jnp.sqrt(dt**3 / 12.0)
@@ -84,7 +84,7 @@ def free_body(
 
     def step(state, numbers):
         q, omega = state
-        # From here to the last line: components in axes d, that begin the step along the body's.
+        # From here to the last line: components in axes d, which start the step along the body's.
         end = fade * omega + spread * numbers[0]
         turned = between * 0.5 * (omega + end) + bridge * numbers[1]
         swing = dt**2 / 12.0 * jnp.cross(inertia * omega, inertia * end)
@@ -107,16 +107,16 @@ def coning_start(
     body: FreeBody,
     phase_rad: Number = 0.0,
 ) -> tuple[Float[Array, "4"], Float[Array, "3"]]:
-    """Attitude q_nb and rates of a body whose x axis goes round its angular momentum in a cone.
+    """Attitude q_nb and rates of a body whose x axis cones about its angular momentum.
 
     Args:
         spin_rad_s: p, the rate about x_b [rad/s].
         cone_half_angle_rad: between x_b and the angular momentum.
         momentum_elevation_rad: of the angular momentum above the horizon.
         momentum_azimuth_rad: of the angular momentum, clockwise from north.
-        body: its coefficients, of which e1 counts.
-        phase_rad: how far x_b has gone round, clockwise seen along the angular momentum; at zero
-            it is at the top of the cone.
+        body: its coefficients; only e1 is used.
+        phase_rad: coning phase of x_b, clockwise seen along the angular momentum; zero at the
+            top of the cone.
 
     Raises:
         ValueError: a spin that is not positive, a cone of a right angle or more, or a number out

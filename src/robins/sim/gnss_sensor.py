@@ -6,7 +6,7 @@ pure JAX (map over ``key`` for a batch of runs), `as_table` makes a `GnssTable` 
     times = fix_times(model, 0.0, 600.0)
     fixes = observe(model, key, times.valid_s, lat, lon, alt, v_n, q_nb, omega_ib_b)
 
-where the truth is that of the instants ``valid_s``. North-east-down and forward-right-down.
+where the truth is given at the instants ``valid_s``. North-east-down and forward-right-down.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from robins.ins.imu_errors import checked_pytree
 from robins.rotation import rotate
 from robins.sim import _given
 
-# What is drawn at a fix is part of the file format, as `robins.sim.random.Component` is.
+# The draws at a fix are part of the file format, as `robins.sim.random.Component` is.
 _NORMALS, _CHANCES = 0, 1  # streams folded into the key of the receiver
 
 
@@ -54,7 +54,7 @@ class _FixChance(IntEnum):
 @checked_pytree
 @dataclass(frozen=True, eq=False)
 class GnssErrorModel:
-    """Errors of a GNSS receiver; vectors are north, east, down, a number stands for all three.
+    """Errors of a GNSS receiver; vectors are north, east, down, or one number for all three.
 
     Raises:
         ValueError: a wrong shape, a value not finite, a negative sigma, a share beyond 0 to 1, a
@@ -65,14 +65,14 @@ class GnssErrorModel:
     sigma_v: Any = None  # (3,) m/s, white error of a velocity; None: the receiver gives none
     markov_sigma_m: Any = None  # (3,) m, slowly changing error of position (first-order Markov)
     markov_tau_s: Any = None  # (3,) s, its correlation time
-    stated_sigma_m: Any = None  # (3,) m, reported by the receiver; None: the truth, both parts
-    stated_sigma_v: Any = None  # (3,) m/s, reported of velocity; None: the truth
+    stated_sigma_m: Any = None  # (3,) m, reported; None: the true one, white and Markov
+    stated_sigma_v: Any = None  # (3,) m/s, reported for velocity; None: the true one
     lever_b_m: Any = None  # (3,) m, from IMU to antenna in body axes; None: no lever arm
     rate_hz: float = 1.0
     time_offset_s: float = 0.0  # time stamp less the instant the fix is true for
     latency_s: float = 0.0  # arrival of the fix less its time stamp
-    outages_s: Any = None  # (k, 2) s, from (included) and to (not) when there are no fixes
-    drop_share: Any = 0.0  # share of the fixes lost one by one
+    outages_s: Any = None  # (k, 2) s, outages without fixes, from (included) to (excluded)
+    drop_share: Any = 0.0  # share of the fixes lost independently
     outlier_share: Any = 0.0  # share of the fixes in gross error
     outlier_size: Any = 10.0  # length of a gross error in sigmas of the white error
 
@@ -123,7 +123,7 @@ class FixTimes(NamedTuple):
 
     valid_s: np.ndarray  # the instants whose truth the fixes measure
     stamp_s: np.ndarray  # time stamps of the receiver
-    arrival_s: np.ndarray  # when the fix is there to be used
+    arrival_s: np.ndarray  # when the fix is available
 
 
 class GnssFixes(NamedTuple):
@@ -147,7 +147,7 @@ def fix_times(model: GnssErrorModel, start_s: float, end_s: float) -> FixTimes:
         ValueError: an end before the start.
     """
     require(end_s >= start_s, f"fixes from {start_s} s to {end_s} s: the end is before the start")
-    # A stamp that is a multiple but for rounding counts as one.
+    # A stamp within rounding of a multiple counts as one.
     first = np.ceil(start_s * model.rate_hz - 1e-6)
     last = np.floor(end_s * model.rate_hz + 1e-6)
     stamp = np.arange(first, last + 1.0) / model.rate_hz
@@ -163,15 +163,15 @@ def antenna(
     omega_ib_b: Float[Array, "*b 3"],
     lever_b_m: Float[Array, "3"],
 ) -> tuple[Array, Array, Array, Array]:
-    """Latitude, longitude, height and velocity of an antenna rigidly on the vehicle.
+    """Latitude, longitude, height and velocity of an antenna on a lever arm l fixed to the vehicle.
 
     Position ``r_e + C_eb l`` and velocity ``v + C_nb (omega_eb_b x l)`` (Groves 2013, chapter
-    14), without approximation: through Earth-fixed coordinates, the velocity along north, east and
-    down at the antenna.
+    14), without approximation: computed in Earth-fixed coordinates, the velocity resolved along
+    north, east and down at the antenna.
     """
     C_en = dcm_en(lat_rad, lon_rad)
     lever_b = jnp.broadcast_to(lever_b_m, omega_ib_b.shape)
-    # The part of the Earth's rotation is added in Earth-fixed axes, where it is constant.
+    # The Earth-rate term is added in Earth-fixed axes, where it is constant.
     lever_e = _turn(C_en, rotate(q_nb, lever_b))
     spin = jnp.broadcast_to(jnp.array([0.0, 0.0, OMEGA_E]), lever_e.shape)
     v_e = _turn(C_en, v_n + rotate(q_nb, jnp.cross(omega_ib_b, lever_b))) - jnp.cross(spin, lever_e)
@@ -198,12 +198,12 @@ def _rows(count: int, sigma: ArrayLike) -> Array:
 
 
 def _standard(white: Array, direction: Array, gross: Array) -> Array:
-    """Errors in sigmas: white ones, and gross ones along a random direction."""
+    """Errors in sigmas: white noise, and gross errors along a random direction."""
     return white + gross * (direction / jnp.linalg.norm(direction, axis=1, keepdims=True))
 
 
 def _lost(model: GnssErrorModel, time_s: Array, chance: Array) -> Array:
-    """Fixes that are dropped by chance, or fall into an outage."""
+    """Mask (m,) of the fixes dropped by chance or within an outage."""
     lost = chance < model.drop_share
     if model.outages_s is None:
         return lost
@@ -238,17 +238,18 @@ def observe(
     q_nb: ArrayLike,
     omega_ib_b: ArrayLike,
 ) -> GnssFixes:
-    """Fixes of a receiver from the truth of its vehicle at the instants the fixes are true for.
+    """Fixes of a receiver from the true motion of its vehicle at the instants of validity.
 
-    What is drawn for a fix depends on its number alone, so outages and losses leave the errors of
-    the other fixes as they were. Gross errors are added along a random direction, their length
+    The draws for a fix depend on its number alone, so outages and losses leave the errors of
+    the other fixes unchanged. Gross errors are added along a random direction, their length
     measured in sigmas of the white error; a fix in gross error states the sigmas of a good one.
     With no lever arm and no error the truth comes back unchanged.
 
     Args:
-        model: of the errors.
+        model: the error model.
         key: of the run and the receiver, from `robins.sim.random.stream`.
-        valid_s: (m,) instants of the fixes, ascending, from `fix_times`; outages are in this time.
+        valid_s: (m,) instants of the fixes, ascending, from `fix_times`, also the time scale of
+            the outages.
         lat_rad: (m,) true latitude of the IMU.
         lon_rad: (m,) true longitude.
         alt_m: (m,) true height above the ellipsoid.
@@ -300,7 +301,7 @@ def _markov(time: Array, tau: Array, normal: Array) -> Array:
         now = fade * before + drive * number
         return now, now
 
-    # The first fix has no past: nothing is left of the zeros it starts from.
+    # Infinite time before the first fix: the zeros it starts from decay completely.
     gone, steady = jnp.zeros((1, 3))[: len(time)], jnp.ones((1, 3))[: len(time)]
     x = jnp.diff(time)[:, None] / tau[1:]
     fades = jnp.concatenate([gone, jnp.exp(-x)])
@@ -309,15 +310,15 @@ def _markov(time: Array, tau: Array, normal: Array) -> Array:
 
 
 def as_table(fixes: GnssFixes, stamp_s: np.ndarray, start_ns: int = 0) -> GnssTable:
-    """The fixes of one run that there are, as a log has them.
+    """`GnssTable` of the fixes of one run, missing ones left out.
 
     Args:
-        fixes: of one run.
+        fixes: those of one run.
         stamp_s: (m,) time stamps [s], from `fix_times`.
         start_ns: time of the run's start, added to the stamps.
 
     Raises:
-        ValueError: fixes of another number, or of many runs.
+        ValueError: the number of fixes is not that of the stamps, or they are of many runs.
     """
     missing = np.asarray(fixes.missing)
     if missing.shape != np.shape(stamp_s):

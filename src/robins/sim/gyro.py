@@ -1,26 +1,26 @@
-"""Gyros: of a spacecraft, read in a closed loop, and of MEMS as papers state them.
+"""Gyros: those of a spacecraft in a closed loop, and MEMS gyros as specified in papers.
 
-A closed loop knows how its body turns only as it goes, and the errors of its gyros do not depend on
-that except by scale factors and misalignments. So a whole run of them is drawn at once by
-`gyro_errors`, and `read_gyro` is what is left for inside the loop:
+In a closed loop the rotation is known only step by step, and gyro errors depend on it only through
+scale factors and misalignments. So `gyro_errors` draws the errors of a whole run at once, and
+inside the loop `read_gyro` computes only
 
     reported = quantised( (I + S + M) theta + angle )
 
 The errors are those of `robins.ins.imu_errors.TriadErrors`, drawn by `robins.sim.imu_sensor`:
 bias, Gauss-Markov drift, random walk of the rate, ramp, white noise (angle random walk), scale,
-misalignment. A gyro's sensitivity to specific force is none of them, for in free fall there is no
-specific force. It is the angle that is quantised, and what a sample could not report is carried to
-the next, so the sum of all is never off by more than half a count.
+misalignment. G-sensitivity is not modelled, because there is no specific force in free fall. The
+angle is quantised, and the remainder of a sample is carried to the next, so the sum of all is never
+off by more than half a count.
 
-`delta_angles` is a MEMS triad as papers on cheap attitude systems state it: constant, slow and
-white errors. What leaves it in a sampling interval is the turn that carries the attitude over that
-interval exactly, its rotation vector, with the errors on top:
+`delta_angles` is a MEMS triad as specified in papers on low-cost attitude systems: constant, slow
+and white errors. Its output in a sampling interval is the exact rotation vector of the attitude
+change over that interval, plus the errors:
 
     theta_k = (1 + s) log(q_k^-1 q_{k+1}) + dt (b + m_k) + dt sigma xi_k
 
-So a perfect gyro leaves no coning error, and whatever a filter's attitude is off by comes from b,
-m, xi and s. White noise is stated per sample; sigma sqrt(dt) is the angle random walk in
-rad/sqrt(s). For datasheet units, quantisation and full scale see `robins.sim.imu_sensor`.
+So a perfect gyro leaves no coning error, and a filter's attitude error comes from b, m, xi and s
+alone. White noise is stated per sample; sigma sqrt(dt) is the angle random walk in rad/sqrt(s).
+For datasheet units, quantisation and full scale see `robins.sim.imu_sensor`.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def gyro_errors(key: Array, model: TriadErrors, count: int, dt_s: Number) -> Gyr
 
     Args:
         key: of the run, `Component.IMU` of `robins.sim.random.stream`.
-        model: of the errors, in rad/s. Its quantum is not used here but in `read_gyro`.
-        count: E, samples.
+        model: the error model, in rad/s. Its quantum is used in `read_gyro`, not here.
+        count: E, number of samples.
         dt_s: sampling interval [s].
 
     Raises:
@@ -80,7 +80,7 @@ def gyro_errors(key: Array, model: TriadErrors, count: int, dt_s: Number) -> Gyr
     angle, _, truth = corrupt(jnp.full(count, dt), rest, rest, slow, key)
     bias = angle / dt
     if model.white is not None:
-        # By sample number, as in `imu_sensor`: no number depends on how many there are.
+        # Drawn by sample number, as in `imu_sensor`, so independently of their count.
         root = jax.random.fold_in(key, _WHITE)
         keys = jax.vmap(lambda number: jax.random.fold_in(root, number))(jnp.arange(count))
         normal = jax.vmap(lambda one: jax.random.normal(one, (3,)))(keys)
@@ -122,7 +122,7 @@ class MemsGyro(NamedTuple):
     markov_time_s: Any = 300.0  # its correlation time
     white_rad_s: Any = 0.0  # white noise of the rate, one sigma of a sample
     scale_factor: Any = 0.0  # relative error
-    sign_drawn: Any = True  # whether the sign of the bias is drawn for each axis, or is that given
+    sign_drawn: Any = True  # draw the sign of the bias for each axis; False: as given
 
 
 class MemsErrors(NamedTuple):
@@ -143,13 +143,13 @@ def delta_angles(
 
     Args:
         key: of the run, `Component.IMU` of `robins.sim.random.stream`.
-        q_nb: (E + 1, 4) attitude at 0, dt, 2 dt ..., body to an inertial frame, scalar first. An
-            interval in which the body turns by more than half a turn counts as the shorter way.
+        q_nb: (E + 1, 4) attitude at 0, dt, 2 dt ..., body to an inertial frame, scalar first. A
+            rotation of more than half a turn in an interval is taken the shorter way.
         dt_s: interval [s].
         gyro: its errors.
 
     Returns:
-        Delta angles (E, 3) and the errors that are in them.
+        Delta angles (E, 3) [rad] and the errors they contain.
 
     Raises:
         ValueError: fewer than two attitudes, or a number out of its range.
@@ -178,9 +178,9 @@ def delta_angles(
 
 
 def integrate_angles(q0_nb: Number, theta_b: _given.Listed) -> Float[Array, "epochs 4"]:
-    """Attitude (E + 1, 4) that delta angles (E, 3) lead to from q0_nb: dead reckoning.
+    """Attitude (E + 1, 4) integrated from q0_nb by delta angles (E, 3) [rad].
 
-    The `delta_angles` of a perfect gyro lead back to the attitudes they were made of.
+    The `delta_angles` of a perfect gyro reproduce the attitudes they were computed from.
 
     Raises:
         ValueError: shapes that do not fit.

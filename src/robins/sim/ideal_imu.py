@@ -1,11 +1,11 @@
-"""Output of an IMU without errors, in two senses.
+"""Output of an error-free IMU, in two senses.
 
-`true_increments` integrates what the body of a smooth motion really feels, by quadrature. A
-mechanisation that works on them shows its discretisation error.
+`true_increments` integrates the true angular rate and specific force of a smooth motion by
+quadrature. A mechanisation fed with them shows its discretisation error.
 
 `ideal_increments` is the exact inversion of the mechanisation: the samples from which it returns a
-given sampled trajectory, whatever its own discretisation. Errors added to these are the only errors
-there are.
+given sampled trajectory, whatever its own discretisation. Sensor errors added to them are then the
+only errors.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
 def true_increments(motion: MotionProfile, time_ns: np.ndarray) -> ImuTable:
-    """Integrals of omega_ib_b and f_b over (time[k-1], time[k]], FRD.
+    """Integrals of omega_ib_b [rad] and f_b [m/s] over (time[k-1], time[k]], FRD.
 
-    Five Gauss-Legendre points an interval: far below rounding at the rates of an IMU. The interval
-    that ends at the first time is as long as the second one; the splines reach that far back.
+    Five Gauss-Legendre points an interval: errors far below rounding at the rates of an IMU. The
+    interval that ends at the first time is as long as the next one; the splines reach that far
+    back.
     """
     t = np.asarray(time_ns) * 1e-9
     dt = np.diff(t)
@@ -47,20 +48,20 @@ def ideal_increments(
 ) -> ImuTable:
     """The increment table from which `from_imu` and `mechanise` return a trajectory.
 
-    Attitude and velocity at the samples of the trajectory are met to rounding. Position is what the
-    mechanisation makes of them; it differs from the given one by the discretisation of the position
-    alone. Every interval is stepped from its true start, the misses in attitude and velocity at its
-    end are taken to the body and put into its samples, until nothing changes. Body axes are those
-    of the trajectory. The row of the first time repeats the second.
+    Attitude and velocity at the samples of the trajectory are met to rounding. Position follows
+    from the mechanisation and differs from the given one only by its discretisation. Every interval
+    is stepped from its true start; the residuals of attitude and velocity at its end are resolved
+    in body axes and added to its sample, until nothing changes. Body axes are those of the
+    trajectory. The row of the first time repeats the second.
 
     Args:
-        trajectory: at the rate wanted, two rows at least.
-        tolerance: of the last correction but one [rad and m/s].
-        iterations: allowed.
+        trajectory: sampled at the rate of the IMU, two rows at least.
+        tolerance: size of a correction at which the iteration stops [rad and m/s].
+        iterations: greatest number of corrections.
 
     Raises:
-        ValueError: too short, near a pole, time that does not increase, or a body that turns too
-            far within a sample.
+        ValueError: the trajectory is too short or near a pole, its time does not increase, or the
+            body turns too far within a sample.
     """
     if len(trajectory) < 2:
         raise ValueError(f"{len(trajectory)} row(s): an increment needs two")
@@ -93,14 +94,13 @@ def increments_between(before: Nav, after: Nav, dt_s: Float[Array, "n"]) -> Incr
     """Ideal increments that lead from each state to the next; pure JAX, so it batches.
 
     The inversion of one step of the mechanisation by three rounds of correction: attitude and
-    velocity are met to 1e-12 where a step turns by half a degree, to 1e-11 where it turns by four.
-    `ideal_increments` does so for a whole table, checks it, and makes the samples of a sensor of
-    it.
+    velocity are met to 1e-12 for a rotation of half a degree a step, to 1e-11 for four degrees.
+    `ideal_increments` does this for a whole trajectory, checks it, and returns an IMU table.
 
     Args:
         before: N states in NED/FRD, leading axis.
-        after: those `dt_s` later; positions are taken as they come.
-        dt_s: (N,).
+        after: the states `dt_s` later; their positions are not met.
+        dt_s: (N,) intervals [s].
     """
 
     def nearer(_, increments: Increments) -> Increments:
@@ -116,6 +116,6 @@ def _doubled(a: np.ndarray) -> np.ndarray:
 
 
 def _miss(before: Nav, after: Nav, reached: Nav) -> tuple[Float[Real, "n 3"], Float[Real, "n 3"]]:
-    """Rotation [rad] and velocity [m/s], in body axes, that each step still lacks."""
+    """Residual rotation [rad] and velocity [m/s] of each step, body axes."""
     turn = to_rotvec(multiply(conjugate(reached.q_nb.wxyz), after.q_nb.wxyz))
     return turn, rotate(conjugate(before.q_nb.wxyz), after.v_n - reached.v_n)

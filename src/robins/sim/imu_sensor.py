@@ -1,14 +1,14 @@
 """An inertial measurement unit: reports of its gyros and accelerometers along a true motion.
 
-In go the ideal increments, the angle and the change of velocity of each sampling interval; out come
-those of a unit with the errors of an `ImuErrorModel`. Every process is discretised exactly, for the
-sampling interval of each sample: the bias at the end of a sample and its integral over the sample
-have their true covariance, so a sum of increments has the same statistics at 10 Hz as at 1 kHz, and
-intervals may vary.
+Input are the ideal increments, the angle and the change of velocity of each sampling interval;
+output are those of a unit with the errors of an `ImuErrorModel`. Every process is discretised
+exactly, for the sampling interval of each sample: the bias at the end of a sample and its integral
+over the sample have their true covariance, so a sum of increments has the same statistics at 10 Hz
+as at 1 kHz, and intervals may vary.
 
 Normal numbers are drawn by sample number, and by error within a sample. So an error switched on or
-off leaves the numbers of the others as they were, and a piece of a run, a longer run and one sample
-at a time (`begin`, `sample`) get the noise that the whole run gets from `corrupt`.
+off leaves the numbers of the others unchanged, and part of a run, a longer run and one sample at a
+time (`begin`, `sample`) get the same noise as the whole run from `corrupt`.
 
 All is pure JAX: map over ``key`` for a batch of runs, and over a stacked model for a sweep.
 """
@@ -31,14 +31,14 @@ from robins.errors import require_kind
 from robins.filters.belief import Number
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 
-# What follows is part of the file format, as `robins.sim.random.Component` is: a table of normal
-# numbers (rows, 2, 3) is drawn once and one more at each sample; gyros are the first of the two.
-# A counter-based generator fills the rows in order, so none depends on how many follow it.
+# The order of draws is part of the file format, as `robins.sim.random.Component` is: a table of
+# normal numbers (rows, 2, 3) is drawn once and another at each sample; the second axis is gyros,
+# accelerometers. A counter-based generator fills the rows in order, so none depends on later rows.
 _ONCE, _SAMPLES = 0, 1  # streams folded into the key of the unit
 
 
 class _SwitchOnRow(IntEnum):
-    """First row of what is drawn when the unit is switched on."""
+    """First row of each error among the numbers drawn at switch-on."""
 
     MARKOV_START = 0
     BIAS = 1
@@ -48,9 +48,9 @@ class _SwitchOnRow(IntEnum):
 
 
 class _SampleRow(IntEnum):
-    """Row of what is drawn at a sample."""
+    """Row of each error among the numbers drawn at a sample."""
 
-    WHITE = 0  # white noise, and what the ends of the processes leave open about their integrals
+    WHITE = 0  # white noise, and the integrals of the processes given their values at both ends
     MARKOV = 1
     WALK = 2
 
@@ -83,11 +83,11 @@ class _Triad(NamedTuple):
 
 
 class SimulatedImu(NamedTuple):
-    """A unit that was switched on: its model and what stays the same until it is switched off."""
+    """A unit after switch-on: its model and the errors that are constant until switch-off."""
 
     gyro: _Triad
     accel: _Triad
-    key: Array  # of what is drawn at each sample
+    key: Array  # key of the numbers drawn at each sample
 
 
 class _TriadState(NamedTuple):
@@ -106,12 +106,12 @@ class ImuState(NamedTuple):
 
 
 def begin(model: ImuErrorModel, key: Array) -> tuple[SimulatedImu, ImuState]:
-    """Switch a unit on: draw what is constant and where its processes start.
+    """Switch a unit on: draw its constant errors and the initial values of its processes.
 
     The Gauss-Markov bias starts in its steady state, the random walk and the ramp at zero.
 
     Args:
-        model: of its errors.
+        model: its error model.
         key: of the run and the unit, from `robins.sim.random.stream`.
     """
     numbers = jax.random.normal(jax.random.fold_in(key, _ONCE), (9, 2, 3))
@@ -143,17 +143,17 @@ def sample(
 def corrupt(
     dt_s: ArrayLike, theta: ArrayLike, dv: ArrayLike, model: ImuErrorModel, key: Array
 ) -> tuple[Array, Array, ImuTruth]:
-    """Reported increments of n ideal samples in a row, and the true errors of the unit.
+    """Reported increments for n consecutive ideal samples, and the true errors of the unit.
 
-    An error the model has not (None) costs nothing and changes nothing: with none at all the
-    increments come back bit for bit. Memory grows with n; a long campaign takes `begin` and
-    `sample` in a scan of its own.
+    An error that is None in the model costs nothing and changes nothing: with none at all the
+    increments come back bit for bit. Memory grows with n; for a long campaign use `begin` and
+    `sample` in a scan.
 
     Args:
         dt_s: (n,) sampling intervals [s].
         theta: (n, 3) ideal angle increments [rad], integrals of omega_ib_b.
         dv: (n, 3) ideal velocity increments [m/s], integrals of the specific force f_ib_b.
-        model: of the errors.
+        model: the error model.
         key: of the run and the unit, from `robins.sim.random.stream`.
 
     Returns:
@@ -183,11 +183,11 @@ _compiled = jax.jit(corrupt)
 def corrupt_table(imu: ImuTable, model: ImuErrorModel, key: Array) -> tuple[ImuTable, ImuTruth]:
     """`corrupt` for a table of ideal samples, rates or increments; the errors have its body axes.
 
-    A rate is taken for the mean over the interval that ends with it. The interval of the first row
-    is not in the table; it counts as long as that of the second.
+    A rate is taken as the mean over the interval that ends with it. The interval of the first row
+    is not in the table; it is taken equal to that of the second.
 
     Raises:
-        TypeError: it is no table of an IMU.
+        TypeError: it is not an `ImuTable`.
         ValueError: fewer than two rows, or time that does not increase.
     """
     require_kind(imu, ImuTable, "corrupt_table")
@@ -254,8 +254,8 @@ def _sample(imu: SimulatedImu, state: ImuState, normals, dt, theta, dv):
 def _report(triad: _Triad, state: _TriadState, normals, elapsed_s, dt, true, dv):
     """One sample of one triad: state, increment, (bias, clipped); dv is the true one."""
     errors, constants = triad.errors, triad.constants
-    now = constants.bias  # at the end of the sample
-    added = None if now is None else now * dt  # to the increment
+    now = constants.bias  # bias at the end of the sample
+    added = None if now is None else now * dt  # its contribution to the increment
     markov, walk, residue = state
     spread_sq = None if errors.white is None else errors.white**2 * dt
     if markov is not None:
@@ -305,7 +305,7 @@ def markov_step(
     dt_s: ArrayLike,
     normal: Float[Array, "*b"],
 ) -> tuple[Array, Array, Array]:
-    """A first-order Gauss-Markov process over dt: its end, and its integral in mean and variance.
+    """End value of a first-order Gauss-Markov process over dt; mean and variance of its integral.
 
     With x = dt/tau the end is ``e^-x bias + w`` with ``var w = sigma^2 (1 - e^-2x)``. Given both
     ends the integral has the mean ``tau tanh(x/2) (bias + end)`` and the variance
@@ -329,7 +329,7 @@ def markov_step(
 def walk_step(
     bias: Float[Array, "*b"], strength: ArrayLike, dt_s: ArrayLike, normal: Float[Array, "*b"]
 ) -> tuple[Array, Array, Array]:
-    """A random walk over dt: its end, and its integral in mean and variance.
+    """End value of a random walk over dt; mean and variance of its integral.
 
     Given both ends the integral has the mean ``dt (bias + end) / 2`` and the variance of an
     integrated Brownian bridge, ``strength^2 dt^3 / 12``.
@@ -348,12 +348,12 @@ def walk_step(
 def quantise(
     increment: Float[Array, "*b"], residue: Float[Array, "*b"], quantum: ArrayLike
 ) -> tuple[Array, Array]:
-    """Whole counts of an increment, and what is left of it for the next one.
+    """Increment rounded to whole counts, and the remainder for the next one.
 
     Args:
-        increment: of the interval.
-        residue: left by the interval before.
-        quantum: of a count; where zero, all is reported.
+        increment: increment of the interval.
+        residue: remainder of the previous interval.
+        quantum: size of a count; zero: not quantised.
     """
     size = jnp.asarray(quantum, float)
     due = increment + residue
@@ -373,5 +373,5 @@ def _less_tanh(u):
 
 
 def _sum(a: Number | None, b: Number | None) -> Number | None:
-    """Sum of two arrays, either of which may be None, for zero."""
+    """Sum of two arrays, either of which may be None, which counts as zero."""
     return b if a is None else a if b is None else a + b

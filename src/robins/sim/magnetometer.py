@@ -1,17 +1,17 @@
-"""A magnetometer: the field in its own axes, with iron about it, disturbances and noise.
+"""A magnetometer: the field in sensor axes, with hard and soft iron, disturbances and noise.
 
 The output of `observe_field` in the Earth's field B at the attitude q_nb is
 
     z = clip(round(M (C_sb (C_bn (T B + d_n) + d_b)) + h + v))
 
-with T a turn of the field, d_n a field added in navigation axes (a magnet in the room), d_b one
-added in body axes (a magnet taken along for a while), C_sb the mounting, M the soft iron, scale
-factors and oblique axes, h the hard iron and v white noise. `ins.magnetometer_calibration` finds
-M and h from turning the sensor about.
+with T a rotation of the field, d_n a field added in navigation axes (a magnet in the room), d_b one
+added in body axes (a magnet carried for a while), C_sb the mounting, M the soft iron, scale factors
+and non-orthogonality, h the hard iron and v white noise. `ins.magnetometer_calibration` estimates
+M and h while the sensor is rotated.
 
-`observe_magnetic_attitude` is the "magnetic attitude" of papers that let a magnetometer report
-roll, pitch and heading. No such sensor exists: one vector determines two angles, and the third has
-to come from elsewhere, so that its error is not independent of its source.
+`observe_magnetic_attitude` is the "magnetic attitude" of papers in which a magnetometer reports
+roll, pitch and heading. No such sensor exists: one vector determines two angles; the third needs
+another source, with whose error its own is correlated.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from robins.manifold import wrap
 from robins.rotation import conjugate, from_rotvec, normalise, rotate
 from robins.sim import _given
 
-_ROUNDING_S = 1e-6  # a sample this near to the edge of a burst is on it
+_ROUNDING_S = 1e-6  # a sample within this of the edge of a burst is on it
 
 
 def observe_field(
@@ -48,23 +48,23 @@ def observe_field(
 ) -> Float[Array, "epochs 3"]:
     """Measured field [T] in sensor axes, which are the body's unless ``q_bs`` is given.
 
-    The normal numbers do not depend on anything but the key. Pure JAX, so it maps over keys.
+    The normal numbers depend on the key alone. Pure JAX, so it maps over keys.
 
     Args:
         key: of the run, `Component.MAGNETOMETER` of `robins.sim.random.stream`.
         q_nb: (E, 4) true attitude, scalar first.
         field_n: (E, 3) or (3,) true field [T] in navigation axes.
         sigma_t: of white noise [T]: a number, (3,) one for each axis, or (E,) one for each epoch.
-        present: (E,) bool, whether there is a sample; NaN where not.
-        turn: (E, 3) rad, see `field_bursts`: the field is turned by the length of the vector about
-            the part of it that is perpendicular to the field, navigation axes.
+        present: (E,) bool, True where there is a sample; NaN elsewhere.
+        turn: (E, 3) rad, navigation axes, see `field_bursts`: the field is rotated by the length of
+            the vector, about its component perpendicular to the field.
         added_n_t: (E, 3) or (3,) field [T] added in navigation axes.
         added_b_t: (E, 3) or (3,) field [T] added in body axes.
         q_bs: (4,) from sensor axes to body axes.
         soft_iron: (3, 3) matrix M, sensor axes; None: the identity.
         hard_iron_t: (3,) offset h [T], sensor axes.
         range_t: full scale [T], at which each axis saturates.
-        quantum_t: one digit of the output [T], to which each axis is rounded.
+        quantum_t: resolution [T], to which each axis is rounded.
 
     Raises:
         ValueError: shapes that do not fit together, a negative sigma, a range or quantum that is
@@ -92,7 +92,7 @@ def observe_field(
 
 
 def _converted(z: Array, range_t: Number | None, quantum_t: Number | None) -> Array:
-    """Digits of the converter: rounded, and saturated."""
+    """Output of the A/D converter: rounded and saturated."""
     if quantum_t is not None:
         _given.number("quantum_t", quantum_t, 0.0, above=True)
         z = quantum_t * jnp.round(z / quantum_t)
@@ -109,7 +109,7 @@ def observe_magnetic_attitude(
     disturbance_rad: _given.Listed | None = None,
     present: _given.Listed | None = None,
 ) -> Float[Array, "epochs 3"]:
-    """Roll, pitch, heading [rad] as papers have a magnetometer measure them; it cannot.
+    """Roll, pitch, heading [rad] of the fictitious "magnetic attitude" sensor of papers.
 
     Each angle has white noise and the disturbance added and is wrapped to [-pi, pi).
 
@@ -118,7 +118,7 @@ def observe_magnetic_attitude(
         euler_rad: (E, 3) true roll, pitch, heading.
         sigma_rad: standard deviation, a number or one for each angle.
         disturbance_rad: (E, 3) added, e.g. of `angle_bursts`.
-        present: (E,) bool, whether there is a sample; NaN where not. None: always.
+        present: (E,) bool, True where there is a sample; NaN elsewhere. None: always.
 
     Raises:
         ValueError: shapes that do not fit together, or a negative sigma.
@@ -142,18 +142,18 @@ def angle_bursts(
     length_s: Number,
     first_s: _given.Listed | None = None,
 ) -> Float[Array, "epochs 3"]:
-    """Disturbance of three angles [rad]: of that size, its sign drawn for each angle and burst.
+    """Bursts of disturbance of three angles [rad]: of a fixed size, signs drawn by angle and burst.
 
-    Zero between the bursts. A burst takes the samples from its beginning on, up to but not at its
-    end; one of a sampling interval is one sample.
+    Zero between the bursts. A burst covers the samples from its beginning (included) to its end
+    (excluded); one as long as a sampling interval is one sample.
 
     Args:
         key: of the run.
         time_s: (E,) times of the samples.
         size_rad: of the disturbance, a number or one for each angle.
-        every_s: from the beginning of a burst to that of the next; infinity: there is one.
-        length_s: of a burst; infinity: it lasts.
-        first_s: when the first begins; None: after ``every_s``.
+        every_s: from the beginning of a burst to that of the next; infinity: one burst only.
+        length_s: duration of a burst; infinity: it never ends.
+        first_s: beginning of the first; None: after ``every_s``.
 
     Raises:
         ValueError: a period or length that is not positive.
@@ -172,10 +172,10 @@ def field_bursts(
     length_s: Number,
     first_s: _given.Listed | None = None,
 ) -> Float[Array, "epochs 3"]:
-    """Turns of the field [rad] as `observe_field` takes them: one axis, drawn, for each burst.
+    """Rotations of the field (E, 3) [rad] for `observe_field`, one axis drawn for each burst.
 
-    The vectors have the length ``size_rad`` and any direction; of it only the part perpendicular
-    to the field counts, which is uniform on its circle. Other arguments are as in `angle_bursts`.
+    The vectors have the length ``size_rad`` and a random direction; only its component
+    perpendicular to the field, uniform on its circle, is used. Other arguments: see `angle_bursts`.
 
     Raises:
         ValueError: a period or length that is not positive.
@@ -195,7 +195,7 @@ def bursts(time_s, every_s, length_s, first_s) -> tuple[Array, Array]:
     _given.number("length_s", length_s, 0.0, above=True, endless=True)
     since = time - (every_s if first_s is None else first_s) + _ROUNDING_S
     number = jnp.maximum(jnp.floor(since / every_s), 0.0)
-    begun = jnp.where(number > 0.0, number, 1.0) * every_s  # never 0 times infinity
+    begun = jnp.where(number > 0.0, number, 1.0) * every_s  # avoids 0 times infinity
     phase = since - jnp.where(number > 0.0, begun, 0.0)
     return (phase >= 0.0) & (phase < length_s), number.astype(jnp.uint32)
 
@@ -205,7 +205,7 @@ def _turned(field: Array, turn: Array) -> Array:
     along = jnp.sum(turn * field, -1, keepdims=True) / jnp.where(size_sq > 0.0, size_sq, 1.0)
     across = turn - along * field
     across_sq, turn_sq = (jnp.sum(v * v, -1, keepdims=True) for v in (across, turn))
-    # Along the field there is no axis; and where there is no turn, the root has no derivative.
+    # Along the field there is no axis; without rotation the square root has no derivative.
     turns = across_sq > 0.0
     ratio = jnp.sqrt(jnp.where(turns, turn_sq, 1.0) / jnp.where(turns, across_sq, 1.0))
     return rotate(from_rotvec(jnp.where(turns, ratio * across, 0.0)), field)

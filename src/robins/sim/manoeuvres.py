@@ -1,4 +1,4 @@
-"""Motions that align an inertial unit: an aircraft that banks, a ship in the sea, a rough road.
+"""Motions for in-flight alignment: a banking aircraft, a ship in waves, a rough road.
 
     s_turn = [Bank(0.0, 10.0), Bank(np.deg2rad(30.0), 31.0), Bank(np.deg2rad(-30.0), 30.0)]
     motion = fly(Geodetic.from_degrees(32.0, 118.0, 5000.0), s_turn, speed_mps=100.0)
@@ -26,7 +26,7 @@ _KNOTS_A_PERIOD = 20
 
 
 class BankedTurn(NamedTuple):
-    """A bank angle, right wing down positive, and how long the leg lasts, rolling in included."""
+    """Bank angle, right wing down positive, and duration of the leg, roll-in included."""
 
     bank_rad: float
     duration_s: float
@@ -55,7 +55,7 @@ MODERATE_SEA = SeaMotion(
     yaw=(Wave(np.deg2rad(1.5), 8.0, 1.5),),
     heave=(Wave(1.0, 7.0, 0.8),),
 )
-"""Round numbers for a ship of some thousand tonnes; assumed, from no one source."""
+"""Round numbers for a ship of some thousand tonnes; assumed, without a source."""
 
 
 def fly(
@@ -69,17 +69,17 @@ def fly(
 ) -> MotionProfile:
     """An aircraft that banks as commanded, at constant ground speed, height and pitch.
 
-    It begins with level wings and takes up the bank of each leg within the leg's first `roll_s`,
+    It begins with level wings and rolls to the bank of each leg within the leg's first `roll_s`,
     smoothly (two continuous derivatives). The heading turns at ``g tan(bank) / V``, the rate of a
-    level coordinated turn. The attitude is banked so that no specific force is felt to the side:
-    by the command, but for the few arcminutes that pitch and Coriolis acceleration require.
+    level coordinated turn. The bank is such that there is no lateral specific force: that
+    commanded, but for the few arcminutes that pitch and Coriolis acceleration require.
 
     Args:
         start: position at the start.
         banks: the legs, in order.
         speed_mps: over the ground.
-        heading_rad: at the start, clockwise from north.
-        pitch_rad: of the nose, throughout.
+        heading_rad: initial heading, clockwise from north.
+        pitch_rad: constant pitch.
         roll_s: time to roll from one bank to the next.
         knots_hz: of the splines.
 
@@ -124,12 +124,12 @@ def sail(
     """A ship on a straight course at constant speed, swaying and heaving in the sea.
 
     Args:
-        start: where, at still water: the height starts where the heave is at time zero.
+        start: position at still water; the heave at time zero adds to its height.
         duration_s: of the motion.
         speed_mps: over the ground, along the course; may be zero.
         heading_rad: the course, clockwise from north; the yaw of the sea adds to the heading only.
-        sea: what it does to the ship.
-        knots_hz: of the splines; at least twenty a period of the fastest wave are taken.
+        sea: roll, pitch, yaw and heave of the ship.
+        knots_hz: knot rate of the splines; raised to twenty a period of the fastest wave.
 
     Raises:
         ValueError: a duration or period that is not positive, a negative speed, or a pole.
@@ -151,7 +151,7 @@ def roughen(
     pitch: Sequence[Wave] = (),
     knots_hz: float = 50.0,
 ) -> MotionProfile:
-    """The same path with small sways in roll and pitch on top, as on a road that is not even.
+    """The same path with small oscillations of roll and pitch added, as on a rough road.
 
     Raises:
         ValueError: a period that is not positive.

@@ -2,8 +2,8 @@
 
 Inertial axes i: z along the Earth's axis, x towards the ascending node of right ascension zero. The
 Earth is a point mass that turns uniformly about z, by ``OMEGA_E t`` from a given angle at t = 0;
-neither its flattening (nodal drift of up to 8 deg a day) nor drag nor precession is in the motion.
-That is enough for torques and fields of an attitude study; it is not an ephemeris.
+flattening (nodal drift of up to 8 deg a day), drag and precession are not modelled. That is enough
+for the torques and fields of an attitude study; it is not an ephemeris.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from robins.errors import require
 from robins.filters.belief import Number
 from robins.sim import _given
 
-LOWEST_M = 100e3  # below it nothing goes round
+LOWEST_M = 100e3  # lowest height of an orbit
 
 # Degree one of the IGRF-14 for 2025.0 [T]: a dipole at the centre, 9.2 deg from the Earth's axis.
 _DIPOLE_E = (-1410.3e-9, 4545.5e-9, -29350.0e-9)  # g11, h11, g10
 
 
 class OrbitStates(NamedTuple):
-    """Places and velocities at times, inertial axes."""
+    """Positions and velocities at times, inertial axes."""
 
     time_s: Any  # (E,)
     r_i_m: Any  # (E, 3) from the Earth's centre
@@ -47,7 +47,7 @@ def circular_orbit(
 
     Args:
         alt_m: height above the equatorial radius of WGS-84, at least 100 km.
-        incl_rad: inclination, from 0 to pi; beyond pi/2 against the Earth's turn.
+        incl_rad: inclination, from 0 to pi; retrograde beyond pi/2.
         raan_rad: right ascension of the ascending node.
         arg_lat_rad: argument of latitude at t = 0, from the ascending node along the motion.
         time_s: (E,) times.
@@ -85,11 +85,11 @@ def dipole_field_i(r_i_m: Float[Array, "*b 3"], earth_angle_rad: Number) -> Floa
     """Field [T] of the tilted dipole in inertial axes, ``(a/r)^3 (3 (m r) r/r^2 - m)``.
 
     It differs from the full field at 500 km by 11 deg rms and 35 deg at most, and in size by a
-    factor of 0.7 to 1.7: enough to unload wheels by, not to find an attitude by.
+    factor of 0.7 to 1.7: accurate enough for wheel desaturation, not for attitude determination.
 
     Args:
-        r_i_m: (..., 3) places from the Earth's centre.
-        earth_angle_rad: (...) how far the Earth has turned against i.
+        r_i_m: (..., 3) positions from the Earth's centre.
+        earth_angle_rad: (...) rotation angle of the Earth relative to i.
     """
     angle = jnp.broadcast_to(jnp.asarray(earth_angle_rad, float), r_i_m.shape[:-1])
     return _dipole(r_i_m, angle)
@@ -112,14 +112,14 @@ def field_along_orbit(
     decimal_year: float = 2025.0,
     knot_s: float = 10.0,
 ) -> Float[Array, "epochs 3"]:
-    """Magnetic field [T] in inertial axes at the places of an orbit.
+    """Magnetic field (E, 3) [T] in inertial axes along an orbit.
 
     Args:
-        orbit: the places; their times increase.
+        orbit: positions at increasing times.
         model: ``"dipole"``, or ``"wmm"`` for the World Magnetic Model of the date.
-        earth_angle_rad: how far the Earth has turned against i at t = 0.
-        decimal_year: the date of the WMM, the same all along; the dipole is that of 2025.0.
-        knot_s: the WMM is computed so far apart and joined by straight lines (15 nT at 10 s).
+        earth_angle_rad: rotation angle of the Earth relative to i at t = 0.
+        decimal_year: date of the WMM, constant along the orbit; the dipole is that of 2025.0.
+        knot_s: spacing of WMM evaluations, interpolated linearly (error 15 nT at 10 s).
 
     Raises:
         ValueError: another model.

@@ -3,11 +3,11 @@
 A stream is named by three numbers: the seed of the campaign, the run, and the component that
 draws. Both generators below are counter-based (Threefry and Philox; Salmon et al., "Parallel
 random numbers: as easy as 1, 2, 3", SC 2011), so the stream of run 137 is the same alone, in a
-batch, on any number of workers and in any order, and a sensor that is added draws from a stream
-of its own and leaves the noise of the others as it was.
+batch, on any number of workers and in any order, and an added sensor draws from a stream of its
+own and leaves the noise of the others unchanged.
 
 The numbers of `Component` are part of the file format: a result folder that states its seed can
-be computed again only while they stay. Add at the end, never renumber, never reuse.
+be reproduced only while they stay. Add at the end, never renumber, never reuse.
 
 `gauss_markov` is the first-order Gauss-Markov process at the instants of a sensor: steady, and
 exact at any step. Its correlation falls as ``exp(-|t|/tau)``. Sampled at equal steps h it is
@@ -31,7 +31,7 @@ from robins import _float64  # noqa: F401
 from robins.filters.belief import Number
 from robins.sim import _given
 
-UNITS_OF_A_KIND = 256  # stride between the streams of two sensors of one kind
+UNITS_OF_A_KIND = 256  # stride between the stream numbers of two sensors of one kind
 
 
 class Component(IntEnum):
@@ -49,10 +49,10 @@ class Component(IntEnum):
     STAR_SENSOR = 9
     SAR = 10
     ODOMETER = 11
-    FAULT = 12  # when and how a fault strikes
-    LINK = 13  # losses and delays on the way from a sensor to the computer
-    FILTER = 14  # draws of a filter itself, e.g. of a particle filter
-    SENSOR = 15  # a sensor of any other kind, by its place among those of a model
+    FAULT = 12  # time and kind of a fault
+    LINK = 13  # losses and delays between a sensor and the computer
+    FILTER = 14  # draws by a filter, e.g. a particle filter
+    SENSOR = 15  # a sensor of any other kind, by its index among those of a model
 
 
 def unit(component: Component, index: SupportsIndex) -> int:
@@ -104,10 +104,10 @@ def gauss_markov(
 
     Args:
         key: of the stream.
-        count: samples, at 0, h, 2h ...
-        width: processes.
+        count: number of samples, at 0, h, 2h ...
+        width: number of processes.
         step_s: h [s].
-        tau_s: correlation time [s], one or ``width`` of them; infinity makes constants.
+        tau_s: correlation time [s], one or ``width`` of them; infinity: constants.
 
     Raises:
         ValueError: no sample, a step or a correlation time that is not positive.

@@ -1,17 +1,17 @@
-"""A three-axis rate table: it carries a gyro and follows commands with a lag.
+"""A three-axis rate table that carries a gyro and follows rate commands with a lag.
 
-Each axis follows its commanded rate c with a first-order lag, and with limits of its rate and of
-its acceleration:
+Each axis follows its commanded rate c with a first-order lag, within limits of its rate and
+acceleration:
 
     w' = clip((c - w)/lag, -a, a),    |c| <= limit of rate.
 
-While the command stays the same, w has a closed form, a ramp of slope a while the lag alone would
-require more and then an exponential, and so has its integral: both are exact at any step. The
-attitude turns by the integral and Magnus' term of the fourth order for a rate whose direction
-changes (Hairer, Lubich & Wanner 2006, "Geometric Numerical Integration", sec. IV.7).
+Under a constant command, w and its integral have a closed form, exact at any step: a ramp of slope
+a while the lag alone would require more, then an exponential. The attitude turns by the integral
+and the fourth-order Magnus term for a rate whose direction changes (Hairer, Lubich & Wanner 2006,
+"Geometric Numerical Integration", sec. IV.7).
 
-The axes are those of what it carries, as if the gimbals were driven to turn it about these: the
-kinematics of gimbals, their lock among them, are not in the model.
+The axes are those of the payload, as if the gimbals were driven to turn it about them: gimbal
+kinematics, gimbal lock included, are not modelled.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from robins.filters.belief import Number
 from robins.rotation import from_rotvec, multiply, normalise
 from robins.sim import _given
 
-_GAUSS = np.sqrt(3.0) / 6.0  # of a step, from its middle to the two points of Gauss
+_GAUSS = np.sqrt(3.0) / 6.0  # of a step, from its middle to its two Gauss points
 
 
 class RateTable(NamedTuple):
-    """Limits of the table; `rate_table` makes one of checked numbers."""
+    """Lag and limits of the table, by axis; made and checked by `rate_table`."""
 
     lag_s: Any  # (3,)
     rate_limit_rad_s: Any  # (3,)
@@ -41,7 +41,7 @@ class RateTable(NamedTuple):
 class TableState(NamedTuple):
     """State of the table."""
 
-    q_ib: Any  # (4,) what it carries to inertial, scalar first
+    q_ib: Any  # (4,) payload to inertial, scalar first
     rate_b: Any  # (3,) rad/s
 
 
@@ -50,7 +50,7 @@ def rate_table(
     rate_limit_rad_s: _given.Listed = np.inf,
     acceleration_limit_rad_s2: _given.Listed = np.inf,
 ) -> RateTable:
-    """A rate table of checked numbers, one for all axes or one each; infinity is no limit.
+    """Make a `RateTable` after checking its numbers, one for all axes or three; infinity: no limit.
 
     Raises:
         ValueError: a lag or limit that is not positive, or another shape.
@@ -82,13 +82,13 @@ def step(
 ) -> tuple[TableState, Float[Array, "4"]]:
     """The state a step later, and its attitude q_ib.
 
-    Exact for a command that stays the same over the step; the attitude to the fourth order in
+    Exact for a constant command over the step; the attitude to the fourth order in
     ``dt_s`` where the direction of the rate changes.
 
     Args:
-        table: what it can do.
-        state: at the beginning.
-        command_b: (3,) commanded rate [rad/s], in the axes of what it carries.
+        table: lag and limits.
+        state: state at the beginning of the step.
+        command_b: (3,) commanded rate [rad/s], payload axes.
         dt_s: length of the step, positive.
     """
     most = table.rate_limit_rad_s
@@ -104,7 +104,7 @@ def step(
 
 
 def _response(table: RateTable, goal: Array, rate: Array, t: Number) -> tuple[Array, Array]:
-    """Rate, and angle gone through, a time t > 0 after a command was given."""
+    """Rate [rad/s] and angle turned [rad] at a time t > 0 after a command was given."""
     lag, most = table.lag_s, table.acceleration_limit_rad_s2
     way = goal - rate
     # Length of the ramp, until the lag alone requires no more than the limit.

@@ -1,15 +1,14 @@
-"""A synthetic aperture radar that finds itself on a map: horizontal position and heading.
+"""A synthetic aperture radar matched to a map: fixes of horizontal position and heading.
 
-Errors are normal, and a share of the samples, struck one by one, is in gross error in all three
-components. The model defines what that means: noise that is ``outlier_factor`` times as
-large (the contaminated normal distribution), or an ``outlier_offset`` of so many sigmas that comes
-on top, or both.
+Errors are normal, and a share of the samples, drawn independently, is in gross error in all three
+components. A gross error is noise ``outlier_factor`` times as large (the contaminated normal
+distribution), or an additional ``outlier_offset`` in sigmas, or both.
 
     SarErrorModel(outlier_share=0.1)                                          # 5 sigma noise
     SarErrorModel(outlier_share=0.1, outlier_factor=1.0, outlier_offset=5.0)  # 5 sigma off
 
-Numbers are drawn with unit deviation for every sample, so a change of the model, or samples that
-go missing, leave the others as they were.
+Numbers are drawn with unit deviation for every sample, so a change of the model and missing
+samples leave the draws of the others unchanged.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ class SarErrorModel(NamedTuple):
     sigma_m: Any = 25.0  # white error of position, a number or (2,) north, east
     heading_sigma_rad: Any = math.radians(1.0)  # white error of heading
     outlier_share: Any = 0.0  # share of the samples in gross error
-    outlier_factor: Any = 5.0  # how many times their noise is larger; 1: not at all
+    outlier_factor: Any = 5.0  # ratio of their noise to that of good samples; 1: none
     outlier_offset: Any = 0.0  # further gross error in sigmas: of position along a random
     # direction, of heading to either side
 
@@ -58,11 +57,11 @@ def observe_sar(
     """Fixes of a run from its true motion.
 
     Args:
-        model: of the errors.
+        model: the error model.
         key: of the run, `Component.SAR` of `robins.sim.random.stream`.
         position: (E,) true positions, not at a pole.
         heading_rad: (E,) true heading.
-        present: (E,) bool, whether there is a fix.
+        present: (E,) bool, True where there is a fix.
 
     Raises:
         ValueError: shapes that do not fit together, a negative sigma, factor or offset, or a share
@@ -101,7 +100,7 @@ def observe_sar(
 
 
 def _directions(key, count):
-    """(count, 3): of one length north and east, in any direction; and 1 or -1."""
+    """(count, 3): north and east of a random horizontal unit vector, and a random sign."""
     draw = jax.random.uniform(key, (count, 2))
     angle = 2.0 * jnp.pi * draw[:, 0]
     side = jnp.where(draw[:, 1] < 0.5, -1.0, 1.0)

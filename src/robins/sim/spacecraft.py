@@ -1,7 +1,7 @@
 """A rigid spacecraft with reaction wheels and magnetorquers.
 
 With J the inertia, the columns of W the axes of the wheels, h their momenta along these and w the
-rate omega_ib_b, the body carries the angular momentum J w + W h, and
+rate omega_ib_b, the total angular momentum in body axes is J w + W h, and
 
     J w' = T + W tau - w x (J w + W h),    h' = -tau,    q' = 1/2 q (0, w),
     T = 3 mu/r^5 (r_b x J r_b) + (m_residual + m) x B_b + disturbance
@@ -11,13 +11,13 @@ w but the total angular momentum in *inertial* axes, H = R(q) (J w + W h), of wh
 
     H' = R(q) T,    w = J^-1 (R(q)^T H - W h):
 
-the torque of the wheels has gone from it, and nothing that they do can change H by a bit.
+the wheel torque cancels, so that the wheels cannot change H, not even by rounding.
 
 A step turns by Cayley's map, q = q0 (1, g)/sqrt(1 + g^2), whose rate is a polynomial,
 ``g' = (w + g x w + g (g w))/2``; (g, H) is integrated by the classical Runge-Kutta method of order
 four (a Munthe-Kaas method: Hairer, Lubich & Wanner 2006, "Geometric Numerical Integration", sec.
-IV.8). So |q| = 1 without a projection, and the order is four in q and in H, while place, field and
-commands stay the same over a step. A step must turn by much less than half a turn.
+IV.8). So |q| = 1 without a projection, and the order is four in q and in H, with position, field
+and commands constant over a step. The rotation in a step must be much less than half a turn.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ from robins.sim import _given
 
 
 class Spacecraft(NamedTuple):
-    """Parameters of a spacecraft; `spacecraft` makes one of checked numbers."""
+    """Parameters of a spacecraft; made and checked by `spacecraft`."""
 
-    inertia_b: Any  # (3, 3) kg m2, of all, wheels that do not spin included
+    inertia_b: Any  # (3, 3) kg m2, of the whole craft, wheels at rest included
     wheel_axes_b: Any  # (3, W) unit columns
     wheel_torque_limit: Any  # (W,) N m
     wheel_momentum_limit: Any  # (W,) N m s
     dipole_limit_a_m2: Any  # (3,) of the magnetorquers
     residual_dipole_b: Any  # (3,) A m2, of everything else on board
-    wheel_works: Any  # (W,) 1, or 0 for a wheel that is lost
+    wheel_works: Any  # (W,) 1, or 0 for a failed wheel
 
 
 class CraftState(NamedTuple):
@@ -66,20 +66,20 @@ def spacecraft(
     residual_dipole_b: _given.Listed = 0.0,
     wheel_works: _given.Listed = 1.0,
 ) -> Spacecraft:
-    """A spacecraft of checked numbers; one number stands for all wheels or axes.
+    """Make a `Spacecraft` after checking its numbers; one number stands for all wheels or axes.
 
     Args:
         inertia_b: (3, 3) moments of inertia [kg m2].
         wheel_axes_b: (3, W) unit columns; W = 0 for a craft without wheels.
-        wheel_torque_limit: (W,) most torque of a wheel, either way [N m].
-        wheel_momentum_limit: (W,) most momentum of a wheel, either way [N m s].
-        dipole_limit_a_m2: (3,) most dipole of the magnetorquer of each axis, either way.
+        wheel_torque_limit: (W,) greatest torque of a wheel, either way [N m].
+        wheel_momentum_limit: (W,) greatest momentum of a wheel, either way [N m s].
+        dipole_limit_a_m2: (3,) greatest dipole of the magnetorquer of each axis, either way.
         residual_dipole_b: (3,) dipole of everything else on board [A m2].
         wheel_works: (W,) 1, or 0 for a wheel that gives no torque.
 
     Raises:
-        ValueError: no rigid body has this inertia, an axis is not of unit length, or a number or
-            shape is out of its range.
+        ValueError: no rigid body has this inertia, an axis is not of unit length, a number is out
+            of its range, or a shape is wrong.
     """
     axes = np.asarray(wheel_axes_b, float)
     if axes.ndim != 2 or axes.shape[0] != 3:
@@ -128,7 +128,7 @@ def _inertia(inertia_b: Number) -> np.ndarray:
 def craft_state(
     craft: Spacecraft, q_ib: _given.Listed, omega_b: _given.Listed, wheel_h: _given.Listed = 0.0
 ) -> CraftState:
-    """The state of given attitude, rate omega_ib_b [rad/s] and momenta of the wheels [N m s].
+    """State with a given attitude, rate omega_ib_b [rad/s] and momenta of the wheels [N m s].
 
     Raises:
         ValueError: shapes that do not fit, or a quaternion that is not of unit length.
@@ -153,10 +153,10 @@ def rate_b(craft: Spacecraft, state: CraftState) -> Float[Array, "3"]:
 
 
 def gravity_gradient(J: u.Matrix, r: u.Three) -> u.Three:
-    """Torque [N m] of gravity on a body of inertia J at r from the Earth's centre, body axes.
+    """Gravity-gradient torque [N m] on a body of inertia J at r from the Earth's centre, body axes.
 
-    3 mu/r^5 (r x J r), far from the Earth and for a body small against its distance (Wertz 1978,
-    eq. 17-31). None at r = 0, which stands for no Earth.
+    3 mu/r^5 (r x J r), for a body small compared with its distance (Wertz 1978, eq. 17-31). Zero
+    at r = 0, which stands for no Earth.
     """
     sq = u.dot(r, r)
     none = sq == 0.0
@@ -175,22 +175,22 @@ def advance(
     disturbance_b: Float[Array, "3"],
     dt_s: Number,
 ) -> CraftState:
-    """The state a step later.
+    """Advance the state by one step.
 
-    A wheel gives no more than its torque limit, none if it is lost, and none towards a momentum
-    limit it has reached; it comes to stop at the limit exactly, by the constant torque that brings
-    it there in this step. The magnetorquers give no more than their limit in each axis.
+    A wheel gives no more than its torque limit, none if it has failed, and none towards a momentum
+    limit it has reached; it reaches the limit exactly, by the constant torque that brings it there
+    in this step. The magnetorquers give no more than their limit in each axis.
 
     Args:
-        craft: what it is built of.
-        state: at the beginning.
-        wheel_torque: (W,) commanded of the wheels, on the body, over the step [N m].
-        dipole_b: (3,) commanded of the magnetorquers over the step [A m2].
-        r_i_m: (3,) place from the Earth's centre, inertial axes; of the middle of the step, or
-            near it. Zeros: no gravity gradient.
-        field_i_t: (3,) magnetic field there, inertial axes.
+        craft: parameters.
+        state: state at the beginning of the step.
+        wheel_torque: (W,) commanded torque of the wheels on the body, constant over the step [N m].
+        dipole_b: (3,) commanded dipole of the magnetorquers, constant over the step [A m2].
+        r_i_m: (3,) position from the Earth's centre [m], inertial axes, at or near the middle of
+            the step. Zeros: no gravity gradient.
+        field_i_t: (3,) magnetic field there [T], inertial axes.
         disturbance_b: (3,) any other torque [N m], body axes.
-        dt_s: length of the step.
+        dt_s: length of the step [s].
     """
     acts = wheel_torque, dipole_b, r_i_m, field_i_t, disturbance_b
     turn = dynamics(craft, state, *acts, dt_s)
@@ -198,7 +198,7 @@ def advance(
 
 
 class TurnDynamics(NamedTuple):
-    """Result of the dynamics of a step."""
+    """Result of `dynamics` over a step."""
 
     gibbs_b: Any  # (3,) tangent of half the turn along its axis, body axes, as three scalars
     momentum_i: Any  # (3,) N m s, total angular momentum after it, inertial axes
@@ -215,7 +215,7 @@ def dynamics(
     disturbance_b: Float[Array, "3"],
     dt_s: Number,
 ) -> TurnDynamics:
-    """The first half of `advance`, whose arguments it has: how the craft turns in a step.
+    """First half of `advance`, with the same arguments: the turn and the momenta of a step.
 
     `kinematics` is the other half. The torques of a step depend on the attitude at its beginning
     and on the turn since, so the attitude after it is not needed here.
@@ -229,7 +229,7 @@ def dynamics(
     dipole = u.scalars(craft.residual_dipole_b + jnp.clip(dipole_b, -limit, limit))
     other = u.scalars(disturbance_b)
 
-    # Within the step everything is seen in the axes 0 that the body has at its beginning.
+    # Within the step all components are in axes 0, the body axes at its beginning.
     C = u.dcm(u.scalars(state.q_ib))
     to_0 = u.transposed(C)
     total, place, field = u.settled(
@@ -258,7 +258,7 @@ def dynamics(
 
 
 def kinematics(q_ib: Float[Array, "4"], gibbs_b: Iterable[Array]) -> Float[Array, "4"]:
-    """The attitude after a turn, from that before it.
+    """Attitude after a turn, from that before it.
 
     Args:
         q_ib: before, body to inertial, scalar first.
@@ -269,7 +269,7 @@ def kinematics(q_ib: Float[Array, "4"], gibbs_b: Iterable[Array]) -> Float[Array
 
 
 def wheel_torques(craft: Spacecraft, wheel_torque: Float[Array, "w"]) -> Float[Array, "w"]:
-    """Torques that the wheels give of a command [N m], while there is room left in them."""
+    """Wheel torques [N m] for a command within the torque limits; momentum limits not applied."""
     most = craft.wheel_torque_limit
     return craft.wheel_works * jnp.clip(wheel_torque, -most, most)
 
@@ -278,7 +278,7 @@ def wheel_momenta_after(
     craft: Spacecraft, wheel_h: Float[Array, "w"], wheel_torque: Float[Array, "w"], dt_s: Number
 ) -> Float[Array, "w"]:
     """Momenta of the wheels [N m s] after a step under a commanded torque [N m]."""
-    # A wheel that was given more than its limit may lose it, but is not torn back to it.
+    # A wheel whose initial momentum is above its limit may slow down, but does not jump to it.
     room = jnp.maximum(craft.wheel_momentum_limit, jnp.abs(wheel_h))
     return jnp.clip(wheel_h - dt_s * wheel_torques(craft, wheel_torque), -room, room)
 

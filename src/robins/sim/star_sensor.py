@@ -1,18 +1,17 @@
 """A star sensor in orbit, and the camera behind it.
 
 `star_errors` and `read_star` are the sensor as a data sheet states it: attitude with white noise,
-about the boresight commonly some times as large as across it, and a low-frequency error from
-warping and from stars that cross the field. All errors of a run are drawn beforehand, so a closed
-loop only turns its attitude by the next of them. `observe_euler` puts white noise on pitch, roll
-and heading of a known motion, as papers do that state one accuracy for the three.
+usually several times as large about the boresight as across it, and a low-frequency error from
+thermal distortion and from stars that cross the field. All errors of a run are drawn in advance, so
+a closed loop only rotates its attitude by the next one. `observe_euler` adds white noise to pitch,
+roll and heading of a known motion, as in papers that state one accuracy for each.
 
-`StarCamera` and `photograph` go a step further down: the stars of a catalogue that are in the field
-of view, each with an error of its own, some missed and some that are none. `measure_attitude` is
-the whole sensor: the image, the stars known again, the attitude by QUEST with its covariance, and
-no answer where there are too few. Both are made of steps: `visible_stars` is the sky without any
-error, as a star simulator shows it to a sensor; `expose` is the image of it; `solve` is the
-attitude. Aberration, the motion of a star across a long exposure and double stars that melt into
-one are not simulated.
+`StarCamera` and `photograph` simulate the image: the stars of a catalogue in the field of view,
+each with its own error, some missed, and false stars. `measure_attitude` is the whole sensor: the
+image, the identification of its stars, the attitude by QUEST with its covariance, NaN where there
+are too few stars. The steps of both are also available: `visible_stars` is the sky without errors,
+as a star simulator shows it to a sensor; `expose` is its image; `solve` is the attitude.
+Aberration, motion blur of a long exposure and merging double stars are not simulated.
 """
 
 from __future__ import annotations
@@ -57,9 +56,9 @@ def star_errors(
 
     Args:
         key: of the run, `Component.STAR_SENSOR` of `robins.sim.random.stream`.
-        sigma_rad: of the white noise of a frame, a number or one for each axis; boresight z.
+        sigma_rad: white noise of a frame, a number or one for each axis; boresight z.
         frame_s: time from frame to frame [s].
-        count: frames.
+        count: number of frames.
         low_frequency_rad: amplitude of the sine, a number or one for each axis; each axis has a
             phase of its own, drawn.
         low_frequency_period_s: its period [s], a number or one for each axis.
@@ -72,7 +71,7 @@ def star_errors(
     sigma = _given.vector("sigma_rad", sigma_rad, 3, low=0.0)
     size = _given.vector("low_frequency_rad", low_frequency_rad, 3, low=0.0)
     period = _given.vector("low_frequency_period_s", low_frequency_period_s, 3, low=0.0, above=True)
-    # By frame number, so that a longer run begins with the shorter one.
+    # Drawn by frame number, so that a longer run begins with the shorter one.
     root = jax.random.fold_in(key, _NOISE)
     keys = jax.vmap(lambda number: jax.random.fold_in(root, number))(jnp.arange(count))
     noise = jax.vmap(lambda one: jax.random.normal(one, (3,)))(keys)
@@ -85,7 +84,7 @@ def star_errors(
 def read_star(
     q_ib: Float[Array, "4"], error: Float[Array, "3"], q_bs: _given.Listed | None = None
 ) -> Float[Array, "4"]:
-    """Measured q_ib: the true attitude after a small turn of the sensor about its own axes.
+    """Measured q_ib: the true attitude after a small rotation about the sensor axes.
 
     ``q_measured = q_ib q_bs exp(e) q_bs^-1``, so the true attitude is ``q_measured exp(-q_bs e)``.
 
@@ -105,11 +104,11 @@ def read_star(
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class StarCamera:
-    """A camera that reports directions of stars. Its axes: boresight z.
+    """A camera that reports directions of stars; boresight z.
 
-    The error of a direction has sigma in each of two angles. It grows with the magnitude of
-    stars fainter than ``sigma_magnitude`` as 10^(growth (m - sigma_magnitude)): 0.2 where the light
-    of the star itself is the noise, 0.4 where it is that of the background.
+    The error of a direction has a sigma in each of two angles. For stars of a magnitude m fainter
+    than ``sigma_magnitude`` it grows as 10^(growth (m - sigma_magnitude)), with a growth of 0.2
+    where shot noise of the star dominates, 0.4 where background noise does.
     """
 
     field_rad: Any = np.pi / 9.0  # full angle of the round field of view, 20 deg
@@ -120,28 +119,28 @@ class StarCamera:
     magnitude_sigma: Any = 0.0  # of the reported magnitude
     missed: Any = 0.0  # probability that a star in the field is not reported
     q_bs: Any = (1.0, 0.0, 0.0, 0.0)  # sensor axes to body axes
-    # the brightest are reported if there are more
+    # greatest number of stars reported, the brightest
     most_stars: int = field(default=40, metadata={"static": True})
-    # directions reported of no star, anywhere in the field
+    # directions without a star, anywhere in the field
     false_stars: int = field(default=0, metadata={"static": True})
 
 
 class StarImage(NamedTuple):
-    """Report of a camera at a moment, brightest first; M = most_stars + false_stars rows."""
+    """Stars in one frame of a camera, brightest first; M = most_stars + false_stars rows."""
 
     vectors_b: Any  # (M, 3) unit vectors, body axes; NaN: none
     sigma_rad: Any  # (M,) of each of the two angles of a direction
     magnitude: Any  # (M,) as reported; NaN: none
-    star: Any  # (M,) int, the truth: place in the catalogue; -1: none or false
+    star: Any  # (M,) int, the true index in the catalogue; -1: none or false
 
 
 def index_for(camera: StarCamera, stars: Stars, margin_rad: float = np.radians(0.5)) -> StarIndex:
-    """The stars that a camera can see, sorted into cells that it can search inside a loop.
+    """Index of the stars that a camera can see, for searches inside a compiled loop.
 
     Args:
-        camera: which is checked here.
+        camera: the camera, which is checked here.
         stars: the catalogue, from `robins.earth.stars`.
-        margin_rad: by which a list reaches beyond the field, for attitudes not exactly known [rad].
+        margin_rad: margin of a cell's list beyond the field, for uncertain attitudes [rad].
 
     Raises:
         ValueError: a figure of the camera out of its range, or a catalogue without a star that is
@@ -169,11 +168,11 @@ def index_for(camera: StarCamera, stars: Stars, margin_rad: float = np.radians(0
 
 
 class StarField(NamedTuple):
-    """Stars before a camera as they are, brightest first; N rows."""
+    """Stars in the field of a camera without errors, brightest first; N rows."""
 
     vectors_s: Any  # (N, 3) unit vectors, sensor axes
     magnitude: Any  # (N,)
-    star: Any  # (N,) int, place in the catalogue; -1: none, and the other numbers mean nothing
+    star: Any  # (N,) int, index in the catalogue; -1: none, the other columns are then undefined
 
 
 def visible_stars(
@@ -189,9 +188,8 @@ def visible_stars(
         index: of the stars, from `index_for`.
         q_is: attitude of the camera, sensor to inertial.
         camera: the camera.
-        most: N; None: as many as the camera reports. The brightest are shown if there are more.
-        margin_rad: how far beyond the edge of the field stars are shown, at most the margin of the
-            index [rad].
+        most: N, the number of brightest stars returned; None: as many as the camera reports.
+        margin_rad: margin beyond the edge of the field [rad], at most that of the index.
     """
     members = near(index, rotate(q_is, jnp.array([0.0, 0.0, 1.0])))
     vectors_s = rotate(conjugate(q_is), jnp.asarray(index.unit_i)[members])
@@ -200,10 +198,10 @@ def visible_stars(
 
 
 def turned(shown: StarField, camera: StarCamera, turn_rad: Float[Array, "3"]) -> StarField:
-    """Stars before a camera that is turned a little [rad], sensor axes, from those shown.
+    """Stars in the field after a small rotation of the camera [rad], sensor axes.
 
-    They are the result of `visible_stars` for the turned camera, to rounding, if the margin of what
-    is shown exceeds the turn.
+    Equal, to rounding, to `visible_stars` for the rotated camera, if the margin of ``shown``
+    exceeds the rotation.
     """
     vectors_s = rotate(conjugate(from_rotvec(turn_rad)), shown.vectors_s)
     return _in_field(shown._replace(vectors_s=vectors_s), camera, camera.most_stars)
@@ -212,11 +210,11 @@ def turned(shown: StarField, camera: StarCamera, turn_rad: Float[Array, "3"]) ->
 def _in_field(
     there: StarField, camera: StarCamera, most: int, margin_rad: float = 0.0
 ) -> StarField:
-    """The first of those that a camera sees."""
+    """The ``most`` brightest stars within the field of view and the magnitude limit."""
     cos_edge = jnp.cos(0.5 * jnp.asarray(camera.field_rad, float) + margin_rad)
     seen = (there.star >= 0) & (there.vectors_s[:, 2] > cos_edge)
     seen = seen & (there.magnitude < camera.magnitude_limit)
-    # Lists are brightest first, so the first of the seen are the brightest.
+    # The lists are brightest first, so the first visible stars are the brightest.
     (first,) = jnp.nonzero(seen, size=most, fill_value=-1)
     star = jnp.where(first >= 0, there.star[first], -1)
     return StarField(there.vectors_s[first], there.magnitude[first], star)
@@ -229,16 +227,16 @@ def photograph(
     camera: StarCamera,
     turn_rad: _given.Listed | None = None,
 ) -> StarImage:
-    """Stars as a camera sees them. Pure JAX: it maps over keys, attitudes and sizes of errors.
+    """Simulated image of a camera. Pure JAX: it maps over keys, attitudes and sizes of errors.
 
     Args:
         key: of the frame.
         index: of the stars, from `index_for`.
         q_ib: true attitude of the body.
         camera: the camera.
-        turn_rad: (3,) an error that all stars share, such as a low-frequency one from
-            `star_errors`: the image is that of the attitude that `read_star` makes of q_ib and
-            it. None: there is none.
+        turn_rad: (3,) an error common to all stars, such as a low-frequency one from
+            `star_errors`: the image is taken at the attitude that `read_star` returns for it.
+            None: no such error.
     """
     q_is = multiply(q_ib, normalise(_given.rows("q_bs", camera.q_bs, 4)))
     if turn_rad is not None:
@@ -247,11 +245,11 @@ def photograph(
 
 
 def expose(key: Array, shown: StarField, camera: StarCamera) -> StarImage:
-    """Image of the stars before a camera: each with its error, some missed, false ones.
+    """Image of the stars in the field: each with its error, some missed, false ones added.
 
     Args:
         key: of the frame.
-        shown: ``camera.most_stars`` rows, of `visible_stars` or `turned`.
+        shown: stars in the field, ``camera.most_stars`` rows from `visible_stars` or `turned`.
         camera: the camera.
     """
     q_bs = normalise(_given.rows("q_bs", camera.q_bs, 4))
@@ -262,7 +260,7 @@ def expose(key: Array, shown: StarField, camera: StarCamera) -> StarImage:
     caught = uniform[: camera.most_stars, 0] >= camera.missed
     star = jnp.where(caught, shown.star, -1)
 
-    # False ones are uniform over the cap of the field, and bright as stars are, see `synthetic`.
+    # False stars are uniform over the field, with the magnitudes of real ones, see `synthetic`.
     cos_edge = jnp.cos(0.5 * jnp.asarray(camera.field_rad, float))
     where = uniform[camera.most_stars :]
     z, azimuth = 1.0 - where[:, 0] * (1.0 - cos_edge), 2.0 * np.pi * where[:, 1]
@@ -306,13 +304,13 @@ def measure_attitude(
         index: of the stars, from `index_for`.
         q_ib: true attitude of the body.
         camera: the camera.
-        turn_rad: an error that all stars share, see `photograph`.
-        q_ib_prior: (4,) attitude as far as known; the stars are then those that
-            `robins.ins.star_identification.track_stars` matches with it. None: each star is known.
+        turn_rad: an error common to all stars, see `photograph`.
+        q_ib_prior: (4,) predicted attitude, with which the stars are identified by
+            `robins.ins.star_identification.track_stars`. None: by their true identity.
         tolerance_rad: of the match [rad]; None: six sigmas of the faintest star that is reported.
 
     Returns:
-        q_ib as measured, its covariance (3, 3) [rad^2] in body axes (of dtheta in
+        Measured q_ib, its covariance (3, 3) [rad^2] in body axes (of dtheta in
         ``q_true = q exp(dtheta)``), the number of stars used. With fewer than two stars, or none
         far enough from another, the first two are NaN.
     """
@@ -327,7 +325,7 @@ def solve(
     q_ib_prior: _given.Listed | None = None,
     tolerance_rad: _given.Listed | None = None,
 ) -> tuple[Float[Array, "4"], Float[Array, "3 3"], Int[Array, ""]]:
-    """The attitude of an image, from `expose`; all else as `measure_attitude` has it."""
+    """Attitude from an image of `expose`; other arguments and results as in `measure_attitude`."""
     star = image.star
     if q_ib_prior is not None:
         boresight = rotate(normalise(_given.rows("q_bs", camera.q_bs, 4)), jnp.array([0.0, 0, 1.0]))
@@ -342,7 +340,7 @@ def solve(
 
 
 def _shifted(unit: Float[Array, "n 3"], angles: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
-    """Directions near z, moved by angles across themselves."""
+    """Unit vectors near z, rotated by two small angles [rad] across the line of sight."""
     first = jnp.stack([unit[:, 2], jnp.zeros(len(unit)), -unit[:, 0]], 1)
     first = first / jnp.sqrt(jnp.sum(first**2, 1, keepdims=True))
     moved = unit + angles[:, :1] * first + angles[:, 1:] * jnp.cross(unit, first)
@@ -355,13 +353,13 @@ def observe_euler(
     """Measured pitch, roll, heading [rad] of the body, each with white noise.
 
     The angles are those of `robins.rotation.to_euler`, in another order. Roll and heading are
-    wrapped to [-pi, pi); a pitch near the vertical is not turned over by its noise.
+    wrapped to [-pi, pi); noise that takes a pitch beyond the vertical does not flip the others.
 
     Args:
         key: of the run, `Component.STAR_SENSOR` of `robins.sim.random.stream`.
         q_nb: (E, 4) true attitude, scalar first.
         sigma_rad: standard deviation, a number or one each for pitch, roll, heading.
-        present: (E,) bool, whether there is a sample; NaN where not.
+        present: (E,) bool, True where there is a sample; NaN elsewhere.
 
     Raises:
         ValueError: shapes that do not fit together, or a negative sigma.

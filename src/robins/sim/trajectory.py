@@ -1,8 +1,8 @@
-"""Smooth motion over the Earth, with velocity, acceleration and angular rate that belong to it.
+"""Smooth motion over the Earth, with consistent velocity, acceleration and angular rate.
 
 A `MotionProfile` is two splines of fifth degree or more: latitude, longitude and height; and the
 attitude quaternion. All else is their derivatives, so it is consistent with the path to rounding,
-whatever the motion was made from, and what an ideal IMU feels runs without steps. Offline, NumPy,
+whatever the motion was made from, and the input of an ideal IMU has no steps. Offline, NumPy,
 north-east-down and forward-right-down; time in seconds from the start of the motion.
 
     motion = sine_velocity(start, amplitude_mps=60.0, period_s=30.0)
@@ -44,7 +44,7 @@ class Kinematics(NamedTuple):
     """A motion at N instants; NumPy."""
 
     lat: np.ndarray  # (N,) rad
-    lon: np.ndarray  # (N,) rad, not folded
+    lon: np.ndarray  # (N,) rad, not wrapped
     alt: np.ndarray  # (N,) m
     v_n: np.ndarray  # (N, 3) m/s over the Earth, NED
     a_n: np.ndarray  # (N, 3) m/s^2, time derivative of the components v_n
@@ -76,7 +76,7 @@ class MotionProfile:
     attitude: BSpline  # (4,): q_nb, not normalised
 
     def at(self, time_s: np.ndarray) -> Kinematics:
-        """Everything at given times [s], which may lie a little outside the motion."""
+        """Kinematics at given times [s], which may lie slightly outside the motion."""
         t = np.asarray(time_s, float)
         (dlat, dlon, alt) = self.path(t).T
         lat_rate, lon_rate, climb = self.path(t, 1).T
@@ -125,12 +125,12 @@ def from_waypoints(
     """Motion through given points at given times.
 
     Args:
-        time_s: (K,) increasing, at least four; taken from the first one on.
+        time_s: (K,) increasing, at least four; the motion starts at the first.
         lat_rad: (K,).
         lon_rad: (K,); may cross 180 deg.
         alt_m: (K,) above the ellipsoid.
-        q_nb: (K, 4) attitude at the points, NED/FRD. Without it the vehicle points where it goes;
-            an aircraft banks so that its turns are coordinated.
+        q_nb: (K, 4) attitude at the points, NED/FRD. Without it the vehicle points along its
+            velocity; an aircraft banks so that its turns are coordinated.
         vehicle: kind of vehicle, if `q_nb` is not given.
 
     Raises:
@@ -174,8 +174,8 @@ def from_velocity(
     time_s: np.ndarray, v_n: np.ndarray, start: Geodetic, q_nb: np.ndarray
 ) -> MotionProfile:
     """Motion of velocity (K, 3) NED [m/s] and attitude (K, 4) at dense times (K,) from zero [s].
-    The times increase. Between the knots the path follows splines of sixth degree, whose rates are
-    those of the velocity at the knots.
+
+    The times increase. The path is a spline of sixth degree with the given velocities at the knots.
 
     Raises:
         ValueError: the start is too near a pole.
@@ -184,7 +184,7 @@ def from_velocity(
     lat0, alt0 = float(start.lat), float(start.alt)
     alt = alt0 + make_interp_spline(time_s, -v_n[:, 2], k=_DEGREE).antiderivative()(time_s)
     lat_rate, lat = np.zeros_like(alt), np.full_like(alt, lat0)
-    # Latitude appears on both sides only through the radii: each pass gains three digits.
+    # Fixed point: latitude enters its own rate through the radii only; a pass gains three digits.
     for _ in range(6):
         lat_rate = v_n[:, 0] / (_radii(lat)[0] + alt)
         lat = lat0 + make_interp_spline(time_s, lat_rate, k=_DEGREE).antiderivative()(time_s)
@@ -207,8 +207,8 @@ def sine_velocity(
 ) -> MotionProfile:
     """Velocity ``mean + amplitude sin(2 pi t / period + phase)`` along north, east and down.
 
-    The body points along the velocity, with its wings level. The path is that of the generator
-    pyins (N. Mayorov) tests its mechanisation with; its pitch has the other sign.
+    The body points along the velocity, with its wings level. The path is that of the generator in
+    the mechanisation tests of pyins (N. Mayorov), whose pitch has the opposite sign.
     """
     mean, amplitude, phase = (
         np.broadcast_to(np.asarray(a, float), 3) for a in (mean_mps, amplitude_mps, phase_rad)
@@ -226,7 +226,7 @@ def along(
 ) -> np.ndarray:
     """Attitude q_nb (N, 4) of given heading and pitch, level; or, for an aircraft, banked.
 
-    The bank is the one with no specific force to the side, as in a coordinated turn.
+    The bank is the one without lateral specific force, as in a coordinated turn.
     """
     level = quaternion(np.zeros_like(pitch_rad), pitch_rad, heading_rad)
     if vehicle == "ground":
@@ -236,7 +236,7 @@ def along(
 
 
 def quaternion(roll_rad: np.ndarray, pitch_rad: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
-    """q_nb (N, 4) of angles (N,); as `robins.rotation.from_euler`, with nothing to compile."""
+    """q_nb (N, 4) of angles (N,); `robins.rotation.from_euler` in NumPy, without compilation."""
     angles = np.stack([heading_rad, pitch_rad, roll_rad], -1)
     return _Rotation.from_euler("ZYX", angles).as_quat(scalar_first=True)
 
@@ -270,17 +270,17 @@ def _column(name: str, values: Values, n: int) -> np.ndarray:
 def at_lever_arm(
     motion: MotionProfile, lever_b_m: Sequence[float] | np.ndarray, knots_hz: float = 100.0
 ) -> MotionProfile:
-    """The motion of a point that is carried along, with the axes of the body.
+    """Motion of a point fixed to the body at a lever arm, with the axes of the body.
 
     The point's path is that of ``r_e + C_eb lever_b``, and its velocity and acceleration are the
-    path's, so all that a rotating Earth and a rotating body do is in them. North, east and down
+    path's, so all effects of Earth and body rotation are included. North, east and down
     are those at the point: they differ from the body's own by the lever arm over the radius of the
     Earth, 0.2 arcsec at 6 m.
 
     Args:
-        motion: of the origin of the body axes.
-        lever_b_m: (3,) from there to the point, in body axes FRD [m].
-        knots_hz: of the new splines.
+        motion: motion of the origin of the body axes.
+        lever_b_m: (3,) lever arm from there to the point, in body axes FRD [m].
+        knots_hz: knot rate of the new splines.
 
     Raises:
         ValueError: not three finite numbers.
@@ -299,7 +299,7 @@ def at_lever_arm(
 
 @jax.jit
 def _carried(lat, lon, alt, q_nb, lever_b):
-    """Latitude, longitude, height and attitude of a point carried along (leading axis)."""
+    """Latitude, longitude, height and attitude at a lever arm (time on the leading axis)."""
     C_en = dcm_en(lat, lon)
     C_eb = C_en @ to_dcm(q_nb)
     r_e = ecef_from_geodetic(lat, lon, alt) + jnp.sum(C_eb * lever_b[None, None], -1)

@@ -1,14 +1,13 @@
 """Gusts and turbulence, and a vehicle carried by the wind.
 
 Horizontal vectors are north, east. `gusts` draws a wind that is held for some seconds at a time.
-`move_in_wind` moves a point mass, whose drag is linear in its velocity through the air, in such a
-wind
+`move_in_wind` moves a point mass with drag linear in its velocity through the air in such a wind
 
     v' = -(v - wind - commanded) / tau
 
-and `wind_motion_at` reads velocity, displacement and acceleration at any instant: both are the
-solution in closed form, so the step of the wind is no step of integration. Velocity and
-displacement are continuous; the acceleration jumps where the wind does.
+and `wind_motion_at` gives velocity, displacement and acceleration at any instant: both use the
+closed-form solution, so the step of the wind is not an integration step. Velocity and displacement
+are continuous; the acceleration jumps where the wind does.
 
 `dryden` and `von_karman` draw continuous turbulence of the horizontal wind. The forms are those of
 MIL-F-8785C, section 3.7.1. With the wave number W = w/V [rad/m], the scale length L and the
@@ -19,9 +18,9 @@ intensity sigma, the one-sided spectra along (u) and across (v) the flight are
     von Karman  u: sigma^2 (2L/pi) / (1 + (aLW)^2)^(5/6)
                 v: sigma^2 (L/pi) (1 + 8/3 (aLW)^2) / (1 + (aLW)^2)^(11/6)          a = 1.339
 
-whose integral over W from zero on is sigma^2. The pattern is frozen in the air and flown through
-with the airspeed V (Taylor's hypothesis). Both functions give samples of these processes that are
-exact at any step: no step is too long, and variance and correlation do not depend on it.
+whose integral over W from zero to infinity is sigma^2. The pattern is frozen in the air and flown
+through with the airspeed V (Taylor's hypothesis). Both functions give samples of these processes
+that are exact at any step: variance and correlation do not depend on its length.
 
 The first component is along, the second to the right of the direction given; with the direction
 zero they are north and east.
@@ -52,16 +51,16 @@ from robins.sim.random import gauss_markov
 # next two numbers are those of `robins.sim.wind`.
 _GUSTS = 0
 
-_ROUNDING = 1e-9  # steps; an instant this short of the next step belongs to it
+_ROUNDING = 1e-9  # steps; an instant this close before a step belongs to it
 
 
 class WindMotion(NamedTuple):
-    """Motion of `move_in_wind`: the state where each step of the wind begins, and at the end."""
+    """Motion of `move_in_wind`: the state at the beginning of each wind step, and at the end."""
 
-    step_s: Any  # for how long each wind is held
+    step_s: Any  # s, duration of each wind
     velocity: Any  # (M + 1, 2) m/s
     displacement: Any  # (M + 1, 2) m, zero at the start
-    target: Any  # (M, 2) m/s, wind plus commanded velocity: where the velocity tends to
+    target: Any  # (M, 2) m/s, wind plus commanded velocity: the steady-state velocity
     tau_s: Any  # time constant
 
 
@@ -77,22 +76,21 @@ def gusts(
     """Winds drawn at fixed times: ``count`` of them, each held for ``every_s``.
 
     The wind of step k blows from ``k every_s`` to ``(k + 1) every_s``, counted from time zero; it
-    is zero where the middle of the step is not between begin and end. What is drawn for a step
-    depends on its number alone, so other times of begin and end leave the gusts between them as
-    they were.
+    is zero where the middle of the step is not between begin and end. The draws for a step depend
+    on its number alone, so other begin and end times leave the gusts between them unchanged.
 
     Args:
         key: of the run, `Component.WIND` of `robins.sim.random.stream`.
         count: number of steps.
-        begin_s: the first gust.
-        end_s: the calm after the last.
-        every_s: for how long a gust is held.
-        speed_m_s: least and greatest speed, evenly distributed between them.
-        direction_rad: where the wind blows to, clockwise from north: the centre, and how far to
-            either side of it, evenly distributed. By default east, give or take 45 deg.
+        begin_s: beginning of the first gust.
+        end_s: end of the last gust.
+        every_s: duration of a gust.
+        speed_m_s: least and greatest speed, uniformly distributed between them.
+        direction_rad: direction towards which the wind blows, clockwise from north: centre and
+            half width of a uniform distribution. By default east, plus or minus 45 deg.
 
     Raises:
-        ValueError: no step, an end before the beginning, a time that a gust is held that is not
+        ValueError: no step, an end before the beginning, a duration of a gust that is not
             positive, speeds that are negative or not in order, a negative half width.
     """
     _given.count_of("count", count)
@@ -111,7 +109,7 @@ def gusts(
     draw = jax.random.uniform(jax.random.fold_in(key, _GUSTS), (count, 2))
     speed = slowest + (fastest - slowest) * draw[:, 0]
     direction = centre + half_width * (2.0 * draw[:, 1] - 1.0)
-    # The middle, for the ends of steps are subject to rounding.
+    # The middle, because the ends of steps are subject to rounding.
     middle = (jnp.arange(count, dtype=float) + 0.5) * every_s
     speed = jnp.where((middle >= begin_s) & (middle < end_s), speed, 0.0)
     return jnp.stack([speed * jnp.cos(direction), speed * jnp.sin(direction)], 1)
@@ -124,13 +122,13 @@ def move_in_wind(
     tau_s: _given.Listed,
     start_m_s: Number,
 ) -> WindMotion:
-    """The motion of a point mass in a wind that is held over steps, exact.
+    """Exact motion of a point mass in a piecewise constant wind.
 
     Args:
         wind: (M, 2) m/s; that of step k blows from ``k step_s`` to ``(k + 1) step_s``.
-        step_s: for how long each is held.
-        commanded_m_s: (2,) velocity through the air that its engines keep up.
-        tau_s: time in which a difference to it fades to 1/e.
+        step_s: duration of each wind [s].
+        commanded_m_s: (2,) commanded velocity through the air.
+        tau_s: time constant with which a deviation from it decays [s].
         start_m_s: (2,) velocity at time zero.
 
     Raises:
@@ -164,8 +162,8 @@ def wind_motion_at(carried: WindMotion, time_s: Number) -> tuple[Array, Array, A
     later one.
 
     Args:
-        carried: from `move_in_wind`.
-        time_s: (...) from zero on.
+        carried: motion, from `move_in_wind`.
+        time_s: (...) instants, none before zero.
 
     Raises:
         ValueError: a time before zero.
@@ -178,9 +176,9 @@ def wind_motion_at(carried: WindMotion, time_s: Number) -> tuple[Array, Array, A
 
 
 def wind_at(wind: Numbers, step_s: Number, time_s: Number) -> Array:
-    """The wind of (M, 2) that blows at instants (...), each step held: (..., 2).
+    """Piecewise constant wind (M, 2) at instants (...): (..., 2).
 
-    Beyond the last step its wind is held; where two steps meet the later one counts.
+    Beyond the last step its wind is held; where two steps meet the later one applies.
 
     Raises:
         ValueError: a step that is not positive, or a time before zero.
@@ -191,14 +189,14 @@ def wind_at(wind: Numbers, step_s: Number, time_s: Number) -> Array:
 
 
 def _after(velocity, displacement, towards, time, tau):
-    """Velocity and displacement a time after, with the wind held; unchanged bit for bit at zero."""
+    """Velocity and displacement after a time in constant wind; unchanged bit for bit at zero."""
     gone = -jnp.expm1(-time / tau)
     missing = towards - velocity
     return velocity + missing * gone, displacement + towards * time - missing * (tau * gone)
 
 
 def _step_of(time_s: Number, step_s: Number, count: int) -> tuple[Array, Array]:
-    """Number of the step an instant is in, and the time since it began."""
+    """Number of the step that contains an instant, and the time since its beginning."""
     _given.number("time_s", time_s, 0.0)
     time = jnp.asarray(time_s, float)
     number = jnp.clip(jnp.floor(time / step_s + _ROUNDING), 0, count - 1)
@@ -214,7 +212,7 @@ DRYDEN_LENGTH_M = 1750.0 * 0.3048
 VON_KARMAN_LENGTH_M = 2500.0 * 0.3048
 
 _A = gamma(1.0 / 3.0) / (math.sqrt(math.pi) * gamma(5.0 / 6.0))  # 1.339 unrounded
-_LEAST_SHARE = 1e-13  # of an eigenvalue, as a share of the greatest
+_LEAST_SHARE = 1e-13  # least eigenvalue accepted, as a share of the greatest
 
 
 def dryden(
@@ -226,15 +224,15 @@ def dryden(
     length_m: _given.Listed = DRYDEN_LENGTH_M,
     direction_rad: Number = 0.0,
 ) -> Float[Array, "{count} 2"]:
-    """Dryden turbulence [m/s] at 0, step, 2 step ..., in its steady state from the first on.
+    """Dryden turbulence (count, 2) [m/s] at 0, step, 2 step ..., in its steady state throughout.
 
     The linear filters that shape white noise into these spectra are discretised exactly, each
     with its covariance over a step.
 
     Args:
         key: of the run, `Component.WIND` of `robins.sim.random.stream`, which may draw gusts too.
-        count: samples.
-        step_s: between samples.
+        count: number of samples.
+        step_s: time between samples [s].
         airspeed_m_s: V.
         sigma_m_s: intensity, a number or (2,) along, across.
         length_m: L, a number or (2,) along, across.
@@ -262,15 +260,15 @@ def von_karman(
 ) -> Float[Array, "{count} 2"]:
     """Von Karman turbulence [m/s] at 0, step, 2 step ...; arguments are those of `dryden`.
 
-    These spectra are not rational, so no finite filter has them. White noise is shaped by FFT
-    instead, round a circle at least twice as long as the record, so that the record has exactly
-    its covariance and no end meets the other (circulant embedding; Dietrich & Newsam 1997). A
-    longer record of the same key is another draw. Step, airspeed and length must be known when
-    the run is compiled.
+    These spectra are not rational, so no finite-order filter produces them. White noise is shaped
+    by FFT instead, on a circle at least twice as long as the record, so that the record has exactly
+    the required covariance without wrap-around (circulant embedding; Dietrich & Newsam 1997). A
+    longer record of the same key is another draw. Step, airspeed and length must be known at
+    compile time.
 
     Raises:
         ValueError: as `dryden`; a step, airspeed or length that is traced; or a step so short
-            that nothing but rounding is between two samples.
+            that two samples differ by rounding only.
     """
     if not _given.known(step_s, airspeed_m_s, length_m):
         raise ValueError(
@@ -302,7 +300,7 @@ def _check(count, step_s, airspeed_m_s, direction_rad):
 
 
 def _turned(pair, direction_rad):
-    """Components north and east of vectors given along and to the right of a direction."""
+    """Rotate components along and to the right of a direction into north and east."""
     cos, sin = jnp.cos(direction_rad), jnp.sin(direction_rad)
     along, right = pair[:, 0], pair[:, 1]
     return jnp.stack([cos * along - sin * right, sin * along + cos * right], 1)
@@ -342,10 +340,10 @@ def _correlation(x, across):
 
 @lru_cache(maxsize=16)
 def _root_spectrum(count: int, step: float, across: bool) -> np.ndarray:
-    """Roots of the eigenvalues, from zero to the highest frequency, of a circle round the record.
+    """Square roots of the circulant's eigenvalues, from zero to the highest frequency.
 
-    No longer circle is needed to keep them positive: along, the correlation is convex, for which
-    that is a theorem (Dietrich & Newsam 1997); across, it is so for every step down to rounding.
+    The circle need not be longer for positive eigenvalues: along, the correlation is convex, which
+    is sufficient (Dietrich & Newsam 1997); across, they are positive for every step, to rounding.
     """
     size = 4
     while size < 2 * (count - 1):

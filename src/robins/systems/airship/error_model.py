@@ -6,22 +6,22 @@ and `corrected`. Errors are *computed minus true* (38),
 
     x = [phi_E, phi_N, phi_U  rad,  dv_E, dv_N, dv_U  m/s,  dlon, dlat  rad,  dalt  m]
 
-Frame n is the true ENU frame, frame c the one that the SINS takes for it: C_cb = C_cn C_nb, where
+Frame n is the true ENU frame, frame c the one computed by the SINS: C_cb = C_cn C_nb, where
 the paper writes C_b^c = C_n^c C_b^n. The misalignment phi is three angles, about up first, then
 east, then north; small ones are a rotation vector, and then phi is also the attitude error of
 `robins.ins.errors`, whose velocity and position errors have the other sign.
 
-Differences of nonlinear functions (rates, gravity, velocity over radius) are taken as such, so with
-the sensors' errors known the model is exact: it is the difference of two mechanisations. Gravity is
+Differences of nonlinear functions (rates, gravity, velocity over radius) are not linearised, so
+with known sensor errors the model is exact: it is the difference of two mechanisations. Gravity is
 that of `robins.earth`, which above the ellipsoid has a small north component.
 
-Eq. (40) in print has two slips: the last cross product has the true rates in the place of their
-errors, which all but cancels the term before it, and the rates of dlat and dlon are exchanged.
+Eq. (40) as printed has two errors: the last cross product has the true rates in place of their
+errors, which nearly cancels the term before it, and the rates of dlat and dlon are exchanged.
 
-As a filter (`CorrectedSins`) the SINS navigates along with the estimate of its errors; once a step
-the estimate is taken off the SINS, and the errors start again at zero. It is the total-state form
-of `model` written differently, so it serves as its check; the paper's local filters are not built
-on it.
+As a filter (`CorrectedSins`) the state is the SINS and the estimate of its errors; once a step the
+SINS is corrected by the estimate, and the errors are reset to zero. It is the total-state form
+of `model` in different variables, so it serves as its check; the paper's local filters do not use
+it.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def dcm_cn(phi: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
 
 
 def misalignment(C_cn: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
-    """The phi [rad] of a matrix: `dcm_cn` undone.
+    """Misalignment phi [rad] of C_cn: the inverse of `dcm_cn`.
 
     phi_E lies within a quarter turn of zero, phi_N and phi_U within half a turn. At phi_E = +-90
     deg the other two are not distinct.
@@ -103,9 +103,9 @@ def misalignment(C_cn: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
 
 
 def rate_matrix_inverse(phi: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
-    """C_w^-1 of phi' = C_w^-1 w_nc_c, w_nc_c the turn rate of c against n.
+    """C_w^-1 of phi' = C_w^-1 w_nc_c, w_nc_c the angular rate of c relative to n.
 
-    It grows as 1/cos(phi_E): at a quarter turn the three angles are singular.
+    It grows as 1/cos(phi_E): the three angles are singular at phi_E = +-90 deg.
     """
     (sE, sN, _), (cE, cN, _) = _parts(jnp.sin(phi)), _parts(jnp.cos(phi))
     o, one = jnp.zeros_like(sE), jnp.ones_like(sE)
@@ -120,7 +120,7 @@ def error_rate(
         phi'  = C_w^-1 [(I - C_cn) w_in + C_cn dw_in - C_cb dw_ib]
         dv'   = (I - C_cn') C_cb f + C_cn' C_cb df - (2 dw_ie + dw_en) x v
                 - (2 w_ie + w_en) x dv + (2 dw_ie + dw_en) x dv + dg
-        dlon' = v_E sec(lat) / (RN + alt), as computed minus as it is truly
+        dlon' = v_E sec(lat) / (RN + alt), computed minus true
         dlat' = v_N / (RM + alt), likewise
         dalt' = dv_U
 
@@ -130,7 +130,7 @@ def error_rate(
     Args:
         x: error state, computed minus true.
         sins: output of the SINS.
-        errors: of its sensors; zero in a filter, which has them as process noise.
+        errors: its sensor errors; zero in a filter, where they are process noise.
     """
     phi, dv = x[PHI], x[VELOCITY]
     C_cn = dcm_cn(phi)
@@ -152,8 +152,8 @@ def step(
 ) -> Float[Array, "9"]:
     """Move errors x by the midpoint rule over a filter period T: x + f(x + f(x) T/2) T.
 
-    The paper uses f, a derivative, as if it were this map. `over` is the SINS on average over the
-    period, or in the middle of it; f_c is then the velocity gained over the length of the period.
+    The paper uses f, a derivative, as if it were this map. `over` is the SINS averaged over the
+    period, or at its middle; f_c is then the velocity increment over the period's length.
     """
     dt = jnp.asarray(dt_s, float)
     middle = x + 0.5 * dt * error_rate(x, over, errors)
@@ -172,7 +172,7 @@ def sins_at(nav: Nav, f_b: Float[Array, "3"]) -> Sins:
 
 
 def error_between(computed: Nav, true: Nav) -> Float[Array, "*b 9"]:
-    """The error state that a SINS at `computed` has when the truth is `true`; NED/FRD both."""
+    """Error state of a SINS at `computed` with the truth at `true`; both NED/FRD."""
     phi = misalignment(_swap_dcm((computed.q_nb @ true.q_nb.inverse()).as_dcm()))
     dv = swap(computed.v_n - true.v_n)
     a, b = computed.position, true.position
@@ -181,7 +181,7 @@ def error_between(computed: Nav, true: Nav) -> Float[Array, "*b 9"]:
 
 
 def corrected(computed: Nav, x: Float[Array, "9"]) -> Nav:
-    """The state less its errors: `error_between` undone."""
+    """State corrected by its errors: the inverse of `error_between`."""
     C_nc = jnp.swapaxes(_swap_dcm(dcm_cn(x[PHI])), -1, -2)
     q_nb = Rotation.from_dcm(C_nc) @ computed.q_nb
     p = computed.position
@@ -190,7 +190,7 @@ def corrected(computed: Nav, x: Float[Array, "9"]) -> Nav:
 
 
 def error_from_tangent(lat_rad: ArrayLike, alt_m: ArrayLike) -> Float[Array, "9 9"]:
-    """The error state by the tangent vector of a `Nav`, to first order.
+    """Matrix from the tangent vector of a `Nav` to the error state, to first order.
 
     That is attitude, velocity, position north, east, down [m], true minus estimated. A small
     misalignment is the same rotation vector in both, for it is defined by C_true = exp(phi x) C. So
@@ -226,7 +226,7 @@ class CorrectedSins:
         return CorrectedSins(self.sins, self.x + delta)
 
     def local(self, other: CorrectedSins) -> Array:
-        """Errors of this SINS, were the other state true, less those it has here."""
+        """Errors of this SINS with the other state as truth, less those it has here."""
         return error_between(self.sins, other.nav) - self.x
 
     @property
@@ -236,12 +236,12 @@ class CorrectedSins:
 
 
 def _motion(given: Airship, course: AirshipCourse) -> Motion:
-    """Motion of a `CorrectedSins`; input of a step: one increment. Wants the rule `feedback`."""
+    """Motion of a `CorrectedSins`; input of a step: one increment. Needs the rule `feedback`."""
     return Motion(_step, Partial(_noise, believed_noise(given), course.datum.metres))
 
 
 def _step(fed: CorrectedSins, block: Increments) -> CorrectedSins:
-    """The SINS over the block, and its errors by (40) about the middle of it."""
+    """Propagate the SINS over the block, and its errors by (40) about the middle of the block."""
     before, after = fed.sins, navigate(fed.sins, block)
     half = Rotation.from_rotvec(0.5 * block.theta)
     p, q = before.position, after.position
@@ -257,7 +257,7 @@ def _step(fed: CorrectedSins, block: Increments) -> CorrectedSins:
 def _noise(
     noise: InsNoise, metres_per_radian: Array, fed: CorrectedSins, block: Increments
 ) -> Array:
-    """Process noise as of the total state; longitude and latitude in radians."""
+    """Process noise as for the total state; longitude and latitude in radians."""
     per_metre = jnp.concatenate([jnp.ones(6), 1.0 / metres_per_radian[::-1], jnp.ones(1)])
     return per_metre[:, None] * walk(noise, block.dt)
 
@@ -274,18 +274,18 @@ class Feedback(Rule):
 
 
 def feedback() -> Rule:
-    """Take the estimated errors off the SINS, once a step when all its measurements are in."""
+    """Correct the SINS by its estimated errors, once a step after all its measurements."""
     return Feedback()
 
 
 def _start_sigma(given: Airship, course: AirshipCourse) -> list[Numbers]:
-    """East, north, up; longitude and latitude in radians."""
+    """Initial sigmas: east, north, up; longitude and latitude in radians."""
     enu = start_sigma(given).reshape(3, 3)[:, [1, 0, 2]].ravel()
     return [enu / np.array([*np.ones(6), *course.datum.metres[::-1], 1.0])]
 
 
 def _reported(course: AirshipCourse) -> np.ndarray:
-    """True minus estimated in metres: errors of velocity and position are the other way round."""
+    """Map to true minus estimated, in metres: velocity and position errors change sign."""
     north, east = course.datum.metres
     return np.diag([1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -east, -north, -1.0])
 
@@ -308,7 +308,7 @@ class EarthRates(NamedTuple):
 
 
 def surroundings(lat: Array, alt: Array, v: Array) -> EarthRates:
-    """Rates, gravity and how the place changes [rad/s], at a place and velocity (ENU)."""
+    """Frame rates, gravity, longitude and latitude rates at a position and velocity (ENU)."""
     omega_ie = swap(earth_rate_n(lat))
     omega_en = swap(transport_rate_n(lat, alt, swap(v)))
     meridian, transverse = curvature_radii(lat)
@@ -322,7 +322,7 @@ def surroundings(lat: Array, alt: Array, v: Array) -> EarthRates:
 
 
 def _swap_dcm(C):
-    """A direction cosine matrix in the other convention on both sides, NED/FRD <-> ENU/RFU."""
+    """Convert a direction cosine matrix between NED/FRD and ENU/RFU."""
     other = swap(C)
     return jnp.swapaxes(swap(jnp.swapaxes(other, -1, -2)), -1, -2)
 

@@ -11,10 +11,10 @@ theta, with v_air = C_b^n v_air_b:
         droll  = (phi_E sin(psi) + phi_N cos(psi)) / cos(theta)
         dpsi   =  phi_D + tan(theta) (phi_E sin(psi) + phi_N cos(psi))
 
-(22) is the paper's constraint *velocity over the ground = velocity through the air + wind*. It is
-made of data, so it is a sensor: what is thought to be the wind should read [v - C v_air]_NE + dw.
-The filters take slopes or sigma points of h(x), so no H is written down here but those of the
-paper, as printed: (44), (45), (48) and the constraint (49), (50).
+(22) is the paper's constraint *velocity over the ground = velocity through the air + wind*. It
+depends on data, so it is a sensor: the assumed wind measures [v - C v_air]_NE + dw. The filters
+use Jacobians or sigma points of h(x), so the only H written out here are those of the paper, as
+printed: (44), (45), (48) and the constraint (49), (50).
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ from robins.systems.study import Instrument, SensorAxes
 
 SAR = "sar_barometer"  # of the paper's first local filter: one vector
 STAR = "star"
-STAR_EARLY = "star_early"  # the sights of an epoch but the last
-WIND, WIND_OF_STAR = "wind", "wind_of_star"  # the second is the same, for the other local filter
+STAR_EARLY = "star_early"  # the sights of an epoch except the last
+WIND, WIND_OF_STAR = "wind", "wind_of_star"  # the same sensor, one for each local filter
 
-FLOOR = 1e-3  # m/s, of a constraint taken for exact: (51) needs covariances that have an inverse
+FLOOR = 1e-3  # m/s, sigma of an exact constraint: (51) needs invertible covariances
 
 Keys = Callable[[Component], Array]
 _EULER = SensorAxes("rad", "Euler", ("pitch", "roll", "heading"))
@@ -62,7 +62,7 @@ _EULER = SensorAxes("rad", "Euler", ("pitch", "roll", "heading"))
 
 
 def level(datum: Datum, p: Geodetic) -> Array:
-    """(..., 2) m north east from the datum."""
+    """Horizontal position (..., 2) [m], north and east of the datum."""
     away = jnp.stack([p.lat - datum.lat, wrap(p.lon - datum.lon)], -1)
     return away * jnp.broadcast_to(datum.metres, away.shape)
 
@@ -101,10 +101,10 @@ RADAR = Instrument(
 
 
 class EarlySights(NamedTuple):
-    """Inputs of sights before the end of an epoch, besides the state."""
+    """Inputs for the star sights before the end of an epoch, besides the state."""
 
     turned_b: ArrayLike  # (S - 1, 3) rad, raw turn of the body from each to the end
-    age_s: ArrayLike  # (S - 1,)
+    age_s: ArrayLike  # (S - 1,) s, time from each to the end
 
 
 def read_euler(x: Any, aux: Any) -> tuple[Angle, Angle, Angle]:
@@ -113,9 +113,9 @@ def read_euler(x: Any, aux: Any) -> tuple[Angle, Angle, Angle]:
 
 
 def read_early(x: WithWind, early: EarlySights) -> tuple[Angle, ...]:
-    """Pitch, roll, heading at each of the early sights, one after the other.
+    """Pitch, roll, heading [rad] at each of the early sights, concatenated.
 
-    The body is taken back by what the gyros felt since, and the navigation frame by its turn:
+    The body is rotated back by the gyro increments since, the navigation frame by its own rotation:
     q(t - age) = exp(omega_in age) q(t) exp(-turned).
     """
     (q_nb, v_n, p), out = x.nav, ()
@@ -187,7 +187,7 @@ def _measure_air(given: Airship, course: AirshipCourse, key: Keys, world: Airshi
 
 
 def _wind(world: AirshipWorld, wind: Array, air_b: Array) -> tuple[Array, Array]:
-    """Wind, NaN where no air data come, and velocity in the air, as filters take them."""
+    """Wind, NaN where there are no air data, and velocity through the air, as filter inputs."""
     there = jnp.isfinite(world.readings[WIND][:, :1])
     return jnp.where(there, wind, jnp.nan), jnp.where(there, air_b, 0.0)
 
@@ -198,17 +198,17 @@ def as_measured(world: AirshipWorld) -> tuple[Array, Array]:
 
 
 def as_it_is(world: AirshipWorld) -> tuple[Array, Array]:
-    """The truth of both."""
+    """True wind and true velocity through the air."""
     return _wind(world, world.wind, world.air_b)
 
 
 def steady(world: AirshipWorld) -> tuple[Array, Array]:
-    """Air data, and for the wind what always blows."""
+    """Air data, and the steady part of the wind."""
     return _wind(world, jnp.broadcast_to(world.steady_wind, world.wind.shape), world.readings[WIND])
 
 
 def along_the_nose(world: AirshipWorld) -> tuple[Array, Array]:
-    """The air speed, forward, as the paper takes it, and the forecast of the wind."""
+    """Airspeed along the forward axis, as in the paper, and the forecast of the wind."""
     speed = jnp.linalg.norm(world.readings[WIND], axis=1)
     air_b = speed[:, None] * jnp.array([[1.0, 0.0, 0.0]])
     return _wind(world, world.wind + world.wind_error, air_b)
@@ -221,7 +221,7 @@ def wind_of(
     read: Callable[..., Array] = read_wind,
     linear: Callable[..., Any] | None = None,
 ) -> Instrument:
-    """The wind as a constraint, believed with a sigma [m/s] on each axis."""
+    """The wind as a constraint with an assumed sigma [m/s] on each axis."""
 
     def believed(given: Airship, course: AirshipCourse) -> Sensor:
         return Sensor(read, jnp.full(2, sigma(given.air_data)), 2, name, linear)
@@ -232,21 +232,21 @@ def wind_of(
 
 AIR_DATA = wind_of(WIND, lambda a: a.noise)
 SOFT = wind_of(WIND, lambda a: float(np.hypot(a.noise, a.wind_error)))
-"""One white noise for air data and wind, where nothing else stands for the error of the wind."""
+"""A single white noise for air data and wind, for filters without states for the wind error."""
 
 
 def wind_constraints(**given: Any) -> tuple[Instrument, Instrument]:
-    """The wind taken for exact, one for each local filter; further arguments as of `wind_of`."""
+    """Exact wind constraints, one for each local filter; further arguments as of `wind_of`."""
     one, other = (wind_of(name, lambda a: FLOOR, **given) for name in (WIND, WIND_OF_STAR))
     return one, other
 
 
 ABOARD = (EARLY_STARS, RADAR, STARS, AIR_DATA)
-"""All that the airship carries, in the order of the updates."""
+"""All instruments of the airship, in the order of the updates."""
 
 HARD = wind_constraints()
 INSTRUMENTS = (*ABOARD, HARD[1])
-"""All that is drawn and shown."""
+"""All instruments that are simulated and shown."""
 
 
 # -------------------------------------------------------------------------------- as printed
@@ -259,8 +259,8 @@ def printed_attitude_rows(
     """Eq. (44) to the letter: errors of pitch, roll, heading by phi_E, phi_N, phi_U.
 
     It mixes two senses of heading: the first row is right for a clockwise one, the other two for a
-    counterclockwise one, and two of their terms belong to neither. So whatever the heading is taken
-    for, towards east an entry that should be 1 is -1, which makes a filter push its error on.
+    counterclockwise one, and two of their terms for neither. So with either sense, at a heading of
+    east an entry that should be 1 is -1, which makes a filter amplify its error.
     """
     (s, c), (sin_pitch, cos_pitch) = _sin_cos(heading_rad), _sin_cos(pitch_rad)
     sin_roll, cos_roll = _sin_cos(roll_rad)
@@ -277,11 +277,11 @@ def printed_attitude_rows(
 def printed_constraint(
     heading_rad: ArrayLike, air_speed_error: ArrayLike
 ) -> tuple[Float[Array, "2 9"], Float[Array, "2"]]:
-    """D and d of (49), (50) to the letter, but for the error of the wind in d, which is unknown.
+    """D and d of (49), (50) to the letter, except for the wind error in d, which is unknown.
 
     dv_E and dv_N are components already, and yet are multiplied by sine and cosine of the heading;
-    d has these two the other way round. D loses a row wherever the heading is cardinal. The air
-    speed error () [m/s] is the dv_a of (50), see `printed_wind`.
+    in d the two are swapped. D loses rank at cardinal headings. The airspeed error () [m/s] is
+    the dv_a of (50), see `printed_wind`.
     """
     s, c = _sin_cos(heading_rad)
     D = jnp.zeros((2, 9)).at[0, 3].set(s).at[1, 4].set(c)
@@ -301,16 +301,15 @@ def _printed_euler(x: Any, aux: Any):
 
 
 def _turned(x: Nav) -> Array:
-    """(3, 3) change of pitch, roll, heading by phi, true minus estimated, NED, as (44) has it."""
+    """(3, 3) derivative of pitch, roll, heading by phi (true minus estimated, NED) as in (44)."""
     return -swap(printed_attitude_rows(*to_euler(x.q_nb.wxyz)))
 
 
 def printed_wind(x: Any, air: tuple[ArrayLike, Array]):
-    """(49), (50): D x = d with x computed minus true; what d leaves over should be zero.
+    """(49), (50): D x = d with x computed minus true, as a residual that should be zero.
 
-    Of a `Nav`, the measured velocity through the air (3,) and the wind as thought (2,), north east,
-    [m/s]. The air speed error dv_a is taken as it can be had: |v - wind| of the SINS less the
-    measured air speed.
+    Arguments are a `Nav`, the measured velocity through the air (3,) and the assumed wind (2,),
+    north east [m/s]. The airspeed error dv_a is |v - wind| of the SINS less the measured airspeed.
     """
     speed = jnp.linalg.norm(jnp.asarray(air[0]))
     wind = jnp.concatenate([jnp.asarray(air[1])[::-1], jnp.zeros(1)])  # east north up

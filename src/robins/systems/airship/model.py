@@ -1,4 +1,4 @@
-"""The airship's navigation states, and how they and their errors move.
+"""The airship's navigation states, their motion and that of their errors.
 
 The mean is the navigation state itself, so the estimate is fed back to the inertial navigation by
 construction, and the paper's nonlinear error model (40) (see `error_model`) is the difference of
@@ -51,10 +51,10 @@ from robins.systems.parts import noise_of_linear
 
 
 class WithWind(NamedTuple):
-    """A navigation state and the error of what is thought to be the wind."""
+    """A navigation state and the error of the assumed wind."""
 
     base: Any  # Nav or InsState
-    wind_error: Array  # (2,) m/s north east, thought minus true
+    wind_error: Array  # (2,) m/s north east, assumed minus true
 
     @property
     def nav(self) -> Nav:
@@ -77,7 +77,7 @@ def navigation(x: Any) -> Nav:
 def nine_states(noise: InsNoise) -> Motion:
     """Motion of the paper's states, a `Nav`; input of a step: one increment.
 
-    The noise believed is one number for the three axes of gyros and one for accelerometers.
+    The assumed noise is one number for the three gyro axes and one for the accelerometers.
     """
     return Motion(step, Partial(_noise, noise), Partial(_linear, noise))
 
@@ -85,7 +85,7 @@ def nine_states(noise: InsNoise) -> Motion:
 def walk(noise: InsNoise, dt: ArrayLike) -> Float[Array, "9 9"]:
     """Factor L of Q over a step of constant white noise.
 
-    Attitude walks by itself, velocity and position as of a random walk of velocity,
+    Attitude is a random walk; velocity is another, with position as its integral,
 
         Q_phi = q_g^2 dt I,   Q_v,p = q_a^2 [dt  dt^2/2; dt^2/2  dt^3/3] (x) I.
     """
@@ -100,7 +100,7 @@ def _noise(noise: InsNoise, x: Nav, block: Increments) -> Array:
 
 
 def _linear(noise: InsNoise, x: Nav, block: Increments):
-    """The step and its slope, the first nine rows and columns of that of fifteen states."""
+    """The step and its Jacobian, the first nine rows and columns of that of fifteen states."""
     one = jax.tree.map(lambda a: jnp.asarray(a, float)[None], block)
     new, Phi, _ = propagate_linear(InsState.start(x), one, noise, segments=1)
     return new.nav, Phi[:9, :9], walk(noise, block.dt)
@@ -159,26 +159,26 @@ def _diagonal(a: Array, b: Array) -> Array:
     return jnp.block([[a, corner], [jnp.zeros((b.shape[0], a.shape[1])), b]])
 
 
-# ------------------------------------------------------------------------- what a filter believes
+# ----------------------------------------------------------------------- assumptions of a filter
 
 
 ENU_OF_NED = np.kron(np.eye(3), swap(np.eye(3)))  # (9, 9) of attitude, velocity, position
 
 
 class States(NamedTuple):
-    """The states of a filter: how they are believed to move and begin, what they are of a run."""
+    """The states of a filter: their motion model, their construction, and initial sigmas."""
 
     motion: Callable[[Airship, AirshipCourse], Motion]
     # navigation, biases of gyros and accelerometers, error of the wind -> state
     of: Callable[[Nav, Array, Array, Array], Any]
-    sigma: Callable[[Airship, AirshipCourse], list[Any]]  # at the start, to be put end to end
+    sigma: Callable[[Airship, AirshipCourse], list[Any]]  # initial, to be concatenated
     # (9, 9) reported = this @ the first nine errors
     reported: Callable[[AirshipCourse], np.ndarray] = lambda course: ENU_OF_NED
     in_parts: bool = False  # an epoch comes as several increments
 
 
 def believed_noise(given: Airship) -> InsNoise:
-    """Noise for filters of nine states, whose noise of velocity stands for the biases."""
+    """Process noise for filters of nine states, in which velocity noise stands for the biases."""
     return InsNoise(jnp.asarray(given.believed.gyro_noise), jnp.asarray(given.believed.accel_noise))
 
 

@@ -52,7 +52,7 @@ class Turbulence(Parameters):
 
 
 class Wind(Parameters):
-    """Wind that always blows, and what comes on top within `span`."""
+    """Steady wind, plus gusts or turbulence within `span`."""
 
     constant: q.SpeedSize = default("10 m/s")
     towards: q.Angle = default("90 deg")
@@ -62,7 +62,7 @@ class Wind(Parameters):
 
     @property
     def gusty(self) -> bool:
-        """True if gusts or turbulence come on top."""
+        """True if there are gusts or turbulence."""
         return self.gusts is not None or self.turbulence is not None
 
     @pydantic.model_validator(mode="after")
@@ -85,7 +85,7 @@ class AirshipImu(Parameters):
     accel_bias: q.AccelSizes = default("1 mg")
     accel_noise: q.AccelWalkSizes = default("4.903325e-3 m/s/sqrt(s)")
     draw: Draw = "random-sign"  # of the biases
-    unsensed: Share = 0.0  # share of the acceleration by gusts that the accelerometers do not feel
+    unsensed: Share = 0.0  # share of the acceleration by gusts that the accelerometers do not sense
 
 
 class InstrumentRate(Parameters):
@@ -118,7 +118,7 @@ class AirshipStar(InstrumentRate):
 
 
 class AirData(InstrumentRate):
-    """Velocity through the air, and what is thought to be the wind: both err."""
+    """Velocity through the air, and the assumed wind, both with errors."""
 
     noise: q.Speed = default("0.3 m/s")  # each axis
     wind_error: q.Speed = default("0.3 m/s")
@@ -135,9 +135,9 @@ class AirshipStart(Parameters):
 
 
 class BelievedNoise(Parameters):
-    """Noise of the inertial unit that filters of nine states believe, for want of bias states.
+    """Noise of the inertial unit assumed by filters of nine states, for want of bias states.
 
-    The product believes the noise of the inertial unit, times `accel_noise_factor` where the hull
+    The product assumes the noise of the inertial unit, times `accel_noise_factor` where the hull
     bends or the unit sits off the centre.
     """
 
@@ -160,7 +160,7 @@ class Airship(Scenario):
     claims: tuple[str, ...] | None = ()  # ids of those the scenario checks
     duration: q.Duration = default("1000 s")
     epoch: q.Duration = default("1 s")  # step of the filters
-    counted: Span = Span(begin=200.0, end=800.0)  # figures pooled over time are of this span
+    counted: Span = Span(begin=200.0, end=800.0)  # span over which metrics are pooled
     place: Position
     hull: AirshipBody = pydantic.Field(default_factory=AirshipBody)
     wind: Wind = pydantic.Field(default_factory=Wind)

@@ -1,10 +1,10 @@
 """The airship's study: filters and the instruments they take, report, claims.
 
 The paper's filters have two local ones, for radar with barometer and for stars, fused by its (51);
-the locals go on from their own means and covariances (`distributed`). What it does not state is
-chosen as the specification does: AEKF adapts R (Sage-Husa), RAUKF has IGG-III weights and an
-innovation fading factor. The constrained filters differ in what they take for the constraint, how
-firmly they believe it, and where it comes in.
+the local filters keep their own means and covariances (`distributed`). Details that it does not
+state follow the specification: AEKF adapts R (Sage-Husa), RAUKF has IGG-III weights and an
+innovation fading factor. The constrained filters differ in the form of the constraint, its sigma,
+and the filter to which it is applied.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from robins.systems.study import Case, Contender, Instrument, Norm, Recipe, Stat
 
 # --------------------------------------------------------------------------------- the filters
 
-# The metric W = I of the paper, whose D has columns of velocity alone. Those of attitude weigh 10
-# m/s a radian: under a plain I they would take nearly all of the correction (244 m).
+# The metric W = I of the paper, whose D has columns of velocity only. Attitude is weighted by
+# 10 m/s per radian: with W = I it would take nearly all of the correction (244 m).
 LEVEL = np.diag([1e12] * 3 + [1.0] * 6)
 
 COMMON = 9  # states that all local filters have
@@ -43,24 +43,24 @@ BOTH = (WIND, WIND_OF_STAR)
 
 
 POINTS = filters.unscented(alpha=1.0, beta=2.0, kappa=0.0)
-"""The paper's sigma points, with a spread that rounding does not swamp (its alpha is 1e-4)."""
+"""The paper's sigma points, with a spread well above rounding (its alpha is 1e-4)."""
 
 
 def ukf(*of: Rule) -> Filter:
-    """Kalman filter by sigma points."""
+    """Unscented Kalman filter."""
     return kalman(POINTS, of)
 
 
 def ekf(*of: Rule) -> Filter:
-    """Kalman filter by derivatives."""
+    """Extended Kalman filter."""
     return kalman(taylor(), of)
 
 
 def robust() -> Filter:
-    """A local filter of RAUKF: equivalent weights, then fading by what they leave.
+    """A local filter of RAUKF: equivalent weights, then fading by the weighted innovations.
 
-    They judge radar and stars, not the wind, whose errors have states. The stars show no position,
-    which the fading of their filter would blow up without end.
+    They apply to radar and stars, not to the wind, whose errors have states. Stars do not observe
+    position, whose covariance the fading of their filter would inflate without bound.
     """
     weights = rules.igg3(1.5, 4.0, 1e-4, patience=None)
     fading = rules.innovation_fading(10, 5.0, reach=1e3)
@@ -68,7 +68,7 @@ def robust() -> Filter:
 
 
 def _locals(local: Callable[[], Filter], wind: Sequence[str] = ()) -> list[filters.Channel]:
-    """Two of one kind, for radar and stars; the first, or both, take the constraint."""
+    """Two local filters of one kind, for radar and stars; one or both use the constraint."""
     channels = (SAR, *wind[:1]), (STAR, *wind[1:])
     return [filters.channel(sensors, local()) for sensors in channels]
 
@@ -79,10 +79,10 @@ def _two(local: Callable[[], Filter], wind: Sequence[str] = (), **how: Any) -> F
 
 
 def _gated(constrained: Filter, assumption: tuple[str, ...]) -> Filter:
-    """The constraint as long as the filter without it does not contradict it.
+    """The constrained filter, while the unconstrained one does not contradict it.
 
-    Level velocity and position are judged. The ratio is higher than its default because the filter
-    without, fused by (51), is overconfident (NEES of velocity 1.95 a state).
+    Horizontal velocity and position are tested. The ratio is higher than its default because the
+    unconstrained filter, fused by (51), is overconfident (NEES of velocity 1.95 a state).
     """
     groups = ((3, 4), (6, 7))
     return filters.guarded(constrained, _two(ukf), assumption, SAR, groups=groups, ratio=3.0)
@@ -99,7 +99,7 @@ def _adaptive() -> Filter:
 
 
 class Candidate(NamedTuple):
-    """A filter of the study, its instruments as it takes them, its states."""
+    """A filter of the study, with its instruments and states."""
 
     make: Callable[[], Filter]
     instruments: tuple[Instrument, ...]
@@ -166,7 +166,7 @@ def as_case(states: States, of: Taken, sigma: Array, world: AirshipWorld) -> Cas
 
 
 def contender(given: Airship, course: AirshipCourse, name: str) -> Contender:
-    """A filter with its model, its data, and what it reports."""
+    """A filter with its model, its data and its reported blocks."""
     make, taking, states = CANDIDATES[name]
     sensors, of = filter_instruments(taking, given, course)
     sigma = jnp.concatenate([jnp.asarray(s) for s in states.sigma(given, course)])
@@ -179,7 +179,7 @@ def contender(given: Airship, course: AirshipCourse, name: str) -> Contender:
     )
 
 
-# ------------------------------------------------------------------------------ what is reported
+# ----------------------------------------------------------------------------------------- report
 
 BLOCKS = (
     StateBlock("attitude", slice(0, 3), "rad", "arcsec", "ENU", ENU),
@@ -188,7 +188,7 @@ BLOCKS = (
 )
 """Blocks reported by every filter of the study, errors being true minus estimated."""
 
-_AROUND_LOSS_S = (-1.0, 100.0, 200.0, 299.0, 350.0, 500.0)  # of which figures are stated
+_AROUND_LOSS_S = (-1.0, 100.0, 200.0, 299.0, 350.0, 500.0)  # after the loss begins
 
 
 def view(given: Airship, course: AirshipCourse) -> View:
@@ -200,7 +200,7 @@ def view(given: Airship, course: AirshipCourse) -> View:
     )
     at_s = [lost.begin + t for lost in given.sar.lost[:1] for t in _AROUND_LOSS_S]
     span, time = given.wind.span, course.epoch_s
-    # an epoch covers the second before it
+    # an epoch covers the step before it
     blown = (time > span.begin + 1e-9) & (time <= span.end + 1e-9) & given.wind.gusty
     return View(
         epoch_s=course.epoch_s,
@@ -216,7 +216,7 @@ def view(given: Airship, course: AirshipCourse) -> View:
 
 
 def published(name: str, windy: bool) -> dict[str, float]:
-    """The row of the paper's table that stands for a filter, if there is one."""
+    """The row of the paper's table for a filter, if there is one."""
     row = PUBLISHED["wind" if windy else "calm"].get(name, ())
     return {f"published_{key}": value for key, value in zip(METRICS, row, strict=False)}
 
@@ -224,10 +224,10 @@ def published(name: str, windy: bool) -> dict[str, float]:
 def airship_metrics(
     epoch_s: np.ndarray, at_s: Sequence[float], statistics: Any
 ) -> dict[str, Metric]:
-    """Metrics of one filter from its campaign statistics, over the epochs that count.
+    """Metrics of one filter from its campaign statistics, over the evaluation epochs.
 
     Means and standard deviations over time are of the length of the horizontal error, averaged over
-    the runs; a NEES is one for a filter that knows how wrong it is.
+    the runs; the NEES per state is one for a consistent filter.
     """
     position, velocity = (np.mean(statistics.norm(n), axis=0) for n in ("horizontal", "velocity"))
     out: dict[str, Any] = dict(zip(METRICS, map(float, [*position, *velocity]), strict=True))

@@ -1,10 +1,9 @@
 """An airship in the wind: its motion, its inertial unit, and one run of all instruments.
 
-A mass without much inertia of its own: it is carried by the wind, towards which its velocity
-settles with a time constant, dv/dt = (v_air + w - v) / T, and holds a course through the air, so in
-a gust it drifts sideways. The motion gives the increments that an ideal inertial unit would report;
-the truth is their mechanisation, so that an error-free unit navigates to it
-exactly.
+A point mass carried by the wind, whose velocity follows with a time constant,
+dv/dt = (v_air + w - v) / T. It holds its heading through the air, so in a gust it drifts sideways.
+The motion gives the increments of an ideal inertial unit; the truth is their mechanisation, so an
+error-free unit navigates to it exactly.
 
 The paper does not state the dynamics (time constant, sway); they are assumptions of the
 specification, and parameters here.
@@ -46,8 +45,8 @@ from robins.systems.airship.parameters import Airship, InstrumentRate
 from robins.systems.parts import as_array, outside, signed
 from robins.systems.study import Instrument
 
-PARTS = 2  # increments between two star sights that a filter with states for biases takes
-_BLEND_S = 20.0  # over which sway grows when gusts set in
+PARTS = 2  # increments between two star sights for filters with bias states
+_BLEND_S = 20.0  # time over which sway grows at the onset of gusts
 
 # Streams folded into the keys of a run; part of the file format, as `Component` is.
 _GUSTS, _TURBULENCE = 0, 1  # of the wind
@@ -64,7 +63,7 @@ class Datum(NamedTuple):
 
 
 class AirshipCourse(NamedTuple):
-    """Data that all runs share."""
+    """Data common to all runs."""
 
     epoch_s: np.ndarray  # (E,)
     sight_s: np.ndarray  # (E S,) of the stars, S in an epoch, the last at its end
@@ -75,7 +74,7 @@ class AirshipCourse(NamedTuple):
 
     @property
     def sights(self) -> int:
-        """S."""
+        """Number of star sights in an epoch, S."""
         return len(self.sight_s) // len(self.epoch_s)
 
 
@@ -92,8 +91,8 @@ class AirshipWorld(NamedTuple):
     gyro_bias: Array  # (3,) rad/s
     accel_bias: Array  # (3,) m/s^2
     wind: Array  # (E, 2) m/s, north east, true
-    steady_wind: Array  # (2,) m/s, the part of it that always blows
-    wind_error: Array  # (E, 2) m/s, of what is thought to be the wind: thought minus true
+    steady_wind: Array  # (2,) m/s, its steady part
+    wind_error: Array  # (E, 2) m/s, assumed minus true wind
     air_b: Array  # (E, 3) m/s, true velocity through the air, body axes
     readings: dict[str, Any]  # of each instrument, leading axis E; NaN where there is none
 
@@ -139,7 +138,7 @@ def _towards(direction: float) -> np.ndarray:
 
 
 def sampled_at(time_s: np.ndarray, instrument: InstrumentRate) -> np.ndarray:
-    """Mask of the times at which an instrument reads: at its own rate, and not where it is lost."""
+    """Mask of the times at which an instrument measures: at its own rate, outside its outages."""
     every = round(1.0 / (time_s[0] * instrument.rate))  # the first step is as long as all
     return (np.arange(1, len(time_s) + 1) % every == 0) & outside(instrument.lost, time_s)
 
@@ -190,7 +189,7 @@ def _steps(given: Airship, step_s: float) -> int:
 def _desired(
     given: Airship, course: AirshipCourse, carried: WindMotion, time_s: Float[Array, "n"]
 ) -> Nav:
-    """The motion at times; position only as exactly as gravity and rates need it."""
+    """The motion at times; position only as accurate as gravity and rates require."""
     velocity, moved, _ = wind_motion_at(carried, time_s)
     zero = jnp.zeros_like(time_s)
     start = course.start.position
@@ -261,7 +260,7 @@ def simulate(
     parts = jax.tree.map(lambda x: by_epoch(x).reshape(count, -1, *x.shape[2:]), parts)
     single = jax.tree.map(by_epoch, single)
     truth = jax.tree.map(lambda x: by_epoch(x)[:, -1], path)
-    blown = wind_at(wind, step, jnp.asarray(course.epoch_s) - 1e-6)  # as the epoch ends
+    blown = wind_at(wind, step, jnp.asarray(course.epoch_s) - 1e-6)  # at the end of the epoch
     through = jnp.concatenate([truth.v_n[:, :2] - blown, truth.v_n[:, 2:]], 1)
     a, of_wind = given.air_data, jax.random.fold_in(key(Component.AIR_DATA), WIND_ERROR)
     world = AirshipWorld(

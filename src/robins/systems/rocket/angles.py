@@ -1,21 +1,21 @@
 """Test-bed A: roll, pitch, yaw and rates of a spinning body, as the paper states the problem.
 
-State x = (roll, pitch, yaw, p, q, r): Euler angles and the rates of the body. The paper does not
-print its state equation; this is the free axisymmetric body that a sounding rocket is above the
-air (k = 1, unless the filters believe wrong kinematic rows):
+State x = (roll, pitch, yaw, p, q, r): Euler angles and body rates. The paper does not print its
+state equation; this is the free axisymmetric body, a model of a sounding rocket above the
+atmosphere (k = 1, unless the filters assume wrong kinematic rows):
 
     roll'  = k (p + (q sin roll + r cos roll) tan pitch)                        (A1)
     pitch' = k (q cos roll - r sin roll)                                        (A2)
     yaw'   = k (q sin roll + r cos roll) / cos pitch                            (A3)
     p' = -e2 p ,   q' = e1 p r - e3 q ,   r' = -e1 p q - e3 r                   (A4)
 
-    F  by differentiating a step of Runge and Kutta of (A1) to (A4)
+    F  by differentiating a Runge-Kutta step of (A1) to (A4)
     Q = diag(angle^2 I, rate^2 I) T                                             (A5)
     z = (p, q, r) + v ,            H = [0  I]    a gyro                         (A6)
     z = (roll, pitch, yaw) + v ,   H = [I  0]    an integrated gyro, "magnetic attitude"   (A7)
 
 It is singular at a pitch of 90 deg. "Magnetic attitude", three angles from one vector, cannot be
-measured: it is kept because the paper's filters are fed with it.
+measured: it is kept because the paper's filters use it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ GYRO, MAGNETIC = "gyro", "magnetic"  # sensors
 
 
 class AngleState(NamedTuple):
-    """Attitude as angles, and rates [rad/s] of the body against inertial space."""
+    """Attitude as Euler angles, and rates [rad/s] of the body relative to inertial space."""
 
     roll: Angle
     pitch: Angle
@@ -52,7 +52,7 @@ class AngleCoefficients(NamedTuple):
 
 
 def angle_state(q_nb: Array, omega_b: Array) -> AngleState:
-    """The state, or a run of them, of an attitude and its rates."""
+    """State, or a time series of states, from attitude and rates."""
     roll, pitch, yaw = map(Angle, to_euler(q_nb))
     return AngleState(roll, pitch, yaw, omega_b)
 
@@ -69,7 +69,7 @@ def slope(c: AngleCoefficients, x: Array) -> Array:
 
 
 def step(c: AngleCoefficients, state: AngleState, u: Array | None) -> AngleState:
-    """One step of the motion by Runge and Kutta's classic rule."""
+    """One step of the motion by the classical Runge-Kutta method."""
     x = jnp.concatenate([jnp.stack([a.rad for a in state[:3]]), state.omega_b])
     h = c.step_s
     k1 = slope(c, x)
@@ -82,23 +82,23 @@ def step(c: AngleCoefficients, state: AngleState, u: Array | None) -> AngleState
 
 
 def no_motion(state: AngleState, u: Array | None) -> AngleState:
-    """No motion; with much noise, what is believed next is only what is measured next."""
+    """No motion; with large process noise, the estimate is the latest measurement alone."""
     return state
 
 
 def dead_reckoned(step_s: Number, state: AngleState, theta_b: Array) -> AngleState:
-    """Turn by the angles [rad] that the gyro reports of a step; its mean rate is that believed."""
+    """Rotate by the gyro's reported angles of a step [rad]; the rate is their mean over it."""
     q = multiply(from_euler(*(a.rad for a in state[:3])), from_rotvec(theta_b))
     return angle_state(q, theta_b / step_s)
 
 
 # (A6)
 def read_rate(state: AngleState, aux: Array | None) -> Array:
-    """(3,) what the gyro reads as a rate [rad/s]."""
+    """Rate read by the gyro (3,) [rad/s]."""
     return state.omega_b
 
 
 # (A7)
 def read_angles(state: AngleState, aux: Array | None) -> tuple[Angle, Angle, Angle]:
-    """Roll, pitch, yaw: what the "magnetic attitude" reads, or a gyro that has been integrated."""
+    """Roll, pitch, yaw (3,) [rad], as read by "magnetic attitude" or an integrated gyro."""
     return state[:3]

@@ -22,8 +22,8 @@ def _common_metrics(course: RocketCourse, statistics: Any) -> dict[str, Metric]:
     """Metrics of both studies: components 0 to 2 are the attitude's.
 
     ``attitude_rms_deg`` is the RMS error of an axis, pooled over the three, ``quiet_rms_deg`` the
-    same long after disturbances, ``burst_peak_deg`` the mean over axes, disturbances and runs of
-    the largest error soon after one.
+    same long after disturbances, ``burst_peak_deg`` the largest error within `PEAK_S` of the
+    beginning of a disturbance, averaged over axes, disturbances and runs.
     """
     counted = statistics.counted
     attitude, quiet = statistics.rms[counted, :3], course.quiet[counted]
@@ -58,7 +58,8 @@ def angle_metrics(course: RocketCourse, statistics: Any) -> dict[str, Metric]:
 def field_metrics(course: RocketCourse, statistics: Any) -> dict[str, Metric]:
     """Metrics of "field-vector": axes are those of the body, then about the field and across it.
 
-    ``total_rms_deg`` is of the angle of the error, ``across_field_rms_deg`` of its part across.
+    ``total_rms_deg`` is the RMS of the error angle, ``across_field_rms_deg`` of its component
+    across the field.
     """
     rms = np.degrees(rms_by_component(statistics))
     out = _common_metrics(course, statistics) | _each(BODY, "deg", rms[:3])

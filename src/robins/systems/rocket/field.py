@@ -1,8 +1,8 @@
 """Test-bed B: attitude on SO(3), driven by the gyro and corrected by the measured field.
 
 State x = (q, b, s): attitude q_nb, whose error phi is seen in n (q = exp(phi) q^), bias b of the
-gyro and, in some filters, its scale factors s. Input theta: the angle that the gyro reports of a
-step T. With C = R(q) J(w), J the left Jacobian of the rotations:
+gyro and, in some filters, its scale factors s. Input theta: the angle reported by the gyro over a
+step T. With C = R(q) J(w), J the left Jacobian of SO(3):
 
     w = (theta - T b) / (1 + s) ,      q <- q exp(w)                            (B1)
 
@@ -17,14 +17,15 @@ step T. With C = R(q) J(w), J the left Jacobian of the rotations:
 After Crassidis & Markley (2003), with rotation vectors in place of their modified Rodrigues
 parameters: the two differ in the third order of a sigma point's length.
 
-One vector leaves the turn about itself open; only because B_n turns along the flight, and because
-the gyro carries the attitude, does it become known in the end. How well is given by the
-information of K vectors with an angle noise sigma on a constant turn, H'R^-1 H of (B4):
+The rotation about a single vector is unobservable; it becomes observable because B_n turns along
+the flight and the gyro propagates the attitude. The accuracy follows from the information of K
+vectors with angle noise sigma on a constant rotation, H'R^-1 H of (B4):
 
     Y = 1/sigma^2 sum_k (I - b_k b_k') ,    b_k = B_k / |B_k|                   (B6)
 
-Its eigenvector of the least eigenvalue is the least known direction; for one vector that is b, with
-an eigenvalue of zero. It is what a perfect gyro would allow: a real one lets old vectors fade.
+The eigenvector of its least eigenvalue is the least observable direction; for one vector that is b,
+with an eigenvalue of zero. This is the bound for a perfect gyro: with a real one the information
+of old vectors decays.
 """
 
 from __future__ import annotations
@@ -53,12 +54,12 @@ from robins.rotation import (
     to_dcm,
 )
 
-FIELD, SNAPSHOT = "field", "snapshot"  # the sensor; the same taken at its word
+FIELD, SNAPSHOT = "field", "snapshot"  # the sensor; the same, used without a motion model
 REPORTED = 9  # attitude in body axes, attitude about and across the field, bias
 
-# Of a turn that is held over a lost sample of the gyro: what a coning body may have changed.
+# One sigma of the error of a held gyro sample, as a share of it: coning changes the rotation.
 HELD_DOUBT = 0.1
-_LEAST, _MOST = 0.3, 3.0  # of the size of the field that is expected
+_LEAST, _MOST = 0.3, 3.0  # plausible magnitudes, relative to the expected field
 
 
 class FieldState(NamedTuple):
@@ -69,7 +70,7 @@ class FieldState(NamedTuple):
 
 
 class ScaledState(NamedTuple):
-    """The same with the scale factors of the gyro's axes."""
+    """`FieldState` with the scale factor errors of the gyro axes."""
 
     q_nb: Rotation
     bias: Any  # (3,)
@@ -80,7 +81,7 @@ AnyState = FieldState | ScaledState
 
 
 class GyroTurn(NamedTuple):
-    """Input of a step: what the gyro reports, and how much more it is doubted than its noise."""
+    """Input of a step: the reported gyro angle, and its uncertainty in addition to its noise."""
 
     theta_b: Any  # (3,) rad
     doubt: Any = 0.0  # rad, one sigma, each axis
@@ -106,17 +107,17 @@ def field_sensor(sine: Array, name: str = FIELD) -> Sensor:
 
 # (B1)
 def propagate(g: GyroNoise, x: AnyState, u: GyroTurn) -> AnyState:
-    """Turn by what the gyro reports of a step."""
+    """Rotate by the reported gyro angle of a step."""
     return x._replace(q_nb=Rotation(normalise(multiply(x.q_nb.wxyz, from_rotvec(_turn(g, x, u))))))
 
 
 def _turn(g: GyroNoise, x: AnyState, u: GyroTurn) -> Array:
-    """(3,) the true turn w of a step, as the state sees it through what the gyro reports."""
+    """Rotation vector w (3,) [rad] of a step: the reported angle corrected for bias and scale."""
     return (u.theta_b - g.step_s * x.bias) / _stretch(x)
 
 
 def _stretch(x: AnyState) -> Array:
-    """(3,) 1 + s, which is far from zero wherever a gyro is worth the name."""
+    """(3,) 1 + s, which is far from zero for any usable gyro."""
     return 1.0 + x.scale if isinstance(x, ScaledState) else jnp.ones(3)
 
 
@@ -124,7 +125,7 @@ def _stretch(x: AnyState) -> Array:
 def propagated(g: GyroNoise, x: AnyState, u: GyroTurn):
     """`propagate` with its Jacobian and noise."""
     w, gain = _turn(g, x, u), 1.0 / _stretch(x)
-    # a step turns little, but coning bodies turn fast
+    # the rotation of a step is small, but not negligible for a coning body
     C = to_dcm(x.q_nb.wxyz) @ left_jacobian(w)
     rows = [jnp.eye(3), -g.step_s * C * gain[None, :], -C * (gain * w)[None, :]]
     n = dim(x)
@@ -134,7 +135,7 @@ def propagated(g: GyroNoise, x: AnyState, u: GyroTurn):
 
 # (B3)
 def noise_of(g: GyroNoise, x: AnyState, u: GyroTurn) -> Array:
-    """(n,) of a step: alike on all axes, so the same in body and navigation axes."""
+    """Standard deviations (n,) of a step: equal on all axes, so the same in body and n axes."""
     angle = jnp.sqrt(g.angle**2 + u.doubt**2)
     return jnp.concatenate([jnp.full(3, angle), jnp.full(3, g.bias), jnp.zeros(dim(x) - 6)])
 
@@ -159,9 +160,9 @@ def field_noise(sine: Array, x: AnyState, field_n: Array) -> Array:
 
 
 def bridged(theta_b: Array) -> GyroTurn:
-    """Angles (E, 3) of a gyro with lost samples, NaN: the last turn is held there, and doubted.
+    """Gyro angles (E, 3) with lost samples (NaN) held at the last one, and their uncertainty.
 
-    Before the first sample nothing is known: no turn, doubted by a radian.
+    Before the first sample the angle is zero with a sigma of one radian.
     """
 
     def hold(last, theta):
@@ -175,10 +176,10 @@ def bridged(theta_b: Array) -> GyroTurn:
 
 
 def plausible(field_b: Array, expected_n: Array, full_scale_t: float | None = None) -> Array:
-    """Fields (..., 3) with NaN for those that no magnetometer in order would read.
+    """Fields (..., 3) with implausible ones replaced by NaN.
 
-    A field of no size, or of less than 0.3 or more than 3 times the expected one, has no direction
-    that could be believed; nor has one with an axis at full scale, where that is known.
+    A zero field, one of less than 0.3 or more than 3 times the expected magnitude, or one with an
+    axis at full scale (where that is known) has no usable direction.
     """
     size, expected = (jnp.sqrt(jnp.sum(x**2, axis=-1)) for x in (field_b, expected_n))
     fits = (size >= _LEAST * expected) & (size <= _MOST * expected)
@@ -188,9 +189,9 @@ def plausible(field_b: Array, expected_n: Array, full_scale_t: float | None = No
 
 
 def rows_of(q_nb: Array, field_n: Array, n: int) -> Array:
-    """(E, 9, n) from a tangent error, whose attitude is in n, to what is reported.
+    """(E, 9, n) from a tangent error, whose attitude is in n, to the reported components.
 
-    Attitude in body axes; in axes along the field, and across it by the vertical; the bias.
+    Attitude error in body axes; the same about the field and across it; the bias.
     """
     b = field_n / jnp.sqrt(jnp.sum(field_n**2, axis=1, keepdims=True))
     level = jnp.cross(jnp.array([[0.0, 0.0, 1.0]]), b)
@@ -202,22 +203,22 @@ def rows_of(q_nb: Array, field_n: Array, n: int) -> Array:
 
 
 class Unobserved(NamedTuple):
-    """The least known direction, and how well the attitude could be known at best."""
+    """The least observable direction, and bounds on the attitude accuracy."""
 
     direction_n: np.ndarray  # (3,) unit vector
-    sigma_rad: float  # about it; infinite where nothing is known
-    across_rad: float  # about the best known direction
+    sigma_rad: float  # about it; infinite where unobservable
+    across_rad: float  # about the best observable direction
     from_field_rad: float  # angle between it and the mean field
     field_turn_rad: float  # largest angle between any vector and the first
 
 
 # (B6)
 def unobserved(field_n: np.ndarray, sigma_rad: float) -> Unobserved:
-    """The least known direction of a run of measured fields, and bounds for a perfect gyro.
+    """Least observable direction for a series of measured fields, and bounds for a perfect gyro.
 
     Args:
-        field_n: (K, 3) field where it is measured, in any unit; NaN rows count for nothing.
-        sigma_rad: of the direction of each vector, about each axis across it.
+        field_n: (K, 3) field where it is measured, in any unit; NaN rows are ignored.
+        sigma_rad: noise of the direction of each vector, about each axis across it.
 
     Raises:
         ValueError: no vector is left, one has no direction, or sigma is not positive.
@@ -232,7 +233,7 @@ def unobserved(field_n: np.ndarray, sigma_rad: float) -> Unobserved:
     b = field / size[:, None]
     Y = (len(b) * np.eye(3) - b.T @ b) / sigma_rad**2
     values, vectors = np.linalg.eigh(Y)
-    # K vectors of one direction leave rounding of the size of eps K
+    # rounding leaves an eigenvalue of about eps K for K vectors of one direction
     floor = 1e-12 * values[-1]
     with np.errstate(divide="ignore"):
         sigma = np.where(values > floor, 1.0 / np.sqrt(np.maximum(values, floor)), np.inf)
@@ -253,7 +254,7 @@ def unobserved(field_n: np.ndarray, sigma_rad: float) -> Unobserved:
 
 
 def sentence(found: Unobserved) -> str:
-    """The same in words."""
+    """Sentence that states the least observable direction and the bounds."""
     north, east, down = found.direction_n
     elevation = np.degrees(np.arcsin(-down))
     azimuth = np.degrees(np.arctan2(east, north)) % 360.0

@@ -51,7 +51,7 @@ class RocketGyro(Parameters):
     drift: q.RateSize = default("5 deg/h")
     drift_time: q.Duration = default("300 s")
     scale_factor: Annotated[float, Quantity("ratio", least="0")] = default("0 ppm")
-    # of the attitude that the gyro is integrated to, where that is what is read of it
+    # white noise of the integrated attitude, where the gyro reads that
     attitude_noise: q.Spread = default("0.5 deg")
     lost: tuple[Span, ...] = ()
 
@@ -76,7 +76,7 @@ class MagneticDisturbance(Parameters):
 class RocketMagnetometer(Parameters):
     """White noise and disturbances, as angles.
 
-    In "field-vector" hard iron is what a calibration left over, and an axis saturates at full
+    In "field-vector" hard iron is the residual after calibration, and an axis saturates at full
     scale.
     """
 
@@ -88,7 +88,7 @@ class RocketMagnetometer(Parameters):
 
 
 class RocketStart(Parameters):
-    """Start of the estimate: its error, and its believed sigma."""
+    """Start of the estimate: its error, and its assumed sigma."""
 
     attitude_error: q.Angles = default("0 deg")
     attitude: q.Spread = default("2 deg")
@@ -128,7 +128,7 @@ class RocketFlight(Scenario):
 
 
 class RocketAssumptions(Parameters):
-    """Motion as the filters believe it: the paper's equation is wrong by some per cent."""
+    """Motion assumed by the filters: the paper's equation with an error of some per cent."""
 
     error: Annotated[float, Quantity("ratio")] = default("0 %")  # of the coefficients
     wrong: Literal["rates", "all"] = "all"  # only e1, e2, e3, or the kinematic rows too

@@ -51,12 +51,12 @@ from robins.systems.study import Case, Contender, Norm, Recipe, StateBlock, Stud
 from robins.systems.tables import block_array
 
 PROBABILITY = 0.999  # of the chi-square tests
-PATIENCE = 30  # samples: 3 s, longer than a burst, shorter than a loss of track to be borne
-FORGETS = (10.0, 10.0)  # rad, rad/s: noise of a step that leaves nothing of what was before
+PATIENCE = 30  # samples: 3 s, longer than a burst, shorter than a tolerable loss of track
+FORGETS = (10.0, 10.0)  # rad, rad/s: noise of a step that removes all past information
 ANGLES_SEEN, RATES_SEEN = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
 _POINTS = filters.unscented(alpha=0.5, beta=2.0, kappa=0.0)
 
-# ------------------------------------------------------------------------- what filters are made of
+# ------------------------------------------------------------------------- parts of the filters
 
 
 def ukf(*rules: Rule) -> Filter:
@@ -70,12 +70,12 @@ def fading(fade: Literal["lumped", "multiple", "projected"] = "lumped", beta: fl
 
 
 def patient_gate() -> Rule:
-    """A gate that gives in when it has refused for too long, and reports it."""
+    """A gate that reopens after too many consecutive refusals, and reports it."""
     return gate(PROBABILITY, PATIENCE, "inflate")
 
 
 def discriminator_of(sensor: str, given: MagneticAttitude) -> Rule:
-    """Rule that separates outliers from model errors; it fades the states that the sensor reads."""
+    """Rule that separates outliers from model errors; it fades the states the sensor measures."""
     rates = sensor == GYRO and given.gyro_reads == "rate"
     seen = RATES_SEEN if rates else ANGLES_SEEN
     rule = discriminator(PATIENCE, PROBABILITY, 0.98, "multiple", threshold=PUBLISHED, weights=seen)
@@ -83,9 +83,10 @@ def discriminator_of(sensor: str, given: MagneticAttitude) -> Rule:
 
 
 def projected_discriminator(robust: Literal["huber", "gate"], looks: int) -> Rule:
-    """The same for one vector, that sees none of the states whole.
+    """The same for a single vector, which observes each state only in part.
 
-    What is faded there by mistake is not found again, hence a threshold by the length of the run.
+    Information faded by mistake is not recovered there, so the threshold follows from the length
+    of the run.
     """
     return discriminator(PATIENCE, PROBABILITY, 0.98, "projected", robust, looks=looks)
 
@@ -93,7 +94,7 @@ def projected_discriminator(robust: Literal["huber", "gate"], looks: int) -> Rul
 def sensors_of(
     given: RocketFlight, course: RocketCourse, names: tuple[str, ...]
 ) -> tuple[tuple[Sensor, ...], Taken]:
-    """`filter_instruments`, of the instruments of these names."""
+    """`filter_instruments` for the instruments of these names."""
     return filter_instruments([i for i in instruments(given) if i.name in names], given, course)
 
 
@@ -101,8 +102,8 @@ def bank(driver: str, *off: str) -> Filter:
     """A bank with the sigma points of the studies.
 
     Args:
-        driver: of the motion, "motion" where none of the instruments drives it.
-        off: sensors that may be off.
+        driver: instrument that drives the motion, "motion" where none does.
+        off: sensors that may be faulty.
     """
     return filters.adaptive(linearise=_POINTS, parts={driver: slice(None)}, off=off)
 
@@ -113,10 +114,10 @@ def bank(driver: str, *off: str) -> Filter:
 class AngleFilter(NamedTuple):
     """A filter of "magnetic-attitude"."""
 
-    sharing: Sharing | None = None  # of the information of two local filters; None: there is one
+    sharing: Sharing | None = None  # between two local filters; None: a single filter
     rule: Rule | None = None
     sensors: tuple[str, ...] = (GYRO, MAGNETIC)
-    raw: bool = False  # its sensor is taken at its word, without a model of the motion
+    raw: bool = False  # its sensor is used directly, without a motion model
     discriminates: bool = False  # outliers from model errors, of each sensor
     adapts: bool = False  # a bank over the process noise
 
@@ -144,7 +145,7 @@ ANGLE_FILTERS: dict[str, AngleFilter] = {
 
 
 def angle_filter(given: MagneticAttitude, chosen: AngleFilter) -> Filter:
-    """The filter itself. Two local filters are reset at every step; scalar shares are halves."""
+    """Make the filter. Two local filters are reset at every step; scalar shares are halves."""
 
     def own(*sensors: str) -> Filter:
         rules = [discriminator_of(s, given) for s in sensors] if chosen.discriminates else []
@@ -153,7 +154,7 @@ def angle_filter(given: MagneticAttitude, chosen: AngleFilter) -> Filter:
     if chosen.raw:
         return kalman(filters.taylor())
     if chosen.adapts:
-        # Of two that read the angles an integrated gyro is off, sooner or later: it only adds up.
+        # Of two sensors of the angles, the integrated gyro becomes wrong: its error accumulates.
         adds_up = given.gyro_reads == "attitude"
         return bank("motion", GYRO, *(() if adds_up else (MAGNETIC,)))
     if chosen.sharing is None:
@@ -169,7 +170,7 @@ def angle_filter(given: MagneticAttitude, chosen: AngleFilter) -> Filter:
 
 @cache  # half a second, the same for all filters of a scenario
 def shares_by_state(given: MagneticAttitude) -> np.ndarray:
-    """(2, 6) by how well gyro and magnetometer see each state at the start."""
+    """(2, 6) shares by the initial observability of each state from gyro and magnetometer."""
     q, omega = start_of(given)
     start = angle_state(with_angle_errors(q, given.start.attitude_error), omega)
     channels = [filters.channel((sensor,), kalman()) for sensor in (GYRO, MAGNETIC)]
@@ -180,12 +181,12 @@ def shares_by_state(given: MagneticAttitude) -> np.ndarray:
 
 
 def angle_sigma(given: MagneticAttitude) -> Array:
-    """(6,) initial, of angles and rates."""
+    """Initial sigma (6,) of angles [rad] and rates [rad/s]."""
     return jnp.repeat(jnp.array([given.start.attitude, given.start.rate]), 3)
 
 
 def angle_model(given: MagneticAttitude, course: RocketCourse, chosen: AngleFilter) -> Model:
-    """Motion and sensors that a filter believes."""
+    """Motion and sensors assumed by a filter."""
     b, T, white = given.believed, given.step, given.gyro.white
     sensors, _ = sensors_of(given, course, chosen.sensors)
     if not chosen.raw:
@@ -200,7 +201,7 @@ def angle_model(given: MagneticAttitude, course: RocketCourse, chosen: AngleFilt
 
 
 def coefficients(given: MagneticAttitude) -> angles.AngleCoefficients:
-    """Coefficients of the believed motion: the paper's equation is wrong by some per cent."""
+    """Coefficients of the assumed motion: the paper's equation with an error of some per cent."""
     wrong = 1.0 + given.believed.error
     kinematic = wrong if given.believed.wrong == "all" else 1.0
     e1, e2, e3 = (wrong * e for e in body_of(given))
@@ -233,9 +234,9 @@ class FieldFilter(NamedTuple):
     """A filter of "field-vector"."""
 
     filter: Filter = ukf()
-    sensors: tuple[str, ...] = (FIELD,)  # or SNAPSHOT, the field taken at its word
+    sensors: tuple[str, ...] = (FIELD,)  # or SNAPSHOT, the field without a motion model
     scaled: bool = False  # scale factors of the gyro are states
-    # outliers separated from model errors, and what is done to outliers, in place of `filter`
+    # how outliers are treated by a rule that separates them from model errors; replaces `filter`
     discriminates: Literal["huber", "gate"] | None = None
 
 
@@ -256,9 +257,9 @@ FIELD_FILTERS: dict[str, FieldFilter] = {
 
 
 def field_model(given: FieldVector, course: RocketCourse, chosen: FieldFilter) -> Model:
-    """Motion and sensor that a filter believes."""
+    """Motion and sensor assumed by a filter."""
     g, T = given.gyro, given.step
-    # a drift of correlation time tau walks away from where it is by this in a step
+    # random walk in a step equivalent to a drift of correlation time tau
     walk = g.drift * math.sqrt(2.0 * T / g.drift_time)
     angle = FORGETS[0] if SNAPSHOT in chosen.sensors else g.white * T
     motion = field.field_motion(field.GyroNoise(*map(jnp.asarray, (angle, walk, T))))
@@ -267,16 +268,16 @@ def field_model(given: FieldVector, course: RocketCourse, chosen: FieldFilter) -
 
 
 def field_sigma(given: FieldVector, chosen: FieldFilter) -> Array:
-    """(n,) initial, of attitude, bias and scale factors."""
+    """Initial sigma (n,) of attitude [rad], bias [rad/s] and scale factors."""
     bias = 0.0 if SNAPSHOT in chosen.sensors else math.hypot(given.gyro.bias, given.gyro.drift)
     scale = [given.scale_factor_sigma] if chosen.scaled else []
     return jnp.repeat(jnp.array([given.start.attitude, bias, *scale]), 3)
 
 
 def field_case(scaled: bool, of: Taken, numbers: tuple[Array, Array], world: RocketWorld) -> Case:
-    """Case of a filter of "field-vector" in a run, scale factors being states or not; pure.
+    """Case of a filter of "field-vector" in a run, with or without scale factor states; pure.
 
-    Its numbers are the initial sigma (n,) and the field (E, 3) [T] in n.
+    ``numbers`` are the initial sigma (n,) and the field (E, 3) [T] in n.
     """
     sigma, field_n = numbers
     world = world._replace(field_n=field_n)

@@ -1,4 +1,4 @@
-"""A rocket in free flight as it is simulated: truth, gyro, magnetometer in both of its readings.
+"""Simulation of a rocket in free flight: truth, gyro, and both kinds of magnetometer.
 
 The two studies share the body, the gyro and the disturbances. Their instruments are declared here.
 """
@@ -37,7 +37,7 @@ from robins.systems.rocket.field import FIELD, SNAPSHOT, field_sensor, plausible
 from robins.systems.rocket.parameters import MagneticAttitude, RocketFlight
 from robins.systems.study import Instrument, SensorAxes
 
-PEAK_S = 3.0  # after the beginning of a disturbance, in which its largest error is looked for
+PEAK_S = 3.0  # after the beginning of a disturbance: window of its largest error
 EULER, BODY = ("roll", "pitch", "yaw"), ("x", "y", "z")
 _SECONDS_A_YEAR = 365.25 * 86400.0
 # Streams folded into the key of the magnetometer; the noise of the integrated gyro is one too.
@@ -45,13 +45,13 @@ _VECTOR, _ANGLES, _DISTURBED, _INTEGRATED = range(4)
 
 
 class RocketCourse(NamedTuple):
-    """Data that all runs share; E steps."""
+    """Data common to all runs; E steps."""
 
     time_s: np.ndarray  # (E,) at the end of each step
     field_n: np.ndarray  # (E, 3) T, launch north-east-down, which is inertial
     alt_m: np.ndarray  # (E,)
-    seen: np.ndarray  # (E,) bool, whether the magnetometer measures
-    felt: np.ndarray  # (E,) bool, whether the gyro does
+    seen: np.ndarray  # (E,) bool, True where the magnetometer measures
+    felt: np.ndarray  # (E,) bool, True where the gyro measures
     bursts: tuple[slice, ...]  # steps within 3 s of the beginning of a disturbance
     quiet: np.ndarray  # (E,) bool, long after one
 
@@ -62,9 +62,9 @@ class RocketWorld(NamedTuple):
     q_nb: Array  # (E + 1, 4) true attitude at the start and at the end of each step
     omega_b: Array  # (E + 1, 3) true rate [rad/s]
     errors: MemsErrors  # of the gyro
-    start_q_nb: Array  # (4,) that filters begin with
+    start_q_nb: Array  # (4,) initial estimate of the filters
     start_omega_b: Array  # (3,)
-    theta_b: Array  # (E, 3) what the gyro turned by in each step [rad]
+    theta_b: Array  # (E, 3) reported gyro angle of each step [rad]
     readings: Mapping[str, Any] = {}  # of the instruments of the study, leading axis E
     field_n: Any = None  # (E, 3) T, the same in all runs: not simulated, but added by a case
 
@@ -78,7 +78,7 @@ def lay_out(given: RocketFlight) -> RocketCourse:
     """Steps, path and field, in NumPy.
 
     Raises:
-        ValueError: the flight ends on the ground, or leaves the life of the magnetic model.
+        ValueError: the flight ends on the ground, or its date is outside the magnetic model's.
     """
     count = math.floor(given.duration / given.step + 1e-9)
     time = given.step * np.arange(1, count + 1)
@@ -118,7 +118,7 @@ def _disturbed(given: RocketFlight, time_s: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def faults(given: RocketFlight, time_s: np.ndarray, name: str) -> dict[str, np.ndarray]:
-    """Masks (E,) of the disturbed magnetometer, by its name, and of a wrongly believed motion."""
+    """Masks (E,) of the disturbed magnetometer, by its name, and of a wrong motion model."""
     burst = given.magnetometer.disturbance
     disturbed = np.zeros(len(time_s), bool)
     if burst is not None:
@@ -128,7 +128,7 @@ def faults(given: RocketFlight, time_s: np.ndarray, name: str) -> dict[str, np.n
 
 
 def body_of(given: RocketFlight) -> FreeBody:
-    """The coefficients of the body as it truly is."""
+    """True coefficients of the body."""
     b = given.body
     return FreeBody(b.e1, *(0.0 if t is None else 1.0 / t for t in (b.spin_decay, b.cone_decay)))
 
@@ -186,7 +186,7 @@ def _rate(given: RocketFlight, course: RocketCourse, key: Array, world: RocketWo
 def _integrated(
     given: RocketFlight, course: RocketCourse, key: Array, world: RocketWorld
 ) -> tuple[Angle, ...]:
-    """Roll, pitch, yaw by a gyro integrated from a start, with its slow errors, and white noise."""
+    """Roll, pitch, yaw (E, 3) [rad] of the integrated gyro: slow errors and white noise."""
     turned = to_rotvec(multiply(conjugate(world.q_nb[:-1]), world.q_nb[1:]))
     path = integrate_angles(world.start_q_nb, turned + given.step * world.bias)
     white = jax.random.normal(jax.random.fold_in(key, _INTEGRATED), turned.shape)
@@ -197,7 +197,7 @@ def _integrated(
 def _magnetic(
     given: RocketFlight, course: RocketCourse, key: Array, world: RocketWorld
 ) -> tuple[Angle, ...]:
-    """Roll, pitch, yaw as papers have a magnetometer measure them."""
+    """Roll, pitch, yaw (E, 3) [rad] of the fictitious "magnetic attitude" sensor."""
     magnet, euler = given.magnetometer, jnp.stack(to_euler(world.q_nb[1:]), 1)
     wrong, seen = _burst(angle_bursts, given, course, key), jnp.asarray(course.seen)
     white = jax.random.fold_in(key, _ANGLES)
@@ -205,7 +205,7 @@ def _magnetic(
 
 
 def _field(given: RocketFlight, course: RocketCourse, key: Array, world: RocketWorld) -> Array:
-    """(E, 3) T."""
+    """Measured field (E, 3) [T], body axes."""
     magnet, field_n = given.magnetometer, jnp.asarray(course.field_n)
     return observe_field(
         jax.random.fold_in(key, _VECTOR),
@@ -239,7 +239,7 @@ def _believed_field(given: RocketFlight, course: RocketCourse, name: str = FIELD
 
 @lru_cache
 def taken_field(full_scale_t: float | None) -> Callable[[RocketWorld], tuple[Array, Array]]:
-    """Plausible readings of the magnetometer and the field expected; one function for one scale."""
+    """Function to take plausible readings and the expected field; cached by full scale."""
 
     def taken(world: RocketWorld) -> tuple[Array, Array]:
         return plausible(world.readings[FIELD], world.field_n, full_scale_t), world.field_n

@@ -1,7 +1,7 @@
-"""A small satellite that steers by its estimate: star sensor, gyro of multi-source noise, wheels.
+"""A small satellite controlled by its estimate: star sensor, gyro of multi-source noise, wheels.
 
-After the patent of a mixed H2/H-infinity filter and its test platform: that filter in the readings
-that can work, the filters that it is compared with, and the one to use instead.
+After the patent of a mixed H2/H-infinity filter and its test platform: that filter in the
+interpretations that can work, the filters that it is compared with, and the recommended one.
 
 `SYSTEM` is made when it is used: the processes of the test bench need the model alone, and
 start much sooner without the campaign's packages.

@@ -2,11 +2,11 @@
 
 Per axis and from star frame to star frame (period Ts) the error of attitude and bias is
 
-    A = [1 -Ts; 0 1],   Q as of the gyro over Ts,   y = dtheta + star noise,   z = dtheta,
+    A = [1 -Ts; 0 1],   Q of the gyro over Ts,   y = dtheta + star noise,   z = dtheta,
 
 and the modelling error n is a rate, Bn = [Ts; 0], or a drift of the bias, Bn = [-Ts^2/2; Ts].
-Between frames the filter moves with the gyro, so one design serves at any rate of rotation. Numbers
-are in arcsec and s inside: in radians variances are of 1e-10, and a solver's tolerances are not.
+Between frames the filter propagates with the gyro, so one design holds at any angular rate.
+Internal units are arcsec and s: in radians variances would be 1e-10, below a solver's tolerances.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ class GainSpec(NamedTuple):
     """Design method of the gain of an axis."""
 
     method: Literal["raw", "h2", "lmi", "riccati"]
-    share: float = 1.0  # gamma over the H-infinity norm that the Kalman filter of the axis has
+    share: float = 1.0  # gamma over the H-infinity norm of the Kalman filter of the axis
     enters: Literal["rate", "bias"] = "rate"  # where the modelling error n does
 
 
 class SensorNoise(NamedTuple):
-    """Believed noise of gyro and star sensor, SI; hashable, for gains are kept."""
+    """Assumed noise of gyro and star sensor, SI; hashable, because gains are cached."""
 
     random_walk: float
     rate_walk: float
@@ -60,7 +60,7 @@ def axis_design(b: SensorNoise, star_rad: float, spec: GainSpec) -> Design:
 
     Raises:
         robins.filters.synthesis.programs.MissingExtra: a design by LMI without the extra "design".
-        robins.filters.synthesis.Unreachable: no gain of this way has such a worst case.
+        robins.filters.synthesis.Unreachable: no gain of this method meets the bound.
     """
     plant = axis_plant(b, star_rad, spec.enters)
     best = kalman_design(plant)
@@ -73,7 +73,7 @@ def axis_design(b: SensorNoise, star_rad: float, spec: GainSpec) -> Design:
 
 
 def gain(b: SensorNoise, spec: GainSpec) -> np.ndarray:
-    """(6, 3) gain of attitude and bias [1, 1/s] on what the star sensor reads."""
+    """(6, 3) gain of attitude and bias [1, 1/s] from the star sensor's measurement."""
     K = np.zeros((6, 3))
     for i, star_rad in enumerate(b.star_rad):
         one = np.array([1.0, 0.0])
@@ -84,7 +84,7 @@ def gain(b: SensorNoise, spec: GainSpec) -> np.ndarray:
 
 
 def inflation(b: SensorNoise, spec: GainSpec) -> np.ndarray:
-    """(6, 3) factor of the noise per frame that makes a Kalman filter of these gains, SI.
+    """(6, 3) factor of added noise per frame with which a Kalman filter has these gains, SI.
 
     sqrt(lambda) Bn of each axis, for a Riccati design.
     """
@@ -99,9 +99,9 @@ def inflation(b: SensorNoise, spec: GainSpec) -> np.ndarray:
 def facts(b: SensorNoise, spec: GainSpec) -> Mapping[str, float]:
     """Figures of a filter from its certified norms, for its metrics.
 
-    ``predicted_rms_arcsec``: the H2 norms of the three axes as one, the error at star frames if the
-    noise is as believed. ``worst_case_share``: the H-infinity norm over that of the Kalman filter,
-    of the worst axis.
+    ``predicted_rms_arcsec``: root sum square of the H2 norms of the three axes, the error at star
+    frames under the assumed noise. ``worst_case_share``: the H-infinity norm over that of the
+    Kalman filter, for the worst axis.
     """
     if spec.method == "raw":
         return {}

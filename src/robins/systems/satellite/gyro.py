@@ -17,9 +17,9 @@ ARCSEC = math.pi / 648000.0
 
 
 def equivalent_walk(rate_walk: Any, markov: Any, markov_time: Any) -> Any:
-    """Random walk of the rate that stands for itself and a Markov drift, sqrt(rrw^2 + 2 s^2/tau).
+    """Rate random walk equivalent to itself plus a Markov drift, sqrt(rrw^2 + 2 s^2/tau).
 
-    A Markov process of correlation time tau walks away from where it is like that at first.
+    For times short against tau a Markov process grows like this random walk.
     """
     return math.sqrt(rate_walk**2 + 2.0 * markov**2 / markov_time)
 

@@ -1,7 +1,7 @@
 """The filters of the satellite: their states, and their models of gyro and star sensor.
 
-The attitude q_ib maps body to inertial, its error is seen in the body: q = q^ exp(dtheta). Over a
-sample of length T the gyro reports theta, and of attitude and bias b
+The attitude q_ib maps body to inertial, with its error in body axes: q = q^ exp(dtheta). Over a
+sample of length T the gyro reports theta, and attitude and bias b obey
 
     q+ = q exp(theta - T b),    dtheta+ = exp(-[theta - T b]x) dtheta - T J dbias,
 
@@ -28,7 +28,7 @@ from robins.systems.satellite.gyro import walk_covariance
 from robins.systems.satellite.nodes import STAR, StateForm
 
 GATE = 0.9999962  # chi-square of 3 at 27.9
-PATIENCE = 20  # frames refused in a row, after which what they agree on is believed again
+PATIENCE = 20  # consecutive refused frames after which their common value is accepted
 Build = Literal["mekf", "quaternion", "gated", "adaptive", "fixed", "fixed-gated", "redesigned"]
 
 
@@ -40,14 +40,14 @@ class AttitudeState(NamedTuple):
 
 
 class QuaternionState(NamedTuple):
-    """State of a filter that adds to the components of the quaternion."""
+    """State of an additive filter, with the quaternion's components."""
 
     q_ib: Array  # (4,)
     gyro_bias: Array  # (3,) rad/s
 
 
 class GyroNoiseModel(NamedTuple):
-    """Believed noise of the gyro, for a sample of length T."""
+    """Assumed noise of the gyro, for a sample of length T."""
 
     step_s: Array  # ()
     factor: Array  # (6, 6) of Q, attitude and bias
@@ -114,7 +114,7 @@ def _read_additive(x: QuaternionState, aux: Array | None) -> BodyRotation:
 
 
 def _rows_additive(q_ib: Array) -> Array:
-    """(6, 7) attitude error in body axes and error of the bias, from those of the components."""
+    """(6, 7) map of component errors to attitude error in body axes and bias error."""
     rows = jnp.zeros((6, 7))
     return rows.at[:3, :4].set(2.0 * xi(q_ib).T).at[3:, 4:].set(jnp.eye(3))
 
@@ -154,7 +154,7 @@ def start(q_ib: Array, attitude_rad: Listed, bias_rad_s: Listed, additive: bool 
     sizes = jnp.repeat(jnp.stack([jnp.asarray(attitude_rad), jnp.asarray(bias_rad_s)]), 3)
     if not additive:
         return Belief(AttitudeState(BodyRotation(q_ib), jnp.zeros(3)), jnp.diag(sizes))
-    # sigma alike about all axes and nothing uncertain along q: P = sigma^2 Xi Xi'/4
+    # sigma equal about all axes and no uncertainty along q: P = sigma^2 Xi Xi'/4
     attitude = linalg.tria(0.5 * sizes[0] * xi(q_ib))
     factor = jnp.zeros((7, 7)).at[:4, :4].set(attitude).at[4:, 4:].set(jnp.diag(sizes[3:]))
     return Belief(QuaternionState(q_ib, jnp.zeros(3)), factor)
@@ -162,7 +162,7 @@ def start(q_ib: Array, attitude_rad: Listed, bias_rad_s: Listed, additive: bool 
 
 @cache  # made before a run is traced: a rule checks its gain, which a trace cannot
 def make_filter(build: Build) -> Filter:
-    """The filter of a build; those that differ in their gains share it, for a gain is data."""
+    """The filter of a build; shared by filters that differ in their gains, which are data."""
     if build == "adaptive":
         return adaptive(parts={"gyro": slice(None)})
     if build == "redesigned":  # imported here: other filters need no designs

@@ -1,10 +1,10 @@
-"""The parts of the loop, each a pure function of what reaches it.
+"""The parts of the loop, each a pure function of its inputs.
 
     belief, gyro --acm--> command --actuators--> torque, dipole --plant--> motion --gyro, star-->
 
-Each is what a process of the test bench runs, and `react` strings them together for a run inside
-one program. There they are kept `compiled_alone`: XLA would else fuse the end of one with the
-beginning of the next, and round otherwise than it does in a process that runs one of them alone.
+Each is the task of a process of the test bench, and `react` chains them for a run inside one
+program. There they are `compiled_alone`: otherwise XLA would fuse the end of one with the
+beginning of the next, and round differently from a process that runs one of them alone.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from robins.sim.spacecraft import (
 from robins.sim.star_sensor import StarCamera, measure_attitude, read_star
 
 STAR = "star"  # the sensor
-NO_GAIN = "lmi_step.failed"  # note of a frame: no new gain passed, the last one stays
-UNIT = 1e-3  # that the length of a quaternion may be off by
+NO_GAIN = "lmi_step.failed"  # note of a frame: no new gain was accepted, the last one is kept
+UNIT = 1e-3  # tolerance of the length of a quaternion
 
 
 class StarSensorFault(NamedTuple):
-    """Effect of the star sensor on the truth at the end of a step, besides noise."""
+    """Faults of the star sensor at the end of a step, besides noise."""
 
-    seen: Array  # () bool, whether there is a frame
-    stuck: Array  # () bool, whether it is the last one again
+    seen: Array  # () bool, True if there is a frame
+    stuck: Array  # () bool, True if it repeats the last one
     turn: Array  # (3,) rad, rotation vector in sensor axes
     factor: Array  # () of the components of the quaternion: 1, -1, or wrong
 
@@ -51,12 +51,12 @@ class StarSensorFault(NamedTuple):
 class NoiseFreeInputs(NamedTuple):
     """External inputs of a step; with leading axis E in a course."""
 
-    ref_q_ib: Array  # (4,) wanted attitude at its beginning
+    ref_q_ib: Array  # (4,) reference attitude at its beginning
     ref_omega_b: Array  # (3,) its rate
     ref_alpha_b: Array  # (3,) and angular acceleration
-    ref_end_q_ib: Array  # (4,) wanted attitude at its end
-    r_i_m: Array  # (3,) place in the middle of it
-    field_i_t: Array  # (3,) magnetic field there
+    ref_end_q_ib: Array  # (4,) reference attitude at its end
+    r_i_m: Array  # (3,) position in the middle of it [m]
+    field_i_t: Array  # (3,) magnetic field there [T]
     disturbance_b: Array  # (3,) N m
     wheel_works: Array  # (W,) 1, or 0 for a wheel that gives no torque
     star: StarSensorFault
@@ -64,11 +64,11 @@ class NoiseFreeInputs(NamedTuple):
 
 
 class CameraOptics(NamedTuple):
-    """The camera of a star sensor, and how it knows its stars."""
+    """The camera of a star sensor, and its star identification."""
 
     camera: StarCamera
     sky: StarIndex
-    match_rad: Array  # () how near a star must be to where it is expected
+    match_rad: Array  # () greatest angle of a match between a star and its predicted direction
 
 
 class ActuatorCommand(NamedTuple):
@@ -87,7 +87,7 @@ class Actuation(NamedTuple):
 
 
 class LoopConstants(NamedTuple):
-    """Numbers of the loop that stay the same in a run; the gyro and the stars are drawn for it."""
+    """Constants of the loop within a run; gyro errors and star noise are drawn for the run."""
 
     craft: Spacecraft
     control: Controller
@@ -96,7 +96,7 @@ class LoopConstants(NamedTuple):
     quantum_rad: Array  # () of the gyro
     lens: CameraOptics | None = None  # where the star sensor is a camera
     gyro_matrix: Any = None  # (3, 3) scale factor errors and misalignments, of a run
-    star_key: Any = None  # of what a camera sees, of a run
+    star_key: Any = None  # key of a camera's images in a run
 
 
 class StepInputs(NamedTuple):
@@ -114,16 +114,16 @@ class StarFrame(NamedTuple):
     q_ib: Array  # (4,); NaN without a frame
     factor: Array | None  # (3, 3) of its covariance [rad], body axes, where it reports one
     stars: Array | None  # () used, where it is a camera
-    seen_q_ib: Array  # (4,) for the next time
+    seen_q_ib: Array  # (4,) for the next frame
 
 
 class VehicleState(NamedTuple):
     """State of the vehicle with its gyro."""
 
     craft: CraftState
-    residue: Array  # (3,) rad, what the gyro has not reported yet
-    theta: Array  # (3,) rad, what it reported last
-    star_q_ib: Array  # (4,) what the star sensor saw last
+    residue: Array  # (3,) rad, angle not yet reported by the gyro
+    theta: Array  # (3,) rad, its last report
+    star_q_ib: Array  # (4,) last attitude of the star sensor
 
 
 def acm(
@@ -134,10 +134,10 @@ def acm(
     wheel_h: Array,
     row: NoiseFreeInputs,
 ) -> ActuatorCommand:
-    """Attitude control: from the estimate, the last sample of the gyro and the wheels' speeds.
+    """Attitude control from the estimate, the last gyro sample and the wheel momenta.
 
-    The rate is that of the gyro less the estimated bias; the field is that of its model, turned
-    into body axes by the estimate.
+    The rate is that of the gyro less the estimated bias; the field is that of its model, resolved
+    in body axes by the estimate.
     """
     held = wheel_momentum_b(given.craft, wheel_h)
     field_b = rotate(conjugate(q_ib), row.field_i_t)
@@ -169,7 +169,7 @@ def actuators(
 def plant(
     given: LoopConstants, state: CraftState, given_by: Actuation, row: NoiseFreeInputs
 ) -> CraftState:
-    """The craft one step on."""
+    """State of the craft one step later."""
     return advance(
         given.craft,
         state,
@@ -183,13 +183,13 @@ def plant(
 
 
 def gyro(given: LoopConstants, before: Array, after: Array, residue: Array, row: StepInputs):
-    """Reported angle of the gyro over a turn (3,), and the residue for the next sample."""
+    """Reported gyro angle (3,) [rad] of a step, and the residue for the next sample."""
     turned = to_rotvec(multiply(conjugate(before), after))
     return read_gyro(turned, row.gyro_angle, given.gyro_matrix, residue, given.quantum_rad)
 
 
 def expected_attitude(given: LoopConstants, q_ib: Array, bias: Array, theta: Array) -> Array:
-    """Attitude where a star camera looks for its stars, from what was believed a step before."""
+    """Predicted attitude for star identification, from the estimate one step before."""
     return multiply(q_ib, from_rotvec(theta - given.step_s * bias))
 
 
@@ -219,7 +219,7 @@ def star_frame(
     factor: Array | None = None,
     stars: Array | None = None,
 ) -> StarFrame:
-    """Frame of the star sensor from an attitude that it has measured."""
+    """Frame of the star sensor from its measured attitude."""
     effect = row.course.star
     now = multiply(q_ib, from_rotvec(effect.turn))
     now = jnp.where(effect.seen & ~effect.stuck, now, before)
@@ -237,7 +237,7 @@ def _looks(
 
 
 def solved_attitude(q_ib: Array, covariance: Array, stars: Array) -> tuple[Array, Array, Array]:
-    """A measured attitude with the factor of its covariance; that of one where there is none."""
+    """A measured attitude with the factor of its covariance; the identity where there is none."""
     there = jnp.all(jnp.isfinite(covariance))
     return q_ib, linalg.cholesky(jnp.where(there, covariance, jnp.eye(3))), stars
 
@@ -248,24 +248,24 @@ def closed_shutter(*_: PyTree) -> tuple[Array, Array, Array]:
 
 
 def believable(q_ib: Array) -> BodyRotation:
-    """An attitude as a measurement; one that is no unit quaternion is taken for missing."""
+    """An attitude as a measurement; one that is not a unit quaternion counts as missing."""
     off = jnp.abs(jnp.sum(q_ib * q_ib) - 1.0)
     return BodyRotation(jnp.where(off <= 2.0 * UNIT, q_ib, jnp.nan))
 
 
 def pointing_error(q_ref_ib: Array, q_ib: Array) -> Array:
-    """Rotation vector from where the craft should point to where it does, reference axes."""
+    """Rotation vector [rad] from the reference attitude to the true one, reference axes."""
     return to_rotvec(multiply(conjugate(q_ref_ib), q_ib))
 
 
 def begin(given: LoopConstants, craft: CraftState) -> VehicleState:
-    """The vehicle before its first step; its gyro has reported the rate that it has."""
+    """The vehicle before its first step; its gyro has already reported the initial rate."""
     theta = given.step_s * rate_b(given.craft, craft)
     return VehicleState(craft, jnp.zeros(3), theta, craft.q_ib)
 
 
 class StateForm(NamedTuple):
-    """Reading of the state of a filter, and writing of its truth."""
+    """Access to a filter's attitude, and its state made from the truth."""
 
     attitude: Callable[[Any], Array]  # mean -> q_ib
     bias: Callable[[Any], Array]
@@ -274,7 +274,7 @@ class StateForm(NamedTuple):
 
 
 def compiled_alone(node: Callable, *args: PyTree) -> PyTree:
-    """A node as if it were compiled alone, so that it gives the same bits as where it is."""
+    """Run a node as if compiled alone, so that it gives the same bits as in its own process."""
     settled = jax.lax.optimization_barrier
     return settled(node(*settled(args)))
 
@@ -291,16 +291,16 @@ def react(
     move: Callable = _MOVES,
     look: Callable = _LOOKS,
 ):
-    """Move the loop on by a step: control acts on the estimate, sensors observe the result.
+    """Advance the loop by a step: control acts on the estimate, sensors observe the result.
 
     Args:
-        form: how the state of the filter is read.
-        given: numbers of the loop.
+        form: access to the state of the filter.
+        given: constants of the loop.
         v: the vehicle at the beginning of the step.
-        belief: of the filter, there.
-        row: what drives the step from outside.
-        move: the plant, or nodes that do the same, kept apart.
-        look: the star sensor, or nodes that do the same, kept apart.
+        belief: the filter's, at the same time.
+        row: external inputs of the step.
+        move: the plant, or equivalent nodes compiled separately.
+        look: the star sensor, or equivalent nodes compiled separately.
     """
     q, bias = compiled_alone(form.attitude, belief.mean), form.bias(belief.mean)
     command = compiled_alone(acm, given, q, bias, v.theta, v.craft.wheel_h, row.course)

@@ -1,4 +1,4 @@
-"""Parameters of a small satellite that steers by its estimate, with units."""
+"""Parameters of a small satellite controlled by its estimate, with units."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class OrbitParameters(Parameters):
 
 
 class Craft(Parameters):
-    """Inertia and what disturbs it; products are the elements xy, xz, yz of the matrix."""
+    """Inertia and disturbances; products are the elements xy, xz, yz of the matrix."""
 
     moments: Annotated[q.Three, Quantity("moment of inertia", above="0 kg m^2")] = default(
         "1.9 kg m^2", "2.1 kg m^2", "2.4 kg m^2"
@@ -37,7 +37,7 @@ class Craft(Parameters):
     dipole: Annotated[q.Three, Quantity("magnetic moment")] = default(
         "0.05 A m^2", "-0.03 A m^2", "0.04 A m^2"
     )
-    # amplitude of a torque on each axis that goes with the orbit, a third of a turn apart
+    # amplitude of a torque on each axis at orbital period, phases 120 deg apart
     disturbance: Annotated[float, Quantity("torque", least="0 N m")] = default("1 uN m")
 
 
@@ -55,7 +55,7 @@ class ReactionWheels(Parameters):
     start: Annotated[float, Quantity("angular momentum")] = default("0 N m s")  # each of them
     lost: tuple[Annotated[int, pydantic.Field(ge=0, le=99)], ...] = ()
     lost_at: q.Time = default("0 s")
-    loss_known: bool = True  # from the start; then torques are shared out among the others
+    loss_known: bool = True  # from the start; torques are then allocated to the others
 
     @pydantic.model_validator(mode="after")
     def _sound(self) -> ReactionWheels:
@@ -106,11 +106,11 @@ class SatelliteGyro(Parameters):
 
 
 class StarFault(Span):
-    """The star sensor reports what is not so, from begin (included) to end (not).
+    """Fault of the star sensor, from begin (included) to end (excluded).
 
-    "stuck": again and again what it reported before; "turned": an attitude turned about its
-    boresight; "sign": in every other second the same attitude with the opposite
-    sign, which is no fault of the sensor; "short": a quaternion whose length is not one.
+    "stuck": its last report repeated; "turned": an attitude rotated about its boresight; "sign": in
+    every other second the same attitude with the opposite sign, which is no fault of the sensor;
+    "short": a quaternion whose length is not one.
     """
 
     kind: Literal["stuck", "turned", "sign", "short"]
@@ -118,10 +118,10 @@ class StarFault(Span):
 
 
 class Camera(Parameters):
-    """The star sensor as a camera: stars, which it tracks about where the filter believes to look.
+    """The star sensor as a camera that tracks stars about the directions predicted by the filter.
 
     Its attitude comes from their directions by QUEST, with a covariance of each frame; the noise of
-    the star sensor is then what gains are designed for.
+    the star sensor is then used for the design of gains.
     """
 
     catalogue: Literal["synthetic", "hipparcos"] = "synthetic"
@@ -150,7 +150,7 @@ class StarSensor(Parameters):
 class SatelliteAssumptions(Parameters):
     """Assumptions of filters; ``drift`` is the random walk of the gyro's rate, with Markov drift.
 
-    Where it is left out they believe the equivalent of the true one.
+    Left out, it is the equivalent of the true one.
     """
 
     drift: Annotated[float, Quantity("rate random walk", above="0 rad/s/sqrt(s)")] | None = None

@@ -1,4 +1,4 @@
-"""A gain designed again at every star frame, by the LMI of the plant as it turns at that moment.
+"""A gain redesigned at every star frame, by the LMI of the plant at the current angular rate.
 
 This is the patent's filter as stated: at every step the transition is formed from the rate that
 the gyro reports, and the mixed H2/H-infinity inequality is solved for it. The plant is that of the
@@ -6,15 +6,15 @@ error of attitude and gyro bias, from star frame to star frame (period T), in ar
 
     A(w) = [exp(-[w]x T)  -T I; 0  I],   y = dtheta + star noise,   z = dtheta,
 
-w the rate over the last sample of the gyro, less the bias that the filter believes. The patent's
-own plant, a quaternion of four components, has no bias to estimate; its sampling I + T Omega(w)/2
-lengthens the quaternion, and with its placement of the noise the best gain is the star sensor alone
+w the rate over the last sample of the gyro, less the estimated bias. The patent's own plant, a
+quaternion of four components, has no bias to estimate; its discretisation I + T Omega(w)/2
+lengthens the quaternion, and with its noise inputs the optimal gain uses the star sensor alone
 (docs/systems/satellite.md). A frame is the step here: between frames no gain is used.
 
-At rest the axes come apart, and the gain is that of `robins.systems.satellite.design`. Each axis
-has its own bound, so its modelling error n is counted in units that make the bound of all one.
+At rest the axes decouple, and the gain is that of `robins.systems.satellite.design`. Each axis
+has its own bound, so its modelling error n is scaled to make all bounds one.
 
-Nothing is promised for a plant that varies: see `robins.filters.synthesis.lmi.EveryStep`.
+No bound is guaranteed for a varying plant: see `robins.filters.synthesis.lmi.EveryStep`.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ NAME, _FAILED = NO_GAIN.split(".")
 
 
 class FrozenPlant(NamedTuple):
-    """Numbers of the plant that do not turn with the craft, arcsec and s; NumPy or JAX."""
+    """Plant data that do not depend on the angular rate, arcsec and s; NumPy or JAX."""
 
     sample_s: Any  # () of the gyro
     period_s: Any  # () of the star sensor
@@ -62,12 +62,12 @@ class FrozenPlant(NamedTuple):
 
 
 def frozen(b: SensorNoise, spec: GainSpec, sample_s: float) -> FrozenPlant:
-    """Design data of three axes, from the believed noise of the sensors.
+    """Design data of three axes, from the assumed noise of the sensors.
 
     Args:
         b: noise of gyro and star sensor.
-        spec: input of n, and the share of the Kalman filter's norm that an axis may have.
-        sample_s: of the gyro [s].
+        spec: input of n, and the bound of an axis as a share of the Kalman filter's norm.
+        sample_s: sampling interval of the gyro [s].
     """
     noise, error, star = np.zeros((6, 6)), np.zeros((6, 3)), np.zeros(3)
     for i, star_rad in enumerate(b.star_rad):
@@ -81,9 +81,9 @@ def frozen(b: SensorNoise, spec: GainSpec, sample_s: float) -> FrozenPlant:
 
 
 def plant_at(rate_b: Numbers, of: FrozenPlant) -> Plant:
-    """The plant of a craft that goes on turning at this rate [rad/s], body axes; current form.
+    """Plant of a craft at a constant rate [rad/s], body axes; current form.
 
-    Its gain is to have an H-infinity norm of at most one.
+    Its gain must have an H-infinity norm of at most one.
     """
     T, eye, none, seen = float(of.period_s), np.eye(3), np.zeros((3, 3)), np.eye(3, 6)
     x, y, z = -T * np.asarray(rate_b, float)
@@ -97,15 +97,15 @@ def plant_at(rate_b: Numbers, of: FrozenPlant) -> Plant:
 def gain_at(rate_b: Numbers, of: FrozenPlant) -> tuple[np.ndarray, np.ndarray]:
     """The certified gain at a rate, on the host.
 
-    A function of its arguments alone: the units of the program are those of the craft at rest.
+    A function of its arguments alone: the scaling of the program is that of the craft at rest.
 
     Args:
-        rate_b: (3,) rad/s.
-        of: numbers of the plant.
+        rate_b: (3,) angular rate [rad/s].
+        of: plant data.
 
     Returns:
-        (6, 3) gain of attitude and bias [1, 1/s], and () bool, whether there is one: an answer
-        whose true norms do not meet the request is none.
+        (6, 3) gain of attitude and bias [1, 1/s], and () bool, True if it is valid: its certified
+        norms meet the requirement.
     """
     known = FrozenPlant(*(np.asarray(x, float) for x in of))
     each = _designer(*((x.shape, x.tobytes()) for x in known))
@@ -127,7 +127,7 @@ class RedesignMemory(NamedTuple):
     """Memory of the rule."""
 
     of: FrozenPlant
-    q_ib: Array  # (4,) believed before the last sample of the gyro
+    q_ib: Array  # (4,) estimate before the last sample of the gyro
     turn: Array  # (3,) rad, over that sample, body axes
     gain: Array  # (6, 3) of the last frame whose design passed; before it that of `initial_state`
     failed: Array  # () frames whose design did not pass
@@ -168,10 +168,10 @@ class LmiStep(Rule):
         return memory, posterior, info.noted(NAME, **{_FAILED: ~passed})
 
     def report(self, start: RedesignMemory, final: RedesignMemory, again: Any, time: Any) -> None:
-        """Report the designs of a run that did not pass; in a stream each note does.
+        """Report the failed designs of a run; in a stream each note reports its own.
 
         Warns:
-            StepWarning: there are such.
+            StepWarning: there are failed designs.
         """
         if again is None:
             return
@@ -185,23 +185,23 @@ class LmiStep(Rule):
 
 
 def redesigned() -> Rule:
-    """Update with the gain of an LMI for the plant of the moment, solved by the host.
+    """Update with the gain of an LMI for the plant at the current rate, solved on the host.
 
-    A frame whose design does not pass is used with the last gain that did. The covariance is the
-    one that the gain truly has, as with `constant_gain`. Begin a state by `initial_state`.
+    A frame whose design fails uses the last accepted gain. The covariance is the one for the gain
+    used, as with `constant_gain`. Begin a state by `initial_state`.
 
-    Notes: ``lmi_step.failed``, whether the design of this frame did not pass.
+    Notes: ``lmi_step.failed``, true if the design of this frame failed.
     """
     return LmiStep()
 
 
 def initial_state(state: FilterState, of: FrozenPlant, gain: Numbers) -> FilterState:
-    """A state of such a filter with its numbers.
+    """Initial state of a filter with the rule `redesigned`.
 
     Args:
         state: of a filter with the rule `redesigned`.
-        of: numbers of the plant.
-        gain: (6, 3) until the first design passes.
+        of: plant data.
+        gain: (6, 3), used until the first design passes.
     """
     as_arrays = FrozenPlant(*(jnp.asarray(x, float) for x in of))
 

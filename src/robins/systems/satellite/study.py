@@ -1,6 +1,6 @@
 """The study "attitude-loop": each filter with its assumptions in the loop, and claims.
 
-Claims are the document's, and those of robins marked so.
+Claims are the patent's, and those of robins, marked "(ours)".
 """
 
 from __future__ import annotations
@@ -61,16 +61,16 @@ class FilterSpec(NamedTuple):
     """A filter of the study."""
 
     build: Build
-    gain: GainSpec | None = None  # of its gains; of a Kalman filter, of what its Q is inflated by
-    drift: float | None = None  # variance of the bias' walk over the believed; None: the true one
+    gain: GainSpec | None = None  # design of its gains, or of the inflation of a Kalman filter's Q
+    drift: float | None = None  # factor on the variance of the bias walk; None: the true walk
     on_host: str = ""  # as of a `Contender`; such a filter runs only where it is named
 
 
 FILTERS: Mapping[str, FilterSpec] = {
-    # the star sensor's reading, moved by the gyro
+    # the star sensor's attitude, propagated by the gyro
     "raw": FilterSpec("fixed", GainSpec("raw"), 1.0),
     "mekf": FilterSpec("mekf", None, 1.0),  # multiplicative EKF
-    "mekf-gate": FilterSpec("gated", None, 1.0),  # the same with a gate that opens again
+    "mekf-gate": FilterSpec("gated", None, 1.0),  # the same with a gate that reopens
     # a bank of them over the scale of the process noise
     "adaptive": FilterSpec("adaptive", None, 1.0),
     "mekf-tuned": FilterSpec("mekf", None, 30.0),  # the same, noise of the bias times 30
@@ -78,7 +78,7 @@ FILTERS: Mapping[str, FilterSpec] = {
     "ekf-quaternion": FilterSpec("quaternion", None, 1.0),  # additive EKF of seven states
     "h2": FilterSpec("fixed", GainSpec("h2"), 1.0),  # steady Kalman gain
     "mixed-lmi": FilterSpec("fixed", GainSpec("lmi", 0.5), 1.0),  # mixed, by LMI, n on the rate
-    # the same, solved again at every star frame for the rate of the moment
+    # the same, solved again at every star frame for the current rate
     "mixed-lmi-step": FilterSpec(
         "redesigned", GainSpec("lmi", 0.5), 1.0, "it solves an LMI in Python at every star frame"
     ),
@@ -99,7 +99,7 @@ FILTERS: Mapping[str, FilterSpec] = {
 
 
 def believed_walk(given: AttitudeLoop, spec: FilterSpec) -> float:
-    """Random walk of the gyro's rate that a filter believes in [rad/s/sqrt(s)]."""
+    """Gyro rate random walk assumed by a filter [rad/s/sqrt(s)]."""
     g = given.gyro
     true = equivalent_walk(g.rate_walk, g.markov, g.markov_time)
     if spec.drift is None:
@@ -114,13 +114,13 @@ class FilterEnvironment(NamedTuple):
     given: LoopConstants
     steps: NoiseFreeInputs  # leading axis E
     due: Array  # (E,) bool
-    attitude_rad: Array  # believed at the start
+    attitude_rad: Array  # initial sigma
     bias_rad_s: Array
     gain: Array  # (6, 3); zeros where there is none
     frozen: Any  # `stepwise.Frozen`, or None
 
 
-# by whether a filter adds to the components of the quaternion
+# keyed by `additive`: True for filters that add to the quaternion's components
 _REACTS = {False: partial(react, model.MULTIPLICATIVE), True: partial(react, model.ADDITIVE)}
 
 
@@ -145,7 +145,7 @@ def contender(given: AttitudeLoop, course: SatelliteCourse, name: str) -> Conten
 
     Raises:
         ValueError: there is no filter of this name, or its design needs a package that is not
-            there.
+            installed.
     """
     require_known("filter", name, FILTERS)
     spec = FILTERS[name]
@@ -245,9 +245,9 @@ CLAIMS = ratio_claims(_RATIOS, _TEXTS)
 
 
 def faults(given: AttitudeLoop, time_s: np.ndarray) -> dict[str, np.ndarray]:
-    """Masks (E,) of the epochs at which gyro and star sensor differ from the filters' belief.
+    """Masks (E,) of the epochs at which gyro and star sensor differ from the filters' model.
 
-    Noise, drift as believed and false stars are no faults.
+    Noise, modelled drift and false stars are no faults.
     """
     g, star, believed = given.gyro, given.star, given.believed.drift
     true = equivalent_walk(g.rate_walk, g.markov, g.markov_time)

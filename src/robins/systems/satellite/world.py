@@ -42,11 +42,11 @@ _CAMERA = 16  # into that of the star sensor, next to the streams of `robins.sim
 
 
 class SatelliteCourse(NamedTuple):
-    """The same in all runs; E steps."""
+    """Data common to all runs; E steps."""
 
     time_s: np.ndarray  # (E,) at the end of each step
     steps: NoiseFreeInputs
-    due: np.ndarray  # (E,) bool, whether a step ends with a star frame
+    due: np.ndarray  # (E,) bool, True where a step ends with a star frame
     given: LoopConstants  # numbers of the loop
 
 
@@ -68,8 +68,8 @@ def lay_out(given: AttitudeLoop) -> SatelliteCourse:
 
     Raises:
         ImportError: the Hipparcos catalogue without the extra "stars".
-        ValueError: a craft that cannot be, wheels that do not turn it about three axes, or a date
-            outside of the life of the magnetic model.
+        ValueError: an impossible inertia, wheels that do not span three axes, or a date outside
+            the validity of the magnetic model.
     """
     dt, o, control = given.step, given.orbit, given.control
     count = math.floor(given.duration / dt + 1e-9)
@@ -123,7 +123,7 @@ def _turned(given: AttitudeLoop, base: Reference, time_s: np.ndarray) -> Referen
 
 
 def _lens(star: StarSensor) -> CameraOptics | None:
-    """The camera of a star sensor that has one, and the stars it may see."""
+    """The camera of a star sensor, if it has one, and the index of its stars."""
     if (given := star.camera) is None:
         return None
     camera = StarCamera(
@@ -168,13 +168,13 @@ class SatelliteWorld(NamedTuple):
     gyro_bias: Array  # (E, 3) its slow part, as a rate [rad/s]
     gyro_matrix: Array  # (3, 3) scale factor errors and misalignments
     star_error: Array  # (E, 3) error of the star sensor at the end of each step [rad]
-    star_key: Array  # of what a camera sees
+    star_key: Array  # key of a camera's images
     craft: CraftState  # at the beginning
-    start_q_ib: Array  # (4,) attitude that filters begin with
+    start_q_ib: Array  # (4,) initial attitude of the filters
 
 
 def true_errors(gyro: SatelliteGyro, bias: Array, ramp: Array) -> TriadErrors:
-    """The gyro as it is; what the parameters give as a half-width of a uniform error is drawn."""
+    """True error model of the gyro; half-widths of uniform errors come as drawn values."""
     return TriadErrors(
         bias=bias,
         ramp=ramp,

@@ -1,15 +1,15 @@
 """Attitude matching in a bank turn: the manoeuvre, and the linear system of its errors.
 
-After Gu & Qin (2005), eq. 6 to 10, with the errors that its printed signs mean. n is east-north-up
-(ENU), s the slave's and m the master's right-forward-up body axes (RFU), omega_in the rate of n.
-The slave sits on the master with a mounting error mu, in slave axes, and a flexure lambda, in
-master axes; a computed attitude is off by phi:
+After Gu & Qin (2005), eq. 6 to 10, with errors defined to match its printed signs. n is
+east-north-up (ENU), s the slave's and m the master's right-forward-up body axes (RFU), omega_in the
+rate of n. The slave is mounted on the master with a mounting error mu, in slave axes, and a flexure
+lambda, in master axes; a computed attitude has the error phi:
 
     C_ms  = exp(lambda x) C_nominal exp(mu x)          (1)   slave axes to master axes
     C_hat = exp(-phi x) C                              (2)
 
-State x = [phi, eps, mu], or [phi, eps, mu, lambda, lambda'], in radians, angles and drift of the
-slave's gyros eps, which have white noise w of density N:
+State x = [phi, eps, mu], or [phi, eps, mu, lambda, lambda'], in radians and rad/s: angles, and the
+drift eps of the slave's gyros, which have white noise w of density N:
 
     phi' = -omega_in x phi - C_ns (eps + w)            (3)   eq. 7 of the paper
     eps' = 0,   mu' = 0                                (4)
@@ -20,9 +20,9 @@ The measurement is the skew part of the product of the attitudes, with white noi
     Z = vee(skew(C_hat_nm C_nominal C_hat_ns'))        (6)   eq. 6
       = phi - C_nm C_nominal mu - C_nm lambda + v      (7)   eq. 10
 
-phi is the error of the slave's *own* attitude, which the flexure turns and the slave's gyros feel:
-so flexure drives no other state, and enters Z once. What the accelerometers do has no part in this
-(velocity is not measured; through omega_in it is 0.02' over 20 s).
+phi is the error of the slave's *own* attitude, which includes the flexure, because its gyros sense
+it: so flexure drives no other state, and enters Z once. Accelerometers do not enter (velocity is
+not measured; its effect through omega_in is 0.02' over 20 s).
 """
 
 from __future__ import annotations
@@ -50,21 +50,21 @@ ATTITUDE = "attitude_matching"  # name of the sensor
 PHI, EPS, MU, LAMBDA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 STATES, STATES_FLEXIBLE = 9, 15
 G_M_S2 = units.parse("1 g", "acceleration")
-MEAN_POINTS = 50  # midpoints of a mean; 50 leave 2e-6 of 3.6 deg of roll
+MEAN_POINTS = 50  # midpoints of a mean; 50 leave an error of 2e-6 for 3.6 deg of roll
 
 
 # ----------------------------------------------------------------------------------- the bank turn
 
 
 def roll_rad(turn: BankTurn, t_s: np.ndarray | float) -> np.ndarray:
-    """Roll, right wing down: that of a coordinated turn, atan(a / g), between the rolls."""
+    """Roll, right wing down; in the turn that of a coordinated one, atan(a / g)."""
     bank = np.arctan(turn.acceleration / G_M_S2)
     at = np.cumsum([0.0, turn.roll_time, turn.turn_time, turn.roll_time])
     return np.asarray(np.interp(t_s, at, [0.0, bank, bank, 0.0]))
 
 
 def heading_rad(turn: BankTurn, t_s: np.ndarray | float) -> np.ndarray:
-    """Heading, clockwise from north, not wrapped; between the rolls it changes by a / v."""
+    """Heading, clockwise from north, not wrapped; in the turn its rate is a / v."""
     turning = np.clip(np.asarray(t_s, float) - turn.roll_time, 0.0, turn.turn_time)
     return np.asarray(turn.heading + turn.acceleration / turn.speed * turning)
 
@@ -85,7 +85,7 @@ def attitude_enu(turn: BankTurn, t_s: np.ndarray | float) -> np.ndarray:
 
 
 def mean_attitude_enu(turn: BankTurn, begin_s: np.ndarray, period_s: float) -> np.ndarray:
-    """Mean of C_nb over each period, (E, 3, 3), from its begin (E,): it turns a constant drift."""
+    """Mean of C_nb over each period, (E, 3, 3), from its begin (E,): it maps a constant drift."""
     inside = (np.arange(MEAN_POINTS) + 0.5) / MEAN_POINTS * period_s
     return np.mean(attitude_enu(turn, np.asarray(begin_s)[:, None] + inside), axis=1)
 
@@ -114,20 +114,20 @@ class LinearSystem(NamedTuple):
     sigma: np.ndarray  # (n,) standard deviations of the initial state
 
     def in_unit(self, unit: str) -> LinearSystem:
-        """The same system, which is in radians, in another unit of angle: F and H stay."""
+        """The system, given in radians, in another unit of angle: F and H are unchanged."""
         per_rad = float(units.from_si(1.0, units.unit(unit, "angle")))
         return self._replace(G=per_rad * self.G, sigma=per_rad * self.sigma)
 
     def start(self) -> Belief:
-        """The belief before the first prediction: no error."""
+        """The belief before the first prediction, with a mean of zero."""
         return Belief(jnp.zeros(len(self.sigma)), jnp.diag(jnp.asarray(self.sigma)))
 
     def model(self, sigma: float) -> Model:
         """The model, for white measurement noise of this size on each axis.
 
-        Everything but the number of states is data, so that filters of one size share what was
-        compiled, in any unit and for any noise. A run takes F for its inputs and H for what the
-        sensor needs: see `inputs`.
+        Everything but the number of states is data, so filters of one size share a compiled
+        program, in any unit and for any noise. F is the input of the motion and H that of the
+        sensor: see `inputs`.
         """
         G = jnp.asarray(self.G)
         return Model(Motion(_move, G, linear=Partial(_moved, G)), (reading(float(sigma)),))
@@ -138,7 +138,7 @@ class LinearSystem(NamedTuple):
 
 
 def reading(sigma: ArrayLike) -> Sensor:
-    """The matched attitude, with white noise of this size on each axis."""
+    """Sensor of the matched attitude, with white noise of this sigma on each axis."""
     return Sensor(_read, jnp.full(3, sigma), 3, ATTITUDE, linear=_seen)
 
 
@@ -185,17 +185,17 @@ def matching_matrix(C_nm: np.ndarray, C_nominal: np.ndarray, flexible: bool = Fa
 def linear_system(
     given: AttitudeMatching, updates: int, flexure: Flexure | None = None
 ) -> LinearSystem:
-    """The system along a bank turn, in radians, as a filter believes it.
+    """The filter's linear system along a bank turn, in radians.
 
     With the period T of the updates, Phi = I + F T and Q = diag(N^2 T I, 0, 0); gyro noise is white
-    on all axes alike, so no rotation changes it. The attitudes in F and H are those of the
+    and equal on all axes, so no rotation changes it. The attitudes in F and H are those of the
     manoeuvre and of the nominal mounting, so nothing depends on a measurement. F is taken to first
     order with the mean attitude of each period: in a roll of 72 deg/s, 3.6 deg go by in 50 ms.
 
     Args:
         given: the scenario.
-        updates: their number.
-        flexure: adds six states that swing so; its bending and tails are not modelled.
+        updates: number of updates.
+        flexure: adds six states of this flexure; its bending and tails are not modelled.
     """
     turn, T, spread = given.manoeuvre, given.period, given.believed
     nominal = np.asarray(Rotation.from_rotvec(given.mounting.nominal).as_dcm())
@@ -231,5 +231,5 @@ def _swing(flexure: Flexure, period_s: float) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _by_axis(of_axis: np.ndarray) -> np.ndarray:
-    """Matrices (3, 2, 2) of an angle and its rate to one of three angles, then three rates."""
+    """Assemble matrices (3, 2, 2) of (angle, rate) into one (6, 6) of three angles, three rates."""
     return np.block([[np.diag(of_axis[:, i, j]) for j in (0, 1)] for i in (0, 1)])

@@ -29,12 +29,12 @@ class MatchingMaster(Parameters):
     """The attitude that the master reports, with white noise at each update."""
 
     attitude_noise: q.Spread
-    # no attitude comes from the first to the second time, as in an outage of the link
+    # begin and end of a time without attitudes, as in an outage of the link
     outage: Annotated[tuple[float, float], Quantity("time", least="0 s")] | None = None
 
 
 class MatchingSlave(Parameters):
-    """True errors of the slave: constant drift, noise, and where its attitude begins."""
+    """True errors of the slave: constant drift, noise, and initial attitude error."""
 
     gyro_bias: Annotated[q.Three, Quantity("angle rate")]
     gyro_noise: q.AngleWalkSize
@@ -59,7 +59,7 @@ class FlexureParameters(Parameters):
 
 
 class BelievedSpread(Parameters):
-    """Standard deviations that filters believe of the start, and of flexure over the true ones."""
+    """Initial standard deviations assumed by filters, and factors on those of the true flexure."""
 
     attitude: q.Spread
     gyro_bias: q.AngleRate
@@ -85,8 +85,8 @@ class AttitudeMatching(Scenario):
     claims: tuple[str, ...] | None = ()
     step: q.Duration = default("10 ms")  # of the truth
     period: q.Duration = default("50 ms")  # of the filters
-    settle: q.Time = default("15 s")  # figures pooled over time count from here
-    # initial errors as given, or of that size with a sign drawn for each axis and run
+    settle: q.Time = default("15 s")  # metrics are pooled from here on
+    # initial errors as given, or with a sign drawn for each axis and run
     signs: Literal["fixed", "random"] = "fixed"
     manoeuvre: BankTurn
     master: MatchingMaster

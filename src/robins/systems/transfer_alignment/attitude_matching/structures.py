@@ -1,14 +1,16 @@
-"""The filter without knowledge of the structure: hypotheses of it, side by side.  Attitudes alone
-do not separate a swing of the structure from an error of the slave's attitude, unless it is known
-how fast and how far it swings. So a bank (`robins.filters.composite.imm`) holds a filter of fifteen
+"""The filter without knowledge of the structure: a bank of hypotheses on flexure and flutter.
+
+Attitudes alone do not separate flexure from an error of the slave's attitude, unless its amplitude
+and time constant are known. So a bank (`robins.filters.composite.imm`) holds a filter of fifteen
 states for each hypothesis,
 
-    stiff, or swings by 4.6', 10', 22' or 46' (three a decade) in 1 s or 10 s
-    flutters not at all, or by three times the noise of the records
+    stiff, or flexure of 4.6', 10', 22' or 46' (three a decade) with a time constant of 1 s or 10 s
+    no flutter, or flutter of three times the noise of the records
 
-each with Huber's rule; it is stiff as likely as not. None is of noisier gyros: attitudes alone do
-not separate those from a swing, and a bank that has them is lost where nothing flexes. The numbers
-were chosen on the random seed 100. The times are decades, and those of two scenarios by that.
+each with Huber's rule; stiff has a probability of one half. There is no hypothesis of noisier
+gyros: attitudes alone do not separate those from flexure, and a bank with them fails on a stiff
+structure. The numbers were chosen on the random seed 100. The time constants are decades, which
+happen to be those of two scenarios.
 """
 
 from __future__ import annotations
@@ -32,8 +34,8 @@ from robins.sim.flexure import Flexure, transition
 from robins.systems.transfer_alignment.attitude_matching import model as am
 
 _SIGMAS, _TIMES_S, _FLUTTERS = (4.64, 10.0, 21.5, 46.4), (1.0, 10.0), (0.0, 3.0)
-_WEIGHED = 0.99  # share of right records that keep their weight
-_OTHER = 1e-5  # that a structure becomes each other one in a step
+_WEIGHED = 0.99  # share of good records that keep their full weight
+_OTHER = 1e-5  # probability of a change to each other structure in a step
 
 _ARCMIN = units.parse("1 arcmin", "angle")
 START = Flexure(np.full(3, 10.0 * _ARCMIN), np.full(3, 1.0))
@@ -43,13 +45,13 @@ START = Flexure(np.full(3, 10.0 * _ARCMIN), np.full(3, 1.0))
 class StructureHypothesis(NamedTuple):
     """A structure."""
 
-    sigma: ArrayLike  # rad, of the swing; 0: stiff
-    time: ArrayLike  # s
-    flutter: ArrayLike  # of the noise of the records
+    sigma: ArrayLike  # rad, of the flexure; 0: stiff
+    time: ArrayLike  # s, its time constant
+    flutter: ArrayLike  # sigma over that of the noise of the records
 
 
 def hypotheses() -> list[HypothesisRow]:
-    """18 structures: every swing with every flutter; wrong is what no structure of none has."""
+    """18 structures: every flexure with every flutter, and the faults that each one implies."""
     swings = [(0.0, 1.0), *((s * _ARCMIN, t) for s in _SIGMAS for t in _TIMES_S)]
     return [
         HypothesisRow(
@@ -77,7 +79,7 @@ def _moved(swing, noise, x, F):
 def _mode(weight: Rule, given: tuple[Numbers, ...], row: StructureHypothesis) -> Mode:
     gyro, noise_rad, period_s = map(jnp.asarray, given)
     Phi, L = transition(row.sigma, row.time, 1.0, period_s)
-    # a stiff structure forgets what the start supposes
+    # a stiff structure drops the initial flexure
     swing = jnp.where(jnp.asarray(row.sigma) > 0.0, jnp.kron(Phi, jnp.eye(3)), 0.0)
     drive = jnp.zeros((am.STATES_FLEXIBLE, 6)).at[am.STATES :].set(jnp.kron(L, jnp.eye(3)))
     G = jnp.concatenate([gyro, drive], axis=1)
@@ -89,7 +91,7 @@ def _mode(weight: Rule, given: tuple[Numbers, ...], row: StructureHypothesis) ->
 def structure_filter(
     system: am.LinearSystem, noise_rad: float, period_s: float
 ) -> Callable[[StructureHypothesis], Mode]:
-    """Function that makes the filter of a hypothesis (see `structure_bank`)."""
+    """Function to make the filter of a hypothesis (see `structure_bank`)."""
     given = system.G[:, :3], noise_rad, period_s
     return Partial(_mode, huber(_WEIGHED), tuple(number("numbers are real", x) for x in given))
 
@@ -98,9 +100,9 @@ def structure_bank(system: am.LinearSystem, noise_rad: float, period_s: float) -
     """The bank over `hypotheses`.
 
     Args:
-        system: with states of the flexure, whose swing is not looked at.
-        noise_rad: of the master's attitude.
-        period_s: of the records.
+        system: with flexure states, whose parameters are not used.
+        noise_rad: noise of the master's attitude [rad].
+        period_s: period of the records [s].
     """
     rows = hypotheses()
     stiff = np.array([row.numbers.sigma == 0.0 for row in rows])

@@ -1,8 +1,8 @@
 """The study "attitude-matching": filters, their properties without a run, and claims.
 
 All filters work in radians and differ in their assumptions. The paper's H-infinity filter has
-R = I and L = I in an unstated unit u of angle, which is R = u^2 and gamma in u here; with its P0
-that is all a unit changes. Covariances do not depend on data in this system, so neither do
+R = I and L = I in an unstated unit u of angle, which is R = u^2 and gamma in u here; apart from P0,
+the unit changes nothing else. Covariances do not depend on data in this system, so neither do
 gamma_min and feasibility.
 """
 
@@ -38,7 +38,7 @@ from robins.systems.transfer_alignment.attitude_matching.world import (
 ARCMIN = units.parse("1 arcmin", "angle")
 FIVE_ARCMIN = Limit("5_arcmin", "attitude", 5.0 * ARCMIN)
 
-# Kalman filters: what R has the variance of. "kf-flexure" has states for what swings.
+# Kalman filters: errors whose variance is in R. "kf-flexure" has flexure states.
 TOLD = {
     "kf": ("noise",),
     "kf-told-flutter": ("noise", "flutter"),
@@ -144,9 +144,9 @@ def existence(
     gamma: float = np.nan,
     over_least: float | None = None,
 ) -> dict[str, Metric]:
-    """Facts on an H-infinity filter, found by running it over nothing but zeros.
+    """Existence and least gamma of an H-infinity filter, found by running it on zero data.
 
-    A filter that does not exist has no result: its figures are there, and empty. The filter has
+    A filter that does not exist has no result: its metrics are present, and empty. The filter has
     one `h_infinity` rule and is given the system and a measurement noise [rad]; gamma is in the
     units of its L x, or `over_least` times the least.
     """
@@ -169,7 +169,7 @@ def existence(
     # the least one that would.
     least, largest = 0.0, float(np.max(attempt(np.inf)[0]))
     try:
-        if largest > 0.0:  # something is measured
+        if largest > 0.0:  # there are measurements
             attempt(largest * (1.0 - 1e-9))
     except Infeasible as refused:
         least = refused.gamma_min if refused.gamma_min is not None else np.nan
@@ -192,7 +192,7 @@ def existence(
 
 
 def _existing(step: Step):
-    """Local bound and margin of a step, where it counts."""
+    """Local bound and margin of a step, where there is a measurement."""
     info = step.info[am.ATTITUDE]
     counts = jnp.any(info.used)
     bound, margin = (info.notes[f"h_infinity.{name}"] for name in ("bound", "margin"))
@@ -232,11 +232,11 @@ NO_RESULT: dict[str, Any] = {
     "gyro_bias_rms_deg_per_h": [np.nan] * 3,
     "share_below_5_arcmin": np.nan,
 }
-"""The figures of a filter that does not exist."""
+"""Metrics of a filter that does not exist."""
 
 
 def metrics_of(statistics: Any) -> dict[str, Metric]:
-    """Metrics of one filter from its campaign statistics, over the epochs that count."""
+    """Metrics of one filter from its campaign statistics, over the evaluation epochs."""
     settled = statistics.settled(FIVE_ARCMIN.name)
     return rms_by_axis(statistics, all_axes=("attitude",)) | {
         "share_below_5_arcmin": Probability.among(settled <= statistics.count_from),
@@ -256,7 +256,7 @@ def _axes(metrics: Mapping[str, Any]) -> np.ndarray:
 
 
 def _best(metrics: Metrics) -> float | None:
-    """The worst axis of the best of the published filters that exist."""
+    """Worst-axis error of the best published filter that exists."""
     ran = [metrics[name] for name in PUBLISHED if name in metrics]
     worst = [float(np.max(_axes(m))) for m in ran if m.get("feasible", True)]
     return min(worst, default=float("nan")) if ran else None

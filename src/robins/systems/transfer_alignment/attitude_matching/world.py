@@ -1,10 +1,9 @@
 """The truth of an attitude matching run, one for all filters.
 
-It is made of full rotations at a fine step: the slave's true attitude is the master's, bent by the
-flexure and turned by the mounting; ideal gyro increments follow from it exactly, so that gyros feel
-the flexure; with drift and noise they carry the slave's computed attitude, in the navigation frame
-that the master's rate turns. Filters see only Z, from the skew part of the product of the two
-attitudes.
+It uses full rotations at a fine step: the slave's true attitude is the master's, rotated by flexure
+and mounting; ideal gyro increments follow from it exactly, so the gyros sense the flexure; with
+drift and noise they propagate the slave's computed attitude, in the navigation frame with the
+master's rate. Filters receive only Z, from the skew part of the product of the two attitudes.
 """
 
 from __future__ import annotations
@@ -31,21 +30,21 @@ from robins.systems.transfer_alignment.attitude_matching.parameters import Attit
 
 
 class MatchingCourse(NamedTuple):
-    """Data that all runs share; N steps of the truth, E updates."""
+    """Data common to all runs; N steps of the truth, E updates."""
 
     q_nm: np.ndarray  # (N + 1, 4) master to n
-    turned_n: np.ndarray  # (N, 4) exp(omega_in dt), by how much n turns in a step
+    turned_n: np.ndarray  # (N, 4) exp(omega_in dt), rotation of n in a step
     load: np.ndarray  # (N + 1,) load factor
     q_nominal: np.ndarray  # (4,) slave to master, as drawn
     at: np.ndarray  # (E,) step at each update
     epoch_s: np.ndarray  # (E,)
-    received: np.ndarray  # (E,) bool, the master's attitude arrives
+    received: np.ndarray  # (E,) bool, True where the master's attitude arrives
 
 
 class MatchingWorld(NamedTuple):
     """One run."""
 
-    measured: Any  # (E, 3) rad, Z; NaN where nothing came
+    measured: Any  # (E, 3) rad, Z; NaN where missing
     state: Any  # (E, 15) the true [phi, eps, mu, lambda, lambda']
 
 
@@ -55,7 +54,7 @@ def lay_out(given: AttitudeMatching) -> MatchingCourse:
     Warns where errors will outgrow the linear model.
 
     Raises:
-        ValueError: the step does not divide the period, or no update would count.
+        ValueError: the step does not divide the period, or no update falls after `settle`.
     """
     turn, every = given.manoeuvre, round(given.period / given.step)
     count = int(turn.duration / given.period + 1e-9)
@@ -111,10 +110,10 @@ def simulate(
     )
     angle, rate = simulate_flexure(structure, swing, dt, steps, c.load)
 
-    # (1): the seat of the slave, and its attitude on the master's
+    # (1): the slave's mounting, and its attitude relative to the master's
     seat = rotation.multiply(c.q_nominal, rotation.from_rotvec(mu))
     q_ns = rotation.multiply(c.q_nm, rotation.multiply(rotation.from_rotvec(angle), seat))
-    # C(k+1) = exp(-omega_in dt) C(k) exp(theta), solved for what ideal gyros report
+    # C(k+1) = exp(-omega_in dt) C(k) exp(theta), solved for the increments of ideal gyros
     unturned = rotation.multiply(c.turned_n, q_ns[1:])
     theta = rotation.to_rotvec(rotation.multiply(rotation.conjugate(q_ns[:-1]), unturned))
     noise = jax.random.normal(key(Component.IMU), theta.shape)
@@ -131,7 +130,7 @@ def simulate(
     # (2): the whole rotation
     error = rotation.multiply(computed[c.at - 1], rotation.conjugate(q_ns[c.at]))
 
-    # Flutter turns the slave at the update, and its gyros follow: its computed attitude has it too.
+    # Flutter rotates the slave at the update; its gyros sense it, so its computed attitude has it.
     shape = (len(course.at), 3)
     shaken = rotation.from_rotvec(f.flutter * jax.random.normal(flutter, shape))
     bent = rotation.multiply(shaken, rotation.from_rotvec(angle[c.at]))

@@ -2,8 +2,8 @@
 
 That one, "adaptive", is a bank of hypotheses. A single innovation does not show whether the
 record or the gyros are disturbed. The following innovations do, and so does the velocity, which
-neither flexure nor gyro noise affects directly. So several filters of the same 24 states run side
-by side, each with a hypothesis of its own, as an interacting multiple model
+neither flexure nor gyro noise affects directly. So several filters of the same 24 states run in
+parallel, each under its own hypothesis, as an interacting multiple model
 (`robins.filters.composite.imm`):
 
                 stiff structure           flexing structure
@@ -12,12 +12,11 @@ by side, each with a hypothesis of its own, as an interacting multiple model
     noisy       gyro noise 15 times       likewise
     drifting    and a bias that walks     likewise, for some tens of seconds
 
-Each weighs outliers by Huber's rule. A structure is stiff or flexes for good, so nothing is mixed
-between the two halves but one part in 10^5. It uses no structure, not even the believed
-one: one that is wrong costs more than none. The numbers are the same everywhere. The factor of
-the gyros and the structure are no scenario's own; they were chosen on runs of A to D and on wrong
-structures, random seed 100. The strength of a kick and the probabilities are older, and were chosen
-with B to D in view.
+Each weights outliers by Huber's rule. A structure is permanently stiff or flexing, so the two
+halves mix by one part in 10^5 only. The bank ignores the assumed structure: a wrong one costs more
+than none. The numbers are the same for all scenarios. The gyro factor and the structure belong to
+no scenario; they were chosen on runs of A to D and on wrong structures, random seed 100. The
+strength of a kick and the probabilities are older, and were chosen with knowledge of B to D.
 """
 
 from __future__ import annotations
@@ -42,8 +41,8 @@ from robins.systems.transfer_alignment.product.parameters import Structure
 
 _ATTITUDE, _GYRO_BIAS, _FLEXURE = slice(0, 3), slice(9, 12), slice(18, 24)
 _STATES = 24
-_STIFF = 1e-3  # of the flexure is left of one that is not there: nothing that matters
-_WEIGHED = 0.99  # share of right records that keep their weight
+_STIFF = 1e-3  # share of the flexure left in a stiff structure: negligible
+_WEIGHED = 0.99  # share of good records that keep their full weight
 
 
 class NoiseHypothesis(NamedTuple):
@@ -67,12 +66,12 @@ class HypothesisNoise(Rule):
     """The rule of `under_hypothesis`."""
 
     hypothesis: NoiseHypothesis
-    stiff: Numbers  # () one where the structure is, else zero
+    stiff: Numbers  # () one for a stiff structure, else zero
 
     name = "supposing"
 
     def process(self, memory: Memory, transition: Transition):
-        """Process noise of the hypothesis, and the flexure that it leaves."""
+        """Process noise of the hypothesis; removes the flexure of a stiff structure."""
         t, (gyro, walk, flexure) = transition, self.hypothesis
         stiff = jnp.asarray(self.stiff) > 0.0
         grown = jnp.ones(_STATES).at[_ATTITUDE].set(gyro).at[_FLEXURE].set(flexure)
@@ -87,12 +86,12 @@ class HypothesisNoise(Rule):
 
 
 def under_hypothesis(hypothesis: NoiseHypothesis, stiff: ArrayLike) -> Rule:
-    """Filter as if a hypothesis held; a stiff structure has no flexure worth the name."""
+    """Filter under a hypothesis; a stiff structure has negligible flexure."""
     own = NoiseHypothesis(*(number("a hypothesis is of real numbers", x) for x in hypothesis))
     return HypothesisNoise(own, number("stiff is one or zero", stiff))
 
 
-GYROS, FLEXURE = ("gyros",), ("flexure",)  # what is wrong in a mode
+GYROS, FLEXURE = ("gyros",), ("flexure",)  # disturbed parts in a mode
 # Changes in one step of the filter, tenths of a second: from the row's hypothesis to the column's.
 _STIFF_MODES = ((QUIET, ()), (NOISY, GYROS), (DRIFTING, GYROS))
 _STIFF_CHANGES = (
@@ -109,7 +108,7 @@ _FLEXING_CHANGES = (
     (5e-3, 1e-4, 2e-2, 1.0 - 2.51e-2),
 )
 _FLEXING_START = (0.97, 0.01, 0.01, 0.01)
-_OTHER_HALF = 1e-5  # that a structure comes loose or stiffens in a step
+_OTHER_HALF = 1e-5  # probability of a change between stiff and flexing in a step
 
 
 def hypothesis_changes() -> np.ndarray:
@@ -139,20 +138,20 @@ def hypothesis_bank() -> Filter:
 # ----------------------------------------------------------------------------------- by name
 
 
-OUTLIERS = 0.999  # share of right records that keep their weight in the other filters
-# What a structure may do of which nothing is known. Too short a time is safe, too long is not.
+OUTLIERS = 0.999  # share of good records that keep their full weight in the other filters
+# Flexure assumed for an unknown structure. Too short a time is safe, too long is not.
 _TEN_ARCMIN = math.radians(10.0 / 60.0)
 UNKNOWN = Structure(sigma=(_TEN_ARCMIN, _TEN_ARCMIN, _TEN_ARCMIN), time=(5.0, 5.0, 5.0))
 
 
 class Variant(NamedTuple):
-    """Construction of a named filter, and the condition on which its model has flexure states."""
+    """Construction of a named filter, and the condition for flexure states in its model."""
 
     flexes: Literal["never", "believed", "always", "untold"]
     make: Callable[[], Filter]
 
     def flexure(self, believed: Structure | None) -> Flexure | None:
-        """Flexure that the states of the filter stand for; None where it has none."""
+        """Flexure modelled by the filter's states; None where it has none."""
         if self.flexes == "untold" or (self.flexes == "always" and believed is None):
             return UNKNOWN.flexure
         return None if believed is None or self.flexes == "never" else believed.flexure

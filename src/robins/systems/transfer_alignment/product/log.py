@@ -1,10 +1,9 @@
 """Align a recorded slave to its recorded master, with the results and their accuracy.
 
 The tables of a `Dataset` hold the slave's samples (``imu``) and the master's records (``master``).
-The slave starts at the state that the first whole record of the master gives. The unknowns of that,
-mounting, flexure and noise of the record, are in its attitude too, so the initial covariance
-correlates them. A gap in the slave's samples that is too long to bridge ends a piece; the next one
-is aligned again.
+The slave starts at the state given by the master's first complete record. Errors of mounting,
+flexure and that record enter the slave's attitude too, so the initial covariance correlates them. A
+gap in the slave's samples that is too long to bridge ends a piece; the next one is aligned again.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ class PairPiece(LogPiece):
 
     world: PairRun
     record: np.ndarray  # (E,) row of the master's table used there, -1 where there is none
-    first: int  # row that the slave starts from
+    first: int  # row of the initial state
 
 
 def on_one_clock(dataset: Dataset) -> RecordedPair:
@@ -95,7 +94,7 @@ def on_one_clock(dataset: Dataset) -> RecordedPair:
 
 
 def pieces_of(recorded: RecordedPair, parameters: PairReplay) -> tuple[list[PairPiece], list[str]]:
-    """The pieces made ready for filters, and a sentence for each stretch that cannot be used.
+    """Pieces prepared for filters, and a sentence for each stretch that cannot be used.
 
     Raises:
         ValueError: no stretch can be used; the message gives the reason.
@@ -166,8 +165,8 @@ def _gyro_rate(
 ) -> np.ndarray:
     """Mean of the gyros over 10 ms, or a sample, to either side of times (M,): (M, 3) rad/s.
 
-    Turned by the nominal mounting it stands in for the master's turn rate where that was not
-    recorded: a lever arm of metres does not notice the biases, nor the mounting error.
+    Rotated by the nominal mounting it replaces the master's angular rate where that was not
+    recorded: with a lever arm of metres, biases and mounting error are negligible.
     """
     edge_s = np.concatenate([[time_s[0] - increments.dt[0]], time_s])
     angle = np.concatenate([np.zeros((1, 3)), np.cumsum(increments.theta, axis=0)])
@@ -184,7 +183,7 @@ def _gyro_rate(
 
 @jax.jit
 def _slave_of(master: Nav, at: Installation, omega_b) -> Nav:
-    """State of the slave by a record of the master: nominal mounting, lever arm, no flexure."""
+    """State of the slave from a master record: nominal mounting, lever arm, no flexure."""
     q_nm, v_n, place = master
     arm_n = q_nm.apply(at.lever_m)
     omega_in = earth_rate_n(place.lat) + transport_rate_n(place.lat, place.alt, v_n)
@@ -193,11 +192,10 @@ def _slave_of(master: Nav, at: Installation, omega_b) -> Nav:
 
 
 def start_belief(belief: Belief, parameters: PairParameters) -> Belief:
-    """Add to an uncorrelated start that the slave's attitude comes from a record of the master.
+    """Correlate an uncorrelated start for a slave attitude that comes from a master record.
 
-    To first order the attitude error is ``C_ns mu + C_nm lambda`` and the noise of the record, all
-    of which come on top of what `belief` doubts by itself; noise of the record is also in velocity
-    and position.
+    To first order the attitude error is ``C_ns mu + C_nm lambda`` plus the noise of the record, all
+    added to the uncertainty of `belief`; noise of the record is also in velocity and position.
     """
     q_ns, q_ms = belief.mean.ins.q_nb, installation_of(parameters).q_ms
     S, n = jnp.asarray(belief.factor), belief.factor.shape[-1]
@@ -221,12 +219,12 @@ def contender(parameters: PairReplay, name: str) -> Contender:
 
 
 def _case(parameters: PairReplay, simulated: Recipe, run: PairRun) -> Case:
-    """The case of a simulated pair, but for the start."""
+    """The case of a simulated pair with another start."""
     given = simulated(run)
     return given._replace(start=start_belief(given.start, parameters))
 
 
-# ---------------------------------------------------------------------------------- what came out
+# ---------------------------------------------------------------------------------------- results
 
 
 def _estimates(mean: ProductState) -> Mapping[str, Numbers]:
@@ -249,8 +247,8 @@ REPORTED = ReportedItems(
     "velocity or attitude (down for up, heading counterclockwise), a nominal mounting or lever arm "
     "that is wrong, flexure without states for it, or noise of master and slave stated too small.",
 )
-_FOUND = ("gyro_bias", "accel_bias", "mounting")  # what an alignment is for, besides the attitude
-_UNKNOWN = 0.7  # of the sigma at the start; what keeps more of it was hardly seen
+_FOUND = ("gyro_bias", "accel_bias", "mounting")  # results of an alignment, besides the attitude
+_UNKNOWN = 0.7  # of the initial sigma; a component that keeps more was hardly observed
 _LARGE_RAD = np.deg2rad(5.0)
 
 
@@ -271,7 +269,7 @@ def metrics_of(answer: FilterEstimates) -> dict[str, Metric]:
 
 
 def remarks(name: str, answer: FilterEstimates) -> list[str]:
-    """Sentences on what the motion did not show, and on a mounting far from the nominal one."""
+    """Sentences on unobserved components, and on a mounting far from the nominal one."""
     remarks_found = []
     before, after = np.asarray(answer.start.sigma), np.asarray(answer.sigma)[-1]
     for block in BLOCKS:

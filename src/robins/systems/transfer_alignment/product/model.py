@@ -1,8 +1,8 @@
-"""The product model: navigation state, mounting and flexure of a slave that reads its master.
+"""The product model: navigation state, mounting and flexure of a slave that receives a master.
 
 The mean is the navigation state itself, so the estimate is fed back by construction, and it lives
-on a manifold, so no attitude is singular and large initial errors are linearised about what was
-learnt so far. NED/FRD; n is the navigation frame, s the slave's axes, m the master's.
+on a manifold, so no attitude is singular and large initial errors are linearised about the current
+estimate. NED/FRD; n is the navigation frame, s the slave's axes, m the master's.
 
 State, in tangent order (18 components, or 24 with flexure):
 
@@ -12,32 +12,32 @@ State, in tangent order (18 components, or 24 with flexure):
     l, l'          flexure and its rate, m
 
 Motion: strapdown mechanisation of samples corrected for the biases, which may walk; a constant mu;
-a flexure that swings by itself, axis by axis (Kain & Cloutier 1989). The slave's gyros feel the
-flexure, so its attitude includes it: flexure has no part in the slave's mechanisation.
+a flexure with independent axes (Kain & Cloutier 1989). The slave's gyros sense the flexure, so its
+attitude includes it: flexure does not enter the slave's mechanisation.
 
     x' = F x + G w      F = diag(F_ins, 0, F_flexure)            Q = diag(Q_ins, 0, Q_flexure)   (1)
                         F_ins, Q_ins: `robins.ins.errors`, as Groves (2013), section 14.2
     l'' + 2 zeta wn l' + wn^2 l = q,  wn = 2.146 / tau,  q of density 4 zeta wn^3 sigma^2,       (2)
                         so by axis F_flexure = [0 1; -wn^2 -2 zeta wn]
 
-Measurement: what the master is expected to read, through mounting, flexure and the lever arm r,
+Measurement: the predicted output of the master, through mounting, flexure and the lever arm r,
 
     C_ms = exp(l x) C_nominal exp(mu x)                                                          (3)
     C_nm = C_ns C_ms^T                                                   attitude                (4)
     v_m  = v_s - C_nm (omega_im x r) + omega_in x C_nm r                 velocity                (5)
     p_m  = p_s - C_nm r                                                  position                (6)
 
-A record stamped t is of t - d. So all of (3) to (6) is of t - d, to where the slave is taken back
-by theta and dv, what its own inertial unit felt since (`RecordDelay`):
+A record stamped t is valid at t - d. So (3) to (6) hold at t - d, to which the slave is propagated
+back by theta and dv, the increments of its own inertial unit since then (`RecordDelay`):
 
     C_ns(t - d) = exp(omega_in d x) C_ns exp((bg d - theta) x)                                   (7)
     v_s(t - d)  = v_s - C_ns (dv - ba d) - (g - (2 omega_ie + omega_en) x v_s) d                 (8)
     p_s(t - d)  = p_s - (v_s + v_s(t - d)) d / 2                                                 (9)
     l(t - d)    = l - l' d                                                                      (10)
 
-What drove the flexure since is not known: it leaves sqrt(4 zeta wn^3 d^3 / 3) of its sigma in the
-attitude, 1 % for 60 ms and 3 s, which the noise of the records has to cover. For small angles and
-d = 0, in columns phi, dv, dp, bg, ba, mu, l, l',
+The noise that drove the flexure since then is unknown: it leaves sqrt(4 zeta wn^3 d^3 / 3) of the
+flexure sigma in the attitude, 1 % for d = 60 ms and tau = 3 s, which the noise of the records must
+cover. For small angles and d = 0, in columns phi, dv, dp, bg, ba, mu, l, l',
 
     H_attitude = [ I  0  0  0  0  -C_ns  -C_nm  0 ]                                             (11)
     H_velocity = [ 0  I  0 ... 0 ] + [(C_nm (omega_im x r)) x - omega_in x (C_nm r) x] H_attitude
@@ -74,7 +74,7 @@ ATTITUDE, VELOCITY, POSITION = "master_attitude", "master_velocity", "master_pos
 
 
 class ProductState(NamedTuple):
-    """Slave, mounting and flexure; without flexure the pytree does not hold it."""
+    """Slave, mounting and flexure; the pytree has no flexure leaf where it is not modelled."""
 
     ins: InsState  # of the slave: 15 components, no scale factors
     mounting_rad: Array  # (3,) mu, slave axes
@@ -82,22 +82,22 @@ class ProductState(NamedTuple):
 
 
 class Installation(NamedTuple):
-    """Place of the slave on the vehicle, as far as it is known."""
+    """Nominal installation of the slave: mounting and lever arm."""
 
     q_ms: Rotation  # C_nominal, slave axes to master axes
     lever_m: Array  # (3,) m, master to slave, master axes
 
 
 class RecordDelay(NamedTuple):
-    """Inputs of a reading of the master, besides the state.
+    """Inputs of a measurement of the master, besides the state.
 
-    The slave's raw increments from when the record was true to now, and the master's turn rate.
+    The slave's raw increments from the validity of the record to now, and the master's rate.
     """
 
-    dt: ArrayLike  # () s, how old the record is
+    dt: ArrayLike  # () s, age of the record
     theta: ArrayLike  # (3,) rad, turn of the slave over dt, body axes
     dv: ArrayLike  # (3,) m/s, velocity gained over dt, body axes now
-    omega_m: ArrayLike  # (3,) rad/s, omega_im of the master when the record was true
+    omega_m: ArrayLike  # (3,) rad/s, omega_im of the master at the record's time of validity
 
 
 class _ProductNoise(NamedTuple):
@@ -140,18 +140,18 @@ def _step_linear(drive: _ProductNoise, x: ProductState, block: ImuBlock):
 
 
 class _DelayedState(NamedTuple):
-    """The slave and the master when the record was true."""
+    """The slave and the master at the record's time of validity."""
 
     v_n: Array  # (3,) of the slave
     q_ns: Rotation
     q_nm: Rotation
     flexure: Array  # (3,) l
     omega_in: Array  # (3,)
-    gained_n: Array  # (3,) m/s by the specific force since
+    gained_n: Array  # (3,) m/s, velocity gained by specific force since then
 
 
 def _then(at: Installation, x: ProductState, lag: RecordDelay) -> _DelayedState:
-    """(3), (4), (7), (8), (10)."""
+    """State at the record's time of validity: (3), (4), (7), (8), (10)."""
     dt = jnp.asarray(lag.dt, float)
     ins, p = x.ins, x.ins.position
     omega_ie = earth_rate_n(p.lat)
@@ -171,19 +171,19 @@ def _read_attitude(at: Installation, x: ProductState, lag: RecordDelay) -> Rotat
 
 
 def _arm_velocity(at: Installation, then: _DelayedState, lag: RecordDelay) -> Array:
-    """Velocity [m/s, NED] of the slave about the master."""
+    """Velocity [m/s, NED] of the slave relative to the master, from the lever arm."""
     turning = then.q_nm.apply(jnp.cross(jnp.asarray(lag.omega_m), at.lever_m))
     return turning - jnp.cross(then.omega_in, then.q_nm.apply(at.lever_m))
 
 
 def _read_velocity(at: Installation, x: ProductState, lag: RecordDelay) -> Array:
-    """(5)."""
+    """Predicted velocity of the master, (5)."""
     then = _then(at, x, lag)
     return then.v_n - _arm_velocity(at, then, lag)
 
 
 def _read_position(at: Installation, x: ProductState, lag: RecordDelay) -> Geodetic:
-    """(6), (9)."""
+    """Predicted position of the master, (6) and (9)."""
     then = _then(at, x, lag)
     dt = jnp.asarray(lag.dt, float)
     back = 0.5 * (x.ins.v_n + then.v_n) * dt
@@ -229,7 +229,7 @@ def _linear_velocity(at: Installation, x: ProductState, lag: RecordDelay):
     H = H.at[:, 0:3].set(skew(then.gained_n))
     H = H.at[:, 3:9].set(-dt * free[3:6, 3:]).at[:, 3:6].add(jnp.eye(3))
     H = H.at[:, 12:15].set(dt * x.ins.q_nb.as_dcm())
-    # the arm turns with the master, and omega_in with velocity and place
+    # the arm rotates with the master; omega_in depends on velocity and position
     C_nm, omega_m = then.q_nm.as_dcm(), jnp.asarray(lag.omega_m)
     arm = skew(C_nm @ at.lever_m)
     by_attitude = skew(C_nm @ jnp.cross(omega_m, at.lever_m)) - skew(then.omega_in) @ arm
@@ -239,12 +239,12 @@ def _linear_velocity(at: Installation, x: ProductState, lag: RecordDelay):
 
 
 class MasterQuantity(NamedTuple):
-    """A quantity that the master reports: all that simulator, filter and report know of it."""
+    """A quantity reported by the master, as used by simulator, filter and report."""
 
     axes: SensorAxes
     field: str  # of the master's `Nav`
     sigma: str  # among the parameters of the master, by axis
-    struck: bool  # an outlier spoils it
+    struck: bool  # outliers affect it
     read: Callable[[Installation, ProductState, RecordDelay], Any]
     linear: Callable[..., Any] | None = None  # likewise, with the Jacobian
 
@@ -274,13 +274,13 @@ def product_model(
         installation: nominal mounting and lever arm.
         sigmas: standard deviations of the `RECORDS` to match, a number or (3,) each: of the
             attitude [rad] as a rotation vector, of velocity [m/s] and position [m], all north east
-            down. Flutter of the structure belongs to the attitude.
-        flexure: sigma, time constant and damping of each axis as the filter believes them; tails
-            and bending are not modelled.
+            down. That of the attitude includes flutter of the structure.
+        flexure: sigma, time constant and damping assumed for each axis; tails and bending are not
+            modelled.
 
     Returns:
         A model of `ProductState` whose input is a `ImuBlock` of the slave's raw increments. Its
-        sensors bear the names of `sigmas`; an attitude is a `Rotation`, a velocity (3,) NED, a
+        sensors have the names of `sigmas`; an attitude is a `Rotation`, a velocity (3,) NED, a
         position a `Geodetic`; the aux of each is a `RecordDelay`.
     """
     motion = moved_by(_step, _step_linear, _ProductNoise(noise, flexure))
@@ -299,12 +299,12 @@ def lag_of(increments: Increments, delay_s: ArrayLike, omega_m: ArrayLike) -> Re
     Args:
         increments: raw blocks of the slave, dt (E, K), theta and dv (E, K, 3); epoch e is the end
             of block e.
-        delay_s: () a record used at an epoch was true so long before it; not negative.
-        omega_m: (E, 3) rad/s, the master's turn rate as recorded; NaN counts as zero.
+        delay_s: () time from the validity of a record to the epoch of its use [s]; not negative.
+        omega_m: (E, 3) rad/s, recorded angular rate of the master; NaN counts as zero.
 
     Returns:
-        `RecordDelay` with a leading axis of E. Before the first increment the motion is taken to
-        have been as in it.
+        `RecordDelay` with a leading axis of E. Motion before the first increment is taken equal to
+        that within it.
     """
     dt = jnp.asarray(increments.dt, float)
     epochs, width = dt.shape
@@ -313,7 +313,7 @@ def lag_of(increments: Increments, delay_s: ArrayLike, omega_m: ArrayLike) -> Re
     last = (jnp.arange(epochs) + 1) * width - 1
 
     def back(carry):
-        """Add the sample before, as much of it as the delay reaches into."""
+        """Add the preceding sample, or the part of it within the delay."""
         k, left, q, dv = carry
         lasts, theta, push = (a[jnp.maximum(last - k, 0)] for a in flat)
         taken = jnp.minimum(left, lasts[:, 0])

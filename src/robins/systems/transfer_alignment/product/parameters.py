@@ -87,7 +87,7 @@ class GroundVehicle(Departure):
     """A ground vehicle that drives legs, on a road that may be rough."""
 
     kind: Literal["vehicle"]
-    speed: q.SpeedSize = default("0 m/s")  # at the start
+    speed: q.SpeedSize = default("0 m/s")  # initial speed
     legs: Annotated[tuple[Leg, ...], pydantic.Field(min_length=1)]
     roll: tuple[Sway, ...] = ()
     pitch: tuple[Sway, ...] = ()
@@ -101,14 +101,14 @@ class GroundVehicle(Departure):
 class PairSlave(Parameters):
     """The inertial unit to be aligned; constants are drawn in each run, with these sigmas.
 
-    Its errors after compensation are, as a patent of Southeast University has them, (6) and (7),
+    Its errors after compensation are those of a patent of Southeast University, (6) and (7),
 
         eps   = eps_const + eps_slow + eps_fast - eps_calibrated        gyros
         nabla = nabla_const + nabla_fast - nabla_calibrated             accelerometers
 
     with fast for white noise and slow for a first-order Gauss-Markov process in its steady state. A
-    calibration finds the constant but for an error of the stated sigma, c = const + error, so that
-    const - c = -error is left of it; where none is stated nothing was calibrated, c = 0.
+    calibration determines the constant with an error of the stated sigma, c = const + error, so
+    const - c = -error remains; where none is stated there was no calibration, c = 0.
     """
 
     rate: q.Frequency = default("50 Hz")
@@ -123,13 +123,13 @@ class PairSlave(Parameters):
 
     @property
     def gyro_left(self) -> Numbers:
-        """(3,) sigma of what is left of the constant drift [rad/s]."""
+        """(3,) sigma of the residual constant drift after calibration [rad/s]."""
         calibrated = self.gyro_calibration
         return as_array(self.gyro_bias if calibrated is None else calibrated)
 
     @property
     def accel_left(self) -> Numbers:
-        """(3,) sigma of what is left of the constant bias [m/s^2]."""
+        """(3,) sigma of the residual constant bias after calibration [m/s^2]."""
         calibrated = self.accel_calibration
         return as_array(self.accel_bias if calibrated is None else calibrated)
 
@@ -140,7 +140,7 @@ class PairSlave(Parameters):
 
     @property
     def gyro_walk(self) -> np.ndarray:
-        """(3,) random walk [rad/s/sqrt(s)] by which the slow drift leaves where it is."""
+        """(3,) random walk [rad/s/sqrt(s)] equivalent to the slow drift over short times."""
         return np.asarray(self.gyro_slow) * np.sqrt(2.0 / np.asarray(self.gyro_slow_time))
 
 
@@ -148,7 +148,7 @@ class PairMaster(Parameters):
     """The records of the master; one at each epoch of the filters."""
 
     rate: q.Frequency = default("10 Hz")
-    # one sigma about north, east, down; flutter of the structure belongs to it
+    # one sigma about north, east, down; includes flutter of the structure
     attitude_noise: q.AngleSizes
     velocity_noise: q.SpeedSizes
     position_noise: q.LengthSizes = default("0 m")
@@ -160,7 +160,7 @@ class PairMounting(Parameters):
 
     nominal: q.Angles = default("0 deg")  # roll, pitch, yaw of the slave
     error: q.Angles = default("0 deg")  # the same in every run
-    sigma: q.AngleSizes = default("0 deg")  # drawn on top
+    sigma: q.AngleSizes = default("0 deg")  # drawn in each run, in addition
 
 
 class Structure(Parameters):
@@ -175,7 +175,7 @@ class Structure(Parameters):
 
     @property
     def flexure(self) -> Flexure:
-        """The same as simulator and filters take it."""
+        """Convert to the `Flexure` of simulator and filters."""
         sigma, time, bending = (as_array(x) for x in (self.sigma, self.time, self.bending))
         return Flexure(sigma, time, self.damping, self.tail_dof, bending)
 
@@ -198,7 +198,7 @@ class PairDisturbance(Parameters):
 class PairStart(Parameters):
     """One sigma of the initial errors of the slave's navigation, north, east, down.
 
-    They are drawn from normal distributions; or all +1 sigma; or 1 sigma of random sign.
+    They are drawn from normal distributions, or all +1 sigma, or 1 sigma with random signs.
     """
 
     attitude: q.AngleSizes
@@ -208,7 +208,7 @@ class PairStart(Parameters):
 
 
 class PairParameters(Parameters):
-    """A master, a slave, what is between them, and how they move."""
+    """A master, a slave, the structure between them, and their motion."""
 
     manoeuvre: Annotated[Aircraft | Ship | GroundVehicle, pydantic.Field(discriminator="kind")]
     slave: PairSlave
@@ -233,7 +233,7 @@ class PairAssumptions(Parameters):
     """Assumptions of the filters; left out: the stated noise, start and mounting are true."""
 
     mounting: q.AngleSizes = default("0.3 deg")  # one sigma of the mounting error
-    # flexure states are for what is given here; tails and bending are not modelled
+    # flexure modelled by states; tails and bending are not modelled
     flexure: Structure | None = None
     gyro_bias_walk: q.RateWalkSizes = default("0 deg/h/sqrt(h)")
     accel_bias_walk: q.AccelRateWalkSizes = default("0 mg/sqrt(h)")
@@ -248,7 +248,7 @@ class Product(Scenario, PairParameters):
     title: str = "Transfer alignment, closed loop"
     filters: Names = ("kf", "product")
     believed: PairAssumptions = pydantic.Field(default_factory=PairAssumptions)
-    # figures pooled over time count from here, when the manoeuvre has shown what there is to see
+    # metrics are pooled from here on, when the manoeuvre has made the states observable
     settle: q.Time = default("0 s")
 
 

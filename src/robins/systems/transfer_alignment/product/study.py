@@ -62,16 +62,16 @@ SENSORS = {name: record.axes for name, record in pm.RECORDS.items()}
 # by every filter, whether or not it has flexure states
 _REPORTED = {block.name: block for block in BLOCKS if block.name != "flexure"}
 _RIGID = 18  # components without flexure states
-# Nothing is known better than this (rad, m/s, m, rad/s, m/s^2, rad), so that covariances that begin
-# with zeros have full rank, as the Joseph form needs.
+# Least initial sigmas (rad, m/s, m, rad/s, m/s^2, rad): zero ones would make the covariance
+# singular, and the Joseph form needs full rank.
 _LEAST = np.repeat([1e-9, 1e-6, 1e-3, 1e-12, 1e-8, 1e-9], 3)
 
 
-# ------------------------------------------------------------------------- what a filter believes
+# ----------------------------------------------------------------------- assumptions of a filter
 
 
 def installation_of(pair: PairParameters) -> pm.Installation:
-    """Place of the slave on the vehicle, as far as it is known."""
+    """Nominal installation of the slave: mounting and lever arm."""
     q_ms = Rotation.from_euler(*pair.mounting.nominal)
     return pm.Installation(q_ms, jnp.asarray(pair.lever_arm, float))
 
@@ -80,7 +80,7 @@ def model_of(pair: PairParameters, believed: PairAssumptions, flexure: Flexure |
     """The product model by its parameters.
 
     Raises:
-        ValueError: a noise of the master is zero, so that its records could not be weighed.
+        ValueError: a noise of the master is zero, so that its records cannot be weighted.
     """
     matched = (pm.ATTITUDE, pm.VELOCITY, *((pm.POSITION,) if believed.position else ()))
     sigmas = {}
@@ -171,8 +171,8 @@ def product_contender(
         pair: assumptions of the filter on both units, the start and the mounting. It does not use
             `pair.disturbance`, `pair.flexure` and the true mounting error.
         name: one of `FILTERS`.
-        believed: of mounting and flexure; by default 0.3 deg and none.
-        blocks: what it reports, see `reported`.
+        believed: assumed mounting and flexure; by default 0.3 deg and none.
+        blocks: reported blocks, see `reported`.
         frame: "NED" or "ENU".
 
     Raises:

@@ -1,18 +1,18 @@
-"""A master and a slave on one vehicle: what both report, and the truth about the slave.
+"""A master and a slave on one vehicle: outputs of both, and the truth of the slave.
 
-The slave's axes are turned from the master's by flexure lambda (master axes), the nominal mounting
+The slave's axes are rotated from the master's by flexure lambda (master axes), the nominal mounting
 and the mounting error mu (slave axes):
 
     q_ns = q_nm exp(lambda) q_nominal exp(mu)
 
-and its gyros and accelerometers feel all of it. `lay_out` inverts the mechanisation once, for a
-slave without lambda and mu; `simulate_pair` turns its increments run by run. With d the turn from
-true to nominal slave axes at either end of a sample,
+and its gyros and accelerometers sense all of it. `lay_out` inverts the mechanisation once, for a
+slave without lambda and mu; `simulate_pair` rotates its increments run by run. With d the rotation
+from true to nominal slave axes at either end of a sample,
 
     exp(theta) = d_begin^-1 exp(theta_nominal) d_end,        dv = d_begin^-1 dv_nominal
 
 which is exact, so an error-free slave navigates to its true attitude and velocity whatever the
-flexure. The lever arm is rigid: that a structure which bends also shifts the slave is left out.
+flexure. The lever arm is rigid: the displacement of the slave by bending is not modelled.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _MASTER = unit(Component.IMU, 1)
 
 
 class PairCourse(NamedTuple):
-    """Data that all runs share: the motion, and increments of an ideal slave.
+    """Data common to all runs: the motion, and increments of an ideal slave.
 
     This slave has its nominal mounting and its lever arm, no flexure, no mounting error and no
     sensor errors; `simulate_pair` adds these run by run.
@@ -79,9 +79,9 @@ class PairCourse(NamedTuple):
     path: Nav  # that slave at each epoch, leading axis E
     start: Nav  # and at time zero
     load_factor: np.ndarray  # (N + 1,) specific force of the master over g
-    master: Nav  # what the master's records describe, leading axis E
+    master: Nav  # true master at the records' times of validity, leading axis E
     master_omega_b: np.ndarray  # (E, 3) rad/s
-    there: np.ndarray  # (E,) bool: the record is not lost
+    there: np.ndarray  # (E,) bool: True unless the record is lost
 
 
 def motion_of(manoeuvre: Aircraft | Ship | GroundVehicle) -> MotionProfile:
@@ -113,8 +113,8 @@ def lay_out(pair: PairParameters) -> PairCourse:
     """Everything that does not depend on a run.
 
     Raises:
-        ValueError: a motion that cannot be; rates that do not divide; a run shorter than an epoch;
-            a window or a step of a disturbance outside the run or without its partner.
+        ValueError: an impossible motion; rates that do not divide; a run shorter than an epoch; a
+            window or a step of a disturbance outside the run or without its partner.
     """
     each = _samples_an_epoch(pair.slave.rate, pair.master.rate)
     motion = motion_of(pair.manoeuvre)
@@ -209,7 +209,7 @@ class PairRun(NamedTuple):
 
     increments: Increments  # dt (E, K), theta (E, K, 3), dv (E, K, 3) as the slave reports
     noise_scale: Any  # (E,) of the process noise factor: 1, more across a gap in the samples
-    start: Nav  # true slave at time zero; of a recorded pair where it is taken to be
+    start: Nav  # true slave at time zero; for a recorded pair its assumed state
     initial_error: Any  # (9,) of attitude, velocity, position: true = retract(estimate, error)
     master: Nav  # leading axis E, as reported; NaN where missing
     master_omega_b: Any  # (E, 3) rad/s, omega_ib_b of the master at the time of its record
@@ -255,9 +255,9 @@ def simulate_pair(pair: PairParameters, course: PairCourse, seed: int, index: Ar
 
 
 def start_estimate(run: PairRun) -> Nav:
-    """The slave's own idea of where it is at time zero, `initial_error` away from the truth.
+    """Initial estimate of the slave at time zero, `initial_error` away from the truth.
 
-    The position is so to the curvature of the Earth, 2e-5 m at 10 m.
+    The position is exact but for the curvature of the Earth, 2e-5 m at 10 m.
     """
     return retract(run.start, -run.initial_error)
 
@@ -272,7 +272,7 @@ def _flexure(pair: PairParameters, course: PairCourse, key: Array) -> tuple[Arra
 
 
 def _felt(course: PairCourse, d: Float[Array, "n 4"]) -> tuple[Array, Array]:
-    """Increments of the true slave axes, (N, 3) each."""
+    """Ideal increments (N, 3) each along the true slave axes."""
     back = conjugate(d[:-1])
     turned = multiply(multiply(back, jnp.asarray(course.turn)), d[1:])
     return to_rotvec(turned), rotate(back, jnp.asarray(course.nominal.dv))
@@ -281,7 +281,7 @@ def _felt(course: PairCourse, d: Float[Array, "n 4"]) -> tuple[Array, Array]:
 def _slave_errors(pair: PairParameters, course: PairCourse, key: Array) -> tuple[Array, ...]:
     """Errors of theta and dv, biases of gyros and accelerometers after each sample; (N, 3) each.
 
-    All errors add, so they are the reports of the unit for a body at rest in free fall.
+    All errors are additive, so they are the output of the unit for a body at rest in free fall.
     """
     s, dt, still = pair.slave, jnp.asarray(course.dt), jnp.zeros((len(course.dt), 3))
     slow = (

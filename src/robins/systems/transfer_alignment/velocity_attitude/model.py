@@ -1,4 +1,4 @@
-"""Velocity and attitude matching: a slave that navigates by itself, and its twelve error states.
+"""Velocity and attitude matching: a free-running slave INS, and its twelve error states.
 
 The model of a patent on transfer alignment (Southeast University), its eqs. (1) to (5), in its
 frames: navigation n east-north-up, body b right-forward-up, heading clockwise from north. The slave
@@ -21,10 +21,10 @@ noise of accelerometers and gyros. The measurement is the slave minus the master
 
     Y = [VE, VN, heading, pitch, roll] = [dV, H1 phi] + v                   (6)
 
-as two sensors, for they have units of their own; updating with one after the other is updating with
-both. As the patent does, the model leaves out the accelerometer along z, which a bank turns into
-the horizontal, and mounting angles between the two units. Euler angles fail where the nose points
-up: see `refuse_steep`.
+as two sensors, which differ in units; sequential updates are equivalent to a joint one. As in the
+patent, the model omits the bias of the z accelerometer, which a bank projects into the horizontal,
+and mounting angles between the two units. Euler angles are singular with the nose up: see
+`refuse_steep`.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def transition(interval: Interval) -> Float[Array, "12 12"]:
 
 
 def process_sigma(gyro_noise: float, accel_noise: float, dt_s: float) -> np.ndarray:
-    """(12,) roots of the diagonal of Q over an interval; noise is alike on all axes: none turns it.
+    """(12,) roots of the diagonal of Q over an interval, for noise equal on all axes.
 
     The noises are an angle random walk [rad/sqrt(s)] and a velocity random walk [m/s/sqrt(s)].
     """
@@ -171,7 +171,7 @@ its (3,) standard deviations [rad]."""
 def euler_difference(slave_q_enu: ArrayLike, master_q_enu: ArrayLike) -> Float[Array, "*b 3"]:
     """Heading, pitch and roll of the slave minus those of the master [rad], in [-pi, pi).
 
-    Of attitudes (..., 4), body RFU to ENU, of boxes that are aligned; NaN where one is missing.
+    Attitudes (..., 4) are body RFU to ENU, of aligned units; NaN where one is missing.
     """
     slave, master = (euler_enu_rfu(jnp.asarray(q, float)) for q in (slave_q_enu, master_q_enu))
     return wrap(jnp.stack([a - b for a, b in zip(slave[::-1], master[::-1], strict=True)], -1))
@@ -197,22 +197,22 @@ def refuse_steep(time_s: np.ndarray, q_nb: ArrayLike) -> None:
 
 
 def dcm_enu(q_nb: ArrayLike) -> Float[Array, "*b 3 3"]:
-    """C from body RFU to ENU of an attitude NED/FRD (..., 4)."""
+    """DCM from body RFU to ENU of an attitude NED/FRD (..., 4)."""
     return to_dcm(swap_q(jnp.asarray(q_nb, float)))
 
 
-# ------------------------------------------------------------------------------ the slave by itself
+# -------------------------------------------------------------------------- the free-running slave
 
-_Q, _V, _V_DOWN, _LAT, _ALT = slice(0, 4), slice(4, 7), 6, 7, 9  # places in the vector of a step
+_Q, _V, _V_DOWN, _LAT, _ALT = slice(0, 4), slice(4, 7), 6, 7, 9  # indices in the vector of a step
 
 
 def start_with_error(start: Nav, error: ArrayLike) -> Nav:
-    """Believed start of the slave.
+    """Initial estimate of the slave.
 
     Args:
         start: the truth, NED/FRD.
         error: (9,) tangent of attitude, velocity and position, true = retract(believed, error); its
-            vertical velocity and height do not count.
+            vertical velocity and height are ignored.
     """
     horizontal = jnp.asarray(error, float).at[jnp.array([5, 8])].set(0.0)
     estimate = retract(start, -horizontal)
@@ -223,11 +223,11 @@ def navigate(start: Nav, increments: Increments) -> tuple[Nav, SlaveFlight]:
     """Navigate over E blocks of K increments; pure, for any number of runs under `vmap`.
 
     Args:
-        start: where the slave believes it is, NED/FRD; its height is held.
-        increments: of the slave as reported, dt (E, K), theta and dv (E, K, 3).
+        start: initial estimate of the slave, NED/FRD; its height is held.
+        increments: reported increments of the slave, dt (E, K), theta and dv (E, K, 3).
 
     Returns:
-        What it computes at the end of each block, NED/FRD, and its mean flight over each.
+        Its computed state at the end of each block, NED/FRD, and its mean flight over each.
     """
     first = vector(start)
     E, K = increments.dt.shape
@@ -249,7 +249,7 @@ def navigate(start: Nav, increments: Increments) -> tuple[Nav, SlaveFlight]:
     _, path = lax.scan(sample, first, samples)
     path = jnp.concatenate([first[None], path])
     dv = increments.dv.reshape(E * K, 3)
-    felt = rotate(path[:-1, _Q], dv).reshape(E, K, 3)  # dv has the axes of a sample's begin
+    felt = rotate(path[:-1, _Q], dv).reshape(E, K, 3)  # dv is in the axes at a sample's begin
     flight = SlaveFlight(
         lat_rad=average(path[:, _LAT]),
         alt_m=average(path[:, _ALT]),
@@ -263,19 +263,20 @@ def navigate(start: Nav, increments: Increments) -> tuple[Nav, SlaveFlight]:
 def as_master_sees(
     own: Nav, flight: SlaveFlight, master: Nav
 ) -> tuple[SlaveFlight, Float[Array, "e 3 3"]]:
-    """The slave's flight and attitudes, corrected by the reports of the master.  A model linearised
-    there errs less than one about the slave's own estimate, whose attitude is off by degrees. Each
-    interval is turned and shifted by the difference at its end, so that the motion within it is
-    still that of the slave's samples.
+    """The slave's flight and attitudes, corrected by the reports of the master.
+
+    A model linearised there has smaller errors than one about the slave's own estimate, whose
+    attitude is wrong by degrees. Each interval is rotated and shifted by the difference at its end,
+    so the motion within it is still that of the slave's samples.
 
     Args:
-        own: what the slave computes at each epoch.
-        flight: over the intervals that end there, likewise.
-        master: as reported at each epoch, of a box aligned with the slave's; NaN where missing, and
-            there the slave's own estimate stands.
+        own: computed state of the slave at each epoch.
+        flight: its computed flight over the intervals that end there.
+        master: as reported at each epoch, for a unit aligned with the slave; where it is NaN, the
+            slave's own estimate is used.
 
     Returns:
-        The flight over the intervals, and C from body RFU to ENU at the epochs.
+        The flight over the intervals, and the DCM from body RFU to ENU at the epochs.
     """
     q = jnp.asarray(master.q_nb.wxyz)
     there = jnp.all(jnp.isfinite(q), -1, keepdims=True)
@@ -295,7 +296,7 @@ def as_master_sees(
 
 
 def true_errors(computed: Nav, true: InsState) -> Float[Array, "*b 12"]:
-    """The state x as it truly is, from truth in NED/FRD; any leading axes."""
+    """True error state x, from truth in NED/FRD; any leading axes."""
     p, position = computed.position, true.position
     parts = (
         jnp.stack([p.lat - position.lat, p.lon - position.lon], -1),

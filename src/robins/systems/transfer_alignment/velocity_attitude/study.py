@@ -1,16 +1,15 @@
 """The study "velocity-attitude": a patent's adaptive H-infinity filter among Kalman filters.
 
-A slave navigates by itself; each filter estimates its errors from what a master reports, with the
+A slave navigates unaided; each filter estimates its errors from the reports of a master, with the
 twelve states of `velocity_attitude.model`, open loop. Scenarios disturb the measurement (flexure,
-outliers), the motion (gyro noise, a step of drift), both, or leave mounting angles that no state
-stands for.
+outliers), the motion (gyro noise, a step of drift), both, or have mounting angles without a state.
 
-Filters assume white noise of a variance at each time. The plain ones believe in the
-stated noise of sensors and master; a slow drift of the gyros (`Slave`) they believe to walk.
-"told-r" also knows the variance of flexure and outliers, but not that flexure is correlated in
-time, which a white R cannot express. "told-q" also knows the gyro noise in its window, and that
-from its step on the drift may walk, as far until the end as the step was large. The model is
-linearised about what the master reports.
+Filters assume white noise of a given variance at each time. The plain ones use the stated noise of
+sensors and master; slow gyro drift (`Slave`) is modelled as a random walk. "told-r" also knows the
+variance of flexure and outliers, but not that flexure is correlated in time, which a white R cannot
+express. "told-q" also knows the gyro noise in its window, and from the step of the drift on assumes
+a random walk that reaches the size of the step at the end. The model is linearised about the
+reports of the master.
 """
 
 from __future__ import annotations
@@ -73,8 +72,8 @@ ADAPTIVE: dict[str, dict[str, Any]] = {
     "adaptive-hinf-compensated": {"weight": ATTITUDE_ROWS, "compensate_first": True},
     "hinf-patent-weights": {"weight": np.ones(va.STATES)},  # L = I, and R = I below
 }
-# Of the product model: closed loop, with states for the mounting. A scenario has the first by
-# itself; the others, one filter under two names, are the bank of seven that runs in addition.
+# Filters of the product model: closed loop, with mounting states. A scenario has the first by
+# default; the others, one filter under two names, are the bank of seven that runs in addition.
 PRODUCT = ("product", "adaptive", "product-adaptive")
 FILTERS = (*TOLD, *FIXED, *ADAPTIVE, *PRODUCT)
 
@@ -96,7 +95,7 @@ class VelocityAttitude(Scenario, PairParameters):
     filters: Names = FILTERS[:-2]
     claims: tuple[str, ...] | None = ()
     told: AssumedDisturbances = pydantic.Field(default_factory=AssumedDisturbances)
-    # figures pooled over time count from here
+    # metrics are pooled from here on
     settle: Annotated[float, Quantity("time", least="0 s")] = default("30 s")
 
 
@@ -104,7 +103,7 @@ class VelocityAttitudeWorld(NamedTuple):
     """One run: the pair, and the open-loop errors that the filters of twelve states estimate."""
 
     pair: Any  # a `PairRun`, for the filters of the product model
-    flight: va.SlaveFlight  # over each interval, as linearised about; leading axis E
+    flight: va.SlaveFlight  # linearisation point over each interval; leading axis E
     C_nb: Any  # (E, 3, 3) at the epochs
     velocity: Any  # (E, 2) m/s, slave minus master
     attitude: Any  # (E, 3) rad, heading, pitch, roll likewise
@@ -113,16 +112,16 @@ class VelocityAttitudeWorld(NamedTuple):
 
 @dataclass(frozen=True)
 class VelocityAttitudeCourse:
-    """Data that all runs share."""
+    """Data common to all runs."""
 
     given: VelocityAttitude
     pair: product.PairCourse
 
     @cached_property
     def least_gamma(self) -> float:
-        """Least gamma [arcmin] of attitude errors by the stated noise, along a perfect run.
+        """Least gamma [arcmin] of attitude errors under the stated noise, along an error-free run.
 
-        The initial uncertainty decides it: the first measurement leaves more than any later one.
+        It is set by the initial uncertainty: the local bound is largest at the first measurement.
         """
         K, E = self.pair.each, len(self.pair.epoch_s)
         theta, dv = (np.asarray(a).reshape(E, K, 3) for a in self.pair.nominal[1:3])
@@ -141,8 +140,8 @@ def lay_out(given: VelocityAttitude) -> VelocityAttitudeCourse:
     Warns where errors will outgrow the linear model.
 
     Raises:
-        ValueError: the pair cannot be laid out, has a lever arm or a delay, or points its nose too
-            high; or nothing is left to count.
+        ValueError: the pair cannot be laid out, has a lever arm or a delay, or pitches too steeply;
+            or no epoch is left to evaluate.
     """
     if any(given.lever_arm) or given.master.delay:
         raise ValueError(
@@ -170,7 +169,7 @@ def simulate(
     """One run, from its number, which may be traced; pure."""
     pair = product.simulate_pair(given, course.pair, seed, index)
     own, flown = va.navigate(va.start_with_error(pair.start, pair.initial_error), pair.increments)
-    # as the slave's box sits
+    # with the slave's mounting
     master_q = multiply(pair.master.q_nb.wxyz, jnp.asarray(course.pair.q_nominal))
     master = pair.master._replace(q_nb=Rotation(master_q))
     flight, C_nb = va.as_master_sees(own, flown, master)
@@ -189,7 +188,7 @@ def simulate(
 
 
 class BelievedNoises(NamedTuple):
-    """Believed noise at each epoch, standard deviations."""
+    """Assumed noise at each epoch, standard deviations."""
 
     process: Any  # (E, 12)
     velocity: Any  # (E, 2) m/s
@@ -197,14 +196,14 @@ class BelievedNoises(NamedTuple):
 
 
 def believed_noise(given: VelocityAttitude, name: str, epoch_s: np.ndarray) -> BelievedNoises:
-    """The noise that a filter believes in: that of the data sheets, worst axis where axes differ.
+    """Noise assumed by a filter: that of the data sheets, of the worst axis where axes differ.
 
-    A filter "told r" adds the variance of outliers in all measurements and of flexure in
-    attitude; one "told q" the gyro noise in its window, and a drift that walks from its step on.
+    A filter "told r" adds the variance of outliers in all measurements and of flexure in attitude;
+    one "told q" the gyro noise in its window, and a random walk of the drift from its step on.
     """
     s, m, told, d = given.slave, given.master, TOLD.get(name, ()), given.told.disturbance
     sigma = va.process_sigma(max(s.gyro_noise), max(s.accel_noise), 1.0 / m.rate)
-    # where it is stated, the slow drift of (6) walks away from the constant of (5)
+    # where it is stated, the slow drift of (6) adds a random walk to the constant of (5)
     sigma[va.EPS] = np.abs(swap(s.gyro_walk)) / math.sqrt(m.rate)
     (north, east, _), tilt = m.velocity_noise, max(m.attitude_noise[:2])
     rows = (sigma, [east, north], [m.attitude_noise[2], tilt, tilt])
@@ -216,7 +215,7 @@ def believed_noise(given: VelocityAttitude, name: str, epoch_s: np.ndarray) -> B
         roll, pitch, heading = given.told.flexure.sigma
         velocity = velocity * factor
         attitude = np.hypot(attitude * factor, [heading, pitch, roll])
-    begin = epoch_s - epoch_s[0] + 1e-9  # of the interval that ends with an epoch; they are even
+    begin = epoch_s - epoch_s[0] + 1e-9  # of the interval that ends at an epoch; all are equal
     if "q" in told and d.gyro_noise_window is not None:
         inside = (begin >= d.gyro_noise_window.begin) & (begin < d.gyro_noise_window.end)
         process[inside, va.PHI] *= d.gyro_noise_factor
@@ -296,7 +295,7 @@ def contender(given: VelocityAttitude, course: VelocityAttitudeCourse, name: str
 def of_product(
     given: VelocityAttitude, name: str, believed: PairAssumptions | None = None
 ) -> Contender:
-    """A filter of the product model that reports as the others do.
+    """A filter of the product model with the reported blocks of the others.
 
     It has the assumptions of the plain ones, unless `believed` is given.
     """
@@ -343,16 +342,16 @@ def view(given: VelocityAttitude, course: VelocityAttitudeCourse) -> View:
 
 
 def metrics_of(epoch_s: np.ndarray, statistics: Any) -> dict[str, Metric]:
-    """Metrics of one filter from its campaign statistics, over the epochs that count.
+    """Metrics of one filter from its campaign statistics, over the evaluation epochs.
 
     Lists run east, north, up and right, forward, up. A run has settled below a limit when its worst
-    attitude axis stays there to the end; how long that takes is the median of all runs, infinite
-    where most never do.
+    attitude axis stays there to the end; the settling time is the median over runs, infinite where
+    most never settle.
     """
     out = rms_by_axis(statistics, all_axes=("attitude",))
     for limit in statistics.limits:
         settled = statistics.settled(limit.name)
-        # E stands for never, and a run that is out at the last epoch but one has shown nothing
+        # E means never; settling within the last second is no evidence
         times = np.append(np.insert(epoch_s[:-1], 0, 0.0), np.inf)[settled]
         out[f"share_below_{limit.name}"] = Probability.among(settled <= statistics.count_from)
         out[f"settled_share_{limit.name}"] = Probability.among(times < epoch_s[-1] - 1.0)
