@@ -102,7 +102,7 @@ class Link:
         self._injector, self._watch = injector, watch
         self._lines = None if baud is None else (SerialLine(baud), SerialLine(baud))
         self._run = 0
-        self._out, self._ready = bytearray(), bytearray()  # before, after the line
+        self._out, self._ready = bytearray(), bytearray()  # to the line, from it
         self.restart(0)
 
     def restart(self, run: int) -> None:

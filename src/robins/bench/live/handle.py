@@ -64,7 +64,7 @@ class LivePage:
             host: address to listen at; any program that reaches it can stop the bench, so an address
                 beyond this machine gives a warning.
             port: to listen at; 0: any that is free.
-            faults: offered for injection by the page: each `{"label": str, "fault": {...}}`.
+            faults: offered for injection, each `{"label": str, "fault": {...}}`.
             says: labels of the operator messages that the page offers.
 
         Raises:
