@@ -61,7 +61,7 @@ class LivePage:
             signals: values of each sample, in this order.
             title: of the page.
             run: number of the run; a page clears its plots when it changes.
-            host: address to listen at; any program that reaches it can stop the bench, so an address
+            host: address to listen at; any program that reaches it can stop the bench, so one
                 beyond this machine gives a warning.
             port: to listen at; 0: any that is free.
             faults: offered for injection, each `{"label": str, "fault": {...}}`.
