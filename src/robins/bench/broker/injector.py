@@ -73,7 +73,7 @@ class Injector:
 
         Args:
             table: the faults of the rig.
-            faults: those of the scenario.
+            faults: active or planned at the start.
             seed: of their random numbers.
 
         Raises:
@@ -103,13 +103,13 @@ class Injector:
         self._added += 1
 
     def clear(self) -> None:
-        """Remove all faults; delayed frames are due now."""
+        """Remove all faults; frames that are held back are due now."""
         self._faults.clear()
         for held in self._held.values():
             held[:] = [one._replace(due_ns=-math.inf, fault=None) for one in held]
 
     def remove(self, fault: LinkFault) -> None:
-        """Remove a fault; frames that it delays still come at their time."""
+        """Remove a fault; frames that it holds back still come at their time."""
         self._faults = [one for one in self._faults if one.is_ is not fault]
 
     def active(self, now_ns: int) -> list[LinkFault]:

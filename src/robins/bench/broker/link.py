@@ -102,7 +102,7 @@ class Link:
         self._injector, self._watch = injector, watch
         self._lines = None if baud is None else (SerialLine(baud), SerialLine(baud))
         self._run = 0
-        self._out, self._ready = bytearray(), bytearray()  # to the line, from it
+        self._out, self._ready = bytearray(), bytearray()  # for the line; through it
         self.restart(0)
 
     def restart(self, run: int) -> None:

@@ -1,9 +1,9 @@
 """Writer of the record of a run: raw frames with their times of arrival, in an MCAP file.
 
 Messages go to the disk in chunks of 512 messages, of 64 KiB or of a quarter of a second, whichever
-comes first, each in one write. So a file of a killed run lacks at most the last quarter of a
-second. Nothing but the input goes into it: the same entries make the same bytes. See `layout` for
-the format.
+comes first, each in one write. So the file of a killed run lacks at most the traffic of the last
+quarter of a second, and may end in a truncated frame. Nothing but the input goes into it: the same
+entries make the same bytes. See `layout` for the format.
 
 The writer is that of the package `mcap`; only the end of a chunk and the write to disk are
 controlled here. By itself `mcap` ends a chunk by size alone: of 3030 frames at 300 Hz, killed by
