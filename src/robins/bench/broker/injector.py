@@ -149,14 +149,14 @@ class Injector:
         where = link, direction
         met = [one for one in self._faults if one.meets(link, direction, kind, now_ns)]
         if met or kind in self._repeated:
-            payload = self._spoilt(where, kind, frame.payload, met, now_ns)
+            payload = self._faulty_payload(where, kind, frame.payload, met, now_ns)
             if payload is not frame.payload:
                 frame = frame._replace(payload=payload)
                 raw = encode_frame(*frame)
         pieces = [LineOutput(None, frame)]
         for one in met:
             if pieces and one.is_.kind not in self._table.device_faults:
-                pieces = self._spoil(where, kind, one, pieces, raw, now_ns)
+                pieces = self._damaged(where, kind, one, pieces, raw, now_ns)
         if pieces and where in self._held:
             pieces += self._overtaken(where, kind)
         return pieces
@@ -194,7 +194,7 @@ class Injector:
 
     # ------------------------------------------------------------------- payloads
 
-    def _spoilt(
+    def _faulty_payload(
         self, where: tuple[str, str], kind: int, payload: bytes, met: list[_Fault], now_ns: int
     ) -> bytes:
         """Payload of a sensor or an actuator under its faults; see `Stage`."""
@@ -231,7 +231,7 @@ class Injector:
 
     # ---------------------------------------------------------------- what the line does
 
-    def _spoil(
+    def _damaged(
         self,
         where: tuple[str, str],
         kind: int,

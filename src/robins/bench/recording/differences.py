@@ -94,7 +94,7 @@ class Differences:
     def found(self) -> list[FieldDifference]:
         """Differences in the frames so far, the earliest first."""
         for number in self._pairs:
-            self._look(number)
+            self._compare(number)
         only: tuple[dict[int, list[int]], ...] = ({}, {})
         for (number, time_ns), (which, waiting) in self._waiting.items():
             only[which].setdefault(number, []).extend([time_ns] * len(waiting))
@@ -127,9 +127,9 @@ class Differences:
         pairs = self._pairs.setdefault(number, [])
         pairs.append((time_ns, x, y))
         if len(pairs) == _BATCH:
-            self._look(number)
+            self._compare(number)
 
-    def _look(self, number: int) -> None:
+    def _compare(self, number: int) -> None:
         """Compare the pairs that differ field by field."""
         pairs, of = sorted(self._pairs[number]), self._message(number)
         self._pairs[number].clear()
@@ -177,7 +177,7 @@ def _of_fields(
                 continue
             first = int(where[0])
             place = of.name, f.name, -1 if f.length == 1 else k, f.unit
-            most, when = _how_much(x[where, k], y[where, k]), _when(frames[first][0], step_ns)
+            most, when = _largest(x[where, k], y[where, k]), _when(frames[first][0], step_ns)
             values = float(x[first, k]), float(y[first, k])
             found.append(FieldDifference(*place, *most, *when, *values, len(where)))
     return found
@@ -188,7 +188,7 @@ def _differ(f: Field, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return bits & ~(np.isnan(x) & np.isnan(y)) if f.kind == "f64" else bits
 
 
-def _how_much(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+def _largest(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     """Largest absolute and largest relative difference."""
     with np.errstate(all="ignore"):  # infinities and NaN are dealt with below
         # unsigned numbers cannot go below zero

@@ -35,7 +35,7 @@ from robins.bench.wire.records import PayloadFault
 
 HELLO_S = 120.0  # time-out for the hello of a part that does not compute
 REVIVED_S = 60.0
-_ANEW = '; on_death = "restart" would restart it'
+_RESTART_HINT = '; on_death = "restart" would restart it'
 _LONG_S = 9.0  # wait for a hello that is reported as an event
 _TELL_S = 0.2  # period of progress reports
 _MOST_DEATHS, _MINUTE_S = 3, 60.0  # deaths of a part without a fault in that time that fail the run
@@ -198,7 +198,7 @@ class Session:
             if refused:
                 self.event("scheduler", refused)
             for k in range(self.steps):
-                self._obey(k)
+                self._execute_commands(k)
                 if self._stop:
                     self._catch_up()
                     return k
@@ -225,7 +225,7 @@ class Session:
         self._catch_up()
         return self.steps
 
-    def _obey(self, step: int) -> None:
+    def _execute_commands(self, step: int) -> None:
         """Execute the commands of the observer; wait while it is paused."""
         time_ns = (step + 1) * self.config.step_ns
         switch(
@@ -463,7 +463,7 @@ class Session:
                 died, now = self._died.setdefault(part, []), time.monotonic()
                 died[:] = [*(at for at in died if now - at < _MINUTE_S), now]
             if setup.on_death == "fail" or self.broker.time_ns == 0:
-                raise BenchError(fatal + ("" if self.rig.once(setup, part) else _ANEW))
+                raise BenchError(fatal + ("" if self.rig.once(setup, part) else _RESTART_HINT))
             if self.deaths > setup.restarts:
                 raise BenchError(f"{fatal}; that is one more than restarts = {setup.restarts}")
             if len(self._died.get(part, ())) >= _MOST_DEATHS:

@@ -72,7 +72,7 @@ WIRE = Wire(
 
 
 def _shifted(values: Values, fault: Any, _: int) -> Values:
-    """Radar that locks on to a wrong place."""
+    """Radar fix that matches a wrong place."""
     return {**values, "place": values["place"] + np.array([fault.shift, 0.0])}
 
 

@@ -59,7 +59,7 @@ def filters() -> Sequence[str]:
 
 
 def timing(given: Airship) -> Timing:
-    """Steps of a flight, one per epoch; figures count from the first epoch at `counted_from`."""
+    """Steps of a flight, one per epoch; figures count from the first epoch in ``counted``."""
     first = max(math.ceil(given.counted.begin / given.epoch - 1e-9) - 1, 0)
     return Timing(given.epoch, round(given.duration / given.epoch), first)
 
@@ -78,7 +78,7 @@ def prepare(setup: Setup, given: Airship) -> AirshipConfig:
     )
 
 
-def _says(part: str, message: str, rows: Mapping[str, np.ndarray]) -> Part:
+def _rows(part: str, message: str, rows: Mapping[str, np.ndarray]) -> Part:
     """Part that sends one row per step."""
 
     def act(state: None, k: int, inputs: Inputs):
@@ -92,24 +92,24 @@ def sins(config: AirshipConfig) -> Part:
     """The inertial unit: the increments of each epoch."""
     u = config.u
     rows = {"dt": u.dt, "theta_b": u.theta, "dv_b": u.dv, "dr_b": u.dr}
-    return _says("sins", "increment", {name: np.asarray(x) for name, x in rows.items()})
+    return _rows("sins", "increment", {name: np.asarray(x) for name, x in rows.items()})
 
 
 def radar(config: AirshipConfig) -> Part:
     """Radar and barometer."""
     place, heading, alt = config.y[SAR]
-    return _says("radar", "fix", {"place": place, "heading": heading.rad, "alt": alt[:, 0]})
+    return _rows("radar", "fix", {"place": place, "heading": heading.rad, "alt": alt[:, 0]})
 
 
 def star(config: AirshipConfig) -> Part:
     """The star sensor."""
-    return _says("star", "attitude", {"euler": np.stack([a.rad for a in config.y[STAR]], axis=1)})
+    return _rows("star", "attitude", {"euler": np.stack([a.rad for a in config.y[STAR]], axis=1)})
 
 
 def air(config: AirshipConfig) -> Part:
     """Forecast and air data; silent where the filter takes none."""
     rows = {"wind_n": config.y[WIND], "through_b": config.aux[WIND]} if WIND in config.y else {}
-    return _says("air", "wind", rows)
+    return _rows("air", "wind", rows)
 
 
 def navigation(config: AirshipConfig) -> Part:

@@ -404,7 +404,7 @@ _IMU = "sensor_msgs/msg/Imu"
 
 
 def topics(config: SatelliteConfig) -> Sequence[Topic]:
-    """Conversions of rates and of attitudes with covariance, inertial to body axes."""
+    """Conversions of rates and attitudes with covariance; body and inertial axes stay."""
     step_s = config.step_ns * 1e-9
     return (
         Topic("gyro", "/gyro/imu", _IMU, lambda v: imu(v["theta_b"] / step_s), "body"),

@@ -25,7 +25,7 @@ from robins.sim.attitude_reference import (
 from robins.systems.satellite.nodes import UNIT
 
 SHARE = 0.5  # of the capacity of the wheels that a slew uses
-_AS_IT_CAN = 0.5  # of the greatest rate, if no rate is commanded
+_DEFAULT_RATE = 0.5  # of the greatest rate, if no rate is commanded
 _OFF = 2.0 * UNIT  # greatest error of the squared norm of a quaternion
 _BRAKES = 4.0  # peak acceleration times duration over initial rate, for a decaying rate: 3.94
 
@@ -94,7 +94,7 @@ def plan_after_command(
     turn, against = (np.asarray(x) for x in _between(there, now))
     angle, speed = float(np.sqrt(np.sum(turn**2))), float(np.sqrt(np.sum(against**2)))
     most, acceleration = limits(config)
-    at_most = min(rate or _AS_IT_CAN * most, most)
+    at_most = min(rate or _DEFAULT_RATE * most, most)
     way_s = max(
         PEAK_RATE * angle / at_most,
         (PEAK_ACCELERATION * angle / acceleration) ** 0.5,
