@@ -23,11 +23,11 @@ from importlib.metadata import PackageNotFoundError, version
 
 try:
     __version__ = version("robins")
-except PackageNotFoundError:  # run from its source, never installed
+except PackageNotFoundError:  # run from source, not installed
     __version__ = "0+unknown"
 
-# Two batched QR factorisations at once, each waiting for the others' threads to do its share, stop
-# jaxlib 0.10 for ever; with one worker each does its own. Read when JAX makes its first array.
+# Two concurrent batched QR factorisations, each waiting for threads of the other, deadlock
+# jaxlib 0.10; with one worker they do not. Read when JAX makes its first array.
 os.environ.setdefault("PJRT_NPROC", "1")
 
 # Name of the front door -> "module:attribute" of its home. `python tests/front_door.py` writes the

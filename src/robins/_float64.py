@@ -1,8 +1,7 @@
 """Turn on 64-bit floats before any numeric module builds an array.
 
-Navigation states lose metres in a few tens of steps in single precision, so float64 is not an
-option here. Importing this module switches JAX over; `require` raises an error where it was
-switched back.
+Navigation states lose metres in a few tens of steps in single precision, so float64 is mandatory.
+Importing this module switches JAX over; `require` raises an error if it was switched back.
 """
 
 import jax

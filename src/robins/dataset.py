@@ -135,7 +135,7 @@ class Dataset:
     imu: ImuTable
     gnss: GnssTable | None = None
     truth: Trajectory | None = None
-    master: Trajectory | None = None  # another INS on the vehicle, to align the IMU to
+    master: Trajectory | None = None  # INS of the vehicle, to align the IMU to
     mag: MagTable | None = None
     attitude: AttitudeTable | None = None  # true attitude, where nothing else is known
     odometry: OdometryTable | None = None  # speed of the wheels
@@ -143,7 +143,7 @@ class Dataset:
     findings: list[Finding] = field(default_factory=list)  # of the readers: what they left out
     time_unit_known: tuple[str, ...] = ()  # files that state the unit of their stamps
     imu_gaps: list[tuple[int, int]] = field(default_factory=list)  # (start_ns, end_ns), by `clean`
-    master_delay_s: float = 0.0  # by how much records of the master are older than their stamps
+    master_delay_s: float = 0.0  # latency of the master: age of its records at their stamps
     # from the IMU to the GNSS antenna, forward, right, down; None where it is not given
     lever_arm_b_m: tuple[float, float, float] | None = None
     mounted: bool = False  # the sensor's axes were turned to the vehicle's when it was loaded
@@ -151,13 +151,13 @@ class Dataset:
 
 @dataclass(frozen=True)
 class RangeTable(_Rows):
-    """Pseudoranges of a GNSS receiver, one a row; satellites of one time stand together.
+    """Pseudoranges of a GNSS receiver, one per row; rows of one epoch are adjacent.
 
-    Corrected for the atmosphere and the clocks of the satellites. A satellite's position is where
-    it sent, Earth-fixed at that time, so that a receiver's model must turn the Earth (Sagnac).
+    Corrected for the atmosphere and the satellite clocks. A satellite's position is that at the
+    time of transmission, Earth-fixed at that time, so the model must apply the Sagnac correction.
     """
 
-    time_ns: np.ndarray  # (N,) int64, does not fall
+    time_ns: np.ndarray  # (N,) int64, never decreasing
     range_m: np.ndarray  # (N,)
     sigma_m: np.ndarray  # (N,)
     satellite_e: np.ndarray  # (N, 3) m
@@ -176,15 +176,15 @@ class OdometryTable(_Rows):
     time_ns: np.ndarray  # (M,) int64
     speed_mps: np.ndarray  # (M,) forward
     yaw_rate: np.ndarray  # (M,) rad/s, positive to the right; NaN where there is none
-    sigma_speed: np.ndarray  # (M,) of the noise of a row
-    sigma_yaw: np.ndarray  # (M,)
+    sigma_speed: np.ndarray  # (M,) m/s noise of a row
+    sigma_yaw: np.ndarray  # (M,) rad/s
     source: str = ""
     rows: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class PlaceTable(_Rows):
-    """True places, Earth-fixed."""
+    """True positions, Earth-fixed."""
 
     time_ns: np.ndarray  # (K,) int64
     r_e: np.ndarray  # (K, 3) m
@@ -194,7 +194,7 @@ class PlaceTable(_Rows):
 
 @dataclass(frozen=True)
 class RangeLog:
-    """Input of a run of tight GNSS."""
+    """Input of a run on pseudoranges and odometry."""
 
     name: str
     ranges: RangeTable

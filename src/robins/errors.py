@@ -1,4 +1,4 @@
-"""Errors of robins where it cannot use its input, or cannot fulfil a request."""
+"""Errors of robins when it cannot use its input, or cannot fulfil a request."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class RobinsError(Exception):
         what: what is wrong.
         where: file and line, folder, option or part; empty where `what` names it.
         fix: what to do about it; empty where `what` contains it.
-        bad_input: whether what was given is wrong; otherwise doing it failed, as on a full disk.
+        bad_input: true if the input is wrong; false if the operation failed, as on a full disk.
     """
 
     bad_input: bool = True
@@ -40,17 +40,17 @@ _NOTHING = object()
 
 
 def require(holds: object, sentence: str, got: object = _NOTHING) -> None:
-    """Refuse an argument unless something holds of it: ``sentence, got ...`` where that is given.
+    """Refuse an argument unless a condition holds: ``sentence, got ...``, if `got` is given.
 
     Raises:
-        ValueError: it does not hold.
+        ValueError: the condition does not hold.
     """
     if not holds:
         raise ValueError(sentence if got is _NOTHING else f"{sentence}, got {got}")
 
 
 def require_kind(given: T, kinds: type | tuple[type, ...], whose: str, fix: str = "") -> None:
-    """Refuse an argument that is of none of some types.
+    """Refuse an argument that is not of one of the given types.
 
     Raises:
         TypeError: ``whose takes a Dataset, got an ImuTable; fix``.
@@ -63,16 +63,16 @@ def require_kind(given: T, kinds: type | tuple[type, ...], whose: str, fix: str 
 
 
 def hint(word: str, among: Iterable[str]) -> str:
-    """The end of a sentence about a word that is not known."""
+    """End of a sentence about an unknown word: the nearest known one, if any."""
     near = difflib.get_close_matches(word, list(among), 1)
     return f"; did you mean '{near[0]}'?" if near else "."
 
 
 def require_known(kind: str, name: str, among: Iterable[str], where: str = "this study") -> None:
-    """Refuse a name that is not among those there are.
+    """Refuse an unknown name.
 
     Raises:
-        ValueError: it is not; the message names the nearest, and all.
+        ValueError: the name is unknown; the message names the nearest known one, and all.
     """
     known = list(among)
     require(
@@ -83,8 +83,8 @@ def require_known(kind: str, name: str, among: Iterable[str], where: str = "this
 
 # ----------------------------------------------------------------------------- names that moved
 
-# By package, what it had: the package that has it now, its name there, and the first release in
-# which it is there, where that is not `FIRST`.
+# By package, its former names: the package that has each now, its name there, and the first
+# release with it there, if that is not `FIRST`.
 MOVED: dict[str, dict[str, tuple[str, ...]]] = {
     "robins.linalg": {"steady_state": ("robins.filters", "steady_kalman")},
     "robins.filters": {
@@ -150,7 +150,7 @@ MOVED: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 FIRST = "0.2"
-KEPT = 2  # minor releases in which an old name goes on working
+KEPT = 2  # minor releases in which an old name keeps working
 
 
 def _minor(release: str) -> tuple[int, int]:
@@ -160,10 +160,10 @@ def _minor(release: str) -> tuple[int, int]:
 
 
 def moved(package: str) -> Callable[[str], Callable]:
-    """The `__getattr__` of a package (PEP 562), for its names in `MOVED`.
+    """Make the `__getattr__` of a package (PEP 562), for its names in `MOVED`.
 
-    Code that uses such a name goes on for `KEPT` minor releases, with a `DeprecationWarning` that
-    states the new place; after them, and for any other name, there is an `AttributeError`.
+    Such a name keeps working for `KEPT` minor releases, with a `DeprecationWarning` that states the
+    new place; after them, and for any other name, an `AttributeError` is raised.
 
     Args:
         package: its ``__name__``.
@@ -187,7 +187,7 @@ def moved(package: str) -> Callable[[str], Callable]:
 
 
 def lazy(package: str, places: Mapping[str, str]) -> Callable:
-    """The `__getattr__` of a package whose names are imported when they are first used.
+    """Make the `__getattr__` of a package whose names are imported when they are first used.
 
     Args:
         package: its ``__name__``.

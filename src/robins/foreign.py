@@ -1,12 +1,12 @@
-"""Files that others wrote: their decoders behind one wrapper, and no size believed.
+"""Decoding of files from other programs: any exception becomes one error, and sizes are checked.
 
-Decoders of other packages raise what they like on damaged bytes. `decoding` stands tightly around
-each call of one and turns every exception into the error of the room that reads; what robins does
-with the result stands outside of it, so that a fault of robins is not taken for a damaged file.
+Decoders of other packages raise arbitrary exceptions on damaged bytes. `decoding` encloses each
+call of one and turns every exception into the error of the reading room; code of robins that uses
+the result stays outside of it, so that a bug of robins is not taken for a damaged file.
 
-A size that a file declares is compared with the bytes that are there before memory is allocated. An
-unpacked size may be `FREE` and `RATIO` times the packed one: measured logs pack 2 to 30 times, and
-what packs better than `RATIO` holds no measurements.
+A declared size is compared with the bytes present before memory is allocated. An unpacked size may
+be up to `FREE` plus `RATIO` times the packed one: real logs compress 2 to 30 times, and data that
+compress better than `RATIO` are no measurements.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Refuse = Callable[[str], RobinsError]
 
 
 def largest(present: int) -> int:
-    """Largest number of bytes that so many packed ones may unpack to."""
+    """Largest number of bytes to which `present` packed bytes may unpack."""
     return FREE + RATIO * present
 
 
@@ -64,12 +64,12 @@ def decoding(refuse: Refuse) -> Iterator[None]:
         first = (str(error).strip().splitlines() or [""])[0]
         kind = type(error).__name__
         if first and type(error).__module__ in ("tomllib", "json.decoder"):
-            raise refuse(first) from error  # a fault of syntax, in words for people
+            raise refuse(first) from error  # a syntax error, in plain words
         raise refuse(f"{kind}: {first}" if first else kind) from error
 
 
 def within(declared: int, present: int, what: str, refuse: Refuse) -> None:
-    """Refuse a declared size that the bytes present cannot unpack to.
+    """Refuse a declared size to which the bytes present cannot unpack.
 
     Raises:
         RobinsError: as `refuse` makes it.
@@ -82,11 +82,11 @@ def within(declared: int, present: int, what: str, refuse: Refuse) -> None:
 
 
 def unpacked(packed: bytes, compression: str, size: int, refuse: Refuse) -> bytes:
-    """Content of a packed block of exactly the size that is declared for it.
+    """Unpack a block of exactly the declared size.
 
     Args:
         packed: the block.
-        compression: "zstd", "lz4", or "" where it is plain.
+        compression: "zstd", "lz4", or "" if it is not compressed.
         size: declared, and checked by `within`.
         refuse: makes the error.
 
@@ -94,7 +94,7 @@ def unpacked(packed: bytes, compression: str, size: int, refuse: Refuse) -> byte
         RobinsError: as `refuse` makes it: it is damaged, or of another size.
     """
     if compression in ("zstd", "lz4"):
-        # no more than the declared size is requested of the decoders, whose own headers may differ
+        # the output is limited to the declared size, since the block's own header may differ
         with decoding(refuse):
             if compression == "zstd":
                 import zstandard
@@ -128,11 +128,11 @@ def arrays_of(
     Args:
         content: of the file.
         refuse: makes the error.
-        names: those wanted, as far as they are there; None: all.
+        names: arrays wanted, as far as present; None: all.
 
     Raises:
-        RobinsError: as `refuse` makes it: it is damaged, declares more than it holds, is packed as
-            NumPy does not pack, or holds objects.
+        RobinsError: as `refuse` makes it: it is damaged, declares more than it holds, is compressed
+            in a way that NumPy does not use, or holds objects.
     """
     archive = archive_of(content, refuse)
     arrays: dict[str, np.ndarray] = {}
@@ -150,7 +150,7 @@ def arrays_of(
 
 
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, refuse: Refuse) -> bytes:
-    """Content of a member, as long as it is declared, compared with its checksum."""
+    """Content of a member, checked against its declared length and checksum."""
     with (
         decoding(lambda why: refuse(f"{member.filename!r} is damaged: {why}")),
         archive.open(member) as file,
@@ -159,7 +159,7 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, refuse: Refuse) -
 
 
 def array_of(raw: bytes, name: str, refuse: Refuse) -> np.ndarray:
-    """Array of the bytes of a ``.npy`` file.
+    """Decode the array in a ``.npy`` file.
 
     Raises:
         RobinsError: as `refuse` makes it: it is cut or damaged, or holds objects.
@@ -184,16 +184,16 @@ def array_of(raw: bytes, name: str, refuse: Refuse) -> np.ndarray:
             f"{name!r} holds {len(raw) - file.tell()} bytes where its header declares {size}: "
             f"{dtype} of shape {shape}"
         )
-    # of a shape that NumPy itself does not take
+    # a shape that NumPy itself does not accept
     with decoding(lambda why: refuse(f"{name!r} is no array of NumPy: {why}")):
         flat = np.frombuffer(raw, dtype, offset=file.tell())
         return flat.reshape(shape, order="F" if fortran else "C").copy(order="K")
 
 
 def arrays_of_hdf5(content: bytes, refuse: Refuse) -> dict[str, np.ndarray]:
-    """Arrays of numbers of an HDF5 file by path, and numbers among its own attributes.
+    """Numeric arrays of an HDF5 file by path, and numeric attributes of the file itself.
 
-    Links to other files lead nowhere.
+    Links to other files are not followed.
 
     Raises:
         RobinsError: as `refuse` makes it: it is damaged, or declares more than it holds.
@@ -243,8 +243,8 @@ def columns_of_parquet(content: bytes, refuse: Refuse) -> dict[str, np.ndarray]:
 def arrays_of_matlab(content: bytes, refuse: Refuse) -> dict[str, np.ndarray]:
     """Real arrays of a MATLAB v5 file, those of structs as ``outer/name``.
 
-    Elements are those of MathWorks' "MAT-File Level 5 File Format". SciPy is not used: it takes
-    the memory that a damaged cell array declares, and follows structs as deep as the stack allows.
+    Elements are those of MathWorks' "MAT-File Level 5 File Format". SciPy is not used: it allocates
+    the memory that a damaged cell array declares, and follows nested structs to a stack overflow.
 
     Raises:
         RobinsError: as `refuse` makes it: it is damaged, or unpacks to more than measurements do.
@@ -268,7 +268,7 @@ def arrays_of_matlab(content: bytes, refuse: Refuse) -> dict[str, np.ndarray]:
 
 
 def _elements(data: bytes, order: str, refuse: Refuse) -> Iterator[tuple[int, bytes]]:
-    """Type and content of the data elements of a body, short ones too."""
+    """Type and content of the data elements of a body, small elements included."""
     at = 0
     while at + 8 <= len(data):
         kind, size = struct.unpack_from(f"{order}II", data, at)
@@ -292,7 +292,7 @@ def _matrix(
     given: str = "",
     depth: int = 0,
 ) -> None:
-    """Put the real arrays of a matrix or struct under their names; pass other classes over."""
+    """Add the real arrays of a matrix or struct to `out` by name; skip other classes."""
     parts = list(_elements(body, order, refuse))
     if len(parts) < 4 or len(parts[0][1]) < 4:
         return

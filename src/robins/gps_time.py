@@ -13,7 +13,7 @@ import numpy as np
 
 _NS = 1_000_000_000
 GPS_EPOCH_S = 315_964_800
-"""1980-01-06 on a count from 1970-01-01 without leap seconds: earlier stamps have no date."""
+"""1980-01-06 in seconds from 1970-01-01 without leap seconds; earlier stamps have no date."""
 
 # UTC dates from which GPS time - UTC has grown by one more second.
 _LEAPS = [
@@ -49,12 +49,12 @@ def utc_of(time_ns: np.ndarray) -> np.ndarray:
     """
     time_ns = np.asarray(time_ns, dtype=np.int64)
     behind = np.searchsorted(_LEAPS_NS, time_ns, side="right")
-    # Of one stamp NumPy makes a scalar, which is no array.
+    # NumPy reduces a single stamp to a scalar.
     return np.asarray(time_ns - behind * _NS).astype("datetime64[ns]")
 
 
 def gps_of(utc_ns: np.ndarray) -> np.ndarray:
-    """GPS time since 1970 of UTC since 1970, both int64 ns; `utc_of` backwards."""
+    """GPS time since 1970 of UTC since 1970, both int64 ns; inverse of `utc_of`."""
     utc_ns = np.asarray(utc_ns, dtype=np.int64)
     leaps_utc_ns = _LEAPS_NS - np.arange(1, len(_LEAPS_NS) + 1) * _NS
     return np.asarray(utc_ns + np.searchsorted(leaps_utc_ns, utc_ns, side="right") * _NS)

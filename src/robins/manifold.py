@@ -4,8 +4,8 @@ A state is any pytree. Its leaves are arrays, which add, and *elements*: objects
 ``retract(delta)`` and ``local(other)``, such as `robins.rotation.Rotation` or `Angle`. The tangent
 vector of a state stacks those of its leaves in pytree order. An element in a state is one, not
 many; many states are one state under `vmap`. An element whose arrays are not in the units of its
-tangent vector has ``units``, by array: texts for a reader of exported code. With no elements this
-room costs nothing: `retract` is addition and `local` subtraction.
+tangent vector has ``units``, by array: texts for a reader of exported code. Without elements there
+is no overhead: `retract` is addition and `local` subtraction.
 
     retract(x, local(x, y)) == y        local(x, retract(x, d)) == d
 """
@@ -25,10 +25,10 @@ State = Any  # a pytree of arrays and elements
 
 
 def wrap(angle_rad):
-    """Fold an angle into [-pi, pi); one that is there already comes back bit for bit."""
+    """Wrap an angle to [-pi, pi); one already in that range is returned bit for bit."""
     turn = 2.0 * jnp.pi
     folded = angle_rad - turn * jnp.floor((angle_rad + jnp.pi) / turn)
-    # The sum can round up to a whole turn just below pi; the fold then lands just below -pi.
+    # The sum can round up to a full turn just below pi; the result is then just below -pi.
     return jnp.where(folded < -jnp.pi, folded + turn, folded)
 
 
@@ -46,7 +46,7 @@ class Angle:
         return Angle(wrap(self.rad + delta[..., 0]))
 
     def local(self, other: Angle) -> Float[Array, "*b 1"]:
-        """Signed shortest way from self to other."""
+        """Shortest signed angle from self to other [rad]."""
         return wrap(other.rad - self.rad)[..., None]
 
 
@@ -65,7 +65,7 @@ def leaves(x: State) -> list[Any]:
 
 
 def _form(leaf):
-    """Form that two leaves must share: the class of an element, the shape of an array."""
+    """Class of an element or shape of an array, which must be equal for two leaves."""
     return type(leaf).__name__ if is_element(leaf) else jnp.shape(leaf)
 
 
@@ -96,7 +96,7 @@ def retract(x: State, delta: Float[Array, "n"]) -> State:
 
 
 def local(x: State, y: State) -> Float[Array, "n"]:
-    """The tangent vector that leads from x to y.
+    """Tangent vector from x to y.
 
     Raises:
         ValueError: the states differ in structure, in a kind of element or in the shape of a leaf.

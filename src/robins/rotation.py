@@ -27,28 +27,28 @@ from robins.errors import require
 from robins.linalg import scalars
 
 if TYPE_CHECKING:
-    Real = Any  # what goes in comes out
+    Real = Any  # NumPy or JAX array; the result is of the same library
 else:
     Real = Array | np.ndarray
 
-_SMALL = 1e-3  # rad^2; below it the series, of which no dropped term exceeds 1e-18
-_SMALL_TURN = 1e-2  # rad^2; below it those of `turn_coefficients`: 1e-16 of the first term
+_SMALL = 1e-3  # rad^2; below it, series whose dropped terms are below 1e-18
+_SMALL_TURN = 1e-2  # rad^2; the same for `turn_coefficients`: 1e-16 of the first term
 
-_SKEWED = 0.05  # of a matrix or a quaternion: one that is written with two digits is one still
+_SKEWED = 0.05  # tolerance of orthogonality and unit norm: accepts numbers of two digits
 _LOCK = 1e-14  # rad from the vertical, about; a unit quaternion is rounded to 3e-16
 
 
 def _same_rank(*arrays):
-    """Leading axes of length one where an array has fewer, for then the rest broadcasts itself."""
+    """Prepend axes of length one to arrays of lower rank, so that they broadcast."""
     most = max(a.ndim for a in arrays)
     return [a.reshape((1,) * (most - a.ndim) + a.shape) for a in arrays]
 
 
 def _refuse_no_quaternion(q):
-    """Refuse what has not four components or not the length one; in compiled code only the first.
+    """Refuse an array that is not a unit quaternion; compiled code checks only for four components.
 
     Raises:
-        ValueError: it is none. What holds NaN is missing, and passes.
+        ValueError: it has not four components, or not unit norm. NaN means missing, and passes.
     """
     shape = np.shape(q)
     require(shape[-1:] == (4,), f"a quaternion has 4 components along its last axis, got {shape}")
@@ -73,8 +73,8 @@ def _components(q):
 
 def _sinc_cos(angle_sq):
     """Return ``sin(a)/a`` and ``cos(a)`` for a = sqrt(angle_sq), smooth at zero."""
-    # Double `where`: the square root is taken of a safe number on the branch that is not used,
-    # else its infinite derivative at zero would reach the gradient as 0 * inf = NaN.
+    # Double `where`: on the unused branch the square root is taken of a safe number, else its
+    # infinite derivative at zero would enter the gradient as 0 * inf = NaN.
     small = angle_sq < _SMALL
     safe = jnp.where(small, 1.0, angle_sq)
     angle = jnp.sqrt(safe)
@@ -122,10 +122,10 @@ def normalise(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
 
 
 def rotate(q: Float[Real, "*#b 4"], v: Float[Real, "*#b 3"]) -> Float[Real, "*b 3"]:
-    """Turn vectors; with q_nb, body components become navigation components.
+    """Rotate vectors; with q_nb, body components become navigation components.
 
     Raises:
-        ValueError: q is no unit quaternion (to 0.05; of a length that compiled code does not see).
+        ValueError: q is no unit quaternion (to 0.05; compiled code does not check the norm).
     """
     _refuse_no_quaternion(q)
     xp = _library(q, v)
@@ -160,7 +160,7 @@ def to_rotvec(q: Float[Real, "*b 4"]) -> Float[Real, "*b 3"]:
 def turn_coefficients(phi: Float[Array, "*b 3"]) -> tuple[Array, Array, Array]:
     """(1 - cos a)/a^2, (a - sin a)/a^3 and (1 - (a/2) cot(a/2))/a^2, each (...), for a = |phi|."""
     sq = jnp.sum(phi * phi, -1)
-    # Double `where`, as above: the root has no slope at zero.
+    # Double `where`, as above: the root is not differentiable at zero.
     small = sq < _SMALL_TURN
     a = jnp.sqrt(jnp.where(small, 1.0, sq))
     x = jnp.where(small, sq, 0.0)
@@ -233,13 +233,13 @@ def from_dcm(C: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
 
 
 def _refuse_no_rotation(C: Array) -> Array | None:
-    """Refuse a matrix that is no rotation; where it is a stand-in, those that are reflections."""
+    """Refuse a matrix that is no rotation; for traced matrices, return the mask of reflections."""
     if isinstance(C, Tracer):
         return jnp.sum(jnp.cross(C[..., 0, :], C[..., 1, :]) * C[..., 2, :], axis=-1) <= 0.0
     with np.errstate(all="ignore"):
         M = np.asarray(C)
         off = np.abs(M @ np.swapaxes(M, -1, -2) - np.eye(3))
-        if np.any(off > _SKEWED):  # not of NaN, which stays NaN
+        if np.any(off > _SKEWED):  # false for NaN, which stays NaN
             raise ValueError(
                 "no direction cosine matrix: C C' differs from the identity by "
                 f"{np.nanmax(off):.3g}"
@@ -275,9 +275,9 @@ def to_euler(q: Float[Array, "*b 4"]) -> tuple[Array, Array, Array]:
     """Roll, pitch, heading [rad] of q_nb (NED from FRD): in [-pi, pi], [-pi/2, pi/2], [-pi, pi].
 
     At pitch = +-90 deg roll and heading are not distinct: roll is then set to zero and the heading
-    takes the whole turn. The angles are found by way of the half sum and the half difference of
-    roll and heading (Bernardes & Viollet 2022), of which only one is lost near the vertical: so
-    they describe the rotation to rounding at every pitch.
+    takes the whole rotation. The angles follow from the half sum and the half difference of roll
+    and heading (Bernardes & Viollet 2022), of which only one is lost near the vertical: so they
+    describe the rotation to rounding at every pitch.
 
     Raises:
         ValueError: as `rotate`.
@@ -362,7 +362,7 @@ class Rotation:
         return Rotation(multiply(self.wxyz, other.wxyz))
 
     def inverse(self) -> Rotation:
-        """The opposite rotation."""
+        """Inverse rotation."""
         return Rotation(conjugate(self.wxyz))
 
     def apply(self, v) -> Float[Array, "*b 3"]:

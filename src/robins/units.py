@@ -4,12 +4,12 @@ A quantity has a *kind*: angle rate, angle random walk, length. The reader of a 
 kind, and a unit of another kind is refused, so deg/h never passes as Hz and deg/h never
 as deg/sqrt(h). Kinds rather than dimensions decide: rad/s and Hz have the same dimension.
 
-Noise is stated in either of two forms that are the same quantity, since sqrt(Hz) = 1/sqrt(s):
+Noise is stated in one of two equivalent forms, since sqrt(Hz) = 1/sqrt(s):
 a random walk (deg/sqrt(h), data sheets) and a density (deg/s/sqrt(Hz), Kalibr and most MEMS);
 1 deg/s/sqrt(Hz) = 60 deg/sqrt(h). The density is that of the two-sided spectrum, as in IEEE Std
 952 and in the discrete noise sigma = density/sqrt(dt).
 
-Standard library only; robins computes in SI and uses this at its edges.
+Standard library only; robins computes in SI and converts units only at its interfaces.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from robins.errors import RobinsError
 _DEG = math.pi / 180.0
 _ARCMIN = _DEG / 60.0
 _ARCSEC = _DEG / 3600.0
-_G = 9.80665  # m/s^2, standard gravity (CGPM 1901): what "g" means on a data sheet
+_G = 9.80665  # m/s^2, standard gravity (CGPM 1901): the "g" of data sheets
 _ROOT_H = 60.0  # sqrt(3600 s) in sqrt(s)
 
 # Kind, unit, value in SI of one unit. The first unit of a kind is its SI unit.
@@ -128,7 +128,7 @@ _TABLE: dict[str, dict[str, float]] = {
     "pressure": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3, "mbar": 1e2},
     "temperature": {"K": 1.0, "degC": 1.0},
 }
-# The same units under another name, so that messages name the quantity that is wanted.
+# The same units under another name, so that messages name the expected quantity.
 _TABLE["specific force"] = _TABLE["acceleration"]
 _TABLE["scale factor"] = _TABLE["ratio"]
 _OFFSETS = {"degC": 273.15}  # SI value of zero, where it is not zero
@@ -164,7 +164,7 @@ class UnitError(RobinsError, ValueError):
     """A quantity that cannot be read: unknown unit, unit of another kind, no unit, no number."""
 
 
-# Ways to type the same symbol. Other spellings get a suggestion instead of a guess.
+# Equivalent spellings of symbols. For others the message makes a suggestion.
 _CHARACTERS = str.maketrans({"µ": "u", "μ": "u", "²": "^2", "³": "^3", "·": " ", "*": " "})
 _NUMBER = re.compile(r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)(.*)", re.DOTALL)
 
@@ -180,7 +180,7 @@ def _with_article(kind: str) -> str:
 
 
 def _nearest(symbol: str, among: Iterable[str]) -> str | None:
-    # Difflib weighs case like any other character; a wrong case is the likeliest slip of all.
+    # Difflib weighs case like any other difference, but a wrong case is the likeliest error.
     among = list(among)
     same = [s for s in among if s.lower() == symbol.lower()]
     near = difflib.get_close_matches(symbol, same or among, n=1, cutoff=0.0 if same else 0.6)
@@ -188,12 +188,12 @@ def _nearest(symbol: str, among: Iterable[str]) -> str | None:
 
 
 def _likely(symbol: str, among: tuple[str, ...]) -> str:
-    """The unit of a kind that was probably meant by one of another kind."""
+    """Unit of a kind that was probably meant by a unit of another kind."""
 
     def rootless(s: str) -> str:
         return re.sub(r"sqrt\((\w+)\)", r"\1", s)
 
-    # deg/h for deg/sqrt(h); then what is near in spelling; then ug for ug/sqrt(Hz), deg for deg/s.
+    # deg/h for deg/sqrt(h); then similar spellings; then ug for ug/sqrt(Hz), deg for deg/s.
     root = [s for s in among if rootless(s) == rootless(symbol)]
     near = _nearest(symbol, root or among)
     begun = [s for s in among if s.startswith(f"{symbol}/") or symbol.startswith(f"{s}/")]
@@ -201,7 +201,7 @@ def _likely(symbol: str, among: tuple[str, ...]) -> str:
 
 
 def unit(symbol: str, kind: str | None = None) -> Unit:
-    """The unit of that symbol, checked to be of that kind.
+    """Find a unit by its symbol, and check its kind.
 
     Raises:
         UnitError: unknown unit, or a unit of another kind.
@@ -298,13 +298,13 @@ def convert(value, from_unit: str, into_unit: str):
 
 
 def as_ending(unit_: str) -> str:
-    """A unit as the end of a metric's name: "deg/sqrt(h)" is "deg_per_sqrt_h"."""
+    """Suffix of a metric's name for a unit: "deg_per_sqrt_h" for "deg/sqrt(h)"."""
     plain = unit_.replace("sqrt(", "sqrt_").replace(")", "").replace("^", "").lower()
     return plain.replace("/", "_per_")
 
 
 def show(value_si, unit_: str, digits: int = 6) -> str:
-    """Text of an SI value in some unit, to so many significant digits: ``"0.1 deg/h"``."""
+    """Text of an SI value in a unit, to `digits` significant digits: ``"0.1 deg/h"``."""
     u = unit(unit_)
     number = f"{from_si(value_si, u):.{digits}g}"
     return number if u.symbol == "1" else f"{number} {u.symbol}"

@@ -1,8 +1,8 @@
 """Lateness and durations of the parts and of whole cycles, over days in little memory.
 
 A histogram keeps each number to one part in 256 (the leading eight bits, as HdrHistogram by G. Tene
-does), so a run of any length needs a few thousand counters, and a number costs the same whenever
-it comes. The largest is kept as it is.
+does), so a run of any length needs a few thousand counters and constant time per number. The
+largest number is kept exactly.
 """
 
 from __future__ import annotations
@@ -11,21 +11,20 @@ from bisect import bisect_right
 from collections import deque
 from typing import Any
 
-_BITS = 8  # kept of a number
-RECENT = 100  # cycles, for who watches
+_BITS = 8  # leading bits kept of a number
+RECENT = 100  # cycles, for the live page
 EDGES_US = (1, 2, 5, 10, 20, 50, 100, 200, 500, *(k * 10**d for d in (3, 4, 5) for k in (1, 2, 5)))
 EDGES_US += (1_000_000,)
-"""Edges of the histogram of lateness; numbers below the first and from the last on are counted too.
-"""
+"""Bin edges of the lateness histogram [us]; numbers outside are counted in two open bins."""
 _KINDS = ("lateness", "compute", "round_trip")
 
 
 class Histogram:
-    """Numbers of nanoseconds; a negative one counts as none.
+    """Histogram of durations [ns]; a negative one counts as 0.
 
     Attributes:
-        count: of them.
-        most: the largest.
+        count: number of durations.
+        most: the largest [ns].
     """
 
     def __init__(self) -> None:
@@ -33,7 +32,7 @@ class Histogram:
         self._cells: dict[int, int] = {}
 
     def add(self, ns: int) -> None:
-        """Add a number [ns]."""
+        """Add a duration [ns]."""
         ns = max(ns, 0)
         shift = max(ns.bit_length() - _BITS, 0)
         cell = (shift << _BITS) + (ns >> shift)
@@ -42,10 +41,10 @@ class Histogram:
         self.most = max(self.most, ns)
 
     def quantile(self, share: float) -> float | None:
-        """The smallest number which so large a share do not exceed, to 0.4 %; None: there is none.
+        """Quantile of the numbers [ns], to 0.4 %; None: the histogram is empty.
 
         Args:
-            share: from 0 to 1.
+            share: of the numbers that do not exceed it, from 0 to 1.
         """
         wanted, passed = share * self.count, 0
         for cell in sorted(self._cells):
@@ -58,7 +57,7 @@ class Histogram:
 
 
 class _Times:
-    """The three times of a part or of a cycle: of all, and of the latest."""
+    """Lateness, compute and round-trip times of a part or of a cycle: all, and the latest."""
 
     def __init__(self) -> None:
         self._all = {kind: Histogram() for kind in _KINDS}
@@ -82,26 +81,26 @@ class _Times:
 
 
 class Latencies:
-    """Accounts of the times of a run.
+    """Lateness, compute and round-trip times of a run, by part and by cycle.
 
-    *Lateness* is how much after its deadline a tick was sent or a cycle began: of waking up, in
-    real time; a clock in lock-step has no deadlines, and none of it. *Compute* is the computing
-    time that a part reports, for a cycle the sum of its parts. *Round trip* is from a tick to its
-    done, for a cycle from its beginning to its end.
+    *Lateness* is the delay of a tick, or of the start of a cycle, after its deadline: the wake-up
+    latency in real time; lock-step has no deadlines and no lateness. *Compute* is the computing
+    time that a part reports, for a cycle the sum over its parts. *Round trip* is from a tick to its
+    done, for a cycle from its start to its end.
     """
 
     def __init__(self) -> None:
         self._parts: dict[str, _Times] = {}
         self._cycle = _Times()
-        self._asked: dict[str, tuple[int, int]] = {}  # by part: step, and when
+        self._asked: dict[str, tuple[int, int]] = {}  # by part: step, time sent [ns]
         self._answered: dict[str, int] = {}  # by part: step
-        self._computed = 0  # ns in the cycle that runs
+        self._computed = 0  # ns in the current cycle
         self._cycles = self._missed = 0
         self._latest_missed = deque[bool](maxlen=RECENT)
         self._late = [0] * (len(EDGES_US) + 1)
 
     def tick(self, part: str, step: int, deadline_ns: int | None, sent_ns: int) -> None:
-        """Note the tick of a part for a step; of a repeated tick the first time counts."""
+        """Record the tick of a part for a step; of a repeated tick the first counts."""
         if self._asked.get(part, (None, 0))[0] == step:
             return
         self._asked[part] = step, sent_ns
@@ -109,7 +108,7 @@ class Latencies:
             self._of(part).add("lateness", sent_ns - deadline_ns)
 
     def done(self, part: str, step: int, received_ns: int, compute_ns: int) -> None:
-        """Note the end of a step of a part; an unrequested or repeated answer does not count."""
+        """Record the end of a step of a part; an unrequested or repeated answer does not count."""
         asked, sent_ns = self._asked.get(part, (None, 0))
         if asked != step or self._answered.get(part) == step:
             return
@@ -122,14 +121,14 @@ class Latencies:
     def cycle(
         self, step: int, deadline_ns: int | None, began_ns: int, ended_ns: int, missed: bool
     ) -> None:
-        """All parts have done a step, or its time is over.
+        """Record the end of a step: all parts are done, or its time is over.
 
         Args:
             step: its number.
-            deadline_ns: when it was to begin; None in lock-step.
-            began_ns: when it began.
-            ended_ns: when the last part had done it.
-            missed: whether that was too late.
+            deadline_ns: planned start; None in lock-step.
+            began_ns: actual start.
+            ended_ns: time at which the last part was done.
+            missed: whether the deadline of the next step was missed.
         """
         if deadline_ns is not None:
             late_ns = max(began_ns - deadline_ns, 0)
@@ -146,8 +145,8 @@ class Latencies:
         """Summary of the run for JSON: microseconds, None where there is no number.
 
         ``histogram`` is that of the lateness of cycles: ``counts`` has one number more than
-        ``edges_us``, that of those below the first edge comes first; an edge belongs to what is
-        above it.
+        ``edges_us``; the first counts lateness below the first edge. A value on an edge belongs to
+        the bin above.
         """
         return {
             "cycles": self._cycles,
@@ -167,7 +166,7 @@ class Latencies:
         }
 
     def table(self) -> str:
-        """The summary for people."""
+        """Summary as a text table."""
         names = [*self._parts, "cycle"]
         wide = max(len(name) for name in names)
         heads = (f"{kind.replace('_', ' ')} [us]" for kind in _KINDS)

@@ -1,6 +1,6 @@
-"""Evaluation of a run and contents of its page: values that a rig gives, and their defaults.
+"""Evaluation of a run and contents of its page, as a rig defines them, and their defaults.
 
-The defaults show all numbers of the messages of a rig, and offer the faults of its lines.
+By default all numbers of the messages of a rig are shown, and the faults of its lines offered.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class MessageSeries(Mapping[str, np.ndarray]):
 class OperatorEvent(NamedTuple):
     """A message that the operator sent through the bench."""
 
-    step: int  # the first whose parts received it
+    step: int  # first step whose parts received it
     message: str
     values: Values
 
@@ -67,8 +67,8 @@ class RunResult(NamedTuple):
     """Result of a run."""
 
     series: MessageSeries
-    config: Any  # of the rig
-    steps: int  # that were done
+    config: Any  # input of the parts, as the rig prepared it
+    steps: int  # completed
     seconds: float  # of the wall clock, from the first tick to the last answer
     latencies: Latencies
     health: Mapping[str, Health]
@@ -86,8 +86,8 @@ class RunFigures(NamedTuple):
 
     Attributes:
         metrics: figures of merit by name, which ends in the unit.
-        counts: of what was odd.
-        warnings: why a reader should doubt the figures.
+        counts: of anomalies, by name.
+        warnings: reasons to doubt the figures.
         arrays: of the solution, as `robins.results.array` makes them.
         lines: figures for a terminal.
     """
@@ -108,10 +108,10 @@ class Alert(NamedTuple):
 
 @runtime_checkable
 class Alarms(Protocol):
-    """Listens to one step after another."""
+    """Watches a run step by step and raises notices."""
 
     def observe(self, series: MessageSeries, step: int) -> list[Alert]:
-        """Notices of a step."""
+        """Notices raised in a step."""
         ...
 
 
@@ -125,9 +125,9 @@ class PageView(NamedTuple):
     Attributes:
         signals: plotted signals, by the parameters of the vehicle.
         sample: (arrays, config, first step since the last sample, step) -> their values.
-        alarms: a listener for a run.
-        counts: (arrays, steps done) -> what was counted, by name.
-        offered: faults that can be injected, each with its label; left out: those of every line,
+        alarms: factory of the `Alarms` of a run.
+        counts: (arrays, steps done) -> counts, by name.
+        offered: faults that can be injected, each with its label; default: those of every line,
             and those of sensors and actuators that need no parameter.
         console_messages: what the operator can send, by label: (arrays, config, last step that was
             done) -> the message and its values.
@@ -154,7 +154,7 @@ _AXES, _WXYZ = "xyz", "wxyz"
 
 
 def drawn(messages: Sequence[Message]) -> list[tuple[Message, Field]]:
-    """Fields with numbers that can be drawn."""
+    """Fields that can be plotted, each with its message."""
     return [(m, f) for m in messages for f in m.fields if f.kind == "f64"]
 
 
@@ -166,7 +166,7 @@ def axes_of(f: Field) -> list[str]:
 
 
 def view_of(messages: Sequence[Message]) -> PageView:
-    """A page that draws every number."""
+    """Default page: a plot of every number."""
     fields = drawn(messages)
     names = [f"{m.name}.{f.name}" for m, f in fields]
 
@@ -186,7 +186,7 @@ def view_of(messages: Sequence[Message]) -> PageView:
 
 
 def offers_of(table: FaultTable) -> tuple[Offer, ...]:
-    """Faults for the page of a rig that offers none: of its lines, then of what it can itself."""
+    """Faults for the page of a rig that offers none: those of its lines, then of its devices."""
     line = [
         {"label": f"{part}: {words}", "fault": {"kind": kind, "link": part, **how} | at}
         for part in table.wire.parts[1:]
@@ -202,7 +202,7 @@ def offers_of(table: FaultTable) -> tuple[Offer, ...]:
 
 
 def latest(values: np.ndarray, since: int, step: int) -> np.ndarray:
-    """Last received row between two steps; else NaN."""
+    """Last received row from step `since` to `step`, both included; NaN if none came."""
     some = values[since : step + 1]
     heard = np.flatnonzero(np.isfinite(some.reshape(len(some), -1)).any(axis=1))
     return np.asarray(some[heard[-1]] if len(heard) else np.full(values.shape[1:], np.nan))

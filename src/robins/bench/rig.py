@@ -1,7 +1,7 @@
 """A vehicle on the bench: its parts, messages and wiring, its faults, its page.
 
-A rig is a class of a few tables and one function: its messages, who sends and takes them, its
-parameters, and how a run of it is prepared. All else has a default that follows from its messages.
+A rig is a class of a few tables and one function: its messages, their senders and receivers, its
+parameters, and the preparation of a run. All else has a default that follows from its messages.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class RigError(RobinsError, ValueError):
 
 
 def named(where: str) -> Any:
-    """Object with a name in a module: "package.module:name".
+    """Import an object by its place, "package.module:name".
 
     Raises:
         RigError: the module has no such name.
@@ -60,8 +60,8 @@ def named(where: str) -> Any:
 def later(where: str) -> Any:
     """Method of a rig that is a function of another module, imported when it is called.
 
-    So processes of parts import what they need alone, and start sooner. The function does not take
-    the rig.
+    So the process of a part imports only what it needs, and starts sooner. The function does not
+    take the rig.
     """
     return staticmethod(lambda *args: named(where)(*args))
 
@@ -77,7 +77,7 @@ class RunConfig(Protocol):
 
     @property
     def frames(self) -> Iterable[int]:
-        """A step of each kind that parts compute otherwise, to be compiled before the first."""
+        """One step of each kind that takes different code, to be compiled before the first step."""
         ...
 
 
@@ -115,24 +115,24 @@ class Rig(Generic[GivenT, KitT]):
     named as data, so that a process imports the code of its own part alone.
 
     Attributes:
-        name: of it.
+        name: of the rig.
         wire: its parts and messages.
-        sends: messages by part, each of one part alone.
-        takes: messages by part.
-        parameters: the class of what flies, or its place, "package.module:Name".
-        code: module whose functions, named as the parts, make them of a config; left out: that of
-            the class.
+        sends: messages sent, by part; each message has one sender.
+        takes: messages received, by part.
+        parameters: the parameter class of the vehicle, or its place, "package.module:Name".
+        code: module with a function of the name of each part, which makes the part from a config;
+            default: the module of the class.
         build: by part, another function that makes it, or its place, "package.module:name".
         console: messages that no part sends: the operator sends them through the bench, and parts
-            take them, if they do, with a lag of one.
-        truth: the message without which nothing can be judged; "": there is none.
-        kept: messages that are noted for figures and page; left out: all.
-        example: the part with which commands are shown; left out: its last.
-        exported: the part that an exported filter can be, by the loop of that name among the files
-            of `robins.bench.wire.c_header.firmware` or of `aboard`; "": none.
-        aboard: (flight) -> its filter and its loop, where these depend on the run; left out: the
+            that take them do so with a lag of one step.
+        truth: the message without which a run cannot be evaluated; "": there is none.
+        kept: messages recorded for figures and page; default: all.
+        example: the part that example commands name; default: its last.
+        exported: the part that an exported filter can replace, by the loop of that name among the
+            files of `robins.bench.wire.c_header.firmware` or of `aboard`; "": none.
+        aboard: (flight) -> its filter and its loop, where these depend on the run; default: the
             filter of the scenario.
-        address: by which processes find it; left out: its name.
+        address: by which processes find it; default: its name.
     """
 
     name: str
@@ -151,13 +151,13 @@ class Rig(Generic[GivenT, KitT]):
     address: str = ""
 
     def __init__(self, **changed: Any):
-        """Check that its tables agree.
+        """Check that the tables agree.
 
         Args:
-            changed: attributes and functions that take the place of those of the class.
+            changed: attributes and functions that replace those of the class.
 
         Raises:
-            RigError: they do not; names the contradiction.
+            RigError: the tables contradict each other.
         """
         known = [name for name in (*Rig.__annotations__, *vars(Rig)) if not name.startswith("_")]
         if strange := sorted(set(changed) - set(known)):
@@ -199,7 +199,7 @@ class Rig(Generic[GivenT, KitT]):
             raise RigError(f"there is no message '{unknown[0]}', only {', '.join(sorted(named))}")
 
     def varied(self, **changed: Any) -> Rig[GivenT, KitT]:
-        """The same rig with other attributes or functions.
+        """Copy of the rig with other attributes or functions.
 
         Raises:
             RigError: they contradict the others.
@@ -213,7 +213,7 @@ class Rig(Generic[GivenT, KitT]):
         raise NotImplementedError
 
     def timing(self, given: Any) -> Timing:
-        """Steps by parameters with ``duration``, ``step``, perhaps ``counted_from``, in seconds."""
+        """Steps of a run, by the parameters ``duration``, ``step``, ``counted_from`` (or 0) [s]."""
         steps = round(given.duration / given.step)
         return Timing(given.step, steps, round(getattr(given, "counted_from", 0.0) / given.step))
 
@@ -224,15 +224,15 @@ class Rig(Generic[GivenT, KitT]):
         return ""
 
     def refuses(self, message: str, values: Values) -> str:
-        """Reason why the operator cannot send this, though each number is within its limits; "":
-        it can be sent.
+        """Reason to refuse an operator message although each number is within its limits;
+        "": it can be sent.
         """
         return ""
 
     def inside(self, config: KitT, steps: int) -> Mapping[str, np.ndarray] | None:
-        """First steps of the same run inside one program, named as `Flown` names them.
+        """First steps of the same run inside one program, fields named as in `MessageSeries`.
 
-        That of a rig with a console takes the messages sent, too. None: it cannot be compared.
+        For a rig with a console it also takes the messages sent. None: no such comparison exists.
         """
         return None
 
@@ -249,17 +249,17 @@ class Rig(Generic[GivenT, KitT]):
         return view_of(self.noted)
 
     def topics(self, config: KitT) -> Sequence[Topic]:
-        """Rows for viewers and ROS 2 of its messages, in the record; others are JSON."""
+        """Conversions of its messages for viewers and ROS 2, in the record; others become JSON."""
         return ()
 
     # ------------------------------------------------------------------ of what there is: defaults
 
     def flies(self) -> Mapping[str, Path]:
-        """Scenarios of its system, by name; the first is flown where none is named."""
+        """Scenarios of its system, by name; the first is the default."""
         return {}
 
     def filters(self) -> Sequence[str]:
-        """Filters that its parameters can be flown with; the first where none is named."""
+        """Filters that can be run with its parameters; the first is the default."""
         return ("",)
 
     def scenarios(self) -> Mapping[str, Path]:
@@ -285,7 +285,7 @@ class Rig(Generic[GivenT, KitT]):
 
     @property
     def noted(self) -> list[Message]:
-        """Messages that are noted for figures and page."""
+        """Messages recorded for figures and page."""
         return [m for m in self.wire.data if m.name in self.kept or not self.kept]
 
     def part(self, name: str, config: KitT) -> Part:
@@ -299,13 +299,13 @@ class Rig(Generic[GivenT, KitT]):
 
     @cached_property
     def given(self) -> type[GivenT]:
-        """Class of the parameters of what flies."""
+        """Parameter class of the vehicle."""
         made: Any = named(self.parameters) if isinstance(self.parameters, str) else self.parameters
         return cast("type[GivenT]", made if isinstance(made, type) else made())
 
     @cached_property
     def table(self) -> FaultTable:
-        """Faults that it can have."""
+        """Faults that can be injected into it."""
         from robins.bench.broker.faults import FaultTable
 
         return FaultTable(self.wire, self.sends, self.takes, self.device_faults()[0])
@@ -341,12 +341,12 @@ class Rig(Generic[GivenT, KitT]):
 
 
 class LoadedRun(NamedTuple):
-    """A run that has been read."""
+    """A run as read from its scenarios."""
 
     name: str
     rig: Rig
     setup: Any  # of the class of the rig
-    given: Any  # parameters of what flies
+    given: Any  # parameters of the vehicle
     text: str  # of the scenario of the bench, for the record
 
     @property

@@ -31,7 +31,7 @@ def _refused(what: str, path: Path, fix: str) -> RobinsError:
 
 @contextlib.contextmanager
 def _folder() -> Iterator[int]:
-    """Open the folder of this user's status files, made if need be.
+    """Open the folder of this user's status files; create it if there is none.
 
     Its path can be predicted, so somebody else may have made it, with links in it. It is opened
     without following a link and checked by its descriptor; files are named relative to that.
@@ -40,7 +40,7 @@ def _folder() -> Iterator[int]:
         The descriptor.
 
     Raises:
-        RobinsError: it belongs to somebody else, others may use it, or it is a link or no folder.
+        RobinsError: it belongs to another user, others may access it, or it is no folder or a link.
     """
     base = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
     base = base if base.is_dir() else Path(tempfile.gettempdir())
@@ -91,7 +91,7 @@ class BenchStatus:
 
     @property
     def due(self) -> bool:
-        """True if the next report is due."""
+        """True when the next report is due."""
         return time.monotonic() - self._told >= EACH_S
 
     def tell(self, state: Mapping[str, Any]) -> None:
@@ -111,7 +111,7 @@ class BenchStatus:
 
 
 def running() -> list[Report]:
-    """Reports of the benches of this user, the oldest first; those of dead ones are removed.
+    """Reports of this user's benches, oldest first; those of dead benches are removed.
 
     Raises:
         RobinsError: the folder of the reports belongs to somebody else.
@@ -131,10 +131,10 @@ def running() -> list[Report]:
 
 
 def _read(folder: int, name: str) -> Report:
-    """Report of a bench.
+    """Read the report of a bench.
 
     Raises:
-        OSError, ValueError, KeyError, TypeError, RecursionError: it is none.
+        OSError, ValueError, KeyError, TypeError, RecursionError: the file is no such report.
     """
     way = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     with open(os.open(name, way, dir_fd=folder), encoding="utf-8") as file:
@@ -145,7 +145,7 @@ def _read(folder: int, name: str) -> Report:
 
 
 def table(benches: list[Report]) -> str:
-    """The same for people."""
+    """Reports as a text table."""
     if not benches:
         return "No bench runs.\n  robins bench up satellite/s1   starts one"
     lines = []
@@ -171,7 +171,7 @@ def table(benches: list[Report]) -> str:
 
 
 def aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    """Rows as lines whose columns stand below each other."""
+    """Lines of text with aligned columns."""
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     return [
         "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows

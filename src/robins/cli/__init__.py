@@ -1,7 +1,7 @@
-"""The command `robins`. What it promises to scripts is written in ``docs/contract.md``.
+"""The command `robins`. ``docs/contract.md`` states the interface for scripts.
 
-Modules here import at their top only what starts in a blink; a command imports what it works with
-when it runs, so that help and usage errors come at once.
+Modules here import only fast modules at their top; a command imports the others when it runs, so
+that help and usage errors come at once.
 """
 
 from robins.cli.commands import app

@@ -1,4 +1,4 @@
-"""Saves compile time: faster compiler settings, and a cache that is kept between commands."""
+"""Saving of compile time: faster compiler settings, and a cache kept between commands."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import sys
 from pathlib import Path
 
 # These halve the time to compile a campaign and leave the time to run it (`benchmarks/compile.py`).
-# XLA ends a process that gives it an unknown setting.
+# XLA aborts on an unknown setting.
 _XLA_FLAGS = (
     "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
     "--xla_backend_optimization_level=1"
 )
-_KNOWN = ("0.10.",)  # versions of jaxlib that take them; others are tried once
+_KNOWN = ("0.10.",)  # versions of jaxlib that accept them; others are tried once
 _TRIAL = """
 try:
     from jaxlib import xla_client
@@ -28,19 +28,19 @@ except (ImportError, AttributeError):
     jax.jit(abs)(1.0)
 """
 _TRIAL_S = 60.0
-_UNKNOWN = b"Unknown flag"  # message of XLA before it ends the process
+_UNKNOWN = b"Unknown flag"  # message of XLA before it aborts
 _REFUSED = (
     "robins: note: this jaxlib ({}) does not take the settings that halve the time to compile; "
     "it will take longer. Nothing else changes."
 )
-_MOST = 1 << 30  # bytes of compiled programs that are kept; those unused for longest go first
+_MOST = 1 << 30  # bytes of compiled programs kept; the least recently used go first
 
 
 def enable() -> None:
-    """Set up JAX for a command, unless it is imported already; what the user has set stays."""
+    """Set up JAX for a command, unless already imported; settings of the user stay."""
     if "jax" in sys.modules:
         return
-    # XLA writes to its developers, such as on slow compilations; its errors come as exceptions.
+    # XLA logs for its developers, such as on slow compilations; its errors come as exceptions.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     folder = _folder()
     if "XLA_FLAGS" not in os.environ and _on_processor():
@@ -63,9 +63,9 @@ def _on_processor() -> bool:
 
 
 def _tried(version: str, folder: Path | None) -> bool | None:
-    """True if a version takes the settings; tried in a process of its own, and remembered.
+    """True if a version of jaxlib accepts the settings; tried in another process, and stored.
 
-    None where the trial itself failed, which is made again next time.
+    None if the trial itself failed; it is repeated next time.
     """
     digest = hashlib.sha256(f"{version} {_XLA_FLAGS}".encode()).hexdigest()[:12]
     memory = folder and folder.parent / f"settings-{digest}"
@@ -91,18 +91,18 @@ def _tried(version: str, folder: Path | None) -> bool | None:
 
 
 def _folder() -> Path | None:
-    """The folder of the user's for what is compiled; None where there can be none."""
+    """The user's folder for compiled programs; None if it cannot be made."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base) / "robins" / f"jax-{_machine()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
-        return None  # a home that cannot be written costs time, not the run
+        return None  # an unwritable home costs time, not the run
     return folder if os.access(folder, os.W_OK) else None
 
 
 def _prune(folder: Path) -> None:
-    """Remove what was not used for longest where a folder holds more than `_MOST`."""
+    """Remove the least recently used files of a folder that holds more than `_MOST` bytes."""
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         every = [(one.stat(), one.path) for one in entries if one.is_file()]
         left = sum(stat.st_size for stat, _ in every)
@@ -114,7 +114,7 @@ def _prune(folder: Path) -> None:
 
 
 def _machine() -> str:
-    """A digest of the processor: machines that share a home must not share its instructions."""
+    """Digest of the processor: machines that share a home must not share compiled code."""
     settings = [platform.machine(), platform.processor()]
     try:
         lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()

@@ -42,12 +42,12 @@ def _workbench() -> Any:
     return importlib.import_module("robins.workbench")
 
 
-_PATIENCE_S = 600.0  # for a report that another coordinator writes
+_PATIENCE_S = 600.0  # wait for a report that another coordinator writes
 _WHERE = click.argument("where", metavar="DIR")
 
 
 def _held(_context: click.Context, _given: click.Parameter, held: bool) -> None:
-    """End this process when who started it closes its standard input, or is gone."""
+    """End this process when its parent closes its standard input, or has ended."""
     if not held:
         return
 
@@ -95,7 +95,7 @@ def run(scenario: str, out: str, workers: int | None, as_json: bool, **options: 
 
 
 def _deliver(bench: Any, where: str, outcome: Any, as_json: bool, to: Path | None = None) -> None:
-    # several coordinators of a campaign end together, and each has all runs to report
+    # several coordinators of a campaign end at the same time, each with all runs to report
     patience_s = 0.0 if to else _PATIENCE_S
     to = to or (_result(where, "report") if "://" in where else Path(where) / "report")
     command, writing = command_line(), Progress("drawing figures")

@@ -57,11 +57,11 @@ def app() -> None:
     """Robust inertial navigation: simulate, navigate real logs, compare filters, check claims."""
 
 
-app.list_commands = lambda ctx: list(app.commands)  # in the order in which one meets them
+app.list_commands = lambda ctx: list(app.commands)  # in the order in which a user needs them
 
 
 def one_run(runs: int | None, what: str) -> None:
-    """Refuse more runs than one of what was recorded."""
+    """Refuse more than one run for recorded data."""
     if runs not in (None, 1):
         raise InputError(f"a recorded {what} is one run", f"--runs {runs}", "omit the option.")
 

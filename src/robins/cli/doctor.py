@@ -1,4 +1,4 @@
-"""The command `doctor`: contents of a log and findings on it, in colours."""
+"""The command `doctor`: contents of a log and findings on it, in colour."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _KINDS = {
 
 
 def warn(findings: Sequence[Any]) -> None:
-    """Report the findings on a log at once; errors end the command and are reported there."""
+    """Print warnings and notes on a log at once; errors end the command and are printed there."""
     for finding in findings:
         if finding.severity != "error":
             click.echo(f"robins: {finding}", err=True)
@@ -33,9 +33,9 @@ def warn(findings: Sequence[Any]) -> None:
 def judge(
     paths: Sequence[Path], columns: Sequence[Path | str], as_json: bool, write: Path | None = None
 ) -> ExitStatus:
-    """Print what there is and the findings; bad input if a run on this log would be wrong.
+    """Print the contents of a log and the findings; bad input if a run on it would be wrong.
 
-    What the log shows of its unit is written to a file where one is named.
+    The inertial unit's parameters as estimated from the log are written to `write`, if given.
     """
     with only_json(as_json):
         from robins.workbench import examine
@@ -50,7 +50,7 @@ def judge(
         except (RobinsError, OSError) as error:
             failure = error
     print_data(found.data if as_json else None, _text(found, given, columns), as_json)
-    if failure is not None:  # after the findings, which explain why nothing may be found
+    if failure is not None:  # after the findings, which may explain the failure
         raise failure
     return ExitStatus.BAD_INPUT if found.counts["error"] else ExitStatus.DONE
 

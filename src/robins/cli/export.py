@@ -32,7 +32,7 @@ def write(name: str, to: Path, *, as_json: bool, **options: Any) -> None:
         f"        {to}/README.md says how to call it"
     )
     if made.program:
-        # what it believes is in the code, so that it flies with what it was exported with
+        # filter parameters are compiled in, so a run must use those of the export
         options_text = "".join(f" --set {shlex.quote(one)}" for one in options["settings"])
         options_text += f" --seed {options['seed']}" if options["seed"] else ""
         node = f"{made.program.name.removesuffix('_board')}={made.program}"

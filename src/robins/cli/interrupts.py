@@ -1,4 +1,4 @@
-"""Handles Ctrl-C: an interrupt must not get lost in a compiler or a garbage collector.
+"""Handling of Ctrl-C: an interrupt must not get lost in a compiler or a garbage collector.
 
 Python raises KeyboardInterrupt wherever the main thread happens to be. After a long call into
 compiled code that is often a callback of the garbage collector, from which nothing can be raised:
@@ -13,7 +13,7 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
-# Functions whose exceptions Python ignores; JAX hangs the first into every garbage collection.
+# Functions whose exceptions Python ignores; JAX adds the first to every garbage collection.
 _DEAF = frozenset({"_xla_gc_callback", "__del__"})
 _AGAIN_S = 0.05
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
@@ -40,10 +40,10 @@ def _interrupt(_number: int, frame: FrameType | None) -> None:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Context in which SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt where it is received.
+    """Context in which SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt on receipt.
 
     SIGTERM and SIGHUP too, so that a command that is killed, or whose terminal is closed, unwinds
-    and leaves no half folder. `nohup` has SIGHUP ignored, and so it stays.
+    and leaves no incomplete folder. A SIGHUP ignored by `nohup` stays ignored.
     """
     global _asked
     _asked = False

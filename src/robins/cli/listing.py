@@ -1,4 +1,4 @@
-"""The command `list`: an overview without importing a system, or the details of one."""
+"""The command `list`: an overview, without importing a system, or the details of one system."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from robins.cli.printing import print_data
 
 
 def listing(system: str | None, as_json: bool) -> None:
-    """Print what there is: an overview, the details of a system, or all of it as JSON."""
+    """Print an overview, the details of a system, or all of it as JSON."""
     from robins import workbench
 
     name, sections = system, workbench.overview()

@@ -52,14 +52,14 @@ SHARED: Mapping[str, Decorator] = {
 class Made(click.Command):
     """A command made of a function of the workbench, whose file is read when it is needed.
 
-    Without a body it computes an outcome, which is published.
+    Without a body it computes an outcome, prints it, and writes it as a result.
 
     Args:
         function: "module:name" in `robins.workbench`.
         short: its line in `robins --help`.
-        body: what is done instead with all that is given; where it takes no `out` it prints.
-        more: options that the function does not have, and the place of the first among the others.
-        name: of the command; by default that of the function.
+        body: called instead with all parameters; one that takes no `out` only prints.
+        more: options that the function does not have, and the position of the first among the rest.
+        name: of the command; default: that of the function.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Made(click.Command):
         self.more, body = more, body or self._publish
         self.common = publishes if "out" in signature(body).parameters else answers
         super().__init__(name or self.function, callback=body, short_help=short)
-        del self.params, self.help, self.epilog  # they are read from the function
+        del self.params, self.help, self.epilog  # replaced by properties that read the function
 
     @cached_property
     def _file(self) -> ast.Module:
@@ -123,7 +123,7 @@ def _made_by(decorator: Decorator) -> list[click.Parameter]:
     """Parameters that a decorator of click adds, in the order of the help."""
 
     def none() -> None:
-        """Take them."""
+        """Carry the parameters."""
 
     return click.command()(decorator(none)).params
 
@@ -191,5 +191,5 @@ def _option(name: str, kind: Any, option: options.Option, default: ast.expr | No
 
 
 def _opposite(_context: click.Context, _given: click.Parameter, value: bool) -> bool:
-    """The second of two flags sets a parameter."""
+    """Invert the value of the second of two opposite flags."""
     return not value

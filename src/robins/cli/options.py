@@ -16,7 +16,7 @@ RESULTS = Path("results")
 
 
 def examples(*lines: str) -> str:
-    """The end of a help text; the control character keeps click from joining its lines."""
+    """End of a help text; a control character keeps click from joining its lines."""
     return "\n".join(("\b", "Examples:", *(f"  {line}" for line in lines)))
 
 
@@ -42,7 +42,7 @@ def _with_formats(
 
 
 def COLUMNS(command: Callable) -> Callable:
-    """Options by which the columns of a log are found that is in no known format."""
+    """Options that name the columns of a log in an unknown format."""
     for one in (
         option(
             "--columns",
@@ -69,7 +69,7 @@ def COLUMNS(command: Callable) -> Callable:
 def _confirm(
     _context: click.Context, _given: click.Parameter, files: tuple[Path, ...]
 ) -> tuple[Path, ...]:
-    """Confirm files of user code before the command reads what names them."""
+    """Confirm files of user code before the command reads files that name them."""
     if files:
         from robins.systems import trust
 
@@ -107,7 +107,7 @@ def publishes(command: Callable) -> Callable:
 
 
 def as_names(_context: click.Context, _given: click.Parameter, text: str | None) -> tuple[str, ...]:
-    """Names that commas part."""
+    """Names separated by commas."""
     if text is None:
         return ()
     names = tuple(name.strip() for name in text.split(","))
@@ -173,7 +173,7 @@ def folder_name(scenario: str) -> str:
 
 
 def log_name(log: Sequence[Path]) -> str:
-    """Name of the result folder of a log, after its first file that is no configuration."""
+    """Name of the result folder of a log, from its first file that is no configuration."""
     first = next((path for path in log if path.suffix != ".toml"), log[0])
     return os.path.basename(os.path.abspath(first)).split(".")[0] or "log"
 

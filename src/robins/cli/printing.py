@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 
 
 def carry_out(name: str, *given: Any, out: Path, as_json: bool, **settings: Any) -> Outcome:
-    """Compute by the workbench, print the outcome, and write it as a result.
+    """Run a function of the workbench, print the outcome, and write it as a result.
 
     Args:
         name: of the function of `robins.workbench`.
         *given: its arguments.
-        out: the result folder, which is refused before anything is computed.
+        out: the result folder; an unusable one is refused before anything is computed.
         as_json: print one object for scripts and nothing else to standard output.
         **settings: its keyword arguments.
     """
     command, writing = command_line(), Progress("drawing figures")
     with contextlib.ExitStack() as held:
-        cache.enable()  # may write a note, on a line of its own
+        cache.enable()  # may print a note, on its own line
         with only_json(as_json), Progress() as progress:
             workbench = importlib.import_module("robins.workbench")
             folder = workbench.publishing(out, command=command, progress=writing)
@@ -44,19 +44,19 @@ def carry_out(name: str, *given: Any, out: Path, as_json: bool, **settings: Any)
 def print_and_write(
     outcome: Outcome, write: Callable[[], Result], writing: Progress, as_json: bool
 ) -> None:
-    """Print what was found, have it written, print where it is; or one object for scripts.
+    """Print an outcome, write it, and print its place; or print one object for scripts.
 
     Args:
         outcome: of a command.
-        write: makes the result folder of it.
-        writing: the progress of that.
-        as_json: print one object only, when it is written.
+        write: makes its result folder.
+        writing: shows the progress of `write`.
+        as_json: print one object only, once it is written.
     """
     try:
         if not as_json:
             _answer(outcome)
             click.echo("\nWriting the report ...")
-    except OSError:  # no reader: what was computed is kept all the same
+    except OSError:  # standard output is closed: the result is written all the same
         write()
         raise
     with only_json(as_json), writing:
@@ -93,5 +93,5 @@ def _warn(outcome: Outcome, as_json: bool) -> None:
 
 
 def print_data(data: Any, text: str, as_json: bool) -> None:
-    """Print what has no folder: one object for scripts, or text."""
+    """Print data without a result folder: one object for scripts, or text."""
     click.echo(json.dumps(data, indent=2, ensure_ascii=False) if as_json else text)

@@ -1,4 +1,4 @@
-"""Progress for people who wait: on a terminal, on standard error, a line at once, then a bar."""
+"""Display of progress on a terminal, on standard error: a line at once, then a bar."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ _ERASED = "\r\x1b[2K"
 
 
 class Progress:
-    """Call it with the share done (0 to 1) and what is being done.
+    """Progress display, called with the share done (0 to 1) and the present activity.
 
-    Used as a context manager, it shows a line at once, before anything heavy is imported, a bar
-    once `WAIT_S` have passed, even if it was not called yet (a compilation takes its time), and
-    takes both away at the end.
+    As a context manager it shows a line at once, before any slow import, and a bar after `WAIT_S`,
+    even if it was not called yet (as in a compilation), and erases both at the end.
     """
 
     def __init__(self, what: str = "starting", stream: Any = None, wait_s: float = WAIT_S):
@@ -32,10 +31,10 @@ class Progress:
         self._timer.daemon = True
 
     def __call__(self, share: float, what: str) -> None:
-        """Note the progress.
+        """Update the progress.
 
         Raises:
-            KeyboardInterrupt: it was requested, and got lost.
+            KeyboardInterrupt: an interrupt was requested, and swallowed by other code.
         """
         interrupts.raise_if_interrupted()
         with self._lock:
@@ -55,7 +54,7 @@ class Progress:
         from rich.progress import Progress as Bar
 
         columns = (
-            SpinnerColumn("line"),  # a compilation reports no share, but it goes on
+            SpinnerColumn("line"),  # shows activity in a compilation, which reports no share
             TextColumn("{task.description}", markup=False),
             BarColumn(),
             TaskProgressColumn(),
@@ -70,7 +69,7 @@ class Progress:
             self._bar.start()
 
     def _line(self, text: str) -> None:
-        """Write to the terminal, if it can erase that; it may have been closed."""
+        """Write a line to a terminal that can erase it; the terminal may have been closed."""
         if self._stream.isatty() and os.environ.get("TERM") != "dumb":
             with contextlib.suppress(OSError):
                 self._stream.write(text)

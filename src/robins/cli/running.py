@@ -1,4 +1,4 @@
-"""Run a command line: errors in a few lines, interrupts, output that cannot be written."""
+"""Execution of a command line: errors in a few lines, interrupts, failures of output."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from robins.cli.commands import app
 from robins.cli.frame import ExitStatus
 from robins.errors import RobinsError
 
-_OF_A_PATH = {  # what is wrong with a path that was given, not with the disk
+_OF_A_PATH = {  # faults of a given path, not of the disk
     *(errno.ENAMETOOLONG, errno.EEXIST, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP),
     *(errno.EACCES, errno.EPERM),
 }
-_OF_THE_BENCH = ("serial", "cobs", "fastcrc", "mcap")  # packages of an extra
+_OF_THE_BENCH = ("serial", "cobs", "fastcrc", "mcap")  # packages of the extra "bench"
 
 
 class _Output:
-    """Standard output that takes any character and remembers if it could not be written to.
+    """Standard output that accepts any character and records a failure to write.
 
-    What its encoding lacks becomes a question mark, or in JSON an escape.
+    Characters that its encoding lacks become question marks, or escapes in JSON.
     """
 
     def __init__(self, stream: Any, as_json: bool):
@@ -66,7 +66,7 @@ class _Output:
             raise
 
     def abandon(self) -> None:
-        """Let what is still buffered go nowhere: the interpreter would try once more at its end."""
+        """Discard buffered output, which the interpreter would try to write again at its end."""
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
 
@@ -80,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     with contextlib.ExitStack() as stack:
-        if sys.stderr is None:  # `2>&-`; the next file to be opened would get its number
+        if sys.stderr is None:  # closed by `2>&-`: the next file opened would get its number
             nowhere = stack.enter_context(open(os.devnull, "w", encoding="utf-8"))
             stack.enter_context(contextlib.redirect_stderr(nowhere))
         if sys.stdout is None:
@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 return _interrupted(for_good=arguments is None)
             if output.failure is not None:
                 output.abandon()
-                if output.failure.errno != errno.EPIPE:  # a reader may go when it has seen enough
+                if output.failure.errno != errno.EPIPE:  # a reader may close the pipe early
                     why = output.failure.strerror or output.failure
                     _print_error(f"cannot write to standard output: {why}")
                 return ExitStatus.FAILED
@@ -124,10 +124,10 @@ def _interrupted(for_good: bool) -> ExitStatus:
 
 
 def _leave(status: ExitStatus) -> NoReturn:
-    """End the process here and now.
+    """End the process without the clean-up of the interpreter.
 
-    A compilation goes on in threads of its own when the interpreter takes the rest away, and that
-    ends in a segmentation fault instead of the status. Files are closed already.
+    Compilation threads may still run during that clean-up, which then ends in a segmentation fault
+    instead of the status. Files are already closed.
     """
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):

@@ -1,8 +1,8 @@
 """Small-matrix algebra on square-root factors.
 
-A *factor* of a covariance P is any matrix S with ``S @ S.T == P``. Filters take their algebra of
-matrices from this room and never call ``jnp.linalg`` themselves, so that what is hard about it
-(singular factors, gradients, signs) is solved in one place.
+A *factor* of a covariance P is any matrix S with ``S @ S.T == P``. Filters take their matrix
+algebra from this room and never call ``jnp.linalg`` themselves, so that its difficulties (singular
+factors, gradients, signs) are solved in one place.
 """
 
 from robins.errors import moved

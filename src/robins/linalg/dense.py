@@ -14,16 +14,16 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from robins import _float64  # noqa: F401  # pyright: ignore[reportUnusedImport]  for its effect
 from robins.errors import require
 
-# What is below this share of a row's length is rounding: such a row depends on those above it.
-# Orthogonalising errs by a few 1e-16 of the length; 1e-14 leaves room for sizes up to about 50.
+# A residual below this share of a row's norm is rounding: the row depends on those above it.
+# Orthogonalisation errs by a few 1e-16 of the norm; 1e-14 leaves room for sizes up to about 50.
 DEPENDENT = 1e-14
 
-# Rows up to which a loop is written out: faster for a measurement, slow to compile for a state.
+# Rows up to which a loop is unrolled: faster for a measurement, slow to compile for a state.
 UNROLLED = 4
 
 
 def block_diagonal(a: Float[Array, "m k"], b: Float[Array, "n l"]) -> Float[Array, "m+n k+l"]:
-    """Two matrices as one: a factor of what is independent, or a transition of what moves alone."""
+    """Block-diagonal matrix: factor of independent states, or transition of uncoupled ones."""
     right, left = jnp.zeros((a.shape[0], b.shape[1])), jnp.zeros((b.shape[0], a.shape[1]))
     return jnp.concatenate(
         [jnp.concatenate([a, right], axis=1), jnp.concatenate([left, b], axis=1)]
@@ -64,7 +64,7 @@ def _signs(upper: Array) -> Array:
 @_triangle.defjvp
 def _triangle_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     # With A = L Q' the change is dL = dA Q + L W, W = Q' dQ skew and such that dL is lower
-    # triangular. Pivots lost in rounding turn nothing, where JAX's own rule divides by them.
+    # triangular. Pivots lost in rounding contribute no rotation; JAX's own rule divides by them.
     (wide,), (slope,) = primals, tangents
     Q, upper = jnp.linalg.qr(wide.T)
     sign = _signs(upper)[None, :]
@@ -87,13 +87,13 @@ def independent_rows(
 ) -> Bool[Array, "m"]:
     """Mask of the rows independent of those above them, to rounding; a row of zeros is not.
 
-    A row that is not finite counts as independent, so that a fault is not taken for a repetition.
+    A row that is not finite counts as independent, so that a fault is not taken for a dependence.
     Gram-Schmidt, each row twice (Parlett 1998, sec. 6.9). QR without row exchange cannot decide:
     past a lost pivot its later ones are arbitrary.
 
     Args:
-        rows: (m, k), each with a scale of its own.
-        size: (m,) of what each row was summed from, where that was larger than the row.
+        rows: (m, k), each with its own scale.
+        size: (m,) magnitude of the terms summed into each row, if larger than the row.
     """
     m = rows.shape[0]
     rows = jax.lax.stop_gradient(rows)
@@ -142,7 +142,7 @@ def plainly_independent(rows: Float[Array, "m k"]) -> Bool[Array, ""]:
 
 
 def lost_in_rounding(rows: Float[Array, "m k"], size: Float[Array, "m"]) -> Bool[Array, "m k"]:
-    """Mask of the entries that are rounding against the size of what their row was summed from."""
+    """Mask of entries that are rounding relative to the terms summed into their row (`size`)."""
     return jnp.abs(rows) <= DEPENDENT * size[:, None]
 
 
@@ -156,7 +156,7 @@ def block_factor(
 
     With spread = H S and noise = R^1/2 this is one square-root Kalman update: X is the factor of
     the innovation covariance, Y X^-1 the gain, Z the posterior factor (Kaminski, Bryson, Schmidt
-    1971). A deficit v is taken away again: ``[spread, noise][..]' - v v'``.
+    1971). A deficit v is subtracted: ``[spread, noise][..]' - v v'``.
     """
     m, n = spread.shape
     blank = jnp.zeros((n, sum(block.shape[1] for block in noise)))
@@ -196,8 +196,8 @@ def cholesky(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 @cholesky.defjvp
 def _cholesky_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    # dL = L W, W the lower half of L^-1 dP L'^-1 (Murray 2016). A step that cannot be taken must
-    # not make the gradients of the others NaN: there L is put aside before it is divided by.
+    # dL = L W, W the lower half of L^-1 dP L'^-1 (Murray 2016). A failed factorisation must not
+    # make other gradients NaN: there L is replaced before it is divided by.
     (P,), (slope,) = primals, tangents
     L = cholesky(P)
     sound = jnp.all(jnp.isfinite(L))
@@ -208,7 +208,7 @@ def _cholesky_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array,
 
 
 def symmetric_root(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The symmetric positive semidefinite root of P; negative rounding becomes zero.
+    """Symmetric positive semidefinite square root of P; negative eigenvalues become zero.
 
     Raises:
         ValueError: P is not square.
@@ -219,16 +219,16 @@ def symmetric_root(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def downdate(L: Float[Array, "n n"], v: Float[Array, "n"]) -> Float[Array, "n n"]:
-    """Lower factor of ``L L' - v v'``; all NaN where no covariance is left.
+    """Lower factor of ``L L' - v v'``; all NaN if that is no covariance.
 
-    Written as ``L chol(I - p p')`` with L p = v: the subtraction meets numbers of order one however
-    badly L is scaled, and L may be singular as long as v is in its range.
+    Computed as ``L chol(I - p p')`` with L p = v: the subtraction is between numbers of order one
+    however badly L is scaled, and L may be singular as long as v is in its range.
     """
     solid, _ = guard(L)
     p = solve_lower(solid, L).T @ solve_lower(solid, v[:, None])
     beyond = jnp.abs(v - (L @ p)[:, 0]) > 1e-10 * jnp.sqrt(jnp.sum(L * L, axis=1))
     root = cholesky(jnp.eye(L.shape[0]) - p @ p.T)
-    # Put aside before the product, whose gradient it would make NaN.
+    # Replaced before the product, whose gradient it would make NaN.
     sound = jnp.all(jnp.isfinite(root))
     lower = L @ jnp.where(sound, root, jnp.eye(L.shape[0]))
     return jnp.where(jnp.any(beyond) | ~sound, jnp.nan, lower)
@@ -271,8 +271,8 @@ def guard(
     pseudo-inverse; the second result is the mask of independent rows.
 
     Args:
-        factor: (n, k), its rows with scales of their own.
-        size: (n,) of what each row was summed from, where that was larger than the row.
+        factor: (n, k), each row with its own scale.
+        size: (n,) magnitude of the terms summed into each row, if larger than the row.
     """
     independent = independent_rows(factor, size)
     kept = jnp.where(independent[:, None], factor, 0.0)
@@ -300,16 +300,16 @@ def eigenvalue_bounds(P: Float[Array, "n n"]) -> tuple[Float[Array, ""], Float[A
 
 
 def as_factor(noise: Array) -> Array:
-    """A vector of standard deviations becomes a diagonal factor; a matrix passes."""
+    """Diagonal factor of a vector of standard deviations; a matrix is returned unchanged."""
     return jnp.diag(noise) if jnp.ndim(noise) == 1 else noise
 
 
 def factor(P: ArrayLike, name: str = "covariance") -> Float[Array, "n n"]:
     """Lower factor of a symmetric positive *semi*definite matrix, at the boundary.
 
-    For use outside compiled code: it looks at the numbers. Zero rows and exactly dependent rows are
-    welcome (Q of rank one, P0 = 0). The matrix is scaled to unit diagonal first, so variances of
-    very different units do not drown each other.
+    Not for compiled code: it reads the numbers. Zero rows and exactly dependent rows are allowed (Q
+    of rank one, P0 = 0). The matrix is scaled to unit diagonal first, so that variances in very
+    different units do not swamp each other.
 
     Args:
         P: (n, n) covariance.
@@ -348,7 +348,7 @@ def factor(P: ArrayLike, name: str = "covariance") -> Float[Array, "n n"]:
             f"{name} is not positive semidefinite: scaled to variances of one, its least "
             f"eigenvalue is {value[0]:.3g}"
         )
-    # What rounding leaves of a zero eigenvalue would be a standard deviation of 1e-8: it is zero.
+    # The rounding of a zero eigenvalue would be a standard deviation of 1e-8: set it to zero.
     rounding = len(P_) * np.finfo(float).eps * greatest
     if np.all(value > 10.0 * rounding):
         root = np.linalg.cholesky(unit)
@@ -357,7 +357,7 @@ def factor(P: ArrayLike, name: str = "covariance") -> Float[Array, "n n"]:
     return tria(jax.device_put(scale[:, None] * root))
 
 
-_DOUBLINGS = 20  # halves of a step tried at most: enough for |A| dt = 1e6
+_DOUBLINGS = 20  # most halvings of a step: enough for |A| dt = 1e6
 
 
 def van_loan(
@@ -365,12 +365,12 @@ def van_loan(
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
     """Discretise ``dx = A x dt + dw``, ``E[dw dw'] = Qc dt`` over a step (Van Loan 1978).
 
-    His exponential holds exp(-A dt) too, which drowns the rest where A dt is large (a fast sensor
-    over a long step). So it is taken over a step with |A| h of order one, and doubled:
+    His exponential contains exp(-A dt) too, which swamps the rest where A dt is large (fast sensor
+    dynamics over a long step). So it is computed for a step with |A| h of order one, and doubled:
     Q(2h) = Q(h) + Phi(h) Q(h) Phi(h)'.
 
     Returns:
-        Phi = exp(A dt), and Qd, the covariance the noise adds over dt [s].
+        Phi = exp(A dt), and Qd, the covariance that the noise adds over dt [s].
 
     Raises:
         ValueError: a shape does not fit, dt is negative, or a number is not finite; in compiled

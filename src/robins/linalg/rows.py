@@ -1,8 +1,8 @@
 """Map of a function over the rows of arrays: a batch for JAX, a loop in a program.
 
-`jax.vmap` leaves no trace of the function of one row, so a program of scalars (`robins.program`)
-would write out each row: a bank of nine modes as nine filters. The JAX primitive ``each_row`` keeps
-that function. JAX compiles, batches and differentiates it as `jax.vmap` of the function.
+`jax.vmap` does not keep the function of one row, so a program of scalars (`robins.program`) would
+unroll all rows: a bank of nine modes as nine filters. The JAX primitive ``each_row`` keeps it. JAX
+compiles, batches and differentiates the primitive as `jax.vmap` of the function.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def each_row(function: Callable[..., T], *args: Tree) -> T:
     """Return ``jax.vmap(function)(*args)``.
 
     Args:
-        function: of one row of each of the arguments; what else it needs it may close over.
+        function: of one row of each of the arguments; it may close over other values.
         args: pytrees of arrays with an equal leading axis.
 
     Raises:
@@ -47,7 +47,7 @@ def each_row(function: Callable[..., T], *args: Tree) -> T:
         return function(*jax.tree_util.tree_unflatten(tree, row))
 
     closed, shapes = jax.make_jaxpr(flat, return_shape=True)(*rows)
-    # What the function closes over are further arguments, the same for each row.
+    # Values that the function closes over are further arguments, the same for each row.
     inner = closed.jaxpr
     jaxpr = jex.Jaxpr(
         [],
@@ -91,7 +91,7 @@ def _jvp(
 ) -> tuple[list[Array], list[Array | ad.Zero]]:
     known = [ad.instantiate_zeros(t) for t in tangents]
     found, slopes = jax.jvp(partial(_batched, **params), tuple(primals), tuple(known))
-    whole = jax.dtypes.float0  # of what is no real
+    whole = jax.dtypes.float0  # tangent type of integers and booleans
     zeros = [ad.Zero(ShapedArray(s.shape, whole)) if s.dtype == whole else s for s in slopes]
     return found, zeros
 

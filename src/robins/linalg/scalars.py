@@ -1,7 +1,7 @@
 """Vectors, matrices and quaternions as tuples of scalars: in a compiled loop faster than arrays.
 
-A scan over small arrays spends its time starting kernels; scalars are joined into few. Under `vmap`
-each scalar is an array over the batch. Long chains of them want `settled` in between.
+A scan over small arrays spends its time starting kernels; scalar operations are fused into few.
+Under `vmap` each scalar is an array over the batch. Long chains of them need `settled` in between.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ def matrix(m: Array) -> Matrix:
 
 
 def settled(*vectors: Three) -> list[tuple[Scalar, ...]]:
-    """The same vectors, computed here and once.
+    """Same vectors behind a fusion barrier, so that each is computed once.
 
-    Else XLA would compute what a component needs once more wherever that component is needed.
+    Otherwise XLA would recompute a component wherever it is used.
     """
     return [scalars(v) for v in jax.lax.optimization_barrier([jnp.stack(v) for v in vectors])]
 
@@ -75,7 +75,7 @@ def apply(m: Matrix, v: Three) -> Three:
 
 
 def transposed(m: Matrix) -> Matrix:
-    """Rows for columns."""
+    """Transpose of a matrix."""
     return tuple(zip(*m, strict=True))
 
 
@@ -102,13 +102,13 @@ def product(p: Three, q: Three) -> tuple[Scalar, Scalar, Scalar, Scalar]:
 
 
 def rotate(q: Three, v: Three) -> Three:
-    """Turn a vector of three by a unit quaternion, scalar first."""
+    """Rotate a 3-vector by a unit quaternion, scalar first."""
     t = times(2.0, cross(q[1:], v))
     return plus(v, times(q[0], t), cross(q[1:], t))
 
 
 def symmetric_inverse(m: Matrix) -> Matrix:
-    """Inverse of a symmetric matrix of three by its cofactors."""
+    """Inverse of a symmetric 3x3 matrix by its cofactors."""
     (a, b, c), (_, d, e), (_, _, f) = m
     aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
     dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b

@@ -1,4 +1,4 @@
-"""A solution as tables: a row for each time of a clock, columns that carry their units."""
+"""Solution as tables: a row for each time of a clock, columns with their units in the name."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from robins import units
 from robins.errors import require_known
 from robins.gps_time import dated, utc_of
 
-_OWN_UNIT = re.compile(r"(.*) \[(.*)\]")  # label of a component in other units than its neighbours
+_OWN_UNIT = re.compile(r"(.*) \[(.*)\]")  # label of a component with its own unit
 _FIRST = ("track", "attitude", "estimate", "sigma")  # roles, in the order of their columns
 
 
@@ -25,7 +25,7 @@ def clocks(solution: xr.Dataset) -> list[str]:
 
 
 def stamps_ns(solution: xr.Dataset, clock: str) -> np.ndarray | None:
-    """(E,) int64 stamps of the log [ns] at the times of a clock; None where no log is behind it."""
+    """(E,) int64 stamps of the log [ns] at the times of a clock; None if it is not from a log."""
     origin = solution.attrs.get("origin_ns")
     if origin is None:
         return None
@@ -52,7 +52,7 @@ def to_dataframe(
 
     Args:
         solution: of a result or an outcome.
-        filter: its name; by default all, one below the other, with an index (filter, time_s).
+        filter: its name; default: all, stacked, with an index (filter, time_s).
         clock: name of the time axis (`clocks`): each sensor has its own.
         si: in SI units and radians; else in the units of the figures.
 
@@ -72,7 +72,7 @@ def to_dataframe(
 
 
 def _table(solution: xr.Dataset, clock: str, si: bool) -> pd.DataFrame:
-    """The table of one filter, which is chosen already."""
+    """Table of a solution of one filter."""
     columns: dict[str, Any] = {}
     if (date := utc(solution, clock)) is not None:
         columns["utc"] = pd.DatetimeIndex(date, tz="UTC")
@@ -90,11 +90,11 @@ def _rank(item: tuple[str, xr.DataArray]) -> int:
 
 
 def _angles(arrays: Mapping[str, xr.DataArray]) -> dict[str, xr.DataArray]:
-    """Roll, pitch and heading where only the quaternion is there."""
+    """Roll, pitch and heading of quaternions that have no angles in the solution."""
     name = "estimate_euler"
     if name in arrays or "q_nb" not in arrays:
         return {}
-    import jax.numpy as jnp  # who reads a result need not wait for JAX
+    import jax.numpy as jnp  # slow to import, and not needed to read most results
 
     from robins import rotation
 
@@ -108,7 +108,7 @@ def _angles(arrays: Mapping[str, xr.DataArray]) -> dict[str, xr.DataArray]:
 
 
 def _columns(name: str, array: xr.DataArray, si: bool) -> dict[str, np.ndarray]:
-    """The components of an array under their names."""
+    """Components of an array by the names of their columns."""
     unit = str(array.attrs.get("units", "1"))
     stem = name.removesuffix(f"_{units.as_ending(unit)}")
     shown = unit if si else str(array.attrs.get("display_unit", unit))

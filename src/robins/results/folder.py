@@ -1,4 +1,4 @@
-"""A folder that appears whole or not at all.
+"""Atomic writing of a folder: it appears complete or not at all.
 
 A writer fills a *stage*, a hidden folder next to the target, and `commit` renames it into place.
 The result that was there is renamed aside first and deleted last, so at every instant one of the
@@ -7,10 +7,10 @@ between the two renames leaves behind is found by `locate` and repaired by `swee
 or write.  A living writer holds advisory locks: on a small file next to the target, so that there
 is one writer of a result at a time, and on its folders. The kernel drops them with the process,
 however that ends, so a file or hidden folder whose lock is free belongs to no writer, and the next
-writer removes it. The content of the file is for people, nothing trusts it.
+writer removes it. The content of the file is for people only; no code relies on it.
 
-A file system may know no locks (some network ones). Then two writers do not see each other, and the
-result of the one that is done last stands, whole.
+Some network file systems have no locks. Then two writers do not see each other, and the result of
+the one that finishes last remains, complete.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import NamedTuple
 
-_TRIES = 20  # of a commit, against other writers of the same folder, where there are no locks
+_TRIES = 20  # of a commit against other writers of the same folder, without locks
 _LEFTOVER = re.compile(r"\.robins-(new|old)-([0-9a-f]{12})-[0-9a-f]{8}")
 
 
 class TargetBusyError(BlockingIOError):
-    """Another writer has the target."""
+    """Another writer holds the target."""
 
 
 class StagedFolder(NamedTuple):
@@ -41,12 +41,12 @@ class StagedFolder(NamedTuple):
 
     path: Path
     target: Path
-    locks: ExitStack  # closing it lets the target go, and the folder
+    locks: ExitStack  # closing it releases the target and the folder
     parents: tuple[Path, ...]  # folders made for it, innermost first
 
 
 def resolve(path: str | os.PathLike[str]) -> Path:
-    """Absolute path without links, so that a linked folder is replaced where it really lies."""
+    """Absolute path without links, so that a linked folder is replaced at its real place."""
     return Path(os.path.realpath(path))
 
 
@@ -55,7 +55,7 @@ def _hidden(target: Path, kind: str) -> Path:
 
 
 def _key(target: Path) -> str:
-    """The name of the target as a digest: it may already have the longest length allowed."""
+    """Digest of the target's name, which may already have the greatest length allowed."""
     return hashlib.sha256(os.fsencode(target.name)).hexdigest()[:12]
 
 
@@ -77,7 +77,7 @@ def _lock(folder: Path) -> ExitStack | None:
     """Lock a folder until the stack is closed; None where the file system cannot.
 
     Raises:
-        BlockingIOError: its writer is alive.
+        BlockingIOError: another writer holds the lock.
     """
     with ExitStack() as stack:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -95,12 +95,12 @@ def _claim(target: Path) -> ExitStack:
     """Claim a target as its only writer until the stack is closed.
 
     Raises:
-        TargetBusyError: another one is.
+        TargetBusyError: another writer holds it.
     """
     path = target.parent / f".robins-lock-{_key(target)}"
     while True:
         with ExitStack() as stack:
-            # Network file systems lock only what is open for writing.
+            # Network file systems lock only files that are open for writing.
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
             stack.callback(os.close, descriptor)
             try:
@@ -108,12 +108,12 @@ def _claim(target: Path) -> ExitStack:
             except BlockingIOError:
                 who = os.pread(descriptor, 200, 0).decode("utf-8", "replace").strip()
                 raise TargetBusyError(errno.EAGAIN, who or "another process", str(target)) from None
-            except OSError:  # no locks here
+            except OSError:  # file system without locks
                 stack.callback(_unlink, path)
                 return stack.pop_all()
             if not _is_at(descriptor, path):
                 continue  # its last holder removed it between our two calls
-            stack.callback(_unlink, path)  # before it is let go
+            stack.callback(_unlink, path)  # before the lock is released
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
             return stack.pop_all()
@@ -132,7 +132,7 @@ def _unlink(path: Path) -> None:
 
 
 def locate(path: str | os.PathLike[str]) -> Path:
-    """Path of a result to read: the path itself, or its folder set aside by a cut commit."""
+    """Path of a result to read: the path, or the folder set aside by an interrupted commit."""
     target = resolve(path)
     if os.path.lexists(target):
         return target
@@ -140,13 +140,13 @@ def locate(path: str | os.PathLike[str]) -> Path:
 
 
 def sweep(target: Path) -> None:
-    """Bring back a result that a dead writer had set aside, delete what dead writers left."""
+    """Restore a result that a dead writer had set aside, and delete leftovers of dead writers."""
     for kind in ("old", "new"):
         for folder in _leftovers(target, kind):
             try:
                 lock = _lock(folder)
             except OSError:
-                continue  # alive, or gone meanwhile
+                continue  # its writer is alive, or it is gone meanwhile
             if lock is None:
                 continue  # cannot be distinguished from a living writer's: leave it
             with lock, suppress(OSError):
@@ -166,13 +166,13 @@ def stage(path: str | os.PathLike[str]) -> StagedFolder:
     """Make the hidden folder in which the content of `path` is built.
 
     Raises:
-        TargetBusyError: another writer builds one.
+        TargetBusyError: another writer holds the target.
         OSError: it cannot be made there.
     """
     target = resolve(path)
     parents = tuple(_missing(target.parent))
     existing = parents[-1].parent if parents else target.parent
-    # Checked, because the short name of the hidden folder would not show it before `commit`.
+    # Checked now: the hidden folder has a short name, and `commit` would be too late.
     if len(os.fsencode(target.name)) > os.pathconf(existing, "PC_NAME_MAX"):
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(target))
     folder, locks = None, ExitStack()
@@ -188,7 +188,7 @@ def stage(path: str | os.PathLike[str]) -> StagedFolder:
                     locks.enter_context(lock)
                 return StagedFolder(folder, target, locks, parents)
             except (BlockingIOError, FileNotFoundError):
-                # A sweep by another writer fell between its making and its locking.
+                # Another writer swept it away between its making and its locking.
                 shutil.rmtree(folder, ignore_errors=True)
     except BaseException:
         _remove(folder, locks, parents)
@@ -210,12 +210,12 @@ def discard(staged: StagedFolder) -> None:
 
 
 def commit(staged: StagedFolder) -> None:
-    """Sync the hidden folder to the disk and make it the target, in place of what was there.
+    """Sync the hidden folder to the disk and rename it to the target, replacing an earlier one.
 
-    The target is let go by `discard`, which then has nothing to delete.
+    The target is released by `discard`, which then has nothing to delete.
 
     Raises:
-        OSError: it could not; what was there is there again.
+        OSError: it failed; the earlier target is in place again.
     """
     for root, _, names in os.walk(staged.path):
         for name in names:
@@ -226,7 +226,7 @@ def commit(staged: StagedFolder) -> None:
             _swap(staged)
             break
         except OSError as error:
-            # Another writer took the place between our two renames: replace its result.
+            # Another writer put its result there between our two renames: replace it.
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST) or attempt == _TRIES - 1:
                 raise
     with suppress(OSError):
@@ -245,7 +245,7 @@ def _swap(staged: StagedFolder) -> None:
                     os.rename(target, aside)
             os.rename(staged.path, target)
         except BaseException:
-            # Also for an interrupt: whichever rename it fell between, one whole folder is in place.
+            # Also for an interrupt: wherever it came, one complete folder is in place.
             if os.path.lexists(aside) and not os.path.lexists(target):
                 os.rename(aside, target)
             raise

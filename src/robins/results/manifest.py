@@ -32,7 +32,7 @@ def digest(path: Path) -> dict[str, Any]:
 
 
 def _seal(manifest: Mapping[str, Any]) -> str:
-    """Checksum of the manifest itself, so that a flipped bit in a seed does not go unseen."""
+    """Checksum of the manifest itself, so that even a flipped bit in a seed is detected."""
     rest = {key: value for key, value in manifest.items() if key != "sha256"}
     return hashlib.sha256(dumps(rest).encode()).hexdigest()
 
@@ -56,7 +56,7 @@ def versions() -> dict[str, str]:
 def make(
     folder: Path, *, scenario: str, scenario_text: str, seed: int, device: str, command: str
 ) -> dict[str, Any]:
-    """The manifest of everything that lies in a folder."""
+    """Manifest of all files in a folder."""
     files = {
         path.relative_to(folder).as_posix(): digest(path)
         for path in sorted(folder.rglob("*"))
@@ -83,10 +83,10 @@ def make(
 
 
 def load(folder: Path, shown: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a manifest and check that it is itself whole and of a version known here.
+    """Read a manifest and check that it is complete and of a known version.
 
     Raises:
-        ResultError: it is not; `shown` is the path to name in the message.
+        ResultError: it is not; the message names the path `shown`.
     """
     try:
         text = (folder / NAME).read_bytes()
@@ -106,7 +106,7 @@ def load(folder: Path, shown: str | os.PathLike[str]) -> dict[str, Any]:
             f"has schema version {manifest['schema']}, this robins reads {SCHEMA_VERSION}",
             "read it with the version of robins that wrote it",
         )
-    # Compared as text too: a cut that takes the last line break only is still a cut.
+    # Compared as text too: the loss of the last line break alone is still damage.
     if manifest.get("sha256") != _seal(manifest) or text != dumps(manifest).encode():
         raise ResultError(shown, f"{NAME} is damaged: its checksum does not fit", _REMAKE)
     if manifest.get("complete") is not True:

@@ -20,17 +20,17 @@ def ignore_progress(share: float, what: str) -> None:
 class Outcome:
     """Outcome of a command: all contents of its result folder, its report and its last lines.
 
-    The part that computes (a system, a campaign) fills in the first part; the one that was called
-    (`robins.workbench`) adds the rest. In `last_lines`, ``{out}`` stands for the folder.
+    The computing room (a system, a campaign) fills in the first fields, and `robins.workbench` the
+    rest. In `last_lines`, ``{out}`` stands for the folder.
     """
 
     solution: xr.Dataset | None = None  # None: there is nothing to draw
     metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # by filter, or by axis
     claims: list[dict[str, Any]] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
-    files: dict[str, bytes | Path] = field(default_factory=dict)  # more; a path is moved in
+    files: dict[str, bytes | Path] = field(default_factory=dict)  # further ones; a path is moved in
     notes: list[str] = field(default_factory=list)  # sentences for the reader
-    warnings: list[str] = field(default_factory=list)  # why a reader should doubt the figures
+    warnings: list[str] = field(default_factory=list)  # reasons to doubt the figures
     verdict: str = ""  # "Consistent: ...", "With care: ..." or "Do not trust: ..."
 
     # of the request
@@ -43,11 +43,11 @@ class Outcome:
 
     # of the presentation
     title: str = ""
-    figures: tuple[str, ...] = ()  # names of those that are drawn; else all
-    tables: list[Any] = field(default_factory=list)  # else that of the metrics; texts, or for rich
-    last_lines: list[str] = field(default_factory=list)  # where else to look, what to do next
+    figures: tuple[str, ...] = ()  # names of the figures to draw; empty: all
+    tables: list[Any] = field(default_factory=list)  # texts or rich tables; empty: the metrics
+    last_lines: list[str] = field(default_factory=list)  # further places to look, next steps
     for_scripts: str = "summary.json"  # the file that --json prints
-    failure: str = ""  # why it is not whole; what there is of it is a result all the same
+    failure: str = ""  # reason why it is incomplete; it is still written as a result
 
     @property
     def summary(self) -> dict[str, Any]:

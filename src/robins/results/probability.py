@@ -17,13 +17,13 @@ LEVEL = 0.95
 
 
 class Probability(NamedTuple):
-    """The share of some independent runs of which something holds.
+    """Share of independent runs for which a condition holds.
 
     Attributes:
         share: of the runs, 0..1.
         low: lower end of the interval.
         high: upper end.
-        of: how many runs.
+        of: number of runs.
         level: of the interval.
     """
 
@@ -48,7 +48,7 @@ class Probability(NamedTuple):
 
     @classmethod
     def read(cls, value: Any) -> Probability | None:
-        """One as it is, or as `summary.json` holds it; None if the value is something else."""
+        """Convert a `Probability`, or its form in `summary.json`; None if the value is neither."""
         if isinstance(value, cls):
             return value
         if not isinstance(value, Mapping) or set(value) != set(cls._fields):
@@ -57,23 +57,23 @@ class Probability(NamedTuple):
 
     @classmethod
     def share_of(cls, value: Any) -> Any:
-        """The share of a probability; any other value as it is."""
+        """Share of a probability; any other value unchanged."""
         found = cls.read(value)
         return value if found is None else found.share
 
 
 def interval(hits: np.ndarray, of: int, level: float = LEVEL) -> tuple[np.ndarray, np.ndarray]:
-    """Both ends of the interval of Clopper and Pearson.
+    """Ends of the Clopper-Pearson confidence interval.
 
     Args:
-        hits: (...) of so many runs it held, 0..of.
+        hits: (...) number of runs for which the condition held, 0..of.
         of: number of runs, at least one.
-        level: probability that the interval holds the true one, at least.
+        level: least probability that the interval contains the true share.
 
     Returns:
         (...) lower and upper ends, as quantiles of the beta distribution.
     """
-    from scipy.special import betaincinv  # who writes a result need not wait for SciPy
+    from scipy.special import betaincinv  # slow to import, and not needed to write a result
 
     hits = np.asarray(hits)
     tail, some, all_ = 0.5 * (1.0 - level), np.maximum(hits, 1), np.minimum(hits, of - 1)

@@ -1,4 +1,4 @@
-"""Reading a result: whole and unchanged, or refused with the reason."""
+"""Reader of results: a result is complete and unchanged, or refused with the reason."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ class Result(NamedTuple):
 def read(path: str | os.PathLike[str]) -> Result:
     """Read a result folder and verify every file in it.
 
-    Files in the folder that the manifest does not list are left alone and not looked at.
+    Files in the folder that the manifest does not list are ignored.
 
     Raises:
-        ResultError: there is none, it is incomplete or damaged, or of an unknown version.
+        ResultError: there is no result, it is incomplete or damaged, or of an unknown version.
     """
     where = folder.locate(path)
     if not where.exists():

@@ -1,4 +1,4 @@
-"""Keeps computed numbers that cannot be written as a result; they may have taken hours."""
+"""Rescue of computed numbers that cannot be written as a result; they may have taken hours."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from robins.results import folder
 
 ARRAYS = "arrays.npz"
 _WHERE = "Its numbers are kept in {}; numpy.load reads them."
-_KEPT = "computed"  # the attribute of an error that takes numbers along
+_KEPT = "computed"  # attribute of an error that carries the numbers
 
 
 class NotWritten(RobinsError, RuntimeError):
-    """A result that was computed and not written; the message names the folder of its numbers."""
+    """A result that was computed but not written; the message names the folder of its numbers."""
 
     bad_input = False
 
@@ -30,7 +30,7 @@ def keep_on_error(tree: Any) -> Generator[None, None, None]:
     """Attach computed arrays to any error that leaves this block, for `rescued` to write.
 
     Args:
-        tree: of arrays; in blocks inside each other that of the inner one counts.
+        tree: of arrays; of nested blocks the innermost counts.
     """
     try:
         yield
@@ -41,15 +41,13 @@ def keep_on_error(tree: Any) -> Generator[None, None, None]:
 
 @contextmanager
 def rescued(path: str | os.PathLike[str]) -> Generator[None, None, None]:
-    """Write what an error carries (`keep_on_error`) where no result folder can be made at `path`.
+    """Write the arrays that an error carries (`keep_on_error`) if no result is written at `path`.
 
-    The arrays go into a new folder next to the result, or among the temporary files where nothing
-    can be written there.
-
-    An interrupt stays one, with a note that names the folder.
+    They go into a new folder next to the result, or into the temporary folder if nothing can be
+    written there. An interrupt is raised again, with a note that names the folder.
 
     Raises:
-        NotWritten: in place of the error, where something was kept.
+        NotWritten: in place of the error, if arrays were saved.
     """
     try:
         yield
@@ -69,7 +67,7 @@ def rescued(path: str | os.PathLike[str]) -> Generator[None, None, None]:
 
 
 def _saved(path: Path, tree: Any) -> Path | None:
-    """The folder that now holds the arrays of a tree; None if no disk takes them."""
+    """Save the arrays of a tree and return the folder; None if no disk takes them."""
     arrays = dict(_arrays("", tree))
     for parent in (folder.resolve(path).parent, Path(tempfile.gettempdir())):
         try:
@@ -83,7 +81,7 @@ def _saved(path: Path, tree: Any) -> Path | None:
 
 
 def _arrays(name: str, tree: Any) -> Iterator[tuple[str, np.ndarray]]:
-    """All arrays of a tree, each under the way to it: ``ekf.rms``."""
+    """All arrays of a tree with their paths, such as ``ekf.rms``."""
     if isinstance(tree, list | tuple):
         tree = dict(enumerate(tree))
     if isinstance(tree, Mapping):

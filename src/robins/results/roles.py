@@ -21,12 +21,12 @@ _MORE = "..."  # or other dimensions, of any number
 class Role(NamedTuple):
     """Role of some arrays, each *of* something: a block of the state, a sensor, a limit."""
 
-    variable: str  # name of an array; in braces what it is of, as a word or as choices
-    dims: str  # by place: as time any serves whose coordinate is in seconds since the start
-    text: str  # long name of an array that brings none; after a semicolon what else to know
-    unit: str = ""  # likewise; empty: each must bring one
-    attrs: tuple[str, ...] = ()  # what an array must have besides
-    named: str = ""  # the role, where the variable's name does not begin with it
+    variable: str  # name of an array; in braces its object, as a word or as choices
+    dims: str  # by position; any time axis in seconds since the start may replace time
+    text: str  # default long name of an array; after a semicolon, remarks
+    unit: str = ""  # default unit; empty: each array must have one
+    attrs: tuple[str, ...] = ()  # further attributes required of an array
+    named: str = ""  # the role, if the name of the variable does not begin with it
 
     @property
     def name(self) -> str:
@@ -39,16 +39,16 @@ class Role(NamedTuple):
         return head, of, tail
 
     def long_name(self, of: str) -> str:
-        """Long name of an array that brings none of its own."""
+        """Default long name of an array of an object."""
         return self.text.partition(";")[0].format(of=of.replace("_", " "))
 
     def called(self, of: str) -> str:
-        """Name of the array of something."""
+        """Name of the array of an object."""
         head, _, tail = self._parts
         return f"{head}{of}{tail}"
 
     def of(self, variable: str) -> str | None:
-        """Object of an array of this name; None if it has no such name."""
+        """Object of an array of this name; None if the name is not of this role."""
         head, of, tail = self._parts
         found = re.fullmatch(f"{head}({of if '|' in of else of and '.+'}){tail}", variable)
         return found[1] if found else None
@@ -215,15 +215,15 @@ ROLES = (
 
 
 def dims(role: Role, of: str) -> list[str]:
-    """Names of the dimensions of an array that brings none of its own."""
+    """Default names of the dimensions of an array."""
     return role.dims.removesuffix(_MORE).format(of=of).split()
 
 
 def row(role: str, of: str) -> Role:
-    """The row of a role for what an array is of.
+    """Row of a role for an object.
 
     Raises:
-        ValueError: there is none.
+        ValueError: there is no such row.
     """
     rows = [r for r in ROLES if r.name == role]
     for one in rows:
@@ -256,7 +256,7 @@ def fault(name: str, array: xr.Variable | xr.DataArray) -> str:
 
 
 def find(solution: xr.Dataset, role: str) -> dict[str, xr.DataArray]:
-    """The arrays of a role, by what each is of (empty where the role has one array only)."""
+    """Arrays of a role by their objects (empty if the role has one array only)."""
     return {
         array.attrs.get("of", ""): solution[name]
         for name, array in solution.variables.items()

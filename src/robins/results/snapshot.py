@@ -1,8 +1,8 @@
-"""One file that holds all a live object knows, so that it goes on bit for bit after a restart.
+"""Snapshot file of a live object's complete state, to continue bit for bit after a restart.
 
 The file is an npz: numbered arrays, and a text in JSON with the name and version of the format, the
 class that wrote it, its parameters as TOML, the plain values between the arrays, and a digest of
-all that. It is written under another name, synced and renamed. Nothing in it is executed.
+all of it. It is written under another name, synced and renamed. Nothing in it is executed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Snapshot(NamedTuple):
 
 
 def write(path: str | os.PathLike[str], kind: str, parameters: str, state: Any) -> None:
-    """Write a snapshot, or leave what was there as it was.
+    """Write a snapshot; on failure an earlier file stays as it was.
 
     Args:
         path: of the file.
@@ -70,10 +70,11 @@ def write(path: str | os.PathLike[str], kind: str, parameters: str, state: Any) 
 
 
 def read(path: str | os.PathLike[str], kind: str) -> Snapshot:
-    """Read a snapshot that a class wrote.
+    """Read a snapshot written by the class `kind`.
 
     Raises:
-        ResultError: the file cannot be read, is none, is damaged, or of another version or class.
+        ResultError: the file cannot be read, is no snapshot, is damaged, or is of another version
+            or class.
     """
     try:
         with open(path, "rb") as file:
@@ -122,7 +123,7 @@ def _digest(body: Any, arrays: list[np.ndarray]) -> str:
 
 
 def _frozen(value: Any, arrays: list[np.ndarray]) -> Any:
-    """Plain JSON, in which an array is its number."""
+    """Value in plain JSON, with an array replaced by its number in `arrays`."""
     if value is None or isinstance(value, bool | str) or type(value) in (int, float):
         return value
     if isinstance(value, dict):

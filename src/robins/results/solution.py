@@ -22,15 +22,15 @@ Variables = dict[str, xr.Variable]
 def variable(
     dims: str | Sequence[str], values: Any, unit: str, long_name: str, frame: str = "", **attrs: Any
 ) -> xr.Variable:
-    """Numbers with their unit, name and frame: a coordinate, such as the time.
+    """Make a variable with unit, name and frame: a coordinate, such as the time.
 
     Args:
         dims: names of the axes of `values`.
         values: anything NumPy takes.
         unit: in the spelling of `robins.units`; "1" for a pure number.
         long_name: for axes and captions, without the unit.
-        frame: axes along which the components are given, e.g. "NED"; needed where there are some.
-        attrs: anything else a figure needs, e.g. ``display_unit="deg/h"``.
+        frame: axes of the components, e.g. "NED"; required if there are components along axes.
+        attrs: further attributes for figures, e.g. ``display_unit="deg/h"``.
     """
     named = {"units": unit, "long_name": long_name} | ({"frame": frame} if frame else {}) | attrs
     return xr.Variable(dims, np.asarray(values), named)
@@ -48,18 +48,18 @@ def array(
     dims: str | None = None,
     **attrs: Any,
 ) -> dict[str, xr.Variable]:
-    """An array of a solution under its name, and with it the coordinate of its axes.
+    """Make an array of a solution, by its name, and the coordinate of its axes.
 
     Args:
         role: of a row of `robins.results.ROLES`.
         values: anything NumPy takes.
-        of: what it is of: a block of the state, a sensor, ...; empty where the row has one array.
-        unit: as of `variable`; else that of the row.
+        of: its object: a block of the state, a sensor, ...; empty if the row has one array.
+        unit: as in `variable`; default: that of the row.
         long_name: likewise.
-        frame: as of `variable`.
+        frame: as in `variable`.
         axes: names of the components along the last dimension.
-        dims: names of the dimensions, between blanks; else those of the row.
-        attrs: as of `variable`; those that the row requires must be among them.
+        dims: names of the dimensions, separated by blanks; default: those of the row.
+        attrs: as in `variable`; must include those that the row requires.
 
     Raises:
         ValueError: there is no such role, or the array lacks what its row requires.
@@ -111,17 +111,17 @@ def check(solution: xr.Dataset) -> None:
 def pack(solution: xr.Dataset) -> bytes:
     """The content of the file: compressed netCDF-4; numbers come back bit for bit.
 
-    Built in memory, so that whatever the disk refuses is refused to a plain write of bytes: HDF5
-    reports a full disk in several ways, some of them when the interpreter ends.
+    Built in memory, so that a disk error arises in a plain write of bytes: HDF5 reports a full disk
+    in several ways, some of them only when the interpreter ends.
     """
     packed = {"zlib": True, "complevel": 1, "shuffle": True}
     encoding = {
-        # Without a fill value of its own xarray would declare one, and NaN has its meaning already.
+        # By default xarray declares NaN as fill value, but NaN already has a meaning.
         name: {"_FillValue": None} | (packed if array.ndim and array.size else {})
         for name, array in solution.variables.items()
         if array.dtype.kind in "biuf"
     }
-    # What a dataset was read from may have left encodings of another file.
+    # A dataset read from a file may carry the encodings of that file.
     solution = solution.drop_encoding()
     return bytes(solution.to_netcdf(engine="h5netcdf", format="NETCDF4", encoding=encoding))
 

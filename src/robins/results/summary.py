@@ -34,10 +34,10 @@ _ORDER = (
 
 
 def plain(value: Any, where: str = "value") -> Any:
-    """The same in the types of JSON: NaN and infinities become null, arrays become lists.
+    """Convert a value to types of JSON: NaN and infinities become null, arrays become lists.
 
     Raises:
-        TypeError: JSON has no form for a part of it; `where` leads to that part in the message.
+        TypeError: a part of it has no form in JSON; the message locates it from `where`.
     """
     if value is None or isinstance(value, bool):
         return value
@@ -67,7 +67,7 @@ def plain(value: Any, where: str = "value") -> Any:
 
 
 def checked(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """A summary in plain types, its keys in the documented order, `files` left for the writer.
+    """Check a summary; return it in plain types and documented order, `files` left to the writer.
 
     Raises:
         TypeError, ValueError: a key is missing, unknown or of the wrong kind; the message names it.
@@ -100,7 +100,7 @@ def checked(summary: Mapping[str, Any]) -> dict[str, Any]:
     for key in _OPTIONAL:
         if not isinstance(flat.get(key, ""), str):
             raise TypeError(f"summary.{key}: {flat[key]!r} is not text")
-    # `files` are the writer's
+    # the writer fills in `files`
     return {key: flat.get(key, {}) for key in _ORDER if key in flat or key not in _OPTIONAL}
 
 

@@ -1,4 +1,4 @@
-"""Writing a result: filled in a hidden folder, which takes its place when it is whole."""
+"""Writer of results: fills a hidden folder, which is renamed into place when it is complete."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from robins.results.errors import ResultError, cannot
 
 SOLUTION, SUMMARY, REPORT, FIGURES = "solution.nc", "summary.json", "report.html", "figures"
 _POLL_S = 0.2
-_OF_THE_DESKTOP = {".DS_Store", "Thumbs.db", "desktop.ini"}  # not put there by a person
+_OF_THE_DESKTOP = {".DS_Store", "Thumbs.db", "desktop.ini"}  # files that the desktop creates
 
 
 class ResultWriter:
@@ -30,12 +30,12 @@ class ResultWriter:
             writer.save_summary(summary)
 
     Args:
-        path: the folder; missing parents are made. A folder there that robins did not write, or
-            that another writer is at work on, is refused at once, before anything is computed.
-        scenario_text: the scenario as it was read, with what the command line changed.
-        device: what computed it, e.g. "cpu" or the name of an accelerator.
-        command: the command line or call that makes the result again.
-        patience_s: how long to wait for another writer of the folder before it is refused.
+        path: the folder; missing parents are made. A folder that robins did not write, or that
+            another writer holds, is refused at once, before anything is computed.
+        scenario_text: the scenario as it was read, with the changes of the command line.
+        device: that computed it, e.g. "cpu" or the name of an accelerator.
+        command: the command line or call that reproduces the result.
+        patience_s: time to wait for another writer of the folder before it is refused.
 
     Raises:
         ResultError: the path cannot or must not be written to; also from every method.
@@ -56,7 +56,7 @@ class ResultWriter:
         self.solution: xr.Dataset | None = None
         self._began = monotonic()
         self._moved: list[Path] = []
-        if not patience_s:  # else another writer may be exchanging it; `commit` looks
+        if not patience_s:  # else another writer may be replacing it; `commit` checks
             _check_replaceable(self.path)
         self._stage = _staged(self.path, patience_s)
 
@@ -71,7 +71,7 @@ class ResultWriter:
         self.solution = dataset
 
     def save_summary(self, values: Mapping[str, Any]) -> None:
-        """Set what goes into `summary.json`; `files` is filled in, `seconds` if it is not given.
+        """Set the contents of `summary.json`; `files` is filled in, `seconds` if it is not given.
 
         Raises:
             TypeError, ValueError: a documented key is missing or wrong, or there are others.
@@ -88,14 +88,14 @@ class ResultWriter:
         self.save_file(REPORT, html.encode())
 
     def save_file(self, name: str, content: bytes | Path) -> None:
-        """Store anything else, e.g. the trajectory in another program's format.
+        """Store any other file, e.g. the trajectory in another program's format.
 
         Args:
             name: inside the folder.
-            content: what it holds; or the file to move in, which stays until the result is there.
+            content: of the file; or the path of a file to move in, kept until the result is done.
 
         Raises:
-            ValueError: the name leads out of the folder or is one of robins' own.
+            ValueError: the name leads out of the folder or is reserved.
         """
         parts = PurePosixPath(name).parts
         if not parts or PurePosixPath(name).is_absolute() or ".." in parts:
@@ -116,10 +116,10 @@ class ResultWriter:
             raise cannot(self.path, f"write {name}", error) from error
 
     def commit(self) -> Path:
-        """Make the result appear; the last call.
+        """Put the result in place; the last call.
 
         Raises:
-            ResultError: no summary was saved, or the disk refused; the earlier result is in place.
+            ResultError: no summary was saved, or the disk failed; the earlier result is in place.
         """
         if self.summary is None:
             raise ResultError(self.path, "has no summary", "call save_summary before the commit")
@@ -172,10 +172,10 @@ class ResultWriter:
 
 
 def _staged(path: Path, patience_s: float) -> folder.StagedFolder:
-    """Stage of a result, when no other writer has its folder.
+    """Stage a result once no other writer holds its folder.
 
     Raises:
-        ResultError: another one still has it after that time, or it cannot be made.
+        ResultError: another writer still holds it after that time, or it cannot be made.
     """
     until = monotonic() + patience_s
     while True:
@@ -194,7 +194,7 @@ def _staged(path: Path, patience_s: float) -> folder.StagedFolder:
 
 
 def _check_replaceable(path: Path) -> None:
-    """Refuse to put a result where something lies that robins did not write."""
+    """Refuse to replace a folder that robins did not write."""
     target = folder.resolve(path)
     elsewhere = "choose a new folder"
     with suppress(FileNotFoundError):

@@ -1,6 +1,6 @@
-"""Messages of ROS 2 as other tools read them: their fields, axes, bytes and definitions.
+"""Messages of ROS 2 for other tools: their fields, axes, bytes and definitions.
 
-- `messages`: the four that a vehicle's sensors and estimates need, and their definitions.
+- `messages`: four messages for a vehicle's sensors and estimates, and their definitions.
 - `convert`: from the frames of robins to those of ROS (REP-103, REP-105).
 - `cdr`: the bytes of a message.
 """

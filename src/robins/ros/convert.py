@@ -5,9 +5,9 @@ NED, or RFU and ENU. Quantities whose frames are named become FLU and ENU:
 
     v_FLU = (x, -y, -z) of FRD = (y, -x, z) of RFU        v_ENU = (y, x, -z) of NED
 
-Without a name (a body in space, an inertial frame) axes stay what they are. Numbers are only
-exchanged and turned in sign, so NaN stays NaN, each by itself; quaternions round. A quantity that
-is not given is marked as the message defines: -1 in the covariance of an Imu, else NaN.
+Without a name (a body in space, an inertial frame) axes are unchanged. Components are only permuted
+and change sign, so each NaN stays NaN; quaternions are rounded. A quantity that is not given is
+marked as the message defines: -1 in the covariance of an Imu, else NaN.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _AXES: dict[str | None, _Axes] = {
     "FRD": _Axes((0, 1, 2), (1.0, -1.0, -1.0), (0.0, 1.0, 0.0, 0.0)),
     "RFU": _Axes((1, 0, 2), (1.0, -1.0, 1.0), (_HALF, 0.0, 0.0, -_HALF)),
 }
-_NOT_KNOWN = (-1.0, *(0.0,) * 8)  # the covariance of what an Imu does not measure
+_NOT_KNOWN = (-1.0, *(0.0,) * 8)  # covariance of a quantity that an Imu does not measure
 _NO_COVARIANCE = (0.0,) * 9
 _NO_VECTOR = (math.nan,) * 3
 
@@ -74,9 +74,9 @@ def imu(
         q_nb: (4,) attitude, scalar first, body to nav.
         omega_covariance: (3, 3) [(rad/s)^2].
         f_covariance: (3, 3) [(m/s^2)^2].
-        q_covariance: (3, 3) of small turns about the body's axes [rad^2].
-        body: axes of the vectors and of the attitude; None: they stay.
-        nav: to which the attitude goes; None: it stays.
+        q_covariance: (3, 3) of small rotations about the body's axes [rad^2].
+        body: frame of the vectors and of the attitude; None: axes are unchanged.
+        nav: frame to which the attitude maps; None: axes are unchanged.
     """
     to_b = _AXES[body]
     none = _NOT_KNOWN
@@ -119,8 +119,8 @@ def nav_sat_fix(
         lat_rad: latitude.
         lon_rad: longitude.
         alt_m: above the WGS-84 ellipsoid.
-        covariance: (3, 3) of the position along the axes of ``nav`` [m^2]; of type "unknown" where
-            a number of it is missing.
+        covariance: (3, 3) of the position along the axes of ``nav`` [m^2]; type "unknown" if one of
+            its numbers is missing.
         nav: axes of the covariance.
         status: of ROS; None: a fix where latitude and longitude are numbers.
         service: of ROS.
@@ -146,18 +146,18 @@ def odometry(
     body: BodyFrame | None = None,
     nav: NavFrame | None = None,
 ) -> Odometry:
-    """A pose and a velocity; what is not given is NaN.
+    """A pose and a velocity; quantities not given are NaN.
 
     Args:
         r_n_m: (3,) position along the axes of nav [m].
         q_nb: (4,) attitude, scalar first, body to nav.
         v_b_mps: (3,) velocity along the body's axes [m/s].
         omega_b: (3,) turn rate [rad/s], body axes.
-        pose_covariance: (6, 6) of position [m] and of small turns [rad] about the axes of nav.
+        pose_covariance: (6, 6) of position [m] and of small rotations [rad] about the axes of nav.
         twist_covariance: (6, 6) of velocity [m/s] and turn rate [rad/s], body axes.
         child_frame_id: name of the body's frame.
         body: its axes; None: they stay.
-        nav: axes of the position, and where the attitude goes; None: they stay.
+        nav: frame of the position, to which the attitude maps; None: axes are unchanged.
     """
     to_b, to_n = _AXES[body], _AXES[nav]
     return Odometry(

@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 Floats: TypeAlias = Sequence[float]
 
 UNKNOWN, DIAGONAL_KNOWN, KNOWN = 0, 2, 3  # types of the covariance of a NavSatFix
-NO_FIX, FIX = -1, 0  # its status
+NO_FIX, FIX = -1, 0  # values of `NavSatFix.status`
 
 
 class Imu(NamedTuple):
@@ -55,7 +55,7 @@ class Odometry(NamedTuple):
     child_frame_id: str
     position: Floats  # (3,) m
     orientation: Floats  # (4,) from the child's frame to the header's
-    pose_covariance: Floats  # (36,) m, rad; of position, then of turns about the header's axes
+    pose_covariance: Floats  # (36,) m, rad; of position, then of rotation about its axes
     linear: Floats  # (3,) m/s
     angular: Floats  # (3,) rad/s
     twist_covariance: Floats  # (36,) m/s, rad/s
@@ -136,7 +136,7 @@ geometry_msgs/TwistWithCovariance twist
 
 
 def definition(kind: type[Message]) -> str:
-    """The definition of a type and of all that it is made of, as MCAP's schema "ros2msg" has it.
+    """Definition of a type and of the types in it, in the format of MCAP's schema "ros2msg".
 
     Source: registry of MCAP (mcap.dev/spec/registry), schema encoding ros2msg.
     """

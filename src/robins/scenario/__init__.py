@@ -1,6 +1,6 @@
 r"""Scenarios: TOML text with units in strings, read into a checked parameter class.
 
-A system states its parameters as a class; a quantity has its kind, and the text its unit:
+A system declares its parameters as a class, each quantity with its kind; the text gives the unit:
 
     Axes = tuple[float, float, float]
 
@@ -14,8 +14,8 @@ A system states its parameters as a class; a quantity has its kind, and the text
     drive = parse(Drive, '[imu]\nrate = "100 Hz"', settings=["imu.gyro_bias=2 deg/h"])
     drive.imu.gyro_bias  # three times 9.7e-6 rad/s: one text serves all axes
 
-In a scenario a number without its unit is refused; in Python code a number is SI. Whatever is wrong
-with a scenario is one `ScenarioError` with one line a fault: path, value, what is allowed.
+In a scenario a number without its unit is refused; in Python code a number is SI. All faults of a
+scenario are raised as one `ScenarioError` with a line per fault: path, value, what is allowed.
 """
 
 from robins.scenario.parameters import (

@@ -1,8 +1,7 @@
 """Parameter classes of systems, with kinds of quantities and their bounds.
 
-Each kind has a range, which keeps slips of a power of ten, and of a unit, out of a simulation; it
-is wider than what any vehicle does. A parameter that is narrower by nature has its bounds where it
-is declared.
+Each kind has a range, which keeps errors of a power of ten or of a unit out of a simulation; it is
+wider than the values of any vehicle. A parameter with a narrower range declares its own bounds.
 """
 
 from __future__ import annotations
@@ -50,23 +49,23 @@ MOST: dict[str, str] = {
     "specific force": "10000 g",
     "scale factor": "1000000 ppm",
 }
-"""The greatest magnitude of a kind."""
+"""Greatest magnitude of each kind."""
 
 LEAST: dict[str, str] = {
     kind: "0 K" if kind == "temperature" else f"-{most}" for kind, most in MOST.items()
 }
-"""The least value of a kind."""
+"""Least value of each kind."""
 
 assert MOST.keys() == units.KINDS.keys(), "every kind has a range"
 
 Share = Annotated[float, pydantic.Field(ge=0.0, le=1.0)]
-"""A part of a whole."""
+"""A share, from 0 to 1."""
 
 Positive = Annotated[float, pydantic.Field(gt=0.0, le=1e6)]
 """A factor or a figure above zero."""
 
 Dof = Annotated[float, pydantic.Field(gt=2.0, le=1e6)]
-"""Degrees of freedom of Student's t that has a variance."""
+"""Degrees of freedom of a Student's t distribution with finite variance (above 2)."""
 
 Entry = Annotated[float, pydantic.Field(ge=-1e3, le=1e3)]
 """An entry of a matrix, or of a vector that gives a direction."""
@@ -77,8 +76,8 @@ class Quantity:
     """Marks a float, or a tuple of floats, as a quantity of a kind: text with a unit, kept as SI.
 
     Bounds are texts too: ``above`` and ``below`` exclude the bound, ``least`` and ``most`` include
-    it. A side without one has that of the kind, `robins.scenario.parameters`. On a tuple of fixed
-    length each item is a quantity, and one serves for all.
+    it; the default is the bound of the kind, in `robins.scenario.parameters`. In a tuple of fixed
+    length each item is a quantity, and a single text sets all.
 
     Raises:
         KeyError: unknown kind.
@@ -97,7 +96,7 @@ class Quantity:
             units.parse(bound, self.kind)
 
     def _bounds(self) -> list[tuple[str, str, Callable[[float, float], bool]]]:
-        """The lower bound, then the upper: its word, its text, and how it is kept."""
+        """Lower and upper bound: keyword, text, and comparison."""
         low = ("at least", self.least or LEAST[self.kind], operator.ge)
         high = ("at most", self.most or MOST[self.kind], operator.le)
         return [
@@ -133,7 +132,7 @@ class Quantity:
 
         def on_each_axis(value, info):
             if isinstance(value, str | int | float):
-                self.read(value, unit_needed=info.mode == "json")  # one slip, one message
+                self.read(value, unit_needed=info.mode == "json")  # one message per error
                 return (value,) * len(items)
             return tuple(value) if isinstance(value, list) else value
 
@@ -146,9 +145,9 @@ def default(text: str, *more: str) -> Any:
 
 
 class Parameters(pydantic.BaseModel):
-    """Base of all parameter classes: unchangeable, no unknown key, no silent conversion.
+    """Base of all parameter classes: immutable, without unknown keys or silent conversions.
 
-    A truth value is no number, text is no number, NaN is refused.
+    Booleans and texts are not numbers, and NaN is refused.
     """
 
     model_config = pydantic.ConfigDict(
@@ -157,7 +156,7 @@ class Parameters(pydantic.BaseModel):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Refuse a default that would stay text."""
+        """Refuse a default text that would not be converted."""
         for name, info in cls.model_fields.items():
             marked = any(isinstance(m, Quantity) for m in info.metadata)
             if marked and isinstance(info.default, str) and not info.validate_default:
@@ -165,7 +164,7 @@ class Parameters(pydantic.BaseModel):
 
 
 class Span(Parameters):
-    """A time from `begin` (included) to `end` (not)."""
+    """A time span from `begin` (included) to `end` (excluded)."""
 
     begin: Annotated[float, Quantity("time", least="0 s")]
     end: Annotated[float, Quantity("time", above="0 s")]
@@ -177,6 +176,6 @@ class Span(Parameters):
         return self
 
     def holds(self, time_s: Any) -> np.ndarray:
-        """Mask of the times in it; those of a grid are rounded."""
+        """Mask of the times in the span, with a tolerance for rounding of times on a grid."""
         time = np.asarray(time_s, float)
         return (time >= self.begin - 1e-9) & (time < self.end - 1e-9)

@@ -1,4 +1,4 @@
-"""Reads a scenario's text into parameters, with a message where that fails.
+"""Reader of a scenario's text into parameters, with messages for its faults.
 
 pydantic's findings become one line a fault, with path, value and fix.
 """
@@ -33,7 +33,7 @@ def faults(
     mapping: Mapping[str, Any],
     errors: list[pydantic_core.ErrorDetails],
 ) -> list[str]:
-    """One line for each thing wrong with the tables of a scenario: unknown keys come first."""
+    """One line for each fault in the tables of a scenario, unknown keys first."""
     unknown, missing, wrong = [], {}, []
     for error in errors:
         path, value = _locate(mapping, error["loc"])
@@ -42,19 +42,19 @@ def faults(
         elif error["type"] == "missing":
             missing[dotted(path)] = f"{dotted(path)}: required, but not given"
         else:
-            # What is wrong with the whole names its keys itself.
+            # A fault of the whole scenario names its keys itself.
             where = f"{dotted(path)} = {_shown(value)}: " if path else ""
             wrong.append(where + _reason(error))
     lines = []
     for path, loc in unknown:
         meant, line = _unknown_key(cls, path, loc)
-        missing.pop(meant, None)  # one slip, one line
+        missing.pop(meant, None)  # one line per error
         lines.append(line)
     return [*lines, *missing.values(), *wrong]
 
 
 def _locate(mapping: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any]:
-    """Path and value of a fault; pydantic's own names for the branches of a union fall away."""
+    """Path and value of a fault, without pydantic's names for the branches of a union."""
     path: list[int | str] = []
     value: Any = mapping
     for i, step in enumerate(loc):
@@ -106,7 +106,7 @@ def _nearest(word: str, among: list[str]) -> str | None:
 def _unknown_key(
     cls: type[pydantic.BaseModel], path: list[int | str], loc: tuple[int | str, ...]
 ) -> tuple[str, str]:
-    """The dotted key that was probably meant (or nothing), and the line of the message."""
+    """Dotted key that was probably meant (or empty), and the line of the message."""
     models = [cls]
     for step in loc[:-1]:
         inner = [m.model_fields[step].annotation for m in models if step in m.model_fields]
@@ -122,7 +122,7 @@ def _unknown_key(
 
 
 def _is_branch(model: type[pydantic.BaseModel], step: int | str) -> bool:
-    """True if that is pydantic's name of a class among several: its own, or that of its tag."""
+    """True if a step is pydantic's name of a class in a union: that of the class or its tag."""
     tags = [tag for info in model.model_fields.values() for tag in get_args(info.annotation)]
     return step == model.__name__ or step in tags
 
@@ -176,8 +176,8 @@ def validate(cls: type[P], mapping: Mapping[str, Any], *, source: str = "") -> P
     Raises:
         ScenarioError: an unknown or missing key, a wrong unit or value.
     """
-    # As JSON, for a TOML list may then fill a tuple and a text a path or a choice, while numbers,
-    # truth values and texts are still never converted into each other.
+    # As JSON, so that a TOML list can fill a tuple, and a text a path or a choice, while numbers,
+    # booleans and texts are never converted into each other.
     try:
         return cls.model_validate_json(json.dumps(mapping, default=date_text))
     except pydantic.ValidationError as error:

@@ -1,4 +1,4 @@
-"""A parameter of a scenario times a factor, with the unit that it is written in."""
+"""Scaling of a parameter of a scenario by a factor, in the unit in which it is written."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def written(parameters: Parameters, mapping: Mapping[str, Any], key: str) -> Any
     """A parameter as the scenario writes it, or as its class writes its default.
 
     Args:
-        parameters: the scenario, read.
+        parameters: the scenario as read.
         mapping: its tables.
         key: path, such as "imu.gyro_noise"; items of a list are named by their number.
 
@@ -53,7 +53,7 @@ def scaled(key: str, value: Any, factor: float) -> Any:
     """A value as it is written, times a factor: a number, a text with a unit, or a list of these.
 
     Raises:
-        ScenarioError: it is neither, or it is zero, which no factor changes.
+        ScenarioError: it is none of these, or it is zero, which no factor changes.
     """
     of = _scaled(key, value, factor)
     if factor != 1.0 and of == _scaled(key, value, 1.0):

@@ -1,4 +1,4 @@
-"""The text of a scenario: TOML in, settings of the command line over it, TOML out."""
+"""Text of a scenario: reading TOML, applying settings of the command line, writing TOML."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from robins.errors import RobinsError
 
 
 class ScenarioError(RobinsError, ValueError):
-    """A scenario that cannot be used; `faults` has one line for each thing that is wrong."""
+    """A scenario that cannot be used; `faults` has one line for each fault."""
 
     def __init__(self, faults: Iterable[str]):
         self.faults = tuple(faults)
@@ -51,7 +51,7 @@ def read_text(path: str | Path) -> str:
 
 
 def mapping_of(text: str, *, source: str = "") -> dict[str, Any]:
-    """The tables of a TOML text.
+    """Parse a TOML text into its tables.
 
     Raises:
         ScenarioError: not TOML; the message names line and column.
@@ -63,7 +63,7 @@ def mapping_of(text: str, *, source: str = "") -> dict[str, Any]:
 
 
 def override(mapping: Mapping[str, Any], settings: Iterable[str]) -> dict[str, Any]:
-    """A copy of the tables with ``path=value`` settings applied, the later ones winning.
+    """Copy of the tables with ``path=value`` settings applied; later ones override earlier ones.
 
     The value is read as TOML (``3``, ``true``, ``["1 m", "2 m"]``), else it is text as it stands
     (``2 deg/h``). Items of a list are named by their number, from 0. `validate`, which knows all
@@ -132,7 +132,7 @@ def dotted(path: Iterable[object]) -> str:
 
 
 def _quoted(text: str) -> str:
-    # JSON's escapes are TOML's, but for the one control character that JSON leaves alone.
+    # JSON's escapes are valid TOML, except for one control character that JSON does not escape.
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 

@@ -1,14 +1,14 @@
 """Physics server of ArduPilot's SITL: receives servo outputs, returns the motion as JSON.
 
-Over UDP; ArduPilot sends to port 9002, we answer to where that came from. Its packets, little
-endian, of 16 channels or, with its parameter SERVO_32_ENABLE, of 32:
+Over UDP: ArduPilot sends to port 9002, and we answer to the sender's address. Its packets, little
+endian, have 16 channels or, with its parameter SERVO_32_ENABLE, 32:
 
     magic u16 (18458; 29569 of 32) | frame_rate u16 [Hz] | frame_count u32 | pwm u16, u16 ... [us]
 
 ArduPilot waits for an answer to each packet, so the two are in lock-step. If none comes for some
-seconds it sends the packet again with the same count, and we answer the same again: nothing is
-computed twice. A count that jumps means lost packets. A smaller count, or another
-port, means that ArduPilot was restarted: the physics then has to restart too.
+seconds it sends the packet again with the same count, and we repeat the answer: nothing is
+computed twice. A jump of the count means lost packets. A smaller count, or another port, means
+that ArduPilot was restarted: the physics then has to restart too.
 
 UDP has no connection, so any host that reaches the port can send. The first sender of a packet is
 the ArduPilot; `admits` is the rule by which another address takes its place. Datagrams of all
@@ -38,8 +38,8 @@ from robins.bench.bridges.errors import BridgeClosed, BridgeError, finite, vecto
 PORT = 9002
 MAGIC = {18458: struct.Struct("<HHI16H"), 29569: struct.Struct("<HHI32H")}
 RANGEFINDERS = 6  # that ArduPilot has fields for
-_WAITING = 64  # datagrams that are kept while an answer is computed
-SILENT_S = 1.0  # without a packet of the old address, before another may take its place
+_WAITING = 64  # datagrams buffered while an answer is computed
+SILENT_S = 1.0  # silence of the bound address before another may replace it
 Vector = Sequence[float] | np.ndarray
 Address = tuple[str, int]
 
@@ -48,9 +48,9 @@ class Servos(NamedTuple):
     """A packet of ArduPilot."""
 
     frame: int  # number of the packet since ArduPilot started
-    rate_hz: int  # steps a second that ArduPilot would like; the physics may take others
+    rate_hz: int  # rate that ArduPilot requests; the physics may use another
     pwm_us: tuple[int, ...]  # 16 or 32 pulses, 1000 to 2000; 0: this output does nothing
-    restarted: bool = False  # ArduPilot was restarted: begin at time zero
+    restarted: bool = False  # ArduPilot was restarted: start at time zero
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,8 +65,8 @@ class BodyState:
         v_n_m_s: north, east, down.
         q_nb: FRD to NED, scalar first.
         airspeed_m_s: of the pitot tube.
-        wind_n_m_s: north, east, down; of the air over ground.
-        apparent_wind: direction [rad], clockwise from ahead, where it comes from; speed [m/s].
+        wind_n_m_s: velocity of the air over ground; north, east, down.
+        apparent_wind: direction it comes from [rad], clockwise from ahead; speed [m/s].
         rangefinders_m: 6 at most.
         battery: voltage [V], current [A].
     """
@@ -85,10 +85,10 @@ class BodyState:
 
 
 def decode(datagram: bytes) -> Servos:
-    """A packet of servo outputs.
+    """Decode a packet of servo outputs.
 
     Raises:
-        BridgeError: it is none: of another length, or of another magic number.
+        BridgeError: the length or the magic number is wrong.
     """
     layout = MAGIC.get(int.from_bytes(datagram[:2], "little"))
     if layout is None or len(datagram) != layout.size:
@@ -102,7 +102,7 @@ def decode(datagram: bytes) -> Servos:
 
 
 def encode(state: BodyState) -> bytes:
-    """The line of JSON of a motion, newlines at both ends included.
+    """JSON line of a motion, newlines at both ends included.
 
     Raises:
         BridgeError: a number is NaN or infinite, or there are too few or too many.
@@ -139,24 +139,24 @@ def encode(state: BodyState) -> bytes:
 class ArduPilotCounts:
     """Counts of datagrams since the socket was opened."""
 
-    packets: int = 0  # of servo outputs, those that are repeated included
-    lost: int = 0  # by the jumps of the count
-    repeated: int = 0  # that ArduPilot sent again, for want of an answer
+    packets: int = 0  # of servo outputs, repeated ones included
+    lost: int = 0  # from jumps of the count
+    repeated: int = 0  # sent again by ArduPilot for lack of an answer
     restarts: int = 0
     wrong: int = 0  # datagrams that are no servo outputs
     strangers: int = 0  # datagrams of an address that is not that of the autopilot
 
 
 class ArduPilotPhysics:
-    """The end of the line that ArduPilot sends to; closes as a context. For one thread.
+    """UDP socket that ArduPilot sends to; closes as a context manager. For one thread.
 
     Attributes:
-        port: that ArduPilot has to send to.
-        counts: of what came.
+        port: to which ArduPilot has to send.
+        counts: of the datagrams received.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = PORT, peer: str = ""):
-        """Listen.
+        """Open the socket.
 
         Args:
             host: address of this machine to listen at.
@@ -166,7 +166,7 @@ class ArduPilotPhysics:
                 port until this end is closed.
 
         Raises:
-            BridgeClosed: the port cannot be had.
+            BridgeClosed: the port is not available.
         """
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -180,7 +180,7 @@ class ArduPilotPhysics:
             ) from None
         self.port: int = self._socket.getsockname()[1]
         self.counts = ArduPilotCounts()
-        self._last: int | None = None  # number of the packet that was handed out last
+        self._last: int | None = None  # number of the last packet returned by `receive`
         self._peer: Address | None = None  # who sent it
         self._declared, self._active = peer, 0.0  # time of the last packet or answer
         self._answer = b""  # to it; empty: none yet
@@ -197,12 +197,12 @@ class ArduPilotPhysics:
         self._socket.close()
 
     def admits(self, sender: Address) -> bool:
-        """True if datagrams of this address are read.
+        """True if datagrams of this address are accepted.
 
-        The bound address always is. Another is if no address is bound yet, or if it is of the same
-        machine, that machine is this one (loopback) or the declared peer, and the bound address has
-        been silent for `SILENT_S` since its last packet and our last answer: a restarted ArduPilot
-        sends from another port, and repeats its packet until it is answered.
+        The bound address always is. Another is accepted if no address is bound yet; or if it is on
+        the same machine, that machine is this one (loopback) or the declared peer, and the bound
+        address has been silent for `SILENT_S` since its last packet and our last answer: a
+        restarted ArduPilot sends from another port, and repeats its packet until it is answered.
         """
         if sender == self._peer:
             return True
@@ -215,9 +215,9 @@ class ArduPilotPhysics:
         return sender[0] == self._peer[0] and known and silent
 
     def receive(self, timeout_s: float) -> Servos | None:
-        """Next packet that requests a step; None: none came in that time.
+        """Next packet that requests a step; None: none came within the time-out.
 
-        A packet that was answered and comes again is answered again and not handed out.
+        A repeated packet that was already answered is answered again and not returned.
 
         Raises:
             BridgeClosed: this end was closed.
@@ -232,7 +232,7 @@ class ArduPilotPhysics:
                 return servos
 
     def reply(self, state: BodyState) -> None:
-        """Answer the packet that was received last with the motion after its step.
+        """Answer the last packet with the motion after its step.
 
         Raises:
             BridgeError: a number is NaN or infinite, or there are too few or too many.
@@ -261,7 +261,7 @@ class ArduPilotPhysics:
             return False
 
     def _sort(self, datagram: bytes, sender: Address) -> Servos | None:
-        """Packet that requests a step; None: it was no packet, or it was answered again."""
+        """Packet that requests a step; None: it was not one, or its answer was repeated."""
         try:
             servos = decode(datagram)
         except BridgeError:
@@ -296,7 +296,7 @@ class ArduPilotPhysics:
             raise BridgeClosed(f"cannot answer: {error}", f"port {self.port}") from None
 
     def _take(self, timeout_s: float) -> tuple[bytes, Address] | None:
-        """The next datagram of an address that is admitted; None: none came in that time."""
+        """Next datagram of an admitted address; None: none came within the time-out."""
         deadline = time.monotonic() + timeout_s
         try:
             while True:

@@ -13,11 +13,11 @@ from robins.errors import RobinsError
 
 
 class BridgeError(RobinsError, ValueError):
-    """A value that a protocol cannot carry, or bytes that are none of its messages."""
+    """A value that a protocol cannot carry, or bytes that are not one of its messages."""
 
 
 class BridgeClosed(RobinsError, ConnectionError):
-    """No program is connected at the other end, or no longer."""
+    """The other end is not connected, or has disconnected."""
 
     bad_input = False
 
@@ -35,7 +35,7 @@ class MissingPackage(RobinsError, ImportError):
 
 
 def needed(module: str, extra: str) -> ModuleType:
-    """A module of an optional package.
+    """Import a module of an optional package.
 
     Raises:
         MissingPackage: it is not installed; names the extra that brings it.
@@ -51,7 +51,7 @@ def needed(module: str, extra: str) -> ModuleType:
 
 
 def finite(name: str, value: float | int, message: str) -> float:
-    """A number that a message can carry.
+    """Check a number for a message.
 
     Raises:
         BridgeError: it is NaN or infinite.
@@ -62,7 +62,7 @@ def finite(name: str, value: float | int, message: str) -> float:
 
 
 def vector(name: str, values: Sequence[float] | np.ndarray, message: str, size: int = 3):
-    """Numbers that a message can carry, as a list of `size` floats.
+    """Check the numbers of a vector field, and return them as a list of `size` floats.
 
     Raises:
         BridgeError: there are more or fewer, or one is NaN or infinite.
@@ -73,10 +73,10 @@ def vector(name: str, values: Sequence[float] | np.ndarray, message: str, size: 
 
 
 def whole(name: str, value: float | int, low: int, high: int, message: str) -> int:
-    """The nearest whole number, where a field holds those from `low` to `high` only.
+    """Round to a whole number for a field that holds `low` to `high`.
 
     Raises:
-        BridgeError: it is beyond them, or not finite.
+        BridgeError: it is out of range, or not finite.
     """
     finite(name, value, message)
     number = round(value)

@@ -1,7 +1,7 @@
 """The simulator that PX4's SITL connects to: MAVLink 2 over TCP, in lock-step.
 
-PX4 is the client, we listen (port 4560 and its instance number). In lock-step its clock is the time
-of our samples, so that neither side can run ahead:
+PX4 is the client, we listen (port 4560 plus its instance number). In lock-step its clock is the
+time of our samples, so neither side can run ahead:
 
     1. We send HIL_SENSOR with the time of the simulation, and what else is due.
     2. PX4 sets its clock, runs once, and sends HIL_ACTUATOR_CONTROLS with the same time.
@@ -28,8 +28,8 @@ from robins.foreign import decoding
 
 PORT = 4560
 SYSTEM, COMPONENT = 1, 200  # ours; PX4 does not look at them
-SEND_S = 5.0  # that PX4 may leave our bytes unread
-FREEWHEEL_S = 0.004  # that a step waits for an answer while PX4 starts
+SEND_S = 5.0  # time-out of a send that PX4 does not read
+FREEWHEEL_S = 0.004  # wait for an answer in each step while PX4 starts
 
 
 @dataclass
@@ -38,18 +38,18 @@ class Px4Counts:
 
     actuators: int = 0
     heartbeats: int = 0
-    late: int = 0  # answers to an earlier sample than the one that a step waited for
+    late: int = 0  # answers to an earlier sample than the one awaited
     others: int = 0  # messages that we do not use
-    bad: int = 0  # pieces of bytes that are no message, of a wrong check for example
+    bad: int = 0  # bytes that form no message, for example because of a wrong checksum
     strangers: int = 0  # connections of another machine, closed at once
 
 
 class Px4Simulator:
-    """The end of the line that PX4 connects to; closes as a context. For one thread.
+    """TCP server that PX4 connects to; closes as a context manager. For one thread.
 
     Attributes:
-        port: that PX4 has to connect to.
-        counts: of what came.
+        port: to which PX4 has to connect.
+        counts: of the messages received.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = PORT, peer: str = ""):
@@ -57,12 +57,12 @@ class Px4Simulator:
 
         Args:
             host: address of this machine to listen at.
-            port: 4560 and the number of PX4's instance; 0: any that is free.
+            port: 4560 plus the number of PX4's instance; 0: any that is free.
             peer: numeric address of the machine of PX4; without it that of the first connection.
 
         Raises:
             MissingPackage: pymavlink is not installed.
-            BridgeClosed: the port cannot be had.
+            BridgeClosed: the port is not available.
         """
         self._mavlink = dialect()
         try:
@@ -99,22 +99,22 @@ class Px4Simulator:
         return not self._answers
 
     def close(self) -> None:
-        """Hang up and stop listening. May be repeated."""
+        """Disconnect and stop listening. May be repeated."""
         self.hang_up()
         self._server.close()
 
     def hang_up(self) -> None:
-        """End the connection that there may be; PX4 can connect again. May be repeated."""
+        """End the connection, if any; PX4 can connect again. May be repeated."""
         if self._line is not None:
             self._line.close()
             self._line = None
 
     def accept(self, timeout_s: float) -> None:
-        """Wait for PX4 to connect, in place of a connection that there may be, and greet it.
+        """End any connection, wait for PX4 to connect, and greet it.
 
         Raises:
-            BridgeTimeout: it did not.
-            BridgeClosed: this end was closed, or PX4 went at once.
+            BridgeTimeout: it did not connect.
+            BridgeClosed: this end was closed, or PX4 disconnected at once.
         """
         self.hang_up()
         deadline = time.monotonic() + timeout_s
@@ -152,7 +152,7 @@ class Px4Simulator:
         self._put(message(sample))
 
     def actuators(self, timeout_s: float) -> Actuators | None:
-        """Next actuator commands of PX4; None: nothing came in that time.
+        """Next actuator commands of PX4; None: none came within the time-out.
 
         Raises:
             BridgeClosed: PX4 is not connected, or has gone.
@@ -167,10 +167,10 @@ class Px4Simulator:
         return self._waiting.popleft()
 
     def step(self, sample: Sensors, timeout_s: float = 5.0) -> Actuators | None:
-        """Send a sample and wait for the answer with its time; None while PX4 starts.
+        """Send a sample and wait for the answer with its time stamp; None while PX4 starts.
 
         A PX4 that was built without lock-step has a clock of its own: then the newest controls
-        count. What else is due (`GnssFix`, `Truth`) is sent before.
+        count. Send other messages that are due (`GnssFix`, `Truth`) before.
 
         Raises:
             BridgeError: the message cannot carry a number of the sample.
@@ -203,16 +203,16 @@ class Px4Simulator:
     def _put(self, packed: Any) -> None:
         line = self._connected()
         line.settimeout(SEND_S)
-        # `pack` leaves the count of messages to who sends.
+        # `pack` leaves the message counter to the sender.
         data = packed.pack(self._mav)
         self._mav.seq = (self._mav.seq + 1) % 256
         try:
             line.sendall(data)
-        except OSError as error:  # of a message cut off nothing more can be sent
+        except OSError as error:  # after a truncated message nothing more can be sent
             raise self._gone(error) from None
 
     def _take(self, timeout_s: float) -> None:
-        """Sort what comes in within a time."""
+        """Receive for a time, and handle each message."""
         line = self._connected()
         line.settimeout(timeout_s)
         try:

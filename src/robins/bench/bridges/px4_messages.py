@@ -6,7 +6,7 @@
     HIL_ACTUATOR_CONTROLS (93), from PX4  `Actuators`
 
 (MAVLink, common message set; PX4 guide, "Simulator MAVLink API".) Here everything is in SI, in NED
-and FRD; the units of the messages are made at the edge. Real numbers of HIL_SENSOR are 32 bit wide,
+and FRD; conversion to the units of the messages is at the edge. HIL_SENSOR has 32-bit floats,
 so a rate of 1 rad/s is rounded by up to 6e-8.
 """
 
@@ -25,14 +25,14 @@ from robins.earth.atmosphere import pressure_altitude_m
 Vector = Sequence[float] | np.ndarray
 
 INT16, UINT16, INT32 = (-(2**15), 2**15 - 1), (0, 2**16 - 1), (-(2**31), 2**31 - 1)
-UNKNOWN = 65535  # of 16-bit fields
+UNKNOWN = 65535  # value of 16-bit fields
 GRAVITY_M_S2 = 9.80665  # of a unit "G" of MAVLink
 GAUSS_PER_T = 1e4
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sensors:
-    """A sample of the inertial sensors, with others when they are due; None: not this time.
+    """A sample of the inertial sensors, and of others when they are due; None: not in this sample.
 
     Attributes:
         time_us: of the simulation. PX4 in lock-step has no other clock.
@@ -41,7 +41,7 @@ class Sensors:
         field_b_T: magnetic flux density, FRD.
         pressure_Pa: static.
         differential_pressure_Pa: of the pitot tube.
-        temperature_K: of the sensors; PX4 takes it with a pressure.
+        temperature_K: of the sensors; PX4 reads it together with a pressure.
     """
 
     time_us: int
@@ -58,13 +58,13 @@ class GnssFix:
     """A fix of a GNSS receiver.
 
     Attributes:
-        time_us: of the simulation; PX4 takes it for UTC too.
+        time_us: of the simulation; PX4 uses it as UTC too.
         lat_rad, lon_rad: geodetic.
         alt_m: above mean sea level.
         v_n_m_s: north, east, down.
         horizontal_m, vertical_m: standard deviations. The field of MAVLink is a dilution of
             precision times 100; PX4 reads it as centimetres, and so it is sent.
-        kind: 3: a fix in three dimensions; 0 or 1: none.
+        kind: 3: a 3D fix; 0 or 1: none.
         satellites: used.
     """
 
@@ -86,7 +86,7 @@ class Truth:
     Attributes:
         time_us: of the simulation.
         q_nb: FRD to NED, scalar first.
-        omega_nb_b_rad_s: rate of the body against the local level, FRD.
+        omega_nb_b_rad_s: turn rate of the body with respect to local level, FRD.
         lat_rad, lon_rad: geodetic.
         alt_m: above mean sea level.
         v_n_m_s: north, east, down.
@@ -128,7 +128,7 @@ class Actuators(NamedTuple):
 
 
 def dialect() -> Any:
-    """MAVLink's common set as pymavlink has it.
+    """Import pymavlink's module of MAVLink's common set.
 
     Raises:
         MissingPackage: pymavlink is not installed.
@@ -163,7 +163,7 @@ def _hil_sensor(s: Sensors) -> Any:
             altitude = pressure_altitude_m(s.pressure_Pa)
         except ValueError as error:
             raise BridgeError(f"pressure_Pa has no height: {error}", name) from None
-        # PX4 takes a pressure only with its height and its temperature.
+        # PX4 accepts a pressure only together with its height and temperature.
         updated |= (
             mavlink.HIL_SENSOR_UPDATED_ABS_PRESSURE
             | mavlink.HIL_SENSOR_UPDATED_PRESSURE_ALT

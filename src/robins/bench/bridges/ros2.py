@@ -1,6 +1,6 @@
 """Topics of ROS 2 over Zenoh, without ROS: publish and subscribe.
 
-ROS 2 is reached by one of two programs on its side, each with its convention for keys:
+ROS 2 is reached through one of two programs on its side, each with its own key convention:
 
 - "ros2dds": zenoh-bridge-ros2dds, next to ROS 2 over DDS. The key is the topic without its first
   slash, "imu/data"; the payload is CDR.
@@ -14,8 +14,8 @@ liveliness token is declared, so tools that list topics do not show ours.
 Messages are those of `robins.ros`, in the frames of ROS; its functions `imu`, `nav_sat_fix` and
 `odometry` make them of what robins has. Only the hash of a type needs rosbags.
 
-A session discovers no peers by itself: it connects to the endpoints that are given and listens at
-those that are given, such as "tcp/127.0.0.1:7447".
+A session discovers no peers by itself: it connects to and listens at the endpoints given, such as
+"tcp/127.0.0.1:7447".
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from typing import Any, Literal
 from robins.bench.bridges.errors import BridgeClosed, BridgeError, needed
 from robins.ros import Message, RosError, Stamped, decode, encode, name_of
 
-DISTRO = "jazzy"  # whose definitions are hashed
+DISTRO = "jazzy"  # distribution of ROS 2 whose definitions are hashed
 Convention = Literal["ros2dds", "rmw_zenoh"]
-KEPT = 100  # samples of a topic that wait to be taken; beyond, the oldest go
+KEPT = 100  # samples of a topic that wait to be taken; then the oldest are dropped
 _ATTACHMENT = struct.Struct("<qqB16s")
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
@@ -68,11 +68,11 @@ def topic_key(
     domain: int = 0,
     distro: str = DISTRO,
 ) -> str:
-    """The key that a topic has in Zenoh.
+    """Zenoh key of a topic.
 
     Args:
         topic: fully qualified, such as "/imu/data".
-        kind: what is sent on it.
+        kind: its message type.
         convention: of the program on the side of ROS.
         domain: ROS_DOMAIN_ID, for rmw_zenoh.
         distro: of ROS, for rmw_zenoh, whose keys have a hash of the definition since Iron.
@@ -99,8 +99,8 @@ class Ros2Topics:
     """A session of Zenoh with publishers and subscribers of ROS topics; closes as a context.
 
     Attributes:
-        bad: samples taken that were no message of their topic.
-        dropped: samples that were not taken in time.
+        bad: samples that could not be decoded as their topic's type.
+        dropped: samples discarded because they were not taken in time.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Ros2Topics:
 
         Args:
             convention: of the program on the side of ROS.
-            connect: endpoints to connect to. A peer tries until they are there, a client does not.
+            connect: endpoints to connect to. A peer retries until they exist, a client does not.
             listen: endpoints to listen at.
             mode: "client" where a router stands between, which then forwards everything.
             domain: ROS_DOMAIN_ID, for rmw_zenoh.
@@ -189,7 +189,7 @@ class Ros2Topics:
         return publisher is not None and publisher.matching_status.matching
 
     def subscribe(self, topic: str, kind: type[Message]) -> None:
-        """Keep what comes on a topic until it is taken, the last 100 samples.
+        """Subscribe to a topic; its last 100 samples wait to be taken.
 
         Raises:
             BridgeError: the topic has no full name, or had another type before.
@@ -209,7 +209,7 @@ class Ros2Topics:
         self._subscribers[key] = self._session.declare_subscriber(key, keep)
 
     def take(self, topic: str, timeout_s: float) -> Stamped | None:
-        """The oldest message that waits on a topic; None: nothing came in that time.
+        """Take the oldest message that waits on a topic; None: none came within the time-out.
 
         Raises:
             BridgeError: there is no subscription to the topic.

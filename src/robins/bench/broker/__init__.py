@@ -1,9 +1,9 @@
-"""The broker of the bench: it holds the far ends of all lines and passes messages on.
+"""The broker of the bench: it holds the bench's ends of all lines and passes messages on.
 
-- `broker`: passes messages between parts, step by step. `link`: one far end, and the checks of its
-  frames.
+- `broker`: passes messages between parts, step by step. `link`: the bench's end of one line, with
+  the checks of its frames, and the errors that end a run.
 - `faults`: faults that can be injected, as parameters; `injector` applies them.
-- `revive`: sends a restarted part all its input again. `errors`: conditions that end a run.
+- `restart`: sends a restarted part its input again. `console`: messages of the operator.
 """
 
 from robins.bench.broker.broker import Broker, Wiring

@@ -1,8 +1,8 @@
-"""Broker of messages between the parts, step by step, over the links whose far ends it holds.
+"""Broker of messages between the parts, step by step, over the links to all of them.
 
-In each step it ticks a part as soon as all parts whose data of this step it needs are done, and the
-step is over when all are. Nothing here depends on how long anything took: only the clock decides
-when a step begins and how long a part is waited for.
+In each step it ticks a part as soon as all parts whose data of this step it needs are done; the
+step is over when all parts are done. Nothing here depends on computing times: only the clock
+decides when a step begins and how long to wait for a part.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from robins.bench.wire.frames import Frame
 from robins.bench.wire.schema import BARE, Wire
 
 Sends = Mapping[str, tuple[str, ...]]  # messages that a part sends
-Takes = Mapping[str, Mapping[str, int]]  # messages that it takes, and how many steps older
-_REMEMBERED = 64  # steps, whose messages are known if they come again
-_REPORT_S = 10.0  # between two reports of the parts that are waited for
-_POLL_S = 0.05  # period of polling everything but the wire while nothing comes
+Takes = Mapping[str, Mapping[str, int]]  # messages that it takes, each with its lag in steps
+_REMEMBERED = 64  # steps for which repeated messages are recognised
+_REPORT_S = 10.0  # period of reports on the parts that are waited for
+_POLL_S = 0.05  # period of polling everything but the lines while nothing comes
 _CLOCK_NS = time.monotonic_ns
 
 
@@ -48,16 +48,16 @@ class Wiring(NamedTuple):
         return tuple(p for p, taken in self.takes.items() if message in taken)
 
     def lag(self, message: str) -> int:
-        """Steps for which a part may wait for a message."""
+        """Greatest lag [steps] with which a part takes a message."""
         return max((taken.get(message, 0) for taken in self.takes.values()), default=0)
 
 
 class Broker:
-    """Hub of the star of links.
+    """Hub of all links.
 
     Attributes:
         links: by part.
-        time_ns: of the run: the end of the step that is being computed.
+        time_ns: time of the run: the end of the current step.
         silent: steps in which a part did not answer in time, by part.
         off: parts without power: nothing is sent to them, and none is waited for.
     """
@@ -84,16 +84,15 @@ class Broker:
             step_ns: length of a step.
             injector: the faults that the links have.
             observe: called with each message that passes: name, time [ns], payload.
-            poll_processes: called now and then while nothing comes, and once a step.
-            done: called with each answer: part, step, when ticked, when answered [ns of the wall
-                clock], time it computed [ns].
-            meanwhile: called when there is nothing to do but to wait for a part: what need not be
-                done before the part computes is done while it does.
+            poll_processes: called now and then while nothing comes, and once per step.
+            done: called with each answer: part, step, times of tick and answer [ns of the wall
+                clock], computing time [ns].
+            meanwhile: called when all parts due are computing, for work that need not precede it.
             keep: the histories of the parts that can be restarted.
-            idle_s: for how long the process of a part has done nothing [s]; one that computes is
-                waited for however long it takes. Infinite: it has none.
-            waiting: given the parts whose hello is waited for, and for how long they have been [s];
-                when they are others, and now and then.
+            idle_s: idle time of the process of a part [s]; a process that computes has no time-out.
+                Infinite: the part has no process.
+            waiting: called with the parts whose hello is missing, and the waiting time [s]: when
+                the parts change, and now and then.
         """
         self.links, self.wiring, self.step_ns = dict(links), wiring, step_ns
         self.time_ns = 0
@@ -112,8 +111,8 @@ class Broker:
         self._lags = {name: wiring.lag(name) for p in links for name in wiring.sends[p]}
         self._sends = {p: frozenset(wiring.sends[p]) for p in links}
         self._kept = dict(keep or {})
-        self._routed: dict[int, set[str]] = {}  # messages by their time, of the last steps
-        self._ticked: dict[str, tuple[int, int]] = {}  # first and last sent [ns of the wall clock]
+        self._routed: dict[int, set[str]] = {}  # messages passed, by time, of the last steps
+        self._ticked: dict[str, tuple[int, int]] = {}  # first and last sent [ns of wall clock]
         self._done: set[str] = set()
         self._by_fd = {link.fd: link for link in links.values()}
         self._fds = list(self._by_fd)
@@ -128,7 +127,7 @@ class Broker:
 
         Args:
             run: its number.
-            patience_s: for a part without a process, or whose process does nothing.
+            patience_s: time-out for a part without a process, or whose process is idle.
 
         Raises:
             BenchError: a part sends nothing, or uses another version of the wire.
@@ -179,19 +178,19 @@ class Broker:
         again_ns: int = 1_000_000_000,
         most_ns: int = 30_000_000_000,
     ) -> None:
-        """One step of all parts.
+        """Execute one step of all parts.
 
         Args:
             number: of the step, from 0.
-            patience_ns: how long a part is waited for before the step goes on without it; None: as
-                long as it takes, up to ``most_ns``.
-            again_ns: a tick that is not answered is sent again after this.
-            most_ns: after which a part that does not answer fails the run, unless its process
-                computes.
+            patience_ns: time-out after which the step goes on without a part; None: ``most_ns``
+                applies.
+            again_ns: time after which an unanswered tick is sent again.
+            most_ns: time after which a part that does not answer fails the run, unless its
+                process computes.
 
         Raises:
             BenchError: a part does not answer.
-            LinkLost: the far end of a port is gone.
+            LinkLost: the far end of a port has closed.
         """
         self._step, self.time_ns = number, (number + 1) * self.step_ns
         self._done, self._ticked = set(self.off), {}
@@ -210,7 +209,7 @@ class Broker:
             self._wait(patience_ns, again_ns, most_ns)
 
     def _wait(self, patience_ns: int | None, again_ns: int, most_ns: int) -> None:
-        """Look after parts that have not answered yet."""
+        """Repeat the tick of parts that have not answered, or give them up."""
         now = _CLOCK_NS()
         for name, (at_ns, last_ns) in list(self._ticked.items()):
             if name in self._done:
@@ -286,7 +285,7 @@ class Broker:
             raise LinkLost(name, error) from None
 
     def switch_off(self, name: str) -> None:
-        """Go on without a part, whose process has ended, until `switch_on`."""
+        """Go on without a part whose process has ended, until `switch_on`."""
         link = self.links[name]
         with contextlib.suppress(OSError):
             link.read(_CLOCK_NS(), self.time_ns)  # its last output is of no use
@@ -297,7 +296,7 @@ class Broker:
             self._kept[name].forget()
 
     def switch_on(self, name: str, patience_s: float) -> None:
-        """Take in a part that was started again; the run waits for its hello.
+        """Include a restarted part again; the run waits for its hello.
 
         Raises:
             BenchError: no hello comes.
@@ -309,13 +308,13 @@ class Broker:
     # ----------------------------------------------------------------------------------- the wire
 
     def poll(self, timeout_s: float) -> None:
-        """Take what comes within a time, pass it on, write what waits; returns when something came.
+        """Receive for up to a time, pass messages on, write pending bytes; return once some came.
 
         Raises:
             LinkLost: the far end of a port is gone.
         """
         by_fd, slow = self._by_fd, []
-        if self._slow:  # lines that take their time
+        if self._slow:  # virtual lines with a baud rate
             due = [t for link in self._slow if (t := link.next_ns()) is not None]
             slow = [link.fd for link in self._slow]
             if due:
@@ -350,10 +349,10 @@ class Broker:
                 self._route(message, frame, age)
 
     def _age(self, name: str, message: str, at_ns: int) -> int | None:
-        """Steps since that of a frame, counted if it is not in its time; None: of no use.
+        """Age of a frame in steps; None: not usable. A frame that is early or late is counted.
 
-        The past stays as it was: a frame of a step that is over goes on only where a part takes its
-        message with such a lag, and only the first one of its message for a step does.
+        The past does not change: a frame of a step that is over is passed on only to parts that
+        take its message with such a lag, and only the first of its message for a step is.
         """
         link, (age, beside) = self.links[name], divmod(self.time_ns - at_ns, self.step_ns)
         if age < 0:
@@ -363,7 +362,7 @@ class Broker:
             link.count("repeated")
             return None
         if age or beside or name in self._done or self._step < 0:
-            link.count("late")  # parts that take it without a lag have computed without it
+            link.count("late")  # parts that take it without a lag have already computed
         usable = not beside and age <= min(self._lags[message], self._step)
         return age if usable else None
 
@@ -413,4 +412,4 @@ class Broker:
                 self._put(link, "stop", b"", self.time_ns)
                 link.flush(_CLOCK_NS())
             except OSError:
-                continue  # it is gone already
+                continue  # its far end has closed already

@@ -1,8 +1,7 @@
 """Messages from the operator to the parts, through the bench: those that no part sends.
 
-A scenario sends them at set times of the run, the page and scripts at any time. Each goes out at
-the boundary of two steps, with the time at which the step before it ended; parts receive it in the
-next step.
+A scenario sends them at set times of the run, the page and scripts at any time. Each is sent
+between two steps, stamped with the end of the earlier one; parts receive it in the later one.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ class Console(NamedTuple):
     Attributes:
         wire: its messages.
         console: names of those that the bench sends.
-        refuses: (message, values) -> why it is refused, though each number is within its limits.
+        refuses: (message, values) -> reason to refuse it although each number is within its limits.
     """
 
     wire: Wire = BARE
@@ -44,8 +43,8 @@ class Console(NamedTuple):
 
         Args:
             message: its name.
-            values: by field, in the units of the wire. One that is left out is NaN where the
-                message has that for missing, else 0.
+            values: by field, in the units of the wire. A field left out is NaN where the message
+                has NaN for missing, else 0.
 
         Raises:
             OperatorMessageError: the bench does not send this message, it has no such field, or a
@@ -126,7 +125,7 @@ def operator_messages_of(operator_console: Console) -> type[OperatorMessage]:
 
 
 def _type(f: Field) -> Any:
-    """Type of a field in a scenario: with a unit where the wire's is one of the SI."""
+    """Type of a field in a scenario: a quantity with a unit where the unit of the wire is SI."""
     one: Any = float if f.kind == "f64" else int
     if f.unit in _KINDS and f.unit != "1":
         of = one if f.length == 1 else tuple[(one,) * f.length]

@@ -30,22 +30,22 @@ _LINE: dict[str, tuple[str, ...]] = {
     "power": ("link",),
     "silent": ("link", "direction"),
 }
-"""Faults of the line and of processes, and what each takes."""
+"""Faults of the line and of processes, with the parameters of each."""
 _NEEDS = {"delay": "delay", "killed": "link", "power": "link"}
 PROCESS = ("killed", "power")
-"""Faults that no frame meets."""
+"""Faults of processes, which do not act on frames."""
 
 
 class DeviceFault(NamedTuple):
-    """A fault of a sensor or an actuator: its frames are sound, their content is not.
+    """A fault of a sensor or an actuator: its frames are valid, their content is wrong.
 
     Attributes:
-        link: of the part that has it.
-        message: that carries it.
-        stage: see `Stage`; a sender that repeats sends its last values again.
+        link: of the faulty part.
+        message: that carries the wrong values.
+        stage: see `Stage`; a "repeated" fault sends the last values again.
         act: (values of the message, the fault, time of the run [ns]) -> values as they are sent.
-        takes: its parameters, besides place and share.
-        needs: one of them that must be given; "": none.
+        takes: names of its parameters, besides place and share.
+        needs: the one of them that is required; "": none.
     """
 
     link: str
@@ -57,12 +57,12 @@ class DeviceFault(NamedTuple):
 
 
 def nothing(said: Values, fault: Any, now_ns: int) -> Values:
-    """Values of a sensor that sees nothing: NaN for every number."""
+    """Values of a sensor without a measurement: NaN for every number."""
     return {name: np.full(np.shape(x), np.nan) for name, x in said.items()}
 
 
 class FaultTable(NamedTuple):
-    """Faults that a rig can have.
+    """Faults that can be injected into a rig.
 
     Attributes:
         wire: its messages.
@@ -78,7 +78,7 @@ class FaultTable(NamedTuple):
 
     @property
     def kinds(self) -> dict[str, tuple[str, ...]]:
-        """All kinds of faults, with what each takes."""
+        """All kinds of faults, with the parameters of each."""
         return _LINE | {kind: (*_PLACE, *one.takes) for kind, one in self.device_faults.items()}
 
     def carried(self, link: str, direction: Direction) -> tuple[str, ...]:
@@ -164,8 +164,8 @@ def faults_of(table: FaultTable, **more: Any) -> type[LinkFault]:
     """The faults of a rig as parameters.
 
     Args:
-        table: what they may be.
-        more: parameters of those of its sensors and actuators: the type and its default.
+        table: the faults of the rig.
+        more: parameters of the faults of its sensors and actuators: type and default.
     """
     fields: dict[str, Any] = {"kind": (Literal[tuple(table.kinds)], ...), **more}
     made = pydantic.create_model("Fault", __base__=LinkFault, **fields)

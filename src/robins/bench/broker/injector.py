@@ -2,12 +2,12 @@
 
 A fault of the line acts on bytes: bit errors (the check is then wrong), loss, duplication,
 disorder, delay, silence. A fault of a sensor or an actuator acts on the content: the payload
-changes, and the frame is as sound as any. Those are applied first, as on the way of a frame.
+changes, and the frame stays valid. Those are applied first, as on the way of a frame.
 
-Random numbers are addressed, not drawn in a row (Salmon et al., "Parallel random numbers: as easy
-as 1, 2, 3", SC 2011: NumPy's Philox): by the seed, the number of the fault, link, direction, and
-the how-manieth frame it met there. So what happens depends on the frames and the clock of the run
-only, never on how fast it ran or which other faults there are.
+Random numbers come from a counter-based generator (Salmon et al., "Parallel random numbers: as easy
+as 1, 2, 3", SC 2011: NumPy's Philox), addressed by the seed, the number of the fault, link,
+direction, and the count of frames that the fault met there. So the result depends on the frames and
+the clock of the run only, never on its speed or on other faults.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from robins.bench.wire.frames import Frame, encode_frame
 from robins.bench.wire.schema import FIRST_DATA
 
 _SECOND_NS = 1_000_000_000
-_CHANCE, _BITS = 0, 1  # what noise is for
+_CHANCE, _BITS = 0, 1  # use of a random number: to hit a frame, to choose bits
 _BLOCK = 256  # chances drawn at once
 
 
@@ -39,7 +39,7 @@ class _HeldFrame(NamedTuple):
     due_ns: float | int
     piece: LineOutput
     type: int
-    fault: int | None  # a reorder, which waits for the next frame of this type
+    fault: int | None  # number of a reorder fault, which holds the frame until the next of its type
 
 
 class _Fault(NamedTuple):
@@ -62,7 +62,7 @@ class _Fault(NamedTuple):
 
 
 class Injector:
-    """Apply faults to the frames that pass.
+    """Applies faults to the frames that pass.
 
     Attributes:
         counts: frames hit so far, by kind and link; parts for "killed" and "power".
@@ -72,9 +72,9 @@ class Injector:
         """Take the faults of a run.
 
         Args:
-            table: what they may be.
-            faults: those there are from the beginning.
-            seed: of their noise.
+            table: the faults of the rig.
+            faults: active or planned at the start.
+            seed: of their random numbers.
 
         Raises:
             ValueError: a seed below 0 or of more than 64 bits.
@@ -96,7 +96,7 @@ class Injector:
             self.add(fault)
 
     def add(self, fault: LinkFault) -> None:
-        """Add a fault after the present ones; if its time has come it acts from now on."""
+        """Add a fault after the present ones; if its begin is past, it acts from now on."""
         kind = None if fault.message is None else self._wire.numbers[fault.message]
         # a number is never used again, even when faults are cleared: each has its own noise
         self._faults.append(_Fault(self._added, fault.begin_ns, fault.end_ns, kind, fault))
@@ -109,7 +109,7 @@ class Injector:
             held[:] = [one._replace(due_ns=-math.inf, fault=None) for one in held]
 
     def remove(self, fault: LinkFault) -> None:
-        """Remove a fault; frames that it holds back come in their time."""
+        """Remove a fault; frames that it holds back still come at their time."""
         self._faults = [one for one in self._faults if one.is_ is not fault]
 
     def active(self, now_ns: int) -> list[LinkFault]:
@@ -134,7 +134,7 @@ class Injector:
     def pass_on(
         self, link: str, direction: Direction, frame: Frame, raw: bytes, now_ns: int
     ) -> list[LineOutput]:
-        """Pieces that become of a frame: one or two; none if it is lost or held back.
+        """Output for a frame: one or two pieces; none if it is lost or held back.
 
         Args:
             link: part whose link it is.
@@ -149,14 +149,14 @@ class Injector:
         where = link, direction
         met = [one for one in self._faults if one.meets(link, direction, kind, now_ns)]
         if met or kind in self._repeated:
-            payload = self._spoilt(where, kind, frame.payload, met, now_ns)
+            payload = self._faulty_payload(where, kind, frame.payload, met, now_ns)
             if payload is not frame.payload:
                 frame = frame._replace(payload=payload)
                 raw = encode_frame(*frame)
         pieces = [LineOutput(None, frame)]
         for one in met:
             if pieces and one.is_.kind not in self._table.device_faults:
-                pieces = self._spoil(where, kind, one, pieces, raw, now_ns)
+                pieces = self._damaged(where, kind, one, pieces, raw, now_ns)
         if pieces and where in self._held:
             pieces += self._overtaken(where, kind)
         return pieces
@@ -171,7 +171,7 @@ class Injector:
         return [one.piece for one in due]
 
     def _hit(self, where: tuple[str, str], one: _Fault) -> int | None:
-        """Number of a frame among those that a fault met there; None: it is spared."""
+        """Count of frames that a fault met on a link before this one; None: this one is spared."""
         stream = one.number, *where
         count = self._met[stream]
         self._met[stream] += 1
@@ -186,7 +186,7 @@ class Injector:
     def _noise(
         self, where: tuple[str, str], one: _Fault, count: int, use: int
     ) -> np.random.Generator:
-        """Random numbers of a fault, for a frame."""
+        """Random generator of a fault for one frame and one use."""
         parts = self._wire.parts
         place = 2 * parts.index(where[0]) + (where[1] == "to")
         key = [self._seed, one.number * 2 * len(parts) + place]
@@ -194,7 +194,7 @@ class Injector:
 
     # ------------------------------------------------------------------- payloads
 
-    def _spoilt(
+    def _faulty_payload(
         self, where: tuple[str, str], kind: int, payload: bytes, met: list[_Fault], now_ns: int
     ) -> bytes:
         """Payload of a sensor or an actuator under its faults; see `Stage`."""
@@ -231,7 +231,7 @@ class Injector:
 
     # ---------------------------------------------------------------- what the line does
 
-    def _spoil(
+    def _damaged(
         self,
         where: tuple[str, str],
         kind: int,
@@ -244,7 +244,7 @@ class Injector:
         fault, held = one.is_, self._held.setdefault(where, [])
         waits = any(h.fault == one.number and h.type == kind for h in held)
         if fault.kind == "reorder" and waits:
-            return pieces  # the one that the frame before it waits for
+            return pieces  # the frame for which an earlier, reordered one waits
         count = self._hit(where, one)
         if count is None:
             return pieces
@@ -261,7 +261,7 @@ class Injector:
         return []  # held, or lost
 
     def _overtaken(self, where: tuple[str, str], kind: int) -> list[LineOutput]:
-        """Frames that waited for one of this kind."""
+        """Reordered frames that waited for a frame of this type."""
         held = self._held[where]
         out = [one.piece for one in held if one.fault is not None and one.type == kind]
         if out:
@@ -270,7 +270,7 @@ class Injector:
 
 
 def _inverted(raw: bytes, bits: int, noise: np.random.Generator) -> bytes:
-    """Copy of a frame with so many bits inverted, no bit twice."""
+    """Copy of a frame with `bits` different bits inverted."""
     out = bytearray(raw)
     for k in noise.choice(8 * len(raw), min(bits, 8 * len(raw)), replace=False):
         out[k // 8] ^= 1 << int(k % 8)

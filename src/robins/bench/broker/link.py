@@ -1,9 +1,9 @@
-"""The bench's end of a link: frames to bytes and back, with counts of all that is wrong.
+"""The bench's end of a link: frames to bytes and back, with counts of all errors.
 
-What leaves gets its header here, then what goes wrong on purpose happens to it, then the line
-takes its time. What arrives goes the same way back. So a receiver that counts frames at the other
-end sees a fault of the line exactly as a real one. A watcher sees the bytes as the part sent them
-and as the part received them: so its record can be replayed.
+An outgoing message gets its header, then the injected faults, then the delay of the line; an
+incoming one takes the reverse path. So a receiver that counts frames at the other end sees an
+injected fault exactly as a real one. A watcher sees the bytes as the part sent them and as the part
+received them: so its record can be replayed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class BenchError(RobinsError, RuntimeError):
 
 
 class LinkLost(BenchError):
-    """A port whose far end is gone."""
+    """A port whose far end has closed."""
 
     def __init__(self, part: str, why: OSError):
         super().__init__(f"the port of '{part}' is gone: {why}")
@@ -40,32 +40,32 @@ Direction = Literal["to", "from"]
 _MOST = 65536  # bytes read at once
 
 Watcher = Callable[[str, Direction, bytes, int], None]
-"""Observer of all that goes over a link, as it was on the line: link, direction, the bytes of a
-whole frame or bytes that are none, time [ns]."""
+"""Observer of the bytes on a link: link, direction, bytes of a complete frame or bytes that form
+none, time [ns]."""
 Refuser = Callable[[str, str, PayloadFault], None]
-"""Receiver of the refused frames: link, message, reason."""
+"""Callback for each refused frame: link, message, reason."""
 
 
 @dataclass
 class Health:
     """Counts of frames from a link to the bench; `Link.count` alone writes it."""
 
-    frames: int = 0  # data frames, sound and new
-    wrong: int = 0  # runs of bytes that are no frame
+    frames: int = 0  # data frames, valid and new
+    wrong: int = 0  # runs of bytes that form no frame
     lost: int = 0  # sequence numbers that never came
     jumps: int = 0  # of sequence numbers, further than frames can have been lost
-    repeated: int = 0  # by its number, or a second one of its message for a step
+    repeated: int = 0  # same sequence number, or a second one of its message for a step
     late: int = 0  # out of order, or of a step that was over
-    early: int = 0  # of a step to come
-    strange: int = 0  # of another run, or a message that this part has not to send
-    refused: int = 0  # sound frames of a length or with numbers that their message cannot have
+    early: int = 0  # of a future step
+    strange: int = 0  # of another run, or a message that this part must not send
+    refused: int = 0  # intact frames whose length or numbers contradict the table of their message
     bytes_in: int = 0
     bytes_out: int = 0
     heard_ns: int = 0  # time of the run when data came last
 
 
 class Link:
-    """The far end of the port of a part.
+    """The bench's end of the line of a part.
 
     Attributes:
         name: of the part.
@@ -89,11 +89,11 @@ class Link:
             name: of the part.
             fd: non-blocking file descriptor, of a pseudo-terminal or a real port.
             wire: its messages.
-            injector: what goes wrong on purpose.
+            injector: of the faults on this link.
             watch: called with everything on the line.
-            baud: of the virtual line; None: bytes get through at once, or the line is real.
-            refuse: called with each frame that contradicts the table of its message; it is counted
-                and goes no further.
+            baud: of the virtual line; None: bytes pass without delay, or the line is real.
+            refuse: called with each frame that contradicts the table of its message; the frame is
+                counted and dropped.
         """
         self.name, self.fd = name, fd
         self._wire, self._refuse = wire, refuse
@@ -102,7 +102,7 @@ class Link:
         self._injector, self._watch = injector, watch
         self._lines = None if baud is None else (SerialLine(baud), SerialLine(baud))
         self._run = 0
-        self._out, self._ready = bytearray(), bytearray()  # for the line, and through it
+        self._out, self._ready = bytearray(), bytearray()  # for the line; through it
         self.restart(0)
 
     def restart(self, run: int) -> None:
@@ -116,7 +116,7 @@ class Link:
     # ------------------------------------------------------------------------------------- to
 
     def send(self, name: str, payload: bytes, time_ns: int, now_ns: int) -> bytes:
-        """Put a message on the line, or what the faults leave of it; `flush` writes it.
+        """Put a message on the line after its faults; `flush` writes it.
 
         Args:
             name: of the message.
@@ -141,7 +141,7 @@ class Link:
         return self._pass(self._injector.pass_on(self.name, "to", frame, raw, now_ns), time_ns)
 
     def release(self, now_ns: int) -> bytes:
-        """Put on the line what a fault held back until now."""
+        """Put frames on the line that a fault delayed until now."""
         return self._pass(self._injector.release(self.name, "to", now_ns), now_ns)
 
     def _pass(self, pieces: list[LineOutput], time_ns: int) -> bytes:
@@ -157,10 +157,10 @@ class Link:
         return raw
 
     def flush(self, wall_ns: int) -> None:
-        """Write what can be written now.
+        """Write as many bytes as the port takes now.
 
         Raises:
-            OSError: the far end is gone.
+            OSError: the far end has closed.
         """
         if self._lines is None:
             self._ready += self._out
@@ -172,7 +172,7 @@ class Link:
             try:
                 written = os.write(self.fd, self._ready)
             except BlockingIOError:
-                return  # the port is full; what is left goes first next time
+                return  # the port is full; the rest goes first next time
             self.count("bytes_out", written)
             del self._ready[:written]
 
@@ -183,7 +183,7 @@ class Link:
 
     @property
     def is_slow(self) -> bool:
-        """True if it has a virtual line, which takes its time."""
+        """True if it has a virtual line with a baud rate."""
         return self._lines is not None
 
     def next_ns(self) -> int | None:
@@ -196,10 +196,10 @@ class Link:
     # ----------------------------------------------------------------------------------- from
 
     def read(self, wall_ns: int, now_ns: int) -> list[tuple[str, Frame]]:
-        """Frames that have come, by name of their message; of data only what may be used.
+        """Frames received, with the names of their messages; of data only usable frames.
 
         Raises:
-            OSError: the far end is gone.
+            OSError: the far end has closed.
         """
         try:
             data = os.read(self.fd, _MOST)
@@ -221,7 +221,7 @@ class Link:
             else:
                 raw = encode_frame(*frame)
                 self._watch(self.name, "from", raw, frame.header.time_ns)
-                if name is not None and self._bars(name, frame, now_ns):
+                if name is not None and self._refuses(name, frame, now_ns):
                     continue
                 pieces = self._injector.pass_on(self.name, "from", frame, raw, now_ns)
                 self._arrive(pieces, found, now_ns)
@@ -229,7 +229,7 @@ class Link:
         return found
 
     def held(self, now_ns: int) -> list[tuple[str, Frame]]:
-        """Frames from the part that a fault held back until now."""
+        """Frames from the part that a fault delayed until now."""
         found: list[tuple[str, Frame]] = []
         self._arrive(self._injector.release(self.name, "from", now_ns), found, now_ns)
         self._count()
@@ -245,25 +245,25 @@ class Link:
         if name != "hello" and (name != "done" or frame.header.run != self._run):
             self.count("strange")
             if frame.header.run == self._run:
-                self._counts(frame, now_ns)  # it has come, and is not lost
-        elif not self._bars(name, frame, now_ns):
+                self._in_sequence(frame, now_ns)  # it has come, and is not lost
+        elif not self._refuses(name, frame, now_ns):
             self._watch(self.name, "from", encode_frame(*frame), frame.header.time_ns)
             if name == "done":
-                self._counts(frame, now_ns)
+                self._in_sequence(frame, now_ns)
             found.append((name, frame))
 
-    def _bars(self, name: str, frame: Frame, now_ns: int) -> bool:
+    def _refuses(self, name: str, frame: Frame, now_ns: int) -> bool:
         """Refuse a frame that contradicts the table of its message."""
         if (why := self._wire.unsound(name, frame.payload)) is None:
             return False
         if name != "hello":  # whose number is not of this run
-            self._counts(frame, now_ns)
+            self._in_sequence(frame, now_ns)
         self.count("refused")
         self._refuse(self.name, name, why)
         return True
 
-    def _counts(self, frame: Frame, now_ns: int) -> bool:
-        """Count the number of a frame; true if it is new and in its order."""
+    def _in_sequence(self, frame: Frame, now_ns: int) -> bool:
+        """Count the sequence number of a frame; true if the frame is new and in order."""
         here = now_ns if frame.header.time_ns == now_ns else None
         most = self._sequence.REMEMBERED + self._most_lost
         self._most_lost = 0
@@ -279,7 +279,7 @@ class Link:
 
     def _use(self, frame: Frame, found: list[tuple[str, Frame]], now_ns: int) -> None:
         name = self._wire.names.get(frame.header.type)
-        new = self._counts(frame, now_ns)
+        new = self._in_sequence(frame, now_ns)
         if name is None:
             self.count("strange")
         elif new:

@@ -1,7 +1,7 @@
 """Restarts a part that died and sends it the messages since its last saved memory.
 
-The same part with the same frames has the same state to the last bit, so a run goes on as if
-nothing had happened. It costs the time to start, and to compute some hundred steps.
+The same part with the same frames reaches the same state to the last bit, so the run continues
+unchanged. The cost is the start of the process, and some hundred steps to compute again.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from robins.bench.wire.receiver import Receiver
 from robins.bench.wire.schema import BARE, NUMBERS
 
 SentFrame = tuple[int | None, bytes]
-"""Bytes that went out to a part, after the step of the tick that they are; None: other frames."""
+"""Step and bytes of a tick sent to a part; the step is None for other frames."""
 
 
 class SentFrames:
@@ -31,26 +31,26 @@ class SentFrames:
     """
 
     def __init__(self, is_there: Callable[[int], bool]):
-        """Start with a run.
+        """Start empty.
 
         Args:
-            is_there: whether the memory of a step has been written.
+            is_there: tells if the memory saved after a step has been written.
         """
         self.sent_frames: list[SentFrame] = []
         self.since = -1
         self._is_there = is_there
 
     def add(self, step: int | None, raw: bytes) -> None:
-        """Remember what goes out, as `SentFrame`."""
+        """Add a frame, as `SentFrame`."""
         self.sent_frames.append((step, raw))
 
     def forget(self) -> None:
-        """Start again: the part has lost its memory and has received nothing."""
+        """Drop all frames: the part has lost its memory and has received nothing."""
         self.sent_frames.clear()
         self.since = -1
 
     def answered(self, step: int) -> None:
-        """Drop frames up to a step whose memory the part has saved."""
+        """Drop frames up to the last step whose memory the part has saved."""
         if is_due(step) and step > self.since and self._is_there(step):
             first = next(k for k, (of, _) in enumerate(self.sent_frames) if of == step)
             del self.sent_frames[: first + 1]
@@ -74,9 +74,9 @@ def catch_up(
         begin: the frame that begins the run.
         answered: the last step whose tick the old one answered; ticks beyond are sent, but their
             answers are left to the broker. -1: none.
-        patience_s: for its hello, and for each answer.
+        patience_s: time-out for its hello, and for each answer.
         poll_processes: called now and then.
-        idle_s: for how long its process has done nothing [s]; one that computes is waited for.
+        idle_s: idle time of its process [s]; a process that computes has no time-out.
 
     Raises:
         BenchError: it does not answer.

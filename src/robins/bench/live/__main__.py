@@ -12,7 +12,7 @@ import socket
 
 from robins.bench.live.server import serve
 
-NICE = 5  # the bench goes first
+NICE = 5  # lower priority than the bench
 
 
 def main() -> None:

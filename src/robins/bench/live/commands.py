@@ -1,4 +1,4 @@
-"""The commands that the page may send to the bench: only those that it was offered."""
+"""Commands from the page to the bench: only those that the page was offered."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from robins.bench.live.feed import JsonObject
 from robins.errors import RobinsError
 
 PLAIN = ("start", "pause", "stop")
-LONGEST_S = 3600.0  # of a fault; without a length it lasts until it is cleared
+LONGEST_S = 3600.0  # duration of a fault; without one it lasts until it is cleared
 
 
 class CommandError(RobinsError, ValueError):
@@ -23,7 +23,7 @@ def read(
     alarms: Sequence[JsonObject] = (),
     says: Sequence[str] = (),
 ) -> JsonObject:
-    """Command sent by a page.
+    """Parse and check a command sent by a page.
 
     Args:
         text: JSON: `{"do": ...}`, with "label" and "duration_s" (or neither) for "inject", with
@@ -34,7 +34,7 @@ def read(
         says: labels of the operator messages.
 
     Returns:
-        The command as `Live.commands` gives it.
+        The command as `LivePage.commands` gives it.
 
     Raises:
         CommandError: it is none; nothing else is raised, whatever was sent.
@@ -77,7 +77,7 @@ def read(
 
 
 def _acknowledged(ids: Any, alarms: Sequence[JsonObject]) -> JsonObject:
-    """Numbers of those alarms that wait, and a label that names them in a record."""
+    """Acknowledgement of alarms: their numbers, and a label that names them in a record."""
     if not isinstance(ids, list) or not all(type(one) is int for one in ids):
         raise CommandError(f"alarms are acknowledged by a list of their numbers: {_short(ids)}")
     found = [one for one in alarms if one["id"] in ids]  # another page may have been quicker

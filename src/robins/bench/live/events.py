@@ -1,7 +1,7 @@
-"""The events of a run, of which a bounded number is kept, and the acknowledgement of alarms.
+"""Latest events of a run, in bounded number, and the acknowledgement of alarms.
 
-An event is a mapping: `id`, `level`, `time_s`, `text`; `count` and `until_s` if it came more than
-once in a row; `acknowledged` of an alarm.
+An event is a mapping: `id`, `level`, `time_s`, `text`; `count` and `until_s` if it repeated in a
+row; `acknowledged` for an alarm.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class Events:
         self._next = 0
 
     def happened(self, level: str, time_s: float, text: str) -> JsonObject:
-        """Note an event; one like the last is the last once more, unless that is acknowledged."""
+        """Add an event; one equal to the last, unless that is acknowledged, raises its count."""
         last = self.kept[-1] if self.kept else {}
         if (last.get("level"), last.get("text")) == (level, text) and "acknowledged" not in last:
             again = {**last, "count": last.get("count", 1) + 1, "until_s": time_s}
@@ -30,7 +30,7 @@ class Events:
         return again
 
     def keep(self, event: JsonObject) -> None:
-        """Keep an event in the place of its former state."""
+        """Store an event, in place of its former state if it is the last."""
         if self.kept and self.kept[-1]["id"] == event["id"]:
             self.kept[-1] = event
         else:
@@ -42,7 +42,7 @@ class Events:
         return [one for one in alarms if "acknowledged" not in one]
 
     def acknowledge(self, ids: Collection[int]) -> None:
-        """Note the acknowledgement of alarms."""
+        """Mark alarms as acknowledged."""
         for one in self.waiting():
             if one["id"] in ids:
                 one["acknowledged"] = True

@@ -41,7 +41,7 @@ class Signal(NamedTuple):
     unit: str
     plot: str
     role: Role = "value"  # "sigma": a band of +-3 about zero; "limit": a dashed line
-    of: str = ""  # "sigma": the value whose deviation it states; "attitude": what that is, "true"
+    of: str = ""  # "sigma": name of the value it belongs to; "attitude": its label, such as "true"
 
 
 def check(signals: Sequence[Signal]) -> None:
@@ -104,8 +104,8 @@ def as_json(signals: Sequence[Signal]) -> list[JsonObject]:
 HEAD = struct.Struct("<IB")
 SAMPLE_HEAD = struct.Struct("<IId")
 MARK = 0xFFFFFFFF  # in place of the number of a sample: it is a history
-RECENT = 300  # samples that a page which comes later is shown each, and those before as a history
-EVENTS = 200  # lines of the same
+RECENT = 300  # latest samples sent one by one to a page that joins late; older ones as a history
+EVENTS = 200  # latest events sent to it
 
 
 class FrameKind(IntEnum):
@@ -119,7 +119,7 @@ class FrameKind(IntEnum):
 
 
 def pack(kind: FrameKind, body: bytes) -> bytes:
-    """A body with its head."""
+    """Frame of a body: its header and the body."""
     return HEAD.pack(len(body), kind) + body
 
 
@@ -158,15 +158,15 @@ def _plain(value: Any) -> Any:
 
 
 def latest(events: Sequence[Any], kind: Callable[[Any], Hashable], most: int) -> list[Any]:
-    """Latest events, as many as there is room for, in their order.
+    """Latest events up to a number, in their order.
 
-    Each kind has the same room, and what one does not need is for the others; so a thousand
-    warnings leave the alarm that came before them.
+    Each kind has an equal share of the room, and the others use what it leaves; so a thousand
+    warnings do not push out an earlier alarm.
 
     Args:
         events: the oldest first.
-        kind: of an event.
-        most: number that there is room for.
+        kind: function that returns the kind of an event.
+        most: number of events to keep.
     """
     if len(events) <= most:
         return list(events)

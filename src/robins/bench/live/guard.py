@@ -46,20 +46,20 @@ def same_origin(origin: str | None, host: str) -> bool:
 
 
 class Guard:
-    """Middleware: answers other sites with 403, lets browsers load nothing from elsewhere."""
+    """Middleware: answers other sites with 403, and forbids browsers to load from other sites."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request or websocket."""
+        """Handle one request or websocket."""
         if scope["type"] not in {"http", "websocket"}:
             return await self._app(scope, receive, send)
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         if known_host(host) and same_origin(headers.get("origin"), host):
             return await self._app(scope, receive, _with_policy(send, host))
-        # Closed before it is accepted, a websocket is answered with 403.
+        # A websocket closed before it is accepted is answered with 403.
         if scope["type"] == "websocket":
             return await send({"type": "websocket.close", "code": 1008})
         plain = [(b"content-type", b"text/plain; charset=utf-8")]

@@ -1,4 +1,4 @@
-"""The bench's handle of its page: it feeds the server process and never waits for it."""
+"""The bench's handle of its live page: feeds the server process without ever blocking on it."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from robins.bench.live.events import Events
 from robins.bench.live.feed import FrameKind, JsonObject, Signal, as_json, check
 from robins.bench.live.history import SampleHistory
 
-START_S = 20.0  # most that a server may take to listen
-END_S = 3.0  # most that it may take to end before it is killed
-PAUSE_S = 1.0  # between two attempts to bring it back
-SEND_BUFFER = 1 << 16  # a browser that does not read holds up no more than this in the kernel
+START_S = 20.0  # time-out for a server to listen
+END_S = 3.0  # time for it to end before it is killed
+PAUSE_S = 1.0  # between two attempts to restart it
+SEND_BUFFER = 1 << 16  # bytes in the kernel for a browser that does not read
 
 Level = Literal["info", "warning", "alarm"]
 
@@ -34,14 +34,14 @@ class LivePage:
     """A page that shows a running bench, served by another process.
 
     The server has its own session, so Ctrl-C leaves it to the bench to end it, and it ends by
-    itself when the bench is gone, whatever became of it. `push`, `status`, `event`, `commands` and
-    `poll` do not block: what the server does not take in time is kept to a bound, and then the
-    oldest samples go and are counted. For one thread; call `poll` now and then.
+    itself when the bench is gone, even if killed. `push`, `status`, `event`, `commands` and `poll`
+    do not block: data that the server does not take in time is kept up to a bound, beyond which the
+    oldest samples are dropped and counted. For one thread; call `poll` regularly.
 
     Attributes:
         url: of the page.
         run: number of the run.
-        dropped: samples that the server was too slow, or not there, to take.
+        dropped: samples lost because the server was too slow or down.
         restarts: times that the server was restarted.
     """
 
@@ -58,17 +58,17 @@ class LivePage:
         """Start the server and wait until it listens.
 
         Args:
-            signals: of each sample, in this order.
+            signals: values of each sample, in this order.
             title: of the page.
             run: number of the run; a page clears its plots when it changes.
-            host: address to listen at; any program that reaches it can stop the bench, so another
-                than this machine gives a warning.
+            host: address to listen at; any program that reaches it can stop the bench, so one
+                beyond this machine gives a warning.
             port: to listen at; 0: any that is free.
-            faults: that the page offers to inject: each `{"label": str, "fault": {...}}`.
+            faults: offered for injection, each `{"label": str, "fault": {...}}`.
             says: labels of the operator messages that the page offers.
 
         Raises:
-            ValueError: signals that cannot be drawn, or faults without a label of their own.
+            ValueError: signals that cannot be plotted, or faults without distinct labels.
             ImportError: the extra "live" is not installed.
             OSError: the host or port is not available.
             RuntimeError: the server does not start.
@@ -85,7 +85,7 @@ class LivePage:
         self._says = tuple(says)
         self._sequence = 0
         self._recent: deque[bytes] = deque()
-        self._history = SampleHistory(len(signals))  # of the samples before
+        self._history = SampleHistory(len(signals))  # of all samples so far
         self._events = Events()
         self._last_status: bytes | None = None
         self._commands: deque[dict[str, Any]] = deque(maxlen=100)
@@ -109,7 +109,7 @@ class LivePage:
 
         Args:
             time_s: since the start of the run.
-            values: of the signals, in their order; NaN: none this time.
+            values: of the signals, in their order; NaN: missing.
 
         Raises:
             ValueError: there are not as many values as signals.
@@ -128,7 +128,7 @@ class LivePage:
         self._pump()
 
     def status(self, status: JsonObject) -> None:
-        """Show the state of the bench; the latest counts. The keys are those of docs/live.md.
+        """Show the state of the bench, in place of the one before; docs/live.md lists the keys.
 
         Raises:
             TypeError: something in it is no number, text, list or mapping.
@@ -137,7 +137,7 @@ class LivePage:
         self._pump()
 
     def event(self, level: Level, time_s: float, text: str) -> None:
-        """Add a line to the events, or to the count of the last if the text is the same.
+        """Add an event, or count it with the last one if the text is the same.
 
         An "alarm" goes to the alarm line too, until it is acknowledged.
 
@@ -153,7 +153,7 @@ class LivePage:
         """Begin another run on the same page: its plots and events are cleared.
 
         Raises:
-            ValueError: it is the run that is shown; pages would not know one from the other.
+            ValueError: it is the run already shown; pages could not tell the two apart.
         """
         if run == self.run:
             raise ValueError(f"run {run} is shown already; another run has another number")
@@ -216,7 +216,7 @@ class LivePage:
         self._wait_until_it_listens()
 
     def close(self) -> None:
-        """End the server; the last samples and events are shown first. May be called twice."""
+        """End the server after it has shown the last samples and events. May be repeated."""
         if not self._closed:
             self._closed = True
             self._end(kill=False)
@@ -235,7 +235,7 @@ class LivePage:
         ours, theirs = socket.socketpair()
         ours.setblocking(False)
         self._pipe, self._unread, self._listens = ours, b"", False
-        # A restarted server shows what the one before it did.
+        # A restarted server shows the same page as the one before.
         self._hello: bytes | None = self._make_hello()
         self._before = self._history.pack(self.run)
         lines = (feed.to_json(event).encode() for event in self._events.kept)
@@ -243,7 +243,7 @@ class LivePage:
         self._samples = deque(self._recent)
         self._status, self._partial = self._last_status, b""
         fds = (theirs.fileno(), self._at.fileno())
-        # -P: a file of the folder the bench was started in must not pass for a module.
+        # -P: files in the working folder must not be imported as modules.
         command = [sys.executable, "-P", "-m", "robins.bench.live"]
         with theirs:
             self._process = subprocess.Popen(
@@ -282,7 +282,7 @@ class LivePage:
             self._receive()
 
     def _next(self) -> bytes:
-        """Next bytes, in the order in which a page needs them; empty: nothing waits."""
+        """Next bytes to send, in the order in which a page needs them; empty: none."""
         if self._hello is not None:
             kind, body, self._hello = FrameKind.HELLO, self._hello, None
         elif self._before:
@@ -368,7 +368,7 @@ def _check_faults(faults: Sequence[JsonObject]) -> None:
 
 
 def _listen(host: str, port: int) -> socket.socket:
-    """A socket that listens. The bench keeps it, so that its port outlives a server."""
+    """Open a listening socket. The bench holds it, so that its port outlives a server."""
     where = f"{host}:{port}"
     try:
         family, kind, proto, _, address = socket.getaddrinfo(

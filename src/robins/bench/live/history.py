@@ -1,15 +1,14 @@
-"""All samples of a run in bounded memory: least and greatest of each signal in buckets of time.
+"""All samples of a run in bounded memory: minimum and maximum of each signal in buckets of time.
 
-A bucket holds `per` samples that follow one another. When all buckets are full, each two become
-one, so there are `BUCKETS / 2` to `BUCKETS` of them however long the run is, and a value that came
-once is still an edge of its bucket. A missing value (NaN) has no part; a bucket without any value
-is NaN.
+A bucket holds `per` consecutive samples. When all buckets are full, pairs are merged, so there are
+`BUCKETS / 2` to `BUCKETS` of them however long the run is, and a single spike stays visible as an
+edge of its bucket. Missing values (NaN) are ignored; a bucket without any value is NaN.
 
     history: run u32 | MARK u32 | buckets u32 | signals u32 | per u32 | samples u32
              | first time f64[buckets] | last time f64[buckets]
              | least f64[signals, buckets] | greatest f64[signals, buckets]
 
-Little endian, by rows. `MARK` stands where a sample has its number, and is the number of none.
+Little endian, by rows. `MARK` is in place of the sequence number of a sample, and no sample has it.
 """
 
 from __future__ import annotations
@@ -21,16 +20,16 @@ import numpy as np
 from robins.bench.live.feed import MARK, SAMPLE_HEAD
 
 BUCKETS = 4096
-BLOCK = 128  # samples are taken in together, since each call of NumPy costs as much as ten values
+BLOCK = 128  # samples added at once: a NumPy call costs as much as ten values
 HISTORY_HEAD = struct.Struct("<6I")
 
 
 class SampleHistory:
-    """Least and greatest values of the samples of a run, in buckets; see above.
+    """Minimum and maximum of the samples of a run, in buckets; see above.
 
     Attributes:
-        samples: how many.
-        per: of them in a bucket.
+        samples: their number.
+        per: samples in a bucket.
     """
 
     def __init__(self, signals: int) -> None:
@@ -42,13 +41,13 @@ class SampleHistory:
         self._waiting = bytearray()
 
     def add(self, samples: bytes) -> None:
-        """Take samples, one or one after another, as `feed.pack_sample` makes them."""
+        """Add one or more concatenated samples, as `feed.pack_sample` makes them."""
         self._waiting += samples
         if len(self._waiting) >= BLOCK * self._row:
             self._take_in()
 
     def pack(self, run: int) -> bytes:
-        """Bytes of the history as sent; empty where there is none."""
+        """Bytes of the history in the format above; empty if there are no samples."""
         self._take_in()
         n, signals = -(-self.samples // self.per), self._least.shape[1]
         if not n:
@@ -80,14 +79,14 @@ class SampleHistory:
             self._halve()
         self.samples += len(rows)
         bucket, begins, many = np.unique(numbers // self.per, return_index=True, return_counts=True)
-        # The first of these buckets may have samples already; one that has none is NaN.
+        # The first of these buckets may already have samples; an empty one is NaN.
         self._first[bucket] = np.fmin(self._first[bucket], time[begins])
         self._last[bucket] = time[begins + many - 1]
         for kept, of in ((self._least, np.fmin), (self._most, np.fmax)):
             kept[bucket] = of(kept[bucket], of.reduceat(values, begins, axis=0))
 
     def _halve(self) -> None:
-        """Make one bucket of each two."""
+        """Merge the buckets in pairs."""
         half, self.per = BUCKETS // 2, 2 * self.per
         for kept, of in (
             (self._first, np.fmin),

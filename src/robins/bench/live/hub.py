@@ -1,7 +1,7 @@
 """The server's data on the bench, and the pages that show them.
 
-Each page has queues of its own, with a bound: one that is slow loses its oldest samples, which are
-counted, and slows no other.
+Each page has its own bounded queues: a slow page loses its oldest samples, which are counted, and
+does not slow the others.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ class Client:
     """Queues of one page.
 
     Attributes:
-        dropped: samples that it was too slow for.
+        dropped: samples lost because the page was too slow.
     """
 
     def __init__(self) -> None:
         self.dropped = 0
         self._lines: deque[str] = deque(maxlen=EVENTS)
-        self._latest: dict[str, str] = {}  # of which only the newest matters
+        self._latest: dict[str, str] = {}  # newest text by key
         self._history = b""
         self._samples: deque[bytes] = deque()
         self._some = asyncio.Event()
 
     def greet(self, hello: str, history: bytes, recent: deque[bytes]) -> None:
-        """Start with a full greeting; drop all that waits."""
+        """Queue the full greeting, and drop all that is queued."""
         self._lines.clear()
         self._latest.clear()
         self._history = history
@@ -43,7 +43,7 @@ class Client:
         self._some.set()
 
     def line(self, text: str) -> None:
-        """Add a line to be sent in order."""
+        """Queue a line."""
         self._lines.append(text)
         self._some.set()
 
@@ -53,7 +53,7 @@ class Client:
         self._some.set()
 
     def sample(self, sample: bytes) -> None:
-        """A sample; the oldest goes if there are too many."""
+        """Queue a sample; if the queue is full, drop the oldest."""
         if len(self._samples) == QUEUE:
             self._samples.popleft()
             self.dropped += 1
@@ -65,7 +65,7 @@ class Client:
         send_text: Callable[[str], Awaitable[None]],
         send_bytes: Callable[[bytes], Awaitable[None]],
     ) -> None:
-        """Send what waits, for ever, as fast as the page takes it."""
+        """Send the queues for ever, as fast as the page takes them."""
         while True:
             if self._lines:
                 await send_text(self._lines.popleft())
@@ -82,7 +82,7 @@ class Client:
 
 
 class Hub:
-    """Receive the data of the bench, keep what a page that comes later needs, and pass it on.
+    """Receiver of the bench's data: passes it on, and keeps what a page that joins late needs.
 
     Attributes:
         clients: pages.
@@ -101,7 +101,7 @@ class Hub:
         self._recent: deque[bytes] = deque()
         self._status: JsonObject | None = None
         self._expected: int | None = None  # number of the next sample
-        self._dropped = 0  # on the way from the bench
+        self._dropped = 0  # samples lost between bench and server
 
     def take(self, kind: int, body: bytes) -> None:
         """Take a frame from the bench."""
@@ -137,7 +137,7 @@ class Hub:
         self._send_all({"kind": "acknowledged", "alarms": alarms})
 
     def beat(self) -> None:
-        """Send each page a sign of life, and the counts of dropped samples."""
+        """Send each page a heartbeat with the counts of dropped samples."""
         for client in self.clients:
             beat = {
                 "kind": "beat",

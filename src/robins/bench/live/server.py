@@ -32,7 +32,7 @@ STATIC = Path(__file__).parent / "static"
 BEAT_S = 0.5
 LONGEST_COMMAND = 4096  # bytes
 MOST_UNREAD = 1 << 16  # bytes of commands that the bench has not taken
-LAST_WORDS_S = 0.2  # for pages to receive that the bench is gone
+LAST_WORDS_S = 0.2  # time to send pages the notice that the bench is gone
 
 Pass = Callable[[dict[str, Any]], bool]
 
@@ -41,7 +41,7 @@ def application(hub: Hub, pass_on: Pass) -> Starlette:
     """The page and its websocket.
 
     Args:
-        hub: what is shown.
+        hub: source of the data shown.
         pass_on: takes a command to the bench; False if the bench does not take it.
     """
 
@@ -95,8 +95,8 @@ async def serve(at: socket.socket, pipe: socket.socket | None) -> None:
     """Serve the page until the bench is gone.
 
     Args:
-        at: listens.
-        pipe: to the bench; None: there is none, and the page waits.
+        at: listening socket.
+        pipe: socket to the bench; None: there is none, and the page waits for one.
     """
     hub = Hub()
     writer: asyncio.StreamWriter | None = None
@@ -152,7 +152,7 @@ async def _beat(hub: Hub) -> None:
 
 
 async def _watch_parent() -> None:
-    """End with the bench even if some process that it forked holds its end of the pipe."""
+    """End with the bench even if a child process of it still holds its end of the pipe."""
     parent = os.getppid()
     while os.getppid() == parent:
         await asyncio.sleep(BEAT_S)

@@ -1,10 +1,10 @@
-"""Transfer of a config to processes: its arrays lie in a file that all of them map, read only.
+"""Transfer of a config to processes: all map one file with its arrays into memory, read only.
 
-So the inputs of a long run are in memory once, however many parts read them, and only as far as
-they have come. Anything that pickles can be sent (PEP 574: arrays travel outside the pickle).
+So the inputs of a long run are in memory once, however many parts read them, and only the pages
+already read. Anything that pickles can be sent (PEP 574: arrays are stored outside the pickle).
 
-The file lies in a folder for temporary files that its bench holds a lock on. The kernel drops the
-lock with the process, however that ends, and the next bench removes the files of dead ones.
+The file is in a temporary folder that its bench holds a lock on. The kernel releases the lock with
+the process, however it ends, and the next bench removes the files of dead ones.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-_END = struct.Struct("<Q")  # where the pickle begins, behind the arrays
+_END = struct.Struct("<Q")  # offset of the pickle, which follows the arrays
 _ALIGNED = 64  # bytes
 _PREFIX, _LOCKED = "robins-parts-", "locked"
 
@@ -33,7 +33,7 @@ def private_folder() -> Iterator[Path]:
     with contextlib.ExitStack() as stack:
         path = Path(tempfile.mkdtemp(prefix=_PREFIX))
         stack.callback(shutil.rmtree, path, ignore_errors=True)
-        with contextlib.suppress(OSError):  # a file system without locks: it is never swept
+        with contextlib.suppress(OSError):  # a file system without locks: the folder is never swept
             stack.enter_context(_locked(path))
             (path / _LOCKED).touch()
         yield path
@@ -44,7 +44,7 @@ def _locked(path: Path) -> Iterator[None]:
     """Lock a folder.
 
     Raises:
-        OSError: another process has it, it is gone, or it cannot be locked.
+        OSError: another process has locked it, it is gone, or it cannot be locked.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
@@ -58,7 +58,7 @@ def _sweep() -> None:
     """Remove the folders of this user's benches that were killed."""
     for path in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
         with contextlib.suppress(OSError):
-            # a folder without the mark is between its making and its locking
+            # a folder without the mark has been made and is about to be locked
             if path.lstat().st_uid == os.getuid() and (path / _LOCKED).exists():
                 with _locked(path):
                     shutil.rmtree(path, ignore_errors=True)
@@ -84,7 +84,7 @@ def put(config: Any, path: Path) -> None:
 
 
 def take(path: Path) -> Any:
-    """A config from a file; its arrays cannot be written to.
+    """Map a config from a file; its arrays are read only.
 
     Raises:
         OSError: it cannot be read.

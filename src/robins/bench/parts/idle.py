@@ -1,6 +1,6 @@
 """Idle time of a process, by the processor time that it uses.
 
-A part that compiles is alive however long that takes; one that waits for what never comes is not.
+A part that compiles may take any time; one that waits for input that never comes is hanging.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-_WORK_S = 0.5  # of processor time; a process that waits at a port uses less in two minutes
+_WORK_S = 0.5  # processor time that counts as work; waiting at a port uses less in two minutes
 
 
 def idleness() -> Callable[[int | None], float]:
-    """Make a function that gives, by its number, how long a process has been idle.
+    """Make a function that returns the idle time [s] of a process, given by its process ID.
 
-    That time [s] begins at the first call for the process. It is infinite where there
-    is no process, or where the system does not show its processor time in ``/proc``.
+    Idle time counts from the first call for the process. It is infinite where there is no process,
+    or where the system does not show its processor time in ``/proc``.
     """
-    worked: dict[int, tuple[float, float]] = {}  # processor time, and when so much was used
+    worked: dict[int, tuple[float, float]] = {}  # processor time used, when first seen [s]
 
     def idle_s(pid: int | None) -> float:
         if pid is None:

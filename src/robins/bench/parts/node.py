@@ -2,7 +2,7 @@
 
 python -m robins.bench.parts.node satellite gyro /dev/pts/5,460800 config
 
-With a folder it saves its memory there, and with a step too it goes on from the memory of that
+Given a folder, it saves its memory there; given a step too, it goes on from the memory of that
 step.
 """
 
@@ -39,7 +39,7 @@ def set_realtime() -> str:
 
 @contextlib.contextmanager
 def realtime(wanted: bool) -> Iterator[str]:
-    """A real-time scheduler for a while, if it is wanted; gives why it was refused, or nothing."""
+    """Context with a real-time scheduler, if wanted; yields the reason of a refusal, or ""."""
     why = set_realtime() if wanted else ""
     try:
         yield why
@@ -50,8 +50,8 @@ def realtime(wanted: bool) -> Iterator[str]:
 
 @contextlib.contextmanager
 def fewer_collections() -> Iterator[None]:
-    """Hardly any collection of garbage in the middle of a step: counted references free what a run
-    makes, and each collection looks at all of JAX.
+    """Context with rare garbage collections, which would delay a step: reference counts free the
+    objects of a run, and each collection scans all of JAX.
     """
     before = gc.get_threshold()
     gc.collect()
@@ -63,7 +63,7 @@ def fewer_collections() -> Iterator[None]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run a part until the bench sends stop, or is gone."""
+    """Run a part until the bench sends stop or has gone."""
     try:
         return _be(arguments)
     except RobinsError as error:  # the bench shows its last line to the user
@@ -86,7 +86,7 @@ def _be(arguments: Sequence[str]) -> int:
     if os.environ.get(REALTIME) and (why := set_realtime()):
         print(why, file=sys.stderr)
     gc.collect()
-    gc.freeze()  # all that was imported and compiled stays, and need not be looked at again
+    gc.freeze()  # imported and compiled objects stay, and need not be scanned
     gc.set_threshold(RARELY)
     try:
         with open_port(address(port), timeout_s=None) as line:

@@ -1,12 +1,12 @@
 """The end of a link at a part of the vehicle: takes bytes, computes at a tick, answers.
 
-A part is a function from what has reached it to what it sends; what the wire does to frames, and
-the order in which they come, is settled here. Firmware does the same, see `bench/wire/firmware`.
+A part is a function from the messages received to those sent; lost, damaged, repeated and reordered
+frames are handled here. Firmware does the same, see `bench/wire/firmware`.
 
-Every so many steps a part saves its memory for the process that may be started in its place. That
-one goes on from the latest memory that is older than the input sent again, so a death costs
-the time of some hundred steps, however long the run has been. A memory is a file in the folder of
-the bench's processes; the part writes it before it answers the tick of that step.
+Every `EVERY` steps a part saves its memory for a process that may replace it. The replacement goes
+on from the latest memory that is older than the input sent again, so a death costs the time of some
+hundred steps, however long the run. A memory is a file in the folder of the bench's processes; the
+part writes it before it answers the tick of that step.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ def path_of(folder: Path, part: str, step: int) -> Path:
 
 
 def save_memory(folder: Path, part: str, step: int, memory: bytes) -> None:
-    """Write a memory, whole or not at all; the one before it stays, older ones go.
+    """Write a memory atomically; keep the one before it and delete older ones.
 
-    Where it cannot be written, those that are there stay, and the run goes on.
+    If it cannot be written, the existing ones stay, and the run goes on.
     """
     path = path_of(folder, part, step)
     with contextlib.suppress(OSError):
@@ -58,7 +58,7 @@ _MOST = 65536  # bytes read at once
 
 _MEMORY = ("_run", "_step_ns", "_sequence", "_sent", "_state", "_inbox", "_done")
 
-Inputs = Mapping[str, Any]  # values by field, by message; None where it did not come
+Inputs = Mapping[str, Any]  # values by field, for each message; None: it did not come
 Sent = Iterable[tuple[str, Values]]  # messages with their values
 
 
@@ -67,12 +67,12 @@ class Part(NamedTuple):
 
     Attributes:
         name: one of the parts of its rig.
-        takes: messages it takes, with their age in steps at the tick: 0 or 1.
+        takes: messages it takes, with their lag in steps: 0 or 1.
         begin: () -> state before the first step.
         act: (state, step, inputs) -> (state, sent), at a tick.
-        example: inputs as they will be, so that all can be compiled before the first tick; one
-            that is left out is None, as if it had not come.
-        rare: computes what no example does, to compile that too.
+        example: inputs of the types to come, to compile all before the first tick; a message left
+            out is None, as if it had not come.
+        rare: runs code that no example reaches, to compile that too.
     """
 
     name: str
@@ -89,8 +89,8 @@ class Station:
     Attributes:
         counts: frames that were not used, by reason: "strange" (another run or an unknown message),
             "repeated", "late" (of a step that is over), "size".
-        over: whether the bench has ended the run.
-        begun: whether the bench has answered.
+        over: true once the bench has ended the run.
+        begun: true once the bench has answered.
     """
 
     def __init__(
@@ -105,8 +105,8 @@ class Station:
         Args:
             part: the part.
             wire: the messages of its rig.
-            memory: of the process that it replaces; None: it starts without one.
-            save_memory: takes the step and the memory now and then; None: memories are not saved.
+            memory: saved by the process that it replaces; None: it starts without one.
+            save_memory: called with step and memory every `EVERY` steps; None: none is saved.
         """
         self.part, self._wire, self._put_aside = part, wire, save_memory
         self.counts: Counter[str] = Counter()
@@ -130,7 +130,7 @@ class Station:
         return encode_frame(header, wire.encode("hello", said))
 
     def feed(self, data: bytes) -> bytes:
-        """Take bytes; the bytes to answer with."""
+        """Take received bytes and return the bytes to answer with."""
         answer = b""
         for frame in self._receiver.feed(data):
             answer += self._take(frame)
@@ -172,7 +172,7 @@ class Station:
         elif not fresh:
             self.counts["repeated"] += 1
         elif self._done and head.time_ns + self.part.takes[name] * self._step_ns <= self._done[1]:
-            self.counts["late"] += 1  # it was computed without
+            self.counts["late"] += 1  # the step was computed without it
         else:
             self._inbox[name, head.time_ns] = frame.payload
         return b""
@@ -219,15 +219,15 @@ class Station:
 
 
 def ready(part: Part, steps: Iterable[int]) -> Part:
-    """The part, with all that it will run compiled, before the clock of a run starts.
+    """Compile all that a part will run, before the clock of a run starts, and return the part.
 
     Args:
-        part: any.
-        steps: one of each kind that it computes otherwise.
+        part: the part.
+        steps: one of each kind that takes different code.
 
     Raises:
-        Exception: whatever the part raises, if it has an example of each message that it takes. One
-            that lacks some, and cannot do without, is compiled by its first steps.
+        Exception: any error of the part, if it has an example of each message that it takes. A part
+            that fails for lack of one is compiled by its first steps.
     """
     given = {name: part.example.get(name) for name in part.takes}
     whole = contextlib.nullcontext() if given.keys() <= part.example.keys() else None
@@ -257,7 +257,7 @@ def serve(port: Any, station: Station) -> Counter[str]:
         if not station.begun and time.monotonic() - said >= HELLO_EACH_S:
             port.write(station.hello())
             said = time.monotonic()
-        # All that is there, in one call: `port.read` needs three calls of the system for it.
+        # All available bytes in one system call: `port.read` needs three.
         if select.select([fd], [], [], None if station.begun else HELLO_EACH_S)[0]:
             data = os.read(fd, _MOST)
             if not data:

@@ -1,7 +1,7 @@
 """Serial ports, and their replacements without hardware.
 
-- `port`: what people write for one; a real one opened; a pseudo-terminal. `listing`: what there is.
-- `line`: bytes that get through at the baud rate. `cable`: two paths, joined; also a program.
+- `port`: addresses of ports; opens real ports and pseudo-terminals, and lists those of the machine.
+- `line`: a virtual line with a baud rate. `cable`: two joined paths, also as a program.
 """
 
 from robins.bench.ports.line import SerialLine

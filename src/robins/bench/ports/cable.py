@@ -1,9 +1,9 @@
-"""A serial cable without hardware: two paths, and what is written to one is read from the other.
+"""A serial cable without hardware: two paths; bytes written to one are read from the other.
 
     python -m robins.bench.ports.cable
 
-It takes the place of the cable between the bench, which opens one path like the port of a real
-board, and a program that stands for the board, which opens the other.
+It replaces the cable between the bench, which opens one path like the port of a real board, and a
+program that simulates the board, which opens the other.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ def cable() -> Iterator[Cable]:
 def _carry(one: Pair, other: Pair, wake: int) -> None:
     """Copy both ways until woken."""
     across = {one.master: other.master, other.master: one.master}
-    waiting = dict.fromkeys(across, b"")  # to be written, by the end that takes it
+    waiting = dict.fromkeys(across, b"")  # bytes to write, by end
     while True:
-        # an end is read from when what came before is through, so no more than that is held
+        # read an end only when its earlier bytes are written, so that no more than those are held
         free = [end for end in across if not waiting[across[end]]]
         full = [end for end in across if waiting[end]]
         readable, writable, _ = select.select([wake, *free], full, [])

@@ -1,9 +1,8 @@
 """A serial line with a baud rate: each byte arrives at its own time.
 
-A pseudo-terminal hands bytes over at once, whatever its baud rate. A line between two of them
-makes them as late as on a wire: a byte is through a byte's time after the one before it, or after
-it was sent, whichever is later. The arithmetic is in whole numbers, of nanoseconds times baud, so
-nothing adds up over days.
+A pseudo-terminal delivers bytes at once, whatever its baud rate. This line delays them as a real
+one: a byte arrives one byte time after the one before it, or after it was sent, whichever is later.
+The arithmetic is in integers, of nanoseconds times baud, so no error accumulates over days.
 """
 
 from __future__ import annotations
@@ -11,18 +10,18 @@ from __future__ import annotations
 from collections import deque
 
 _SECOND_NS = 1_000_000_000
-BITS_PER_BYTE = 10  # a start bit, eight, a stop bit
+BITS_PER_BYTE = 10  # a start bit, eight data bits, a stop bit
 
 
 class SerialLine:
     """One direction of a serial line.
 
-    It holds at most ``most`` bytes; what is sent beyond is dropped, the newest first, as by a
-    transmitter whose buffer is full. The check of a frame that was cut so fails.
+    It holds at most ``most`` bytes; new bytes beyond that are dropped, as by a transmitter whose
+    buffer is full. A frame truncated in this way fails its checksum.
 
     Attributes:
-        dropped: bytes so far that found no room.
-        backlog: bytes sent and not taken yet.
+        dropped: number of bytes dropped so far.
+        backlog: number of bytes sent and not yet taken.
     """
 
     def __init__(self, baud: int, bits_per_byte: int = BITS_PER_BYTE, most: int = 65536) -> None:
@@ -46,10 +45,10 @@ class SerialLine:
         self.backlog = 0
         # bursts without a pause: when the first byte left begins [ns times baud], what is left
         self._bursts: deque[tuple[int, bytes]] = deque()
-        self._free = 0  # when the last byte is through; times begin at 0
+        self._free = 0  # arrival of the last byte [ns times baud], from 0
 
     def send(self, data: bytes, now_ns: int) -> None:
-        """Put bytes on the line; they begin now, or when those before them are through."""
+        """Put bytes on the line; transmission starts now, or after the bytes before."""
         room = self._most - self.backlog
         self.dropped += max(0, len(data) - room)
         if kept := bytes(data[:room]):
@@ -59,7 +58,7 @@ class SerialLine:
             self.backlog += len(kept)
 
     def take(self, now_ns: int) -> bytes:
-        """The bytes that are through by now and were not taken before."""
+        """Take the bytes that have arrived by now."""
         now = now_ns * self._baud
         out: list[bytes] = []
         while self._bursts:
@@ -78,7 +77,7 @@ class SerialLine:
 
     @property
     def next_ns(self) -> int | None:
-        """Time at which the next byte is through [ns]; None: the line is empty."""
+        """Arrival time of the next byte [ns]; None: the line is empty."""
         if not self._bursts:
             return None
         return -(-(self._bursts[0][0] + self._byte) // self._baud)
@@ -87,9 +86,7 @@ class SerialLine:
 def load(
     bytes_count: float | int, seconds: float | int, baud: int, bits_per_byte: int = BITS_PER_BYTE
 ) -> float:
-    """Share of what a line can carry that so many bytes in so many seconds are.
-
-    Above 1 the backlog grows for ever.
+    """Utilisation of a line by a number of bytes in a time; above 1 the backlog grows for ever.
 
     Raises:
         ValueError: no time, or no baud.

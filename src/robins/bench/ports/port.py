@@ -4,7 +4,7 @@ A link of the bench has two ends. Without hardware both are those of a pseudo-te
 holds the master, the part opens the path of the slave like any serial port. With hardware the part
 is a board, and the bench opens the device itself.
 
-`list_ports` lists those of this machine, and whether we may use them.
+`list_ports` lists the ports of this machine, and whether we may use them.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Address(NamedTuple):
 
 
 def address(text: str) -> Address:
-    """An address as people write it: ``/dev/ttyUSB0,460800``, or ``/dev/ttyUSB0`` for 460800 baud.
+    """Parse an address: ``/dev/ttyUSB0,460800``, or ``/dev/ttyUSB0`` for 460800 baud.
 
     Raises:
         PortError: the speed is no number, or the path is none, is no port, or may not be opened.
@@ -58,13 +58,13 @@ def address(text: str) -> Address:
 
 
 def program(text: str) -> Path | None:
-    """The program that stands for a part, if that is what a text names; else it is a port."""
+    """Path of the program that a text names in place of a port; None: it names a port."""
     path = Path(text.strip())
     return path.resolve() if path.is_file() and os.access(path, os.X_OK) else None
 
 
 def parted(texts: Mapping[str, str]) -> tuple[dict[str, Address], dict[str, Path]]:
-    """Boards at their ports, and programs, each by the part that it stands for.
+    """Boards at their ports, and programs, each by the part that it replaces.
 
     Raises:
         PortError: as `address`.
@@ -103,15 +103,15 @@ def _group(path: str) -> str:
 def open_port(at: Address, timeout_s: float | None = 0.0) -> serial.Serial:
     """Open a port: raw, 8 data bits, no parity, one stop bit, no flow control, ours alone.
 
-    What came in before is thrown away. Writing waits until the driver has taken all; who must not
-    wait writes to ``fileno()``, which is non-blocking.
+    Earlier input is discarded. Writing blocks until the driver has taken all bytes; write to
+    ``fileno()`` not to block.
 
     Args:
         at: the port.
-        timeout_s: that a read waits at most; 0: not at all, None: until something comes.
+        timeout_s: of a read; 0: do not wait, None: wait until something comes.
 
     Raises:
-        PortError: it cannot be opened, is in use by another program, or cannot be so fast.
+        PortError: it cannot be opened, is in use by another program, or does not support the speed.
     """
     if why := obstacle(at.path):
         raise PortError(why, f"port '{at.path}'")
@@ -161,10 +161,10 @@ class Pair:
 
 
 def open_pair() -> Pair:
-    """A pseudo-terminal that carries any byte unchanged both ways, with or without a part on it.
+    """Open a pseudo-terminal that passes any byte unchanged both ways, even with no part on it.
 
     Raises:
-        PortError: the system gives no more of them.
+        PortError: the system has no free pseudo-terminal.
     """
     try:
         master, slave = os.openpty()
@@ -175,7 +175,7 @@ def open_pair() -> Pair:
     return Pair(master, slave, os.ttyname(slave))
 
 
-EXAMPLE = "gyro"  # the part that the next command is shown with
+EXAMPLE = "gyro"  # part in the example of the next command
 
 
 class PortInfo(NamedTuple):
@@ -185,8 +185,8 @@ class PortInfo(NamedTuple):
     description: str
     manufacturer: str
     serial_number: str
-    usable: bool  # whether we may open it; who else has it open shows only when it is opened
-    why: str  # it is not usable, with what to do
+    usable: bool  # whether we may open it; use by another program shows only on opening
+    why: str  # reason why it is not usable, with the fix
 
 
 def list_ports() -> list[PortInfo]:
@@ -216,7 +216,7 @@ def _number(path: str) -> int:
 
 
 def table(ports: Sequence[PortInfo]) -> str:
-    """The ports for people, with what to type next."""
+    """Ports as a text table, with the next command to type."""
     if not ports:
         return (
             "No serial port found.\n"

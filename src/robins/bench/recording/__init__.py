@@ -1,7 +1,7 @@
 """Records of the lines: written, read, replayed to a part, compared.
 
-- `layout`: how entries lie in an MCAP file. `writer`, `reader`: to the disk and back.
-- `topics`: messages for other tools along with the frames, a row a topic.
+- `layout`: entries in an MCAP file. `writer`, `reader`: to the disk and back.
+- `topics`: messages for other tools, next to the frames; a row per topic.
 - `replay`: a part runs again on a record. `differences`: two runs, field by field.
 """
 

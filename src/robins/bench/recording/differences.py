@@ -15,16 +15,16 @@ from robins.bench.wire.frames import Frame
 from robins.bench.wire.schema import FIRST_DATA, Wire
 
 _Pair = tuple[int, bytes, bytes]  # time [ns], and the payloads of both
-_BATCH = 1024  # pairs that are looked at together, since each call of NumPy costs as much as many
+_BATCH = 1024  # pairs compared at once, to spread the overhead of a NumPy call
 
 
 @dataclass(frozen=True)
 class FieldDifference:
     """One number of one message, over all frames in which it differs.
 
-    Differences that fields cannot express have an empty `field`: frames that only one of the two
-    has, and frames of a message that this version does not know or knows by another length. Then
-    `a` and `b` count the frames, and the other measures are 0.
+    `field` is empty for frames that cannot be compared by field: those that only one of the two
+    has, and those of a message that this version does not know or whose length differs. Then `a`
+    and `b` count the frames, and the other measures are 0.
     """
 
     message: str
@@ -35,22 +35,22 @@ class FieldDifference:
     max_rel: float  # of the larger one of the two
     first_step: int  # from 0; -1: the length of a step is not known
     first_time_s: float
-    a: float  # of the first frame that differs
+    a: float  # value in the first frame that differs
     b: float
     count: int  # of frames that differ
 
 
 class Differences:
-    """Differences between the frames of two runs, taken as they come.
+    """Differences between the frames of two runs, found as the frames come.
 
-    Frames belong together if message and time are the same; of several such, as of a tick that was
-    repeated, the first to the first. Numbers are compared bit by bit, so -0.0 is not 0.0, but NaN
-    is NaN, whatever its bits. Run and sequence in the header are not looked at, and messages of the
-    protocol are left out. Only frames whose partner has not come yet are kept.
+    Frames are paired by message and time; several of the same message and time, as after a repeated
+    tick, in their order. Numbers are compared bit by bit, so -0.0 is not 0.0, but NaN equals NaN,
+    whatever its bits. Run and sequence in the header are ignored, and messages of the protocol are
+    left out. Only unpaired frames are kept.
 
     Attributes:
-        frames: with data, of the one and of the other.
-        until_ns: the latest time of each.
+        frames: number of data frames of each run.
+        until_ns: latest time of each.
     """
 
     def __init__(self, wire: Wire, step_ns: int = 0):
@@ -62,14 +62,14 @@ class Differences:
         """
         self._wire, self._step_ns = wire, step_ns
         self.frames, self.until_ns = [0, 0], [0, 0]
-        # of the one whose partner has not come, by message and time
+        # unpaired frames by message and time: run (0 or 1), payloads
         self._waiting: dict[tuple[int, int], tuple[int, deque[bytes]]] = {}
         self._pairs: dict[int, list[_Pair]] = {}  # that differ, by message
         self._odd: dict[int, list[int]] = {}  # times of pairs that differ in no field
         self._found: dict[tuple[str, str, int], FieldDifference] = {}
 
     def take(self, which: int, frame: Frame) -> None:
-        """A frame of the one (0) or of the other (1)."""
+        """Take a frame of the first run (0) or of the second (1)."""
         key = number, time_ns = frame.header.type, frame.header.time_ns
         if number < FIRST_DATA:
             return
@@ -86,15 +86,15 @@ class Differences:
             self._differ(number, time_ns, x, y)
 
     def take_both(self, a: Frame | None, b: Frame | None) -> None:
-        """A frame of each, which need not belong together; None: it has no more."""
+        """Take a frame of each run, which need not be a pair; None: the run has no more."""
         for which, frame in enumerate((a, b)):
             if frame is not None:
                 self.take(which, frame)
 
     def found(self) -> list[FieldDifference]:
-        """The earliest difference first, of all that came until now; none: an empty list."""
+        """Differences in the frames so far, the earliest first."""
         for number in self._pairs:
-            self._look(number)
+            self._compare(number)
         only: tuple[dict[int, list[int]], ...] = ({}, {})
         for (number, time_ns), (which, waiting) in self._waiting.items():
             only[which].setdefault(number, []).extend([time_ns] * len(waiting))
@@ -109,7 +109,7 @@ class Differences:
         return sorted(found, key=lambda d: (d.first_time_s, self._place(d)))
 
     def _place(self, d: FieldDifference) -> tuple[int, int, int]:
-        """Place of a number in the table of messages; one without a field comes last."""
+        """Sort key: place in the table of messages; a difference without a field comes last."""
         of = next((m for m in self._wire.data if m.name == d.message), None)
         if of is None:
             return 1 << 16, 0, 0
@@ -127,10 +127,10 @@ class Differences:
         pairs = self._pairs.setdefault(number, [])
         pairs.append((time_ns, x, y))
         if len(pairs) == _BATCH:
-            self._look(number)
+            self._compare(number)
 
-    def _look(self, number: int) -> None:
-        """Field by field at the pairs that differ."""
+    def _compare(self, number: int) -> None:
+        """Compare the pairs that differ field by field."""
         pairs, of = sorted(self._pairs[number]), self._message(number)
         self._pairs[number].clear()
         for new in _of_fields(self._wire, of, pairs, self._step_ns) if of and pairs else ():
@@ -157,7 +157,7 @@ def differences(
 
 
 def _when(time_ns: int, step_ns: int) -> tuple[int, float]:
-    """Step and time [s]; a message has the time of its step's end."""
+    """Step and time [s] of a message, which is stamped with the end of its step."""
     return time_ns // step_ns - 1 if step_ns else -1, time_ns * 1e-9
 
 
@@ -177,7 +177,7 @@ def _of_fields(
                 continue
             first = int(where[0])
             place = of.name, f.name, -1 if f.length == 1 else k, f.unit
-            most, when = _how_much(x[where, k], y[where, k]), _when(frames[first][0], step_ns)
+            most, when = _largest(x[where, k], y[where, k]), _when(frames[first][0], step_ns)
             values = float(x[first, k]), float(y[first, k])
             found.append(FieldDifference(*place, *most, *when, *values, len(where)))
     return found
@@ -188,10 +188,10 @@ def _differ(f: Field, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return bits & ~(np.isnan(x) & np.isnan(y)) if f.kind == "f64" else bits
 
 
-def _how_much(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """The largest difference and the largest relative one."""
+def _largest(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Largest absolute and largest relative difference."""
     with np.errstate(all="ignore"):  # infinities and NaN are dealt with below
-        # whole numbers have no sign to go below zero
+        # unsigned numbers cannot go below zero
         apart = np.where(x > y, x - y, y - x).astype(np.float64)
         apart[np.isnan(apart)] = np.inf
         larger = np.fmax(np.abs(x), np.abs(y)).astype(np.float64)
@@ -203,7 +203,7 @@ def _how_much(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 def table(
     found: Sequence[FieldDifference], names: tuple[str, str] = ("recorded", "replayed")
 ) -> str:
-    """Differences for people, one line each.
+    """Text table of differences, one line each.
 
     Args:
         found: of `differences`.
@@ -232,7 +232,7 @@ def name_of(d: FieldDifference) -> str:
 
 def _row(d: FieldDifference) -> tuple[str, ...]:
     a, b = f"{d.a:.9g}", f"{d.b:.9g}"
-    if a == b:  # as many digits as it takes
+    if a == b:  # as many digits as are needed to tell them apart
         a, b = repr(d.a), repr(d.b)
     when = "-" if d.first_step < 0 else str(d.first_step), f"{d.first_time_s:.9g}"
     most = f"{d.max_abs:.3g}", f"{d.max_rel:.3g}"

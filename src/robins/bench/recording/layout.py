@@ -1,9 +1,9 @@
 """The layout of a record: its entries, and how an MCAP file holds them.
 
 MCAP (mcap.dev) is a container of time-stamped messages that other tools open too. Ours has a topic
-for each link and direction, ``/gyro/from`` or ``/adm/to``, whose messages are the bytes as they
-were on the line, and ``/events`` in JSON. A metadata record with the header of the run comes
-first; messages lie in chunks that are not compressed and have a check each.
+for each link and direction, ``/gyro/from`` or ``/adm/to``, whose messages are the bytes on the
+line, and ``/events`` in JSON. A metadata record with the header of the run comes first; messages
+are in uncompressed chunks, each with a checksum.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Entry(NamedTuple):
     received_ns: int
     link: str  # part whose link it is
     direction: Literal["to", "from"]  # the part
-    data: bytes  # a whole frame with its zeros, or bytes that were none
+    data: bytes  # a complete frame with its zeros, or bytes that form no frame
 
 
 class Event(NamedTuple):
@@ -72,7 +72,7 @@ def schemas(wire: Wire) -> tuple[Schema, Schema]:
 
 
 def json_text(what: str, value: Any) -> str:
-    """The one JSON text of a value.
+    """Canonical JSON text of a value.
 
     Raises:
         RecordingError: JSON cannot hold it; ``what`` names it.

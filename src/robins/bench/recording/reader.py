@@ -1,4 +1,4 @@
-"""Reads the record of a run, up to the last whole frame."""
+"""Reader of the record of a run, up to the last complete frame."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from robins.bench.wire.frames import VERSION
 from robins.errors import RobinsError
 from robins.foreign import decoding
 
-LONGEST = 1 << 24  # bytes of a record; a length beyond it is damage: no memory is allocated
+LONGEST = 1 << 24  # bytes of a record; a larger length means damage, and no memory is allocated
 _ABOUT = {"wire", "header", "check"}
 _Place = tuple[str, Literal["to", "from"]]
 _EVENTS: _Place = ("", "from")  # no link has this name
@@ -34,8 +34,8 @@ class Record(NamedTuple):
     header: dict[str, Any]
     entries: Sequence[layout.Entry] | Entries  # in the order in which they were written
     events: list[layout.Event]
-    whole: bool  # closed, and every check of the file holds
-    why: str  # it is not, or nothing
+    whole: bool  # closed, and every checksum of the file holds
+    why: str  # reason why it is not whole; else empty
 
 
 class Entries:
@@ -57,19 +57,19 @@ class _Damage(RobinsError):
 
 
 def read_record(path: str | Path) -> Record:
-    """Read a record, or as much of it as there is.
+    """Read a record, or as much of it as is intact.
 
-    A file that was cut or is partly damaged gives what comes before, with the reason.
+    Of a truncated or damaged file, the entries before the damage are read; `why` has the reason.
 
     Raises:
         RecordingError: there is no such file, it is no record of the bench, it is of another
-            version of the wire, or it ends before the header of the run is whole.
+            version of the wire, or it ends within the header of the run.
     """
     return _read(Path(path), lambda reader: reader.entries)
 
 
 def open_record(path: str | Path) -> Record:
-    """Check a record and read all but its entries, which are read when they are gone through.
+    """Check a record and read all but its entries, which are read when they are iterated.
 
     Raises:
         RecordingError: as `read_record`.
@@ -147,7 +147,7 @@ def _header(path: str, reader: _RecordReader) -> dict[str, Any]:
 
 
 class _RecordReader:
-    """Goes through a file, record by record."""
+    """Reader of an MCAP file, record by record."""
 
     def __init__(self, file: BinaryIO) -> None:
         self.entries: list[layout.Entry] = []
@@ -155,11 +155,11 @@ class _RecordReader:
         self._file = file
         self._at = self._check = self._before = 0
         self._topics: dict[int, _Place | None] = {}  # None: of messages for other tools
-        self._count = 0  # messages so far, which have numbers
-        self.why = ""  # it did not come to the end
+        self._count = 0  # messages so far; they are numbered
+        self.why = ""  # reason why reading stopped early
 
     def take(self, size: int) -> bytes:
-        """Read so many bytes, or as many as there are."""
+        """Read `size` bytes, or fewer at the end of the file."""
         data = self._file.read(size)
         self._at += len(data)
         self._check = zlib.crc32(data, self._check)
@@ -169,7 +169,7 @@ class _RecordReader:
         """The next record.
 
         Raises:
-            _Damage: there is none that is whole; the messages of half a chunk are taken.
+            _Damage: it is incomplete; the messages of a truncated chunk are taken.
         """
         at, self._before = self._at, self._check
         head = self.take(layout.RECORD.size)
@@ -184,7 +184,7 @@ class _RecordReader:
         return opcode, body
 
     def records(self) -> Iterator[None]:
-        """Take all records, one by one, up to the first damage, which `why` describes."""
+        """Take the records one by one, up to the first damage, which `why` describes."""
         try:
             while self.step():
                 yield
@@ -193,7 +193,7 @@ class _RecordReader:
         yield
 
     def step(self) -> bool:
-        """Take the next record; whether there is more to come.
+        """Take the next record; true if there is more to come.
 
         Raises:
             _Damage: the file ends, or is damaged there.
@@ -209,7 +209,7 @@ class _RecordReader:
         return opcode != Opcode.DATA_END
 
     def _chunk(self, at: int, data: bytes) -> None:
-        """The messages of a chunk whose end may be missing."""
+        """Take the messages of a chunk, which may be truncated."""
         if len(data) < layout.CHUNK.size:
             if (
                 at + len(data) == self._at
@@ -269,7 +269,7 @@ class _RecordReader:
         self._count += 1
 
     def _end(self, at: int, body: bytes) -> None:
-        """The checks of all of the data and of the summary after it."""
+        """Verify the checksums of the data and of the summary."""
         if body != struct.pack("<I", self._before):
             raise _Damage(f"is damaged before byte {at}: the check of all fails")
         check, tail = 0, b""
@@ -289,7 +289,7 @@ def _stream(body: bytes) -> ReadDataStream:
 
 
 def _place(channel: mcap.Channel) -> _Place | None:
-    """Link and direction of a topic, or that of events; None: its messages are for other tools."""
+    """Link and direction of a topic, or `_EVENTS`; None: its messages are for other tools."""
     if channel.topic == layout.EVENTS:
         return _EVENTS
     if channel.message_encoding in (MessageEncoding.CDR, MessageEncoding.JSON):

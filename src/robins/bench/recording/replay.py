@@ -1,9 +1,9 @@
 """Replay of one part of a recorded run on its recorded input, with a comparison of its answers.
 
-The part gets every byte that it got, in that order, wrong ones included, and as in lock-step the
-next tick waits until it is done with the one before. So a part whose output depends on its input
-alone sends the same bits again, however the run was paced; one that has been changed does not, and
-`robins.bench.recording.differences` finds the differences.
+The part receives every recorded byte in the recorded order, corrupt ones included, and as in
+lock-step the next tick waits until the part is done with the last. So a part whose output depends
+on its input alone sends the same bits again, however the run was paced; for one that has been
+changed, `robins.bench.recording.differences` finds the differences.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from robins.bench.wire.records import RecordError
 from robins.bench.wire.schema import BARE, FIRST_DATA, NUMBERS, Wire
 from robins.errors import RobinsError
 
-PATIENCE_S = 60.0  # with a part that neither answers nor computes
-_LOOK_S = 0.1  # at whether the part still lives
+PATIENCE_S = 60.0  # time-out of a part that neither answers nor computes
+_LOOK_S = 0.1  # period of checks that the part is alive
 _HELLO, _TICK, _DONE, _STOP, _BEGIN = (
     NUMBERS[name] for name in ("hello", "tick", "done", "stop", "begin")
 )
@@ -40,7 +40,7 @@ one."""
 
 
 class ReplayError(RobinsError, RuntimeError):
-    """A replay that cannot be done, or a part that did not go through with it."""
+    """A replay that cannot be done, or that a part did not complete."""
 
     bad_input = False
 
@@ -49,9 +49,9 @@ class Replayed(NamedTuple):
     """Answers of a part to a record, compared with those in the record."""
 
     part: str
-    compared: Differences  # frames with data, as the part sent them then and now
-    first_difference: str | None  # of any byte, but how long computing took; in words
-    steps: int  # that were replayed
+    compared: Differences  # data frames of the part, recorded and replayed
+    first_difference: str | None  # of any byte except computing times; in words
+    steps: int  # replayed
     step_ns: int
     starts: int  # of the part; more than one where it was restarted in the record
 
@@ -87,18 +87,18 @@ def replay(
 ) -> Replayed:
     """Run a part again on a record, and compare its answers.
 
-    Where the part was restarted in the record, it is restarted here. Of the record and of
-    the answers, only what cannot be compared yet is kept.
+    The part is restarted where it was restarted in the record. Memory holds only frames that are
+    still to be compared.
 
     Args:
-        entries: of a run, in the order in which they were written; gone through more than once.
-            Those of a record that was cut are replayed so far.
+        entries: of a run, in the order in which they were written; iterated more than once. A
+            truncated record is replayed up to its end.
         wire: its messages.
         part: whose link it is.
         start: runs the part at a port.
-        patience_s: for the part's hello, and for each step.
+        patience_s: time-out for the part's hello, and for each step.
         progress: called with the steps done, and their total.
-        says: called with each frame with data that the part sends now.
+        says: called with each data frame that the part sends in the replay.
 
     Raises:
         ReplayError: the record has nothing of the part, or the part has another schema, died, did
@@ -130,10 +130,10 @@ def replay(
 
 
 def recorded(entries: Iterable[Entry], part: str) -> Iterator[Frame]:
-    """Frames with data that a part sent in a record, each once, in order.
+    """Data frames that a part sent in a record, each once, in order.
 
     Raises:
-        ReplayError: the record has nothing of the part; at its end.
+        ReplayError: the record has nothing of the part; raised at its end.
     """
     for _, rows in groupby(_rows(entries, part), _life_of):
         newest = -1
@@ -153,13 +153,13 @@ def _is_recorded(frame: Frame, begin: Frame) -> bool:
 
 
 def _rows(entries: Iterable[Entry], part: str) -> Iterator[_LinkRow]:
-    """The record of a part from its first begin on.
+    """Record of a part from its first begin on.
 
-    A begin that comes before the first tick answers a hello that was repeated; a later one begins
-    another life.
+    A begin before the first tick answers a repeated hello; a later one starts another lifetime of
+    the part.
 
     Raises:
-        ReplayError: there is none; at the end.
+        ReplayError: there is no begin; raised at the end.
     """
     begin, life, ticked = None, -1, False
     links: set[str] = set()
@@ -190,7 +190,7 @@ def _rows(entries: Iterable[Entry], part: str) -> Iterator[_LinkRow]:
 
 
 class _Replay:
-    """Replay of one life of a part."""
+    """Replay of one lifetime of a part, from start to exit."""
 
     def __init__(
         self,
@@ -209,7 +209,7 @@ class _Replay:
         self._where = "before its hello"
 
     def run(self, rows: Iterable[_LinkRow], count: Callable[[], None]) -> None:
-        """Send the part its recorded input; the life gets its answers then and now."""
+        """Send the part its recorded input; pass recorded and new answers to the comparison."""
         self._greet()
         latest, last = -1, self._life.begin.header
         for row in rows:
@@ -221,7 +221,7 @@ class _Replay:
             for tick in row.ticks():
                 step = int(BARE.decode("tick", tick.payload)["step"])
                 self._life.ticked(step)
-                if step >= latest:  # a part has forgotten its answers to older ones
+                if step >= latest:  # a part does not keep its answers to older ones
                     self._where = f"in step {step}"
                     for frame in self._until_done(step, latest):
                         self._life.says(frame)
@@ -276,7 +276,7 @@ class _Replay:
         return self._waiting.pop(0)
 
     def _write(self, data: bytes) -> None:
-        """Put bytes on the line; reads, too, so that neither end waits for the other."""
+        """Write bytes to the line; read meanwhile, so that the two ends cannot deadlock."""
         began = time.monotonic()
         master = self._pair.master
         while data:
@@ -299,7 +299,7 @@ class _Replay:
         return True
 
     def _check(self, began: float) -> None:
-        """Require that the part lives, and that there is time left or it computes."""
+        """Check that the part is alive, and that it computes or has time left."""
         poll = getattr(self._process, "poll", None)
         if poll is not None and (code := poll()) is not None and not self._read(0.0):
             raise ReplayError(f"part '{self._part}' died {self._where} (exit code {code})")
@@ -314,10 +314,10 @@ class _Replay:
 
 
 class _PartLifetime:
-    """Comparison of a part's answers then and now, from one begin to the next.
+    """Comparison of a part's recorded and new answers, from one begin to the next.
 
     Attributes:
-        begin: the frame with which it began.
+        begin: its first frame.
         step_ns: length of a step.
     """
 
@@ -331,7 +331,7 @@ class _PartLifetime:
     ):
         self._wire, self.begin, self.step_ns = wire, begin, step_ns
         self._compared, self._says = compared, says
-        self._then: dict[int, Frame] = {}  # by sequence number, not compared yet
+        self._then: dict[int, Frame] = {}  # recorded, by sequence number, not compared yet
         self._now: dict[int, Frame] = {}
         self._newest = self._tick = self._answered = -1  # of the record
         self._first: tuple[int, str] | None = None
@@ -341,7 +341,7 @@ class _PartLifetime:
         return self.begin.header.run
 
     def ticked(self, step: int) -> None:
-        """Note a tick that was sent to it."""
+        """Record a tick that was sent to the part."""
         self._tick = step
 
     def said(self, row: _LinkRow) -> None:
@@ -360,7 +360,7 @@ class _PartLifetime:
                 self._answered = max(self._answered, step)
 
     def says(self, frame: Frame) -> None:
-        """Take a present answer."""
+        """Take a new answer."""
         self._says(frame)
         self._compared.take(1, frame)
         self._now[frame.header.sequence] = frame
@@ -377,11 +377,11 @@ class _PartLifetime:
             self._first = number, words
 
     def first_difference(self) -> str | None:
-        """The first frame that is not the same, in words, at the end."""
+        """First frame that differs, in words; call it at the end."""
         for number, frame in self._then.items():
             place_text = f"{_place(self, frame)}: {_frame_text(self._wire, frame)}"
             self._differs(number, f"{place_text} was recorded and is not said now")
-        # a record that was cut, or a part that died, ends in the middle of an answer
+        # a truncated record, or a part that died, ends in the middle of an answer
         whole = self._tick <= self._answered
         for number, frame in self._now.items():
             if whole or number < self._newest:

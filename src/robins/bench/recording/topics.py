@@ -1,15 +1,15 @@
-"""Messages of the wire as topics that other tools decode: a table, a row a topic.
+"""Messages of the wire as topics that other tools decode: a table with a row per topic.
 
 A row names a message, its type of ROS 2 or JSON, the function that converts it, and its frame:
 
     Topic("sample", "/imu", "sensor_msgs/msg/Imu", lambda v: imu(v["omega_b"], body="FRD"), "imu")
     Topic("mode", "/mode", JSON, as_json)
 
-A `Recorder` with rows writes, next to each sound frame that a part sends, what the rows make of it.
-The header has the time of the frame, so the start of the run is zero, or where the row names it a
-stamp of the message: GPS time becomes UTC, as in ROS, and a count from elsewhere stays. Messages of
-ROS are along the axes that `robins.ros.convert` names; JSON has the fields and units of the wire.
-The functions of that module are here too, for the rows.
+A `Recorder` with rows writes the converted messages next to each valid frame that a part sends.
+The header has the time of the frame, zero at the start of the run, or the stamp of the message that
+the row names: GPS time becomes UTC, as in ROS; a stamp with another origin stays. ROS messages use
+the axes that `robins.ros.convert` names; JSON has the fields and units of the wire.
+The functions of that module are re-exported here, for the rows.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class ConvertedMessage(NamedTuple):
 
 
 def as_json(values: Values) -> dict[str, Any]:
-    """All fields of a message as JSON has them: lists, and null where a number is not finite."""
+    """Fields of a message in the types of JSON: lists, and null where a number is not finite."""
 
     def plain(x: Any) -> Any:
         if isinstance(x, list):
@@ -73,9 +73,9 @@ def as_json(values: Values) -> dict[str, Any]:
 
 
 def completed(rows: Iterable[Topic], wire: Wire, sends: Mapping[str, Iterable[str]]) -> list[Topic]:
-    """Rows, and one of JSON for each message of a part that none of them names.
+    """Rows, plus one of JSON for each message of a part that no row names.
 
-    Its topic is ``/part/message``, with underscores for what no topic may have.
+    Its topic is ``/part/message``, with underscores for characters that a topic cannot have.
 
     Args:
         rows: of the table.
@@ -96,10 +96,10 @@ def completed(rows: Iterable[Topic], wire: Wire, sends: Mapping[str, Iterable[st
 
 
 class Topics:
-    """Rows, ready to be applied to what parts send.
+    """Converter of the frames that parts send, by the rows of a table.
 
     Attributes:
-        failed: messages that a row's function could not make; they are left out.
+        failed: number of messages that a row's function could not make; they are left out.
     """
 
     def __init__(self, wire: Wire, rows: Iterable[Topic]):
@@ -110,7 +110,7 @@ class Topics:
             rows: of the table.
 
         Raises:
-            RecordingError: a row names a message, a type, or a topic that cannot be, or its
+            RecordingError: a row names an unknown message or type or an impossible topic, or its
                 function does not make the type of the row.
         """
         self.failed, self._wire = 0, wire
@@ -132,7 +132,7 @@ class Topics:
             self._by_number.setdefault(number, []).append((row, _schema(row, wire.message(number))))
 
     def of(self, entry: Entry) -> list[ConvertedMessage]:
-        """Messages that the rows make of an entry; none if it is no sound frame."""
+        """Messages that the rows make of an entry; none if it is no valid frame."""
         if not self._by_number or entry.direction != "from" or len(entry.data) < 2:
             return []
         try:
@@ -146,7 +146,7 @@ class Topics:
         for row, schema in rows:
             try:
                 data = _bytes_of(row, row.make(values), _stamp(row, values, head.time_ns))
-            except _FAILS:  # a topic for other tools is not worth the run, and the frame is kept
+            except _FAILS:  # a failed conversion must not end the run; the frame itself is kept
                 self.failed += 1
                 continue
             encoding = MessageEncoding.JSON if row.type == JSON else MessageEncoding.CDR
@@ -205,7 +205,7 @@ def _schema(row: Topic, of: Message) -> Schema:
         "frame_id": {"type": "string"},
     }
     for f in of.fields:
-        # Foxglove takes one type a field, so null is described in words
+        # Foxglove accepts one type per field, so null is described in words
         one = {"type": "number" if f.kind == "f64" else "integer"}
         many = {"type": "array", "items": one, "minItems": f.length, "maxItems": f.length}
         unit = "" if f.unit == "1" else f" [{f.unit}]"

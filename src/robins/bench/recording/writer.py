@@ -1,15 +1,15 @@
 """Writer of the record of a run: raw frames with their times of arrival, in an MCAP file.
 
 Messages go to the disk in chunks of 512 messages, of 64 KiB or of a quarter of a second, whichever
-comes first, each in one write. So a file that was cut anywhere lacks what came in the last quarter
-of a second, and half a frame of what had reached the disk. Nothing but what is given goes into it:
-the same entries make the same bytes. See `layout` for how they lie there.
+comes first, each in one write. So the file of a killed run lacks at most the traffic of the last
+quarter of a second, and may end in a truncated frame. Nothing but the input goes into it: the same
+entries make the same bytes. See `layout` for the format.
 
-The writer is that of the package `mcap`; only when a chunk is over, and how it reaches the disk, is
-decided here. By itself it ends a chunk by size alone: of 3030 frames at 300 Hz, killed by SIGKILL,
-its usual chunks of 1 MiB left none and those of 64 KiB lacked 2.1 s, where this lacks 0.2 s. It
-takes 8.6 us a message (116 000 a second), where a writer of our own took 2.2 us. A bench of seven
-parts passes 31 messages a step, so a step costs 0.2 ms more, mostly while the parts compute.
+The writer is that of the package `mcap`; only the end of a chunk and the write to disk are
+controlled here. By itself `mcap` ends a chunk by size alone: of 3030 frames at 300 Hz, killed by
+SIGKILL, its default chunks of 1 MiB left none, and those of 64 KiB lost 2.1 s, where this loses
+0.2 s. It takes 8.6 us a message (116 000 a second); a writer of our own took 2.2 us. A bench of
+seven parts passes 31 messages a step, so a step costs 0.2 ms more, mostly while the parts compute.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ CHUNK_NS = 250_000_000
 
 
 class Recorder:
-    """Writes a record; a context manager that closes it.
+    """Writer of a record; a context manager that closes it.
 
     Attributes:
         path: of the file.
-        messages: all that was taken so far: entries, events, and messages for other tools.
-        lost: of them, those that found no disk.
+        messages: number taken so far: entries, events, and messages for other tools.
+        lost: number of them that could not be written to disk.
     """
 
     def __init__(
@@ -57,9 +57,9 @@ class Recorder:
         Args:
             path: of the file.
             wire: the messages that go over the lines.
-            header: of the run, such as its scenario, seeds and versions; becomes JSON.
+            header: of the run, such as its scenario, seeds and versions; stored as JSON.
             topics: rows that convert the frames that parts send for other tools.
-            overwrite: whether a file that is there is replaced.
+            overwrite: whether to replace an existing file.
 
         Raises:
             RecordingError: the file is there, JSON cannot hold the header, or a row of the topics
@@ -103,9 +103,9 @@ class Recorder:
         """Take an entry: a frame or bytes that went over a link.
 
         Args:
-            entry: with the time it came.
-            time_ns: of the header of the frame, where the caller knows it; else it is looked up,
-                and bytes that are no frame have the time they came.
+            entry: with its time of arrival.
+            time_ns: of the header of the frame, if the caller knows it; else it is decoded, and
+                bytes that form no frame get the time of arrival.
 
         Raises:
             OSError: the disk is full, or gone; raised once, later entries are counted as lost.
@@ -141,7 +141,7 @@ class Recorder:
         return self._decoded.failed
 
     def flush(self) -> None:
-        """Hand to the disk what has been taken; for times in which nothing comes.
+        """Write the open chunk to disk; for times without traffic.
 
         Raises:
             OSError: as `write`.
@@ -158,7 +158,7 @@ class Recorder:
             raise
 
     def close(self) -> None:
-        """Write the summary by which other tools find their way, and close the file.
+        """Write the summary, which other tools use as an index, and close the file.
 
         Raises:
             OSError: as `write`.
@@ -174,7 +174,7 @@ class Recorder:
             self._disk.close()
 
     def _clean(self) -> None:
-        """Begin a chunk."""
+        """Start a chunk."""
         self._first = self._last = self._taken = self._size = 0
 
     def _channel(self, topic: str, encoding: str, schema: Schema) -> int:
@@ -212,7 +212,7 @@ class Recorder:
 
 
 class _Disk:
-    """A file that gets what is written to it when it is flushed, in one write."""
+    """File that writes its buffer to disk in one write, when it is flushed."""
 
     def __init__(self, path: Path, mode: str):
         self._file = FileIO(path, mode)  # unbuffered: what has been written outlives this process

@@ -1,6 +1,6 @@
-"""The rigs of the bench: one a vehicle, each in a folder or a file of its own; a row in the table.
+"""The rigs of the bench: one per vehicle, each in its own folder or file, and listed in a table.
 
-A user's own rig is in a file, "pendulum.py:rig".
+A user's own rig is named with its file, "pendulum.py:rig".
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from robins.systems.catalogue import is_file
 __all__ = ["RIGS", "UnknownRig", "rig_of"]
 
 RIGS: tuple[str, ...] = ("satellite", "ins-gnss", "airship", "laboratory", "multirotor")
-"""Rigs that come with robins: each a module here, which calls it RIG."""
+"""Rigs that come with robins: each is a module here with the attribute RIG."""
 
 
 class UnknownRig(RobinsError, ValueError):
@@ -26,15 +26,15 @@ class UnknownRig(RobinsError, ValueError):
 
 
 def rig_of(name: str, folder: Path = Path(), named_in: str | os.PathLike[str] = "") -> Rig:
-    """A rig by its name, or "file.py:name", relative to a folder.
+    """Find a rig by its name, or by "file.py:name" relative to a folder.
 
     Args:
         name: of the rig.
-        folder: to which a file is relative.
-        named_in: file that names it; empty where the user does.
+        folder: to which the file is relative.
+        named_in: file that names the rig; empty if the user does.
 
     Raises:
-        UnknownRig: there is none; the message lists the known ones.
+        UnknownRig: there is no such rig; the message lists the known ones.
         RobinsError: it is a file named in another file, and the user has not confirmed it.
     """
     if name in RIGS:

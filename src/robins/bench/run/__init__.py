@@ -1,8 +1,9 @@
 """A run on the bench.
 
 - `setup`: its parameters.
-- `session`: its execution. `part_processes`: its processes. `clocks`: the start of each step.
-- `telemetry`, `outcome`: its results, in a `room` on disk if it is long.
+- `session`: its execution. `processes`: those of its parts. `clocks`: the start of each step.
+- `orders`, `switching`: faults and messages of the operator; faults of processes.
+- `telemetry`, `outcome`: its results, in a `number_store` on disk if it is long.
 - `watching`: the page and the status file.
 """
 

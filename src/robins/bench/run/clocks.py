@@ -1,7 +1,7 @@
 """Clocks that start each step: as soon as possible, or at its time.
 
-Soft real time: an ordinary kernel wakes us late now and then, and Python collects garbage. Lateness
-is counted, not excluded.
+Soft real time: an ordinary kernel wakes us late at times, and Python collects garbage. Lateness is
+counted, not excluded.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from robins.bench.broker.link import BenchError
 from robins.bench.rig import LoadedRun
 
 Overrun = Literal["continue", "skip", "abort"]
-_BEHIND_S, _BEHIND_PERIODS = 1.0, 10.0  # the longer: from so much on a run is behind its clock
-_SPIN_NS = 200_000  # before a deadline from which on we do not sleep
+_BEHIND_S, _BEHIND_PERIODS = 1.0, 10.0  # lag of a run that is behind: the longer
+_SPIN_NS = 200_000  # before a deadline: busy wait instead of sleep
 
 
 class LockStep:
@@ -32,19 +32,19 @@ class LockStep:
         return False
 
     def behind(self, step: int) -> str:
-        """Return no sentence: in lock-step there is no clock to be behind."""
+        """Empty: in lock-step there is no clock to be behind."""
         return ""
 
     def rested(self, ns: int) -> None:
-        """The run was paused so long; nothing comes of it."""
+        """Ignore a pause of the run: there are no deadlines."""
 
 
 class RealTime:
-    """Step k begins at t0 + k/rate on the monotonic clock, whenever the one before it ended.
+    """Clock by which step k begins at t0 + k/rate (monotonic), whenever step k - 1 ended.
 
     Attributes:
-        patience_ns: how long a part is waited for.
-        skipped: deadlines that were let go by.
+        patience_ns: time-out of a part in a step.
+        skipped: number of deadlines skipped.
     """
 
     def __init__(self, rate_hz: float, overrun: Overrun = "continue", patience: float = 1.0):
@@ -85,13 +85,13 @@ class RealTime:
         return deadline
 
     def rested(self, ns: int) -> None:
-        """The run was paused so long; all deadlines move."""
+        """Move all deadlines by the duration of a pause [ns]."""
         if self._began_ns is not None:
             self._began_ns += ns
 
     def behind(self, step: int) -> str:
-        """A sentence when the run, after a step, is far behind its clock: once, and again whenever
-        that has doubled. Deadlines that were let go by count too.
+        """Notice that the run is far behind its clock after a step: once, and again whenever the
+        lag has doubled; else empty. Skipped deadlines count too.
         """
         assert self._began_ns is not None
         due_ns = self._began_ns + round((step + 1) * 1e9 / self._rate_hz)
@@ -103,7 +103,7 @@ class RealTime:
         return f"the run is {late_s:.1f} s behind its clock: {self._rate_hz:g} Hz is too fast"
 
     def over(self, step: int) -> bool:
-        """True if the step that is just done has missed the deadline of the next one.
+        """True if the step just completed has missed the deadline of the next one.
 
         Raises:
             BenchError: it has, and the policy is to abort.

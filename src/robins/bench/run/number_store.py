@@ -1,7 +1,7 @@
-"""Room for the arrays of a run: in memory, or on disk where they are large.
+"""Storage for the arrays of a run: in memory, or on disk if they are large.
 
-On disk they lie in a file that has lost its name as soon as it was opened. It goes with the last
-array that is used, or with the process, whatever ends it; so there is nothing to remove.
+On disk they are in a file that is unlinked as soon as it is open. The system frees it with the last
+array, or with the process, however that ends; so nothing needs to be removed.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ import numpy as np
 
 from robins.results.errors import cannot
 
-LARGE = 64 << 20  # bytes, above which arrays lie on disk
+LARGE = 64 << 20  # bytes above which arrays are stored on disk
 _PIECE = 1 << 17  # numbers written at once
 
-Shapes = Mapping[str, tuple[tuple[int, ...], float | int]]  # by name, with what fills them
+Shapes = Mapping[str, tuple[tuple[int, ...], float | int]]  # shape and fill value, by name
 
 
 class NumberStore:
     """Arrays of 64-bit numbers by name.
 
     Attributes:
-        arrays: to be read and written.
+        arrays: readable and writable.
     """
 
     def __init__(self, shapes: Shapes, folder: Path | None = None):
-        """Make room.
+        """Allocate the arrays.
 
         Args:
-            shapes: of the arrays, with the number that fills each: nan, or 0 of whole numbers.
-            folder: where the file is if they are large; by default that for temporary files.
+            shapes: shape and fill value of each array: NaN, or 0 for whole numbers.
+            folder: of the file, if they are large; default: the temporary folder.
 
         Raises:
-            robins.results.ResultError: the file system has no room for them.
+            robins.results.ResultError: the file system has not enough space for them.
         """
         self._file: mmap.mmap | None = None
         size = sum(8 * int(np.prod(shape)) for shape, _ in shapes.values())
@@ -55,13 +55,13 @@ class NumberStore:
             self.arrays[name], at = array, at + array.nbytes
 
     def forget(self) -> None:
-        """Let go of the memory of what lies on disk; it is read again when it is needed."""
+        """Release the memory of arrays on disk; they are read again when needed."""
         if self._file is not None and hasattr(mmap, "MADV_DONTNEED"):  # not on every system
             self._file.madvise(mmap.MADV_DONTNEED)
 
 
 def _filled(shapes: Shapes, size: int, where: Path) -> mmap.mmap:
-    """A file without a name, as memory. It is written whole, so that a full disk is met here."""
+    """Memory map of an unlinked file. All of it is written, so that a full disk shows here."""
     with tempfile.TemporaryFile(dir=where) as file:
         for shape, what in shapes.values():
             count = int(np.prod(shape))

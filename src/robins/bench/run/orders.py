@@ -12,11 +12,11 @@ from robins.bench.rig import LoadedRun
 from robins.bench.wire.fields import Values
 
 QueuedMessage = tuple[str, bytes, bool]
-"""Name and payload of an operator message that is due; true where the scenario has planned it."""
+"""Name and payload of an operator message that is due, and true if the scenario planned it."""
 
 
 class Orders:
-    """Faults and messages of a run.
+    """Faults and operator messages of a run.
 
     Attributes:
         operator_events: messages sent.
@@ -60,15 +60,15 @@ class Orders:
     # ---------------------------------------------------------------------------------- messages
 
     def say(self, message: str, values: Values) -> None:
-        """Queue a message for the next step; before the first one, it waits for its end.
+        """Queue a message for the next step; before the run, until the first step has ended.
 
         Raises:
-            SayError: it cannot be sent.
+            OperatorMessageError: it cannot be sent.
         """
         self._ordered.append((message, self._rig.operator_console.payload(message, values), False))
 
     def due(self, step: int) -> list[QueuedMessage]:
-        """Messages sent before a step, in order: of the same message the last one stands."""
+        """Messages due before a step, in order; of several of one name, parts use the last."""
         if step == 0:
             return []
         planned = [one for at, one in self._planned if at <= step]

@@ -1,4 +1,4 @@
-"""The outcome of a run on the bench: figures for scripts, sentences for people, arrays to draw."""
+"""Outcome of a run on the bench: figures for scripts, sentences for people, arrays to plot."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _EVENTS = 200  # listed; all are in the record
 
 
 def run_figures(flight: LoadedRun, result: RunResult) -> RunFigures:
-    """Figures of the rig for the run; none of a run without a step, of which no rig need know.
+    """Evaluation of the run by its rig; empty for a run without a step.
 
     Raises:
-        BenchError: the rig cannot judge it; names the line that failed.
+        BenchError: the rig cannot evaluate it; names the line that failed.
     """
     if not result.steps:
         return RunFigures()
@@ -38,7 +38,7 @@ def run_figures(flight: LoadedRun, result: RunResult) -> RunFigures:
 
 
 def in_one_program(flight: LoadedRun, result: RunResult) -> Mapping[str, np.ndarray] | None:
-    """The same run inside one program; None where a run of this kind has none to compare with.
+    """Same run inside one program; None: such a run cannot be compared.
 
     Raises:
         BenchError: the rig cannot compute it; names the line that failed.
@@ -119,7 +119,7 @@ def outcome(flight: LoadedRun, result: RunResult, record: Path | None) -> Outcom
     if not (result.steps or result.failure):
         failures = ["it was stopped before its first step"]
     said, inside = RunFigures(arrays=arrays_of(flight.rig.noted, result.series)), None
-    # Both are the user's own code; where it fails, what was flown is still shown.
+    # Both may be the user's own code; if it fails, the run itself is still shown.
     try:
         inside = in_one_program(flight, result)
     except BenchError as error:
@@ -158,7 +158,7 @@ def outcome(flight: LoadedRun, result: RunResult, record: Path | None) -> Outcom
 
 
 def text(account: dict[str, Any], said: RunFigures, result: RunResult) -> str:
-    """The figures for a terminal: errors, the wire, how late parts were, what happened."""
+    """Text for a terminal: figures of merit, health of the lines, lateness of parts, events."""
     wire = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in account["counts"].items() if v)
     lines = [*said.lines, f"{'wire':<16}{wire}\n", result.latencies.table()]
     lines += [
@@ -188,7 +188,7 @@ def solution(name: str, series: MessageSeries, said: RunFigures, result: RunResu
 
 
 def lateness(result: RunResult) -> dict[str, Any]:
-    """Histogram of how late steps began, where they had deadlines."""
+    """Histogram of the lateness of steps; empty in lock-step."""
     counted = result.latencies.summary()["histogram"]
     if not any(counted["counts"]):
         return {}

@@ -1,4 +1,4 @@
-"""The processes of the parts: spawned (never forked), watched, killed, and none left over."""
+"""Processes of the parts: spawned (never forked), watched, and all ended at exit."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from robins.bench.parts.station import path_of
 from robins.bench.rig import Rig
 
 _ERROR = re.compile(r"[\w.]*(Error|Exception|Interrupt)\b")
-_GRACE_S = 2.0  # between the signal to stop and being killed
+_GRACE_S = 2.0  # between the signal to stop and the kill
 
 
 class ProcessExit(NamedTuple):
@@ -29,7 +29,7 @@ class ProcessExit(NamedTuple):
 
     part: str
     code: int  # negative: the signal that ended it
-    error_output: str  # its last words on standard error
+    error_output: str  # its last output on standard error
 
     def __str__(self) -> str:
         how = f"ended with status {self.code}"
@@ -40,7 +40,7 @@ class ProcessExit(NamedTuple):
 
 
 class PartProcesses:
-    """Processes, one a part; a context that ends them all however it is left."""
+    """Processes of the parts; a context manager that ends them all on any exit."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class PartProcesses:
             config: for all of them.
             realtime: whether they request a real-time scheduler.
             restarts: whether they save their memory, to be restarted from it.
-            programs: in the place of a part of the rig, by part; each is given the path of a port.
+            programs: replacements of parts, by part; each is given the path of a port.
         """
         self._rig, self._config, self._programs = rig, config, programs
         self._realtime, self._restarts = realtime, restarts
@@ -87,7 +87,7 @@ class PartProcesses:
         """
         assert self._folder is not None
         words = (self._folder / f"{part}.txt").open("wb")
-        # Steps are short: handing each to a thread of JAX and back takes longer than some of them.
+        # Steps are short: dispatch to a thread of JAX and back takes longer than some of them.
         environment = {**os.environ, "JAX_CPU_ENABLE_ASYNC_DISPATCH": "false"}
         if self._realtime:
             environment[REALTIME] = "1"
@@ -114,7 +114,7 @@ class PartProcesses:
         return None if running is None else running.pid
 
     def idle_s(self, part: str) -> float:
-        """Time in which the process of a part has done next to nothing [s]; see `idleness`."""
+        """Idle time of the process of a part [s]; see `idleness`."""
         return self._idle_s(self.process(part))
 
     def remembers(self, part: str, step: int) -> bool:
@@ -136,7 +136,7 @@ class PartProcesses:
             self._running[part].kill()
 
     def end(self) -> None:
-        """End all: those that received a stop end by themselves, the others are killed."""
+        """End all: processes that received a stop end by themselves, the others are killed."""
         until = time.monotonic() + _GRACE_S
         while any(p.poll() is None for p in self._running.values()):
             if time.monotonic() > until:

@@ -33,13 +33,13 @@ from robins.bench.run.telemetry import Telemetry, require_truth
 from robins.bench.wire.frames import VERSION
 from robins.bench.wire.records import PayloadFault
 
-HELLO_S = 120.0  # for the hello of a part that does not compute
+HELLO_S = 120.0  # time-out for the hello of a part that does not compute
 REVIVED_S = 60.0
-_ANEW = '; on_death = "restart" would restart it'
-_LONG_S = 9.0  # of waiting for a hello, before it is an event
-_TELL_S = 0.2  # between two words on how far it is
-_MOST_DEATHS, _MINUTE_S = 3, 60.0  # of one part, by itself, until the run fails
-_POLL_NS = 50_000_000  # how often processes are looked at
+_RESTART_HINT = '; on_death = "restart" would restart it'
+_LONG_S = 9.0  # wait for a hello that is reported as an event
+_TELL_S = 0.2  # period of progress reports
+_MOST_DEATHS, _MINUTE_S = 3, 60.0  # deaths of a part without a fault in that time that fail the run
+_POLL_NS = 50_000_000  # period of checks on the processes
 
 
 @runtime_checkable
@@ -81,8 +81,8 @@ class Session:
         clock: decides when a step begins.
         done: steps so far.
         step_ms: duration of the last step.
-        pace: steps a second, of late.
-        deaths: of processes, so far.
+        pace: recent rate [steps/s].
+        deaths: number of processes that have died so far.
     """
 
     def __init__(
@@ -94,19 +94,19 @@ class Session:
         paused: bool = False,
         config: RunConfig | None = None,
     ):
-        """Make ready.
+        """Prepare a run.
 
         Args:
             flight: the run.
-            record: where to write the record; None: none.
+            record: path of the record to write; None: none.
             watch: the observer.
-            progress: called with the share that is done, and the present activity.
-            paused: whether it waits for a "start" of the observer.
-            config: of the same run, if it has been made before.
+            progress: called with the share done, and the present activity.
+            paused: whether to wait for a "start" of the observer.
+            config: of the same run, if it has already been made.
 
         Raises:
             ScenarioError: the length of the run does not fit the scenario.
-            PortError, ResultError: a port cannot be opened; there is no room for what passes.
+            PortError, ResultError: a port cannot be opened; there is no space for the telemetry.
             BenchError: the rig cannot prepare the run.
         """
         self.flight, self.rig, self._watch = flight, flight.rig, watch
@@ -135,12 +135,12 @@ class Session:
         self.done = 0
         self.step_ms = self.pace = 0.0
         self._histories: dict[str, SentFrames] = {}  # of parts that are restarted if they die
-        self._died: dict[str, list[float]] = {}  # when, of late, by part; not of those killed
-        self._barred: set[tuple[str, str]] = set()  # links and messages that were reported
+        self._died: dict[str, list[float]] = {}  # recent times of deaths without a fault, by part
+        self._barred: set[tuple[str, str]] = set()  # links and messages already reported
         self._paused, self._stop = paused, False
         self._speaks: dict[str, str] = {}  # by part: the port that its process opens
-        self._passed: deque[tuple[Entry, int]] = deque()  # not written yet
-        self._heard: deque[tuple[str, int, bytes]] = deque()  # not noted yet
+        self._passed: deque[tuple[Entry, int]] = deque()  # to be recorded
+        self._heard: deque[tuple[str, int, bytes]] = deque()  # to be added to the telemetry
         self._glanced_ns = 0
         self._began_ns = time.monotonic_ns()
 
@@ -171,7 +171,7 @@ class Session:
             finally:
                 seconds = time.monotonic() - began
                 self.broker.stop()
-                with contextlib.suppress(BenchError):  # whose failure has been reported, or is next
+                with contextlib.suppress(BenchError):  # its failure has been reported, or is next
                     self._catch_up()
                 if self._watch is not None:
                     self._watch.over(self, bool(failure))
@@ -192,13 +192,13 @@ class Session:
         )
 
     def _go(self) -> int:
-        """All steps."""
+        """Execute all steps and return the number completed."""
         told, counted, since = 0.0, 0, time.monotonic()
         with fewer_collections(), realtime(self.flight.setup.fifo) as refused:
             if refused:
                 self.event("scheduler", refused)
             for k in range(self.steps):
-                self._obey(k)
+                self._execute_commands(k)
                 if self._stop:
                     self._catch_up()
                     return k
@@ -225,7 +225,7 @@ class Session:
         self._catch_up()
         return self.steps
 
-    def _obey(self, step: int) -> None:
+    def _execute_commands(self, step: int) -> None:
         """Execute the commands of the observer; wait while it is paused."""
         time_ns = (step + 1) * self.config.step_ns
         switch(
@@ -270,7 +270,8 @@ class Session:
         """Send the parts a message before the next step; a field left out is missing or 0.
 
         Raises:
-            SayError: the bench does not send it, it has no such field, or one beyond its limits.
+            OperatorMessageError: the bench does not send it, it has no such field, or a value is
+                beyond its limits.
         """
         self._orders.say(message, values)
 
@@ -314,7 +315,7 @@ class Session:
         return stack.enter_context(recorder)
 
     def _wire(self, stack: contextlib.ExitStack) -> Broker:
-        """Open the far ends and start the processes."""
+        """Open the ports and start the processes."""
         setup = self.flight.setup
         links: dict[str, Link] = {}
         for part in self.rig.parts:
@@ -345,7 +346,7 @@ class Session:
         )
 
     def _waiting(self, parts: Sequence[str], since_s: float) -> None:
-        """Show the parts whose hello is waited for."""
+        """Report the parts whose hello is missing."""
         processes = [part for part in parts if part not in self.ports]
         silent = [part for part in parts if part in self.ports]
         words = [f"{', '.join(processes)}: starting, compiling"] * bool(processes)
@@ -381,7 +382,7 @@ class Session:
 
     def event(self, kind: str, text: str, shown: bool = True) -> None:
         """Record an event."""
-        self._catch_up()  # what passed before it stands before it
+        self._catch_up()  # earlier traffic comes first in the record
         one = Event(self._wall_ns(), kind, text, {"time_s": round(self.time_s, 9)})
         self.events.append(one)
         if self._recorder is not None:
@@ -397,10 +398,10 @@ class Session:
             self._passed.append((Entry(self._wall_ns(), link, direction, data), time_ns))
 
     def _refused(self, link: str, message: str, why: PayloadFault) -> None:
-        """Report a frame that contradicts its table; those like it that follow are only counted.
+        """Report a refused frame; later ones of the same link and message are only counted.
 
         Raises:
-            BenchError: it is the truth, without which nothing is to be judged.
+            BenchError: it is the truth, without which the run cannot be evaluated.
         """
         if message == self.rig.truth and why.sized and message in self.rig.sends[link]:
             raise BenchError(
@@ -415,14 +416,14 @@ class Session:
         self._heard.append((message, time_ns, payload))
 
     def _catch_up(self) -> None:
-        """Write and note down what has passed since; the parts do not wait for that."""
+        """Record the traffic since the last call, while the parts compute."""
         while self._heard:
             self.telemetry.observe(*self._heard.popleft())
         recorder, failure = self._recorder, None
         while recorder is not None and self._passed:
             try:
                 recorder.write(*self._passed.popleft())
-            except OSError as error:  # it counts what it loses from here on
+            except OSError as error:  # the recorder counts what it loses from here on
                 failure = error
         if failure is not None:
             raise BenchError(f"the record cannot be written: {failure}")
@@ -436,14 +437,14 @@ class Session:
         if now - self._glanced_ns > _POLL_NS:
             self._glanced_ns = now
             if self._recorder is not None and self._paused:
-                self._recorder.flush()  # nothing comes that would
+                self._recorder.flush()  # no traffic comes that would do so
             self._reap()
 
     def _reap(self, until: str | None = None) -> None:
         """Handle processes that have ended, by the policy of the setup.
 
         Raises:
-            BenchError: one has, and the run is to fail.
+            BenchError: a process has ended, and the policy is to fail.
         """
         deaths = self.part_processes.deaths()
         while until is not None and until not in [d.part for d in deaths]:
@@ -458,11 +459,11 @@ class Session:
             self.deaths += 1
             self.event("died", str(death))
             fatal = f"{death}, at {self.time_s:.1f} s of the run"
-            if by_itself:  # a fault may kill it as often as it likes
+            if by_itself:  # kills by a fault are not limited
                 died, now = self._died.setdefault(part, []), time.monotonic()
                 died[:] = [*(at for at in died if now - at < _MINUTE_S), now]
             if setup.on_death == "fail" or self.broker.time_ns == 0:
-                raise BenchError(fatal + ("" if self.rig.once(setup, part) else _ANEW))
+                raise BenchError(fatal + ("" if self.rig.once(setup, part) else _RESTART_HINT))
             if self.deaths > setup.restarts:
                 raise BenchError(f"{fatal}; that is one more than restarts = {setup.restarts}")
             if len(self._died.get(part, ())) >= _MOST_DEATHS:
@@ -478,16 +479,16 @@ class Session:
             return self.event("restarted", f"'{part}' was restarted and told {told} again")
 
     def _require_alive(self, part: str) -> None:
-        """Check that a restarted part has not died at once; others wait for their turn.
+        """Check that a restarted part has not died at once; deaths of others are handled later.
 
         Raises:
-            _RestartFailedError: it has.
+            _RestartFailedError: it has died.
         """
         if died := self.part_processes.deaths(part):
             raise _RestartFailedError(died[0])
 
 
 def wiring(rig: Rig, config: RunConfig) -> Wiring:
-    """Links of a rig: which part sends which message to which."""
+    """Senders and receivers of the messages of a rig."""
     takes = {part: dict(rig.part(part, config).takes) for part in rig.parts}
     return Wiring(rig.wire, rig.sends, takes, rig.console)

@@ -117,11 +117,11 @@ def setup_of(rig: Rig) -> type[Setup]:
 
 @contextlib.contextmanager
 def calling(rig: Rig, name: str, otherwise: str = "") -> Iterator[None]:
-    """Call a function of a rig, which may be the user's own.
+    """Context in which a function of a rig, perhaps the user's own, is called.
 
     Args:
-        rig: whose it is.
-        name: field of the rig.
+        rig: the rig.
+        name: of the function.
         otherwise: advice in addition to correcting it.
 
     Raises:
@@ -156,7 +156,8 @@ def built_in() -> dict[str, Path]:
 
 
 def read(name: str, settings: tuple[str, ...] = ()) -> LoadedRun:
-    """A run by the name of a scenario of the bench or of a system, a file of either, or a rig.
+    """Read a run, named by a scenario of the bench or of a system, a file of either, or a rig.
+
 
     Args:
         name: "noisy-line", "satellite/s1", "satellite" (its first), "mine.toml", "pendulum.py:rig".
@@ -164,8 +165,8 @@ def read(name: str, settings: tuple[str, ...] = ()) -> LoadedRun:
             `Setup.set`.
 
     Raises:
-        ScenarioError: there is none of this name, or it cannot be used.
-        robins.bench.rigs.UnknownRig: it is of a rig that there is not.
+        ScenarioError: there is no scenario of this name, or it cannot be used.
+        robins.bench.rigs.UnknownRig: it names an unknown rig.
     """
     text, rig = _text(name)
     if not text:
@@ -182,10 +183,10 @@ def read(name: str, settings: tuple[str, ...] = ()) -> LoadedRun:
 
 
 def _require_programs(ports: Mapping[str, str], named_in: str | os.PathLike[str]) -> None:
-    """Refuse programs in the place of parts that a file names and the user has not confirmed.
+    """Refuse programs that a file names to replace parts, unless the user has confirmed them.
 
     Raises:
-        RobinsError: one is not confirmed.
+        RobinsError: a program is not confirmed.
     """
     for port in ports.values():
         if (path := program(port)) is not None:
@@ -193,7 +194,7 @@ def _require_programs(ports: Mapping[str, str], named_in: str | os.PathLike[str]
 
 
 def _text(name: str) -> tuple[str, Rig]:
-    """The text of a scenario, empty if it is not one of the bench; and its rig."""
+    """Text of a scenario of the bench, empty for other names; and the rig."""
     if is_file(name) or name in RIGS:
         return "", rig_of(name)
     ours = built_in()
@@ -227,7 +228,7 @@ def _flies(rig: Rig, setup: Setup) -> Parameters:
 
 
 def changed(flight: LoadedRun, options: Mapping[str, Any]) -> LoadedRun:
-    """The same run with other options of its setup, in SI; ``ports`` are added to.
+    """Copy of a run with other options of its setup, in SI; ``ports`` extend those there are.
 
     Raises:
         ScenarioError: an option that does not fit.
@@ -281,11 +282,11 @@ def steps_of(flight: LoadedRun) -> int:
 def recorded_flight(
     header: Mapping[str, Any], record: str | os.PathLike[str], filter_: str | None = None
 ) -> LoadedRun:
-    """The run of a record, from its header; or the same with another filter.
+    """Run of a record, from its header; or the same run with another filter.
 
     Raises:
         ScenarioError: the header is of another version of robins.
-        RobinsError: it names code that the user has not confirmed.
+        RobinsError: the header names code that the user has not confirmed.
     """
     rig = recorded_rig(header, record)
     try:

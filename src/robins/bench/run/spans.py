@@ -1,6 +1,6 @@
 """Times at which faults were active, for the live page.
 
-It gets the state of the bench each half second, and some faults are shorter.
+The page gets the state of the bench every half second, and some faults are shorter.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ from collections.abc import Iterable
 
 from robins.bench.live.feed import JsonObject
 
-MOST = 100  # that are kept, the latest
+MOST = 100  # latest spans kept
 
 
 class FaultSpans:
-    """Listens to which faults are on, step by step."""
+    """Begin and end of each fault, observed step by step."""
 
     def __init__(self) -> None:
         self._ends: dict[tuple[str, float], float | None] = {}
 
     def observe(self, active: Iterable[tuple[str, float]], time_s: float) -> None:
-        """Take what is on after a step.
+        """Take the faults that are active after a step.
 
         Args:
             active: label and begin [s] of each fault.

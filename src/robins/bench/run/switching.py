@@ -1,7 +1,7 @@
 """Faults of processes: parts that are killed, and parts whose power is switched off and on.
 
-A part that was killed is brought back to its state, if the run restarts what dies. One that had
-no power has lost its state: it starts again as before the first step, in the middle of the run.
+A killed part is brought back to its state, if the run restarts dead parts. A part without power
+loses its state: it starts in the middle of the run as before the first step.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ def switch(
 ) -> None:
     """Apply the faults of processes, before a step.
 
-    A part is started again as soon as it is off, and waits, so that it is ready when it is switched
-    on: what it takes to start is not part of the fault. Boards are left alone.
+    The process of a part is started again as soon as the part is switched off, and waits to be
+    switched on: so its start-up time does not prolong the fault. Boards are left alone.
 
     Args:
         injector: the faults of the run.
         part_processes: its processes.
         broker: its hub.
-        time_ns: of the run, that of the end of the step.
+        time_ns: time of the run at the end of the step.
         speaks: the ports of the parts that are processes.
-        reap: waits until a part has died, and does what the run is to do then.
+        reap: waits until a part has died, and applies the policy of the run.
         event: notes an event by its kind and text.
 
     Raises:

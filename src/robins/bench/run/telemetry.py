@@ -13,23 +13,23 @@ from robins.bench.evaluation import MessageSeries
 from robins.bench.rig import Rig
 from robins.bench.run.number_store import NumberStore
 
-_OFTEN = 1 << 12  # messages, after which the memory of those before is let go
+_OFTEN = 1 << 12  # messages between two releases of memory
 
 
 class Telemetry:
-    """Listens to what passes."""
+    """Recorder of the messages that pass, as arrays."""
 
     def __init__(self, rig: Rig, steps: int, step_ns: int, beside: Path | None = None):
-        """Make room.
+        """Allocate the arrays.
 
         Args:
-            rig: whose messages are kept.
+            rig: whose messages are recorded.
             steps: E.
-            step_ns: length of each.
-            beside: a file in whose folder a long run is kept; else that for temporary files.
+            step_ns: length of a step.
+            beside: a file in whose folder a long run is stored; None: the temporary folder.
 
         Raises:
-            robins.results.ResultError: there is no room on disk.
+            robins.results.ResultError: there is not enough space on disk.
         """
         self._wire, self._step_ns = rig.wire, step_ns
         every = rig.noted
@@ -60,10 +60,10 @@ class Telemetry:
 
 
 def require_truth(rig: Rig, series: MessageSeries, counted: slice, time_s: float) -> None:
-    """Require that the truth is known in some step that counts.
+    """Require that the truth is known in at least one counted step.
 
     Raises:
-        BenchError: the truth is not known in any step that counts.
+        BenchError: it is not.
     """
     if not (truth := rig.truth):
         return
@@ -75,10 +75,10 @@ def require_truth(rig: Rig, series: MessageSeries, counted: slice, time_s: float
 
 
 def difference(series: MessageSeries, inside: Mapping[str, np.ndarray]) -> float:
-    """Greatest difference of a run from the same inside one program, over what both know.
+    """Greatest absolute difference of a run from the same run inside one program.
 
-    Infinite where one has a number and the other none. Components that only one has, such as those
-    of a wheel that is not there, are left out.
+    Infinite if a number is missing in one of the two. Components that only one has, such as those
+    of an unused wheel, are left out.
     """
     worst = 0.0
     for name, wanted in inside.items():

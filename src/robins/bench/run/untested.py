@@ -1,4 +1,4 @@
-"""Warnings of a run that is too short or too slow for its test."""
+"""Warnings on a run that is too short or too slow for its test."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from robins.scenario import Parameters, Span
 
 
 def doubts(flight: LoadedRun, result: RunResult) -> list[str]:
-    """Sentences on planned events that did not happen, and on a clock that was not kept.
+    """Warnings on planned events that did not happen, and on a missed clock rate.
 
-    Of a run that failed the reason is known, so only the latter.
+    For a failed run, whose reason is known, only the latter.
     """
     behind = [event for event in result.events if event.kind == "behind"]
     late = [f"At {one.fields['time_s']:g} s {one.text}" for one in behind[-1:]]
@@ -44,7 +44,7 @@ def _after(what: str, begin_s: float, end_s: float) -> str:
 
 
 def _spans(given: Parameters, where: str = "") -> Iterator[tuple[str, Span]]:
-    """Times of the disturbances of a scenario: its lists of spans, with their names."""
+    """Names and spans of the planned disturbances of a scenario."""
     for name in type(given).model_fields:
         value = getattr(given, name)
         if isinstance(value, Parameters):

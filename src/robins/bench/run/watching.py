@@ -15,9 +15,9 @@ from robins.bench.run.setup import steps_of
 from robins.bench.run.spans import FaultSpans
 from robins.bench.status import STARTING, BenchStatus
 
-_EACH_S = 0.05  # samples for the page come no faster than that
+_EACH_S = 0.05  # least period of samples for the page
 _STATUS_S = 0.5
-_COMMANDS, _COMMANDS_S = 10, 10.0  # so many are shown in so long a time
+_COMMANDS, _COMMANDS_S = 10, 10.0  # at most so many commands are shown in so many seconds
 STEP = Signal("time of a step", "ms", "time of a step")
 _PREPARING = {
     "state": "preparing",
@@ -57,12 +57,12 @@ class PageObserver:
         """Take the page, if there is one."""
         self._page, self._status = page, status
         self._told = 0.0
-        self._due = 0.0  # when the page gets its next sample
-        self._alarms, self._listens = None, False  # of the rig, from the first step on
-        self._since = 0  # first step that no sample has shown
+        self._due = 0.0  # time of the next sample for the page
+        self._alarms, self._listens = None, False  # those of the rig, set at the first step
+        self._since = 0  # first step after the last sample
         self._commanded: deque[float] = deque(maxlen=_COMMANDS)
         self._flooded = False
-        self._command = ""  # that was shown last
+        self._command = ""  # last command shown
         self._spans = FaultSpans()
 
     def over(self, session: Session, failed: bool) -> None:
@@ -79,9 +79,9 @@ class PageObserver:
             self._page.event(level, time_s, text)
 
     def _shown(self, text: str) -> str:
-        """Text shown of a command, so that many do not hide all else; the record has each.
+        """Text to show for a command; beyond a rate, commands are only recorded, not shown.
 
-        One that comes again and again is shown, since the page counts it in one line.
+        A repeated command is always shown, since the page counts it in one line.
         """
         if text == self._command:
             return text
@@ -114,7 +114,7 @@ class PageObserver:
             for level, text in self._alarms.observe(series, step) if self._alarms else ():
                 self._page.event(level, session.time_s, text)
             now = time.monotonic()
-            if now >= self._due:  # a step that comes a little late does not make the next one wait
+            if now >= self._due:  # a late sample does not delay the next one
                 self._due = max(self._due + _EACH_S, now - _EACH_S)
                 values = view.sample(series, session.config, self._since, step)
                 self._page.push(session.time_s, [*values, session.step_ms])
@@ -172,7 +172,7 @@ def _clock(session: Session) -> str:
 
 
 def starting_state(flight: LoadedRun) -> JsonObject:
-    """The same before there are any parts.
+    """State of the bench for the page before any part has started.
 
     Raises:
         ScenarioError: the length of the run does not fit the scenario.
@@ -216,7 +216,7 @@ def _health(session: Session) -> dict[str, dict[str, int]]:
 
 
 def page_for(rig: Rig, given: Any, title: str, run: int, host: str, port: int) -> LivePage:
-    """A live page for a run.
+    """Start a live page for a run.
 
     Raises:
         ImportError, OSError, RuntimeError: as of `LivePage`.

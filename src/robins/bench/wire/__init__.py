@@ -1,12 +1,12 @@
 """The wire: the messages between the parts of a vehicle over serial lines.
 
-- `fields`: what a message is made of.
+- `fields`: messages and their fields.
 - `schema`: every message of a rig in one table; encoder, decoder, documentation and C header follow
   it.
-- `records`: payloads, from values to bytes and back, and the gate that each of them passes.
+- `records`: payloads, from values to bytes and back, and the check that each of them passes.
 - `frames`: header, check and COBS around them.
 - `receiver`: frames out of a stream of bytes of which some are wrong.
-- `c_header`: the same for firmware; `firmware`: a board to begin with.
+- `c_header`: the same for firmware; `firmware`: example of a board.
 """
 
 from robins.bench.wire.fields import Field, Message

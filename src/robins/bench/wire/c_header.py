@@ -248,9 +248,9 @@ def c_header(wire: Wire) -> str:
 
 
 def firmware(wire: Wire) -> dict[str, str]:
-    """The files of a board, by name: the wire, the platform, one for a PC, and an example.
+    """Source files of a board, by name: the wire, the platform, one for a PC, and examples.
 
-    An example is the loop of a part, and is given where the wire has a part of its name.
+    An example is the loop of a part, included where the wire has a part of its name.
     """
     there = resources.files("robins.bench.wire") / "firmware"
     kinds, loop = (".c", ".h", ".mk"), "_board.c"

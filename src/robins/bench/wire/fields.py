@@ -15,15 +15,15 @@ SIZES: dict[WireType, int] = {"u8": 1, "u16": 2, "u32": 4, "u64": 8, "f64": 8}
 
 
 class Field(NamedTuple):
-    """Some numbers of one kind."""
+    """A field of a message: a number or a vector."""
 
     name: str
     kind: WireType
     length: int
     unit: str  # "1": a pure number
     text: str
-    limits: tuple[float, float] | None = None  # least and most of a sound frame; None: of its type
-    missing: bool = False  # whether NaN stands for a number that there is not
+    limits: tuple[float, float] | None = None  # in a valid frame; None: those of its type
+    missing: bool = False  # whether NaN stands for a missing number
 
     @property
     def span(self) -> str:

@@ -38,7 +38,7 @@ class Header(NamedTuple):
     """Header of a frame."""
 
     type: int  # number of the message, see `robins.bench.wire.schema`
-    run: int  # of this run: it marks a frame of an earlier one, left in a buffer
+    run: int  # number of the run; identifies frames of an earlier run left in a buffer
     sequence: int  # of the link and direction, from 0, modulo 2^32
     time_ns: int  # of the payload's content, since the start of the run
     version: int = VERSION
@@ -76,8 +76,8 @@ def decode_frame(stuffed: bytes) -> Frame:
         stuffed: what lies between them, without them.
 
     Raises:
-        FrameError: it is no frame: not stuffed rightly ("cobs"), too short, too long, of a wrong
-            check ("crc"), or of another version.
+        FrameError: it is no frame: invalid stuffing ("cobs"), too short, too long, a wrong checksum
+            ("crc"), or another version.
     """
     try:
         body = cobs.decode(stuffed)

@@ -1,4 +1,4 @@
-"""Extracts frames from a stream of bytes, however it is cut and whatever is damaged."""
+"""Extraction of frames from a stream of bytes in any pieces, damaged or not."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ LONGEST = LEAST + MOST_PAYLOAD + (LEAST + MOST_PAYLOAD) // 254 + 1
 class Counts:
     """Counts of frames at a receiver."""
 
-    frames: int = 0  # good ones
-    cobs: int = 0  # not stuffed rightly
+    frames: int = 0  # valid ones
+    cobs: int = 0  # invalid stuffing
     short: int = 0
-    long: int = 0  # longer than any frame, dropped while they came
+    long: int = 0  # longer than any frame, dropped while received
     crc: int = 0  # check wrong
     version: int = 0
     header: int = 0
 
     @property
     def wrong(self) -> int:
-        """Runs of bytes between zeros that are no frame."""
+        """Runs of bytes between zeros that form no frame."""
         return self.cobs + self.short + self.long + self.crc + self.version + self.header
 
 
 class Receiver:
-    """Takes bytes, gives frames; what is wrong is counted and skipped to the next zero.
+    """Decoder of bytes to frames; after an error it counts, and skips to the next zero.
 
-    What it gives depends on the bytes alone, not on how they are cut into pieces, and it never
-    holds more than the longest frame.
+    Its output depends on the bytes alone, not on how they are split, and it never holds more than
+    the longest frame.
 
     Attributes:
         counts: so far.
@@ -44,7 +44,7 @@ class Receiver:
         self._too_long = False
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that end in these bytes."""
+        """Take bytes; return the frames that end in them."""
         found: list[Frame] = []
         *ended, rest = bytes(data).split(EDGE)
         for piece in ended:
@@ -81,14 +81,14 @@ class Receiver:
 
 
 class Sequence:
-    """Numbers of the frames of one link and direction: what was lost, repeated, came late.
+    """Sequence numbers of one link and direction: counts of lost, repeated and late frames.
 
     Attributes:
         lost: numbers that have not come and are not expected any more.
         repeated: frames whose number had come before.
-        late: frames that came after one of a higher number; they are not lost any more.
-        jumps: times that the sender restarted its count, or went on further than frames can have
-            been lost.
+        late: frames that came after one of a higher number; they no longer count as lost.
+        jumps: times that the sender restarted its count, or skipped more numbers than frames can
+            have been lost.
     """
 
     REMEMBERED = 1024
@@ -101,12 +101,12 @@ class Sequence:
         self._of_now: set[int] = set()
 
     def take(self, number: int, now_ns: int | None = None, most: int = 2**31) -> bool:
-        """Count a frame; true if it is new and in its order, and so may be used.
+        """Count a frame; true if it is new and in order, and so usable.
 
         Args:
-            number: of the frame.
-            now_ns: the time of the run, of a frame that is of this time. None: it may be an old
-                one. A frame of now whose number is old, but did not come now, is no repeated one:
+            number: sequence number of the frame.
+            now_ns: time of the run, if the frame is stamped with it; None: it may be an old frame.
+                A current frame with an old number that has not come at this time is not repeated:
                 its sender has restarted its count.
             most: frames that can have been lost before it; a number further ahead is a jump.
         """
@@ -136,7 +136,7 @@ class Sequence:
         return False
 
     def _came(self, number: int, now_ns: int) -> bool:
-        """True if a number has come at this time already; so many are remembered, no more."""
+        """True if a number has already come at this time; remembers up to `REMEMBERED` numbers."""
         if now_ns != self._now_ns:
             self._now_ns, self._of_now = now_ns, set()
         if number in self._of_now:

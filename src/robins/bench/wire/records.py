@@ -15,7 +15,7 @@ _CODES = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "f64": "d"}
 
 
 class RecordError(RobinsError, ValueError):
-    """Values or bytes that are not those of the message."""
+    """Values or bytes that do not fit the message."""
 
 
 class PayloadFault(NamedTuple):
@@ -29,7 +29,7 @@ class MessageCodec:
     """The payloads of one message."""
 
     def __init__(self, of: Message):
-        """Lay out its numbers."""
+        """Lay out the numbers of the message."""
         self.message, self.size, self._names = of, of.size, {f.name for f in of.fields}
         self._numbers = tuple(
             (f.name + f"[{k}]" * (f.length > 1), *(f.limits or (0.0, 256.0 ** SIZES[f.kind])), f)
@@ -39,11 +39,11 @@ class MessageCodec:
         self._all = struct.Struct("<" + "".join(f"{f.length}{_CODES[f.kind]}" for f in of.fields))
 
     def encode(self, values: Values) -> bytes:
-        """The payload.
+        """Encode a payload.
 
         Args:
-            values: by field; a number, or as many as the field has. Floats go as they are, bit for
-                bit, NaN included.
+            values: by field; a number, or as many as the field has. Floats are copied bit for bit,
+                NaN included.
 
         Raises:
             RecordError: a field is missing, unknown, of another length, or beyond its type.
@@ -56,7 +56,7 @@ class MessageCodec:
         return b"".join([_field(of.name, f, values[f.name]) for f in of.fields])
 
     def decode(self, payload: bytes) -> Values:
-        """The values: a number for a field of one, else an array.
+        """Decode a payload: a number for a field of length one, else an array.
 
         Raises:
             RecordError: the payload is not as long as the message.
@@ -76,9 +76,9 @@ class MessageCodec:
         return out
 
     def unsound(self, payload: bytes) -> PayloadFault | None:
-        """Check of every frame: its length, and least and most of each number; None: sound.
+        """Check length and limits of a payload; None: it is valid.
 
-        An infinity is beyond every limit; NaN passes only where the table has it for a missing
+        An infinity exceeds every limit; NaN passes only where the table has it for a missing
         number.
         """
         if len(payload) != self.size:

@@ -1,8 +1,8 @@
 """All messages on the lines of a rig, in one table: encoded, checked, documented, put into C.
 
 The messages of the protocol are those of every rig; a rig adds its parts and its data. Numbers are
-part of the protocol. Add at the end, never renumber, never reuse; a change of the fields of a
-message is a new version of the table.
+part of the protocol: add at the end, never renumber, never reuse. A change of the fields of a
+message makes a new version of the table.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Wire:
     """The parts of a rig and their messages.
 
     Attributes:
-        parts: who talks, the bench first; the place in it is the number of a part.
+        parts: names, the bench first; the index of a part is its number.
         messages: all of them by number, those of the protocol first.
         names: of the messages, by number.
         numbers: of the messages, by name.
@@ -75,7 +75,7 @@ class Wire:
             messages: with its data; numbers from 16 to 255.
 
         Raises:
-            WireError: a name or a number is there twice, or a number is one of the protocol's.
+            WireError: a name or a number is used twice, or a number is reserved for the protocol.
         """
         self.parts = (BENCH, *parts)
         self.messages = (*PROTOCOL, *messages)
@@ -115,7 +115,7 @@ class Wire:
 
         Raises:
             KeyError: there is no such message.
-            RecordError: values that are not those of the message.
+            RecordError: the values do not fit the message.
         """
         return self._record(name).encode(values)
 
@@ -145,7 +145,7 @@ class Wire:
 
     @cached_property
     def number(self) -> int:
-        """CRC-32C of the table as it is documented: the same table, the same number."""
+        """Version number of the table: CRC-32C of its documentation."""
         return fastcrc.crc32.iscsi(self.markdown().encode())
 
     def markdown(self) -> str:
@@ -161,4 +161,4 @@ class Wire:
 
 
 BARE = Wire((), ())
-"""The protocol alone."""
+"""Table with the messages of the protocol alone."""

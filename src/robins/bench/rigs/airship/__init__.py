@@ -1,6 +1,6 @@
 """The airship on the bench: inertial navigation, radar, stars, air data, and the computer.
 
-Any filter of the study flies that takes the measurements of the paper's, with or without the wind.
+It runs any filter of the study that takes the measurements of the paper, with or without the wind.
 A step is an epoch of the filter; a measurement that is not sent in a step is missing in it.
 """
 
@@ -72,7 +72,7 @@ WIRE = Wire(
 
 
 def _shifted(values: Values, fault: Any, _: int) -> Values:
-    """A radar that takes another place for the one below."""
+    """Radar fix that matches a wrong place."""
     return {**values, "place": values["place"] + np.array([fault.shift, 0.0])}
 
 

@@ -59,7 +59,7 @@ def filters() -> Sequence[str]:
 
 
 def timing(given: Airship) -> Timing:
-    """A step is an epoch; the figures of the study count from the first that is not before."""
+    """Steps of a flight, one per epoch; figures count from the first epoch in ``counted``."""
     first = max(math.ceil(given.counted.begin / given.epoch - 1e-9) - 1, 0)
     return Timing(given.epoch, round(given.duration / given.epoch), first)
 
@@ -78,8 +78,8 @@ def prepare(setup: Setup, given: Airship) -> AirshipConfig:
     )
 
 
-def _says(part: str, message: str, rows: Mapping[str, np.ndarray]) -> Part:
-    """Part that sends row after row."""
+def _rows(part: str, message: str, rows: Mapping[str, np.ndarray]) -> Part:
+    """Part that sends one row per step."""
 
     def act(state: None, k: int, inputs: Inputs):
         said = {name: x[k] for name, x in rows.items() if k < len(x)}
@@ -89,37 +89,37 @@ def _says(part: str, message: str, rows: Mapping[str, np.ndarray]) -> Part:
 
 
 def sins(config: AirshipConfig) -> Part:
-    """The inertial unit, with what an epoch adds up to."""
+    """The inertial unit: the increments of each epoch."""
     u = config.u
     rows = {"dt": u.dt, "theta_b": u.theta, "dv_b": u.dv, "dr_b": u.dr}
-    return _says("sins", "increment", {name: np.asarray(x) for name, x in rows.items()})
+    return _rows("sins", "increment", {name: np.asarray(x) for name, x in rows.items()})
 
 
 def radar(config: AirshipConfig) -> Part:
     """Radar and barometer."""
     place, heading, alt = config.y[SAR]
-    return _says("radar", "fix", {"place": place, "heading": heading.rad, "alt": alt[:, 0]})
+    return _rows("radar", "fix", {"place": place, "heading": heading.rad, "alt": alt[:, 0]})
 
 
 def star(config: AirshipConfig) -> Part:
     """The star sensor."""
-    return _says("star", "attitude", {"euler": np.stack([a.rad for a in config.y[STAR]], axis=1)})
+    return _rows("star", "attitude", {"euler": np.stack([a.rad for a in config.y[STAR]], axis=1)})
 
 
 def air(config: AirshipConfig) -> Part:
     """Forecast and air data; silent where the filter takes none."""
     rows = {"wind_n": config.y[WIND], "through_b": config.aux[WIND]} if WIND in config.y else {}
-    return _says("air", "wind", rows)
+    return _rows("air", "wind", rows)
 
 
 def navigation(config: AirshipConfig) -> Part:
-    """The navigation computer: any filter that takes what comes; what does not come is missing.
+    """The navigation computer with any filter; a measurement that does not come is missing.
 
-    Its state is that of the filter and the last increment.
+    Its state is the state of the filter and the last increment.
     """
     windy = WIND in config.y
     begin = Increments(*(np.asarray(x)[0] for x in config.u))
-    online: list[OnlineFilter] = []  # made when it is needed, not where only its inputs are queried
+    online: list[OnlineFilter] = []  # made at the first step; not needed to query the inputs
     starts: list[Any] = []
 
     def first() -> tuple[FilterState, Increments]:
@@ -155,7 +155,7 @@ def navigation(config: AirshipConfig) -> Part:
 
 
 def _kept(step: Step) -> jax.Array:
-    """Attitude, velocity, place and their sigmas, in one vector."""
+    """Attitude, velocity, position and their sigmas, in one vector."""
     belief = step.posterior
     x = nav_of(belief.mean)
     place = jnp.stack([x.position.lat, x.position.lon, x.position.alt])
@@ -163,13 +163,13 @@ def _kept(step: Step) -> jax.Array:
 
 
 def _state_fields(x: np.ndarray) -> Values:
-    """The fields of a state, of a vector or of vectors (E, 19)."""
+    """Fields of the state message from a vector (19,) or vectors (E, 19)."""
     place = {"lat": x[..., 7], "lon": x[..., 8], "alt": x[..., 9]}
     return {"q_nb": x[..., :4], "v_n": x[..., 4:7], **place, "sigma": x[..., 10:19]}
 
 
 def inside(config: AirshipConfig, steps: int | None = None) -> dict[str, np.ndarray]:
-    """The first epochs of the same flight, or all, inside one program."""
+    """Same flight inside one program: its first `steps` epochs, or all."""
     made = CANDIDATES[config.filter].make()
     y, u, aux = jax.tree_util.tree_map(lambda x: x[:steps], (config.y, config.u, config.aux))
     done = run(made, config.model, config.start, y, u, aux, keep=_kept)
@@ -177,7 +177,7 @@ def inside(config: AirshipConfig, steps: int | None = None) -> dict[str, np.ndar
 
 
 def errors(config: AirshipConfig, series: MessageSeries) -> np.ndarray:
-    """(E, 9) true less estimated attitude [rad], velocity, position [m], each ENU."""
+    """(E, 9) true less estimated attitude [rad], velocity [m/s], position [m], each ENU."""
     q, v, *place = (np.asarray(series[f"state.{f}"]) for f in ("q_nb", "v_n", "lat", "lon", "alt"))
     truth = jax.tree_util.tree_map(lambda x: x[: len(q)], config.truth)
     estimate = Nav(Rotation(q), jnp.asarray(v), Geodetic(*place))
@@ -186,7 +186,7 @@ def errors(config: AirshipConfig, series: MessageSeries) -> np.ndarray:
 
 
 def judge(flight: LoadedRun, result: RunResult) -> RunFigures:
-    """Errors over the epochs that count."""
+    """Errors over the counted epochs."""
     series, counted = result.series, slice(counted_from(flight, result.steps), None)
     error, sigma = errors(result.config, series), series["state.sigma"] @ np.abs(ENU_OF_NED).T
     arrays: dict[str, Any] = {}

@@ -1,8 +1,8 @@
 """INS/GNSS on the bench: inertial unit, receiver, navigation computer, each on its own line.
 
-The plant is a simulated drive or a recorded log, or there is none: boards send the samples. The
-computer runs `robins.systems.ins_gnss.LiveInsGnss`, whose epochs are those of `robins replay`. The
-computer can also be a program: `robins.systems.ins_gnss.aboard`, and the C in this folder.
+The samples come from a simulated drive, from a recorded log, or from boards. The computer runs
+`robins.systems.ins_gnss.LiveInsGnss`, whose epochs are those of `robins replay`, or it is a C
+program: `robins.systems.ins_gnss.aboard`, and the C in this folder.
 """
 
 from __future__ import annotations
@@ -78,12 +78,12 @@ WIRE = Wire(
 
 
 def _shifted(values: Values, fault: Any, _: int) -> Values:
-    """A position that is off to the north."""
+    """Fix shifted to the north."""
     return {**values, "lat": values["lat"] + fault.shift / 6.378137e6}
 
 
 def _blind(values: Values, *_: Any) -> Values:
-    """No satellites: a stamp and no numbers."""
+    """Outage: a stamp without numbers."""
     nothing = np.full(3, np.nan)
     return {**values, "lat": np.nan, "lon": np.nan, "alt": np.nan, "v_n": nothing, "quality": 0}
 

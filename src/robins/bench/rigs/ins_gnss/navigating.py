@@ -1,4 +1,4 @@
-"""The journey, its three parts, and its evaluation."""
+"""Config of a drive, its three parts, and its evaluation."""
 
 from __future__ import annotations
 
@@ -56,11 +56,11 @@ _SHARED = ("system", "title", "imu", "start", "aids", "update", "outages", "log"
 
 
 class NavigationParameters(InsGnssReplay):
-    """Beliefs of the navigation computer, and the source of the samples.
+    """Filter parameters of the navigation computer, and the source of the samples.
 
     A configuration of a replay, with the files of a ``log``; or a scenario of a simulated drive,
-    whose sensors are believed as they are drawn. With neither, boards at ``imu`` and ``gnss`` send
-    at ``imu_rate`` and ``fix_rate``, for the ``duration``.
+    whose sensor errors the filter assumes as simulated. With neither, boards at ``imu`` and
+    ``gnss`` send at ``imu_rate`` and ``fix_rate``, for the ``duration``.
     """
 
     log: tuple[str, ...] = ()
@@ -75,7 +75,7 @@ class NavigationParameters(InsGnssReplay):
     def model_validate_json(
         cls, json_data: str | bytes | bytearray, **options: Any
     ) -> NavigationParameters:
-        """Parse a scenario; that of a drive is split into truth and beliefs."""
+        """Parse a scenario; that of a drive is split into truth and filter parameters."""
         said = json.loads(json_data)
         if "legs" in said:
             gnss = {k: v for k, v in said.get("gnss", {}).items() if k in Gnss.model_fields}
@@ -105,14 +105,14 @@ def _logged(files: tuple[str, ...]) -> Dataset:
 
 
 def _rate_hz(table: ImuTable | GnssTable | None) -> float:
-    # rounded as a replay rounds it: whether a sample is missing may hang on the last digit
+    # rounded as in a replay: the detection of a missing sample may depend on the last digit
     if table is None or len(table) < 2:
         return 1.0
     return 1.0 / float(np.median(np.diff(table.time_ns) * 1e-9))
 
 
 def timing(given: NavigationParameters) -> Timing:
-    """A step is a sample: of the log in the order of its rows, whatever gaps there are."""
+    """Steps of a run, one per sample; those of a log in the order of its rows, gaps ignored."""
     if given.log:
         samples = _logged(given.log).imu
         return Timing(1.0 / _rate_hz(samples), len(samples), 0)
@@ -150,7 +150,7 @@ def prepare(setup: Any, given: NavigationParameters) -> InsGnssConfig:
 
 
 def imu(config: InsGnssConfig) -> Part:
-    """The inertial unit: a sample a step."""
+    """The inertial unit: one sample per step."""
     samples = None if config.dataset is None else config.dataset.imu
 
     def act(state: None, k: int, inputs: Inputs):
@@ -163,7 +163,7 @@ def imu(config: InsGnssConfig) -> Part:
 
 
 def gnss(config: InsGnssConfig) -> Part:
-    """The receiver: a fix with the first sample that is not older; in an outage, one of NaN.
+    """The receiver: a fix with the first sample that is not older; in an outage, a fix of NaN.
 
     Its state is the number of the next fix.
     """
@@ -190,8 +190,8 @@ def gnss(config: InsGnssConfig) -> Part:
 
 
 InsGnssNavigationState = tuple[LiveInsGnss, tuple[Navigation, ...]]
-"""State of the navigation computer: an object that is always the same, and changes; and epochs that
-have not been sent: one is sent a step."""
+"""State of the navigation computer: one mutable object, and the epochs still to be sent, one per
+step."""
 
 
 def navigation(config: InsGnssConfig) -> Part:
@@ -199,7 +199,7 @@ def navigation(config: InsGnssConfig) -> Part:
     made: list[LiveInsGnss] = []
 
     def begin() -> InsGnssNavigationState:
-        if not made:  # which compiles, and is not needed where only its inputs are queried
+        if not made:  # compiles; not needed to query the inputs
             made.append(
                 LiveInsGnss(config.given, *config.rates_hz, config.filter, machine=config.machine)
             )
@@ -256,7 +256,7 @@ def aboard(flight: LoadedRun) -> ExportSources:
 
 
 def topics(config: InsGnssConfig) -> tuple[Topic, ...]:
-    """Samples and fixes as ROS 2 has them, so that `robins replay` reads a record; states."""
+    """Conversions to ROS 2 of samples and fixes, for `robins replay` of a record, and of states."""
 
     def fix(v: Values) -> Message:
         covariance = np.diag(np.square(v["sigma"]))
@@ -313,13 +313,13 @@ def _nav(series: MessageSeries, message: str, rows: np.ndarray | slice = slice(N
 
 
 def epochs_of(series: MessageSeries) -> np.ndarray:
-    """Steps in which the filter's final report of each epoch was sent, in the order of epochs."""
+    """Steps in which the final estimate of each epoch was sent, in the order of epochs."""
     heard = np.flatnonzero(series["epoch.time"] > 0)[::-1]
     return heard[np.unique(series["epoch.time"][heard], return_index=True)[1]]
 
 
 def against_fixes(config: InsGnssConfig, log: Log, series: MessageSeries) -> dict[str, Any]:
-    """Distances of the antenna from the fixes, as of `robins replay`.
+    """Distances of the antenna from the fixes, as in `robins replay`.
 
     The gyro bias is not on the wire: with a latency it would move the antenna by the lever arm
     times both.
@@ -337,7 +337,7 @@ def against_fixes(config: InsGnssConfig, log: Log, series: MessageSeries) -> dic
 
 
 def against_truth(t: Trajectory, series: MessageSeries) -> np.ndarray:
-    """(E, 9) true less estimated attitude [rad], velocity and position [m], each NED."""
+    """(E, 9) true less estimated attitude [rad], velocity [m/s], position [m], each NED."""
     at = np.clip(np.searchsorted(t.time_ns, series["state.time"]), 0, len(t) - 1)
     place = Geodetic(*(np.asarray(x)[at] for x in (t.lat_rad, t.lon_rad, t.alt_m)))
     truth = Nav(Rotation(np.asarray(t.q_nb)[at]), jnp.asarray(t.v_n)[at], place)
@@ -354,7 +354,7 @@ _OFFERED = (
 
 
 def view() -> PageView:
-    """A page with attitude, velocity, and where the vehicle is from where it was first."""
+    """Page with attitude, velocity, and position relative to the start."""
     plots = (("velocity", "m/s"), ("position from the start", "m"), ("sigma of the position", "m"))
     three = [
         Signal(f"{plot} {axis}", unit, plot)

@@ -1,13 +1,13 @@
 """The whole test bench of a satellite: dynamics, kinematics and a star simulator of their own.
 
-It is the rig `satellite` but for three parts. The plant is two computers: `dynamics` sends how the
-craft turns in a step, `kinematics` where it then points, which dynamics receives in the next step.
-`sky` is the star simulator: it shows the stars before the star sensor, whose camera adds its
-errors, identifies the stars and solves. So a real star sensor can be shown a sky.
+It is the rig `satellite` except for three parts. The plant is two computers: `dynamics` sends the
+turn of the craft in a step, `kinematics` the attitude after it, which dynamics receives in the next
+step. `sky` is the star simulator: it shows the stars in the field of view to the star sensor, whose
+camera adds its errors, identifies the stars and solves. So a real star sensor can be tested.
 
 All messages of the satellite are also those of this rig, with `turn` and `stars` in addition.
 
-`parts` has the parts that are new, and the same run inside one program.
+`parts` has the new parts, and the same run inside one program.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["RIG", "STARS", "TAKES", "WIRE"]
 
-STARS = 48  # shown at most: those that a camera reports, and some at the edge of its field
+STARS = 48  # shown at most: those that a camera reports, and some at the edge of its field of view
 _SPLIT = {"plant": ("dynamics", "kinematics"), "star": ("sky", "star")}
 
 WIRE = Wire(
@@ -67,7 +67,7 @@ TAKES = {part: taken for part, taken in messages.TAKES.items() if part != "plant
 
 
 def _hidden(said: Values, fault: Any, _: int) -> Values:
-    """Stars without the brightest."""
+    """Star field without its brightest stars."""
     said["vectors_s"][: 3 * fault.stars] = np.nan
     said["magnitude"][: fault.stars] = np.nan
     return said
@@ -77,7 +77,7 @@ _SAID: dict[str, DeviceFault] = {
     "dark": DeviceFault("sky", "stars", "blind", nothing),
     "hidden": DeviceFault("sky", "stars", "said", _hidden, ("stars",)),
 }
-"""A star simulator that shows nothing, or all but its brightest ``stars``."""
+"""Star simulator that shows nothing, or all but the brightest ``stars``."""
 _STARS = Annotated[int, pydantic.Field(ge=1, le=STARS)]
 _OFFERED: tuple[dict[str, Any], ...] = (
     {"label": "sky: dark", "fault": {"kind": "dark"}},
@@ -100,7 +100,7 @@ class LaboratoryRig(SatelliteRig):
     inside = later(f"{__name__}.parts:inside")
 
     def flies(self) -> dict[str, Path]:
-        """The scenario of the satellite that has a camera."""
+        """Scenario of the satellite with a camera."""
         return {"laboratory/stars": named("robins.systems.satellite:SYSTEM").scenarios["stars"]}
 
     def device_faults(self) -> tuple[dict[str, DeviceFault], dict[str, Any]]:

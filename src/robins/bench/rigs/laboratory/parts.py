@@ -1,11 +1,11 @@
-"""The parts of the laboratory that the rig of the satellite has not, and its run in one program.
+"""Parts of the laboratory that the rig of the satellite lacks, and its run in one program.
 
 The equations are those of the satellite, cut in two. `robins.sim.spacecraft.advance` is `dynamics`
 and then `kinematics`; `robins.sim.star_sensor.measure_attitude` is `visible_stars`, `expose` and
 `solve`. On the bench each is compiled by itself, and `inside` keeps them apart in the same way, so
 in lock-step a run over lines has the bits of `inside`. These are also the bits of the satellite's
-own rig, unless its stars have an error in common: there it turns the camera, and here the
-directions that the camera is shown, which is the same but for rounding.
+own rig, unless its stars have a common error: there it turns the camera, and here the star
+directions shown to the camera, which is equal to rounding.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ from robins.systems.satellite.nodes import (
 )
 from robins.systems.satellite.parameters import AttitudeLoop
 
-MARGIN_RAD = 2e-3  # shown beyond that edge, for a camera that is turned a little
+MARGIN_RAD = 2e-3  # beyond the field of view, for a slightly misaligned camera
 
 
 def prepare(setup: Any, given: AttitudeLoop) -> SatelliteConfig:
     """The config of a run, which is that of the satellite.
 
     Raises:
-        ScenarioError: there is no camera that a sky can be shown.
+        ScenarioError: the satellite has no camera.
     """
     if given.star.camera is None:
         raise ScenarioError(
@@ -85,10 +85,10 @@ _follows = jax.jit(partial(compiled_alone, spacecraft.kinematics))
 
 
 def dynamics(config: SatelliteConfig) -> Part:
-    """Part that computes how the craft turns in a step: its momentum, under all torques.
+    """Part that computes the turn of the craft in a step, and its momentum, under all torques.
 
-    The attitude at the beginning of the step is the last of kinematics; if nothing came, it is
-    the end of the turn before.
+    The attitude at the start of the step is the last from kinematics; if none came, it is that
+    at the end of the last turn.
     """
     wheels = len(config.vehicle.craft.wheel_h)
     turns = driven(config, _turns)
@@ -161,7 +161,7 @@ def _sensor(
 
 
 def _solves(lens: CameraOptics, star_key: Array, vectors_s, magnitude, looks_q_ib, error, number):
-    # Which stars they are is for the sensor to find out: here only whether there is one.
+    # Only the presence of a star counts here: the sensor identifies it.
     there = StarField(vectors_s, magnitude, jnp.where(jnp.isnan(magnitude), -1, 0))
     key = jax.random.fold_in(star_key, number)
     image = expose(key, turned(there, lens.camera, error), lens.camera)
@@ -173,7 +173,7 @@ def _is_due(config: SatelliteConfig, step: int) -> bool:
 
 
 def sky(config: SatelliteConfig) -> Part:
-    """The star simulator: the stars before the sensor, without an error, when a frame is due."""
+    """The star simulator: the stars in the field of view, without errors, when a frame is due."""
 
     def act(state: None, k: int, inputs: Inputs):
         motion = inputs["motion"]
@@ -193,10 +193,10 @@ _expected = jax.jit(nodes.expected_attitude)
 def star(config: SatelliteConfig) -> Part:
     """The star sensor: a camera that identifies stars near its predicted attitude.
 
-    That is the last of attitude determination, turned by the gyro. As long as there is none, or
-    its estimate is marked as unreliable, the sensor uses its own last attitude. Its state is the
-    attitude (4,) that it saw last, for one that is stuck, the attitude (4,) where it looks for its
-    stars, and the bias (3,) [rad/s] of the gyro.
+    The prediction is the last of attitude determination, turned by the gyro. As long as there is
+    none, or it is flagged as unreliable, the sensor uses its own last attitude. Its state is the
+    last attitude (4,) that it measured, for the fault of a stuck sensor, the predicted attitude
+    (4,), and the bias (3,) [rad/s] of the gyro.
     """
     sees = driven(config._replace(machine="jax"), _sensor)  # an image has no place in a program
     q_first, bias = (
@@ -252,5 +252,5 @@ _REACT = partial(nodes.react, move=_move, look=_look)
 def inside(
     config: SatelliteConfig, steps: int | None = None, said: Sequence[OperatorEvent] = ()
 ) -> Mapping[str, np.ndarray] | None:
-    """The same run inside one program, of the same parts."""
+    """Same run inside one program, with the same parts."""
     return judging.inside(config, steps, said, _REACT)

@@ -1,7 +1,7 @@
-"""A multirotor on the bench, flown by PX4 or ArduPilot, unchanged, or by our autopilot.
+"""A multirotor on the bench, flown by unmodified PX4 or ArduPilot, or by our autopilot.
 
-The craft, its inertial unit with compass and barometer, its receiver and its autopilot, each on its
-own line. The part `autopilot` is ours, or the end of a socket that PX4's or ArduPilot's SITL is at.
+The craft, its inertial unit with compass and barometer, its GNSS receiver and its autopilot each
+have their own line. The part `autopilot` is ours, or a socket to the SITL of PX4 or ArduPilot.
 
 - `flight`: parameters of a scenario, and evaluation of a run.
 - `craft`: the physics and the instruments.
@@ -24,7 +24,7 @@ from robins.scenario import Quantity, default
 __all__ = ["MOTORS", "RIG", "WIRE"]
 
 MOTORS = ("front right", "rear left", "front left", "rear right")
-"""Motors in the order of PX4 and ArduPilot for a quadrotor in X, from 0 here."""
+"""Motors of an X quadrotor in the order of PX4 and ArduPilot, but numbered from 0."""
 _RATE, _FORCE, _SPEED, _FAR = 1e4, 1e4, 1e3, 1e5  # rad/s, m/s^2, m/s, m: far beyond any flight
 
 WIRE = Wire(
@@ -70,12 +70,12 @@ WIRE = Wire(
 
 
 def _magnet(values: Values, fault: Any, _: int) -> Values:
-    """A magnet to the right of the compass."""
+    """Compass disturbed by a magnet on its right."""
     return {**values, "field_b": values["field_b"] + np.array([0.0, fault.field, 0.0])}
 
 
 def _motor(values: Values, fault: Any, _: int) -> Values:
-    """A motor that gives a share of its command, or nothing."""
+    """Motor that gives a share of its command, or nothing."""
     share = np.ones(len(MOTORS))
     share[fault.motor] = fault.left
     return {**values, "control": values["control"] * share}
@@ -97,7 +97,7 @@ _FAULTS: dict[str, Any] = {
 }
 _OPTIONS: dict[str, Any] = {
     "autopilot": (Literal["own", "px4", "ardupilot"], "own"),
-    "address": (str, "127.0.0.1"),  # of this machine, where the autopilot connects
+    "address": (str, "127.0.0.1"),  # of this machine, to which the autopilot connects
     "port": (Annotated[int, pydantic.Field(ge=0, le=65535)], 0),  # 0: that of the autopilot
 }
 
@@ -127,7 +127,7 @@ class MultirotorRig(Rig):
     judge = later(f"{__name__}.flight:judge")
 
     def options(self) -> dict[str, Any]:
-        """Autopilot, and where one that is another program connects."""
+        """Autopilot, and the address to which an external one connects."""
         return _OPTIONS
 
     def device_faults(self) -> tuple[dict[str, DeviceFault], dict[str, Any]]:
@@ -135,7 +135,7 @@ class MultirotorRig(Rig):
         return _SAID, _FAULTS
 
     def once(self, setup: Any, part: str) -> str:
-        """An autopilot that is a program of its own has a state that no record holds."""
+        """Reason why an external autopilot cannot be replayed: its state is in no record."""
         if part != "autopilot" or setup.autopilot == "own":
             return ""
         return f"'{part}' is {setup.autopilot}, a program whose state no record holds"

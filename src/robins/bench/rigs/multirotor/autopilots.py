@@ -1,6 +1,6 @@
 """Autopilots of the multirotor: ours, or PX4's or ArduPilot's SITL at the end of a socket.
 
-Another program is waited for in `Part.rare`: once, in the process of the part, before its hello.
+`Part.rare` waits for another program to connect: once, in the part's process, before its hello.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from robins.bench.wire.fields import Values
 from robins.earth.atmosphere import G0
 from robins.rotation import conjugate, from_dcm, from_rotvec, multiply, rotate, to_rotvec
 
-CONNECT_S = 100.0  # that another program may take to start; the bench waits for a part a bit longer
+CONNECT_S = 100.0  # time for another program to start; less than the bench waits for a part
 ANSWER_S = 10.0
 _AGAIN = "begin the run anew, then start the autopilot's SITL again"
 
@@ -43,21 +43,21 @@ def _motors(shares: ArrayLike | Sequence[float] = (0.0,) * 4, answered: bool = T
 
 # ------------------------------------------------------------------------------------------ ours
 
-READY_S = 1.0  # that the instruments settle before the motors turn
-LEVEL_1_S, COMPASS, PLACE, SPEED = 0.1, 0.02, 0.1, 0.3  # shares of an error taken: by the second,
-# of a sample of the compass, of a fix
+READY_S = 1.0  # settling time of the instruments before the motors start
+LEVEL_1_S, COMPASS, PLACE, SPEED = 0.1, 0.02, 0.1, 0.3  # gains: of level per second, of a compass
+# sample, of position and velocity per fix
 CLIMB_M_S, PUSH_M_S2 = 2.0, 4.0  # limits
-HOLD_1_S, FOLLOW_1_S, LEAN_1_S2 = 1.0, 2.5, 2.0  # of position, of velocity, of what wind leaves
-TURN_1_S, RATE_1_S = 6.0, 20.0  # of attitude, of turn rate
-_UNMIX = np.linalg.inv(np.vstack([np.ones(4), craft.MIXER]))  # thrusts of a force and torques
+HOLD_1_S, FOLLOW_1_S, LEAN_1_S2 = 1.0, 2.5, 2.0  # gains: position, velocity, wind integral
+TURN_1_S, RATE_1_S = 6.0, 20.0  # gains: attitude, turn rate
+_UNMIX = np.linalg.inv(np.vstack([np.ones(4), craft.MIXER]))  # thrusts from a force and torques
 
 
 class EstimatorState(NamedTuple):
-    """Estimates of our autopilot, and the acceleration with which it leans against the wind."""
+    """Estimates of our autopilot, and the integral acceleration that compensates the wind."""
 
     q_nb: Any  # (4,)
     v_n: Any  # (3,) m/s
-    p_n: Any  # (3,) m, of the start
+    p_n: Any  # (3,) m from the start
     lean_n: Any  # (3,) m/s^2
 
 
@@ -71,7 +71,7 @@ def estimated(
     field_n: Array,
     dt: Array,
 ) -> EstimatorState:
-    """A step of strapdown, held to the vertical of a hover, to the compass and to the fixes.
+    """Strapdown step, corrected by the vertical of a hover, the compass and the fixes.
 
     A complementary filter of constant gains (Mahony, Hamel & Pflimlin, IEEE Trans. Automatic
     Control 53, 2008). ``fix`` (6,) is position [m] and velocity [m/s], NED; NaN is missing.
@@ -97,7 +97,7 @@ def estimated(
 def controlled(
     s: EstimatorState, omega_b: Array, height_m: Array, dt: Array
 ) -> tuple[EstimatorState, Array]:
-    """Position over velocity over attitude over rate; the motors' shares (4,), not yet limited."""
+    """Cascade of position, velocity, attitude and rate loops; motor commands (4,), not limited."""
     down = jnp.asarray(DOWN)
     off = HOLD_1_S * (-height_m * down - s.p_n)
     wanted = off * jnp.minimum(1.0, CLIMB_M_S / jnp.maximum(jnp.linalg.norm(off), 1e-9))
@@ -106,7 +106,7 @@ def controlled(
     f_n = jnp.clip(FOLLOW_1_S * off + lean, -PUSH_M_S2, PUSH_M_S2) - G0 * down
     size = jnp.linalg.norm(f_n)
     z = -f_n / size
-    y = jnp.cross(z, jnp.array([1.0, 0.0, 0.0]))  # the nose to the north
+    y = jnp.cross(z, jnp.array([1.0, 0.0, 0.0]))  # heading north
     y = y / jnp.linalg.norm(y)
     q_wanted = from_dcm(jnp.stack([jnp.cross(y, z), y, z], axis=1))
     turn = to_rotvec(multiply(conjugate(s.q_nb), q_wanted))
@@ -116,7 +116,7 @@ def controlled(
 
 
 def own_autopilot(config: MultirotorConfig) -> Part:
-    """Ours: hovers at the height of the scenario. Its state is its mind and the last sample."""
+    """Our autopilot: hovers at the height of the scenario. State: estimates and last sample."""
     dt, nothing = config.step_ns * 1e-9, np.full(6, np.nan)
     none = np.zeros(3)
     rest = {"omega_b": none, "f_b": -G0 * DOWN, "field_b": nothing[:3], "pressure": np.nan}
@@ -163,7 +163,7 @@ def _until_lost(line: of_px4.Px4Simulator | of_ardupilot.ArduPilotPhysics) -> It
 
 
 def px4(config: MultirotorConfig) -> Part:
-    """The simulator's end of the line to PX4; while PX4 starts, the motors rest."""
+    """The simulator's side of the connection to PX4; while PX4 starts, the motors are off."""
     lines: list[of_px4.Px4Simulator] = []
 
     def connect() -> None:
@@ -198,7 +198,7 @@ def _sensors(time_us: int, sample: Values) -> Sensors:
 
 
 def ardupilot(config: MultirotorConfig) -> Part:
-    """The physics' end of the line to ArduPilot, which makes its own samples of the motion."""
+    """The physics' side of the connection to ArduPilot, which simulates its own sensors."""
     lines: list[of_ardupilot.ArduPilotPhysics] = []
 
     def asked(patience_s: float, fix: str) -> of_ardupilot.Servos:

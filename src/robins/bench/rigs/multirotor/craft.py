@@ -25,16 +25,17 @@ from robins.rotation import conjugate, from_rotvec, multiply, rotate, to_dcm
 
 DOWN = np.array([0.0, 0.0, 1.0])
 ARM_M = 0.18  # of each motor, along x and along y
-REACTION_M = 0.05  # torque about z over thrust
+REACTION_M = 0.05  # ratio of torque about z to thrust
+
 FORWARD, RIGHT = np.array([1.0, -1.0, 1.0, -1.0]), np.array([1.0, -1.0, -1.0, 1.0])
-# The first two propellers turn to the left, seen from above, and the craft reacts to the right.
+# The first two propellers turn counter-clockwise seen from above; the reaction is clockwise.
 REACTS = np.array([1.0, 1.0, -1.0, -1.0])
-MIXER = np.stack([-ARM_M * RIGHT, ARM_M * FORWARD, REACTION_M * REACTS])  # (3, 4) N m of N
+MIXER = np.stack([-ARM_M * RIGHT, ARM_M * FORWARD, REACTION_M * REACTS])  # (3, 4) N m per N
 MOST_N, LAG_S = 8.0, 0.02  # of a motor
 MASS_KG, DRAG_KG_S = 1.5, 0.2
 INERTIA_KG_M2 = np.array([0.02, 0.02, 0.04])
 DAMPING = 2e-3  # N m s/rad
-FIX_S, SLOW_S = 0.2, 0.02  # between two fixes; between two of compass and barometer
+FIX_S, SLOW_S = 0.2, 0.02  # periods of fixes; of compass and barometer
 
 
 class Airframe(NamedTuple):
@@ -49,7 +50,7 @@ class Airframe(NamedTuple):
 
 
 def at_rest() -> Airframe:
-    """Level, its nose to the north, on the ground."""
+    """Craft level on the ground, heading north."""
     none = np.zeros(3)
     return Airframe(np.array([1.0, 0.0, 0.0, 0.0]), none, none, none, np.zeros(4), -G0 * DOWN)
 
@@ -74,7 +75,7 @@ def moved(s: Airframe, control: Array, wind_n: Array, dt: Array) -> Airframe:
 
 
 def craft(config: MultirotorConfig) -> Part:
-    """The craft; a motor command stands until the next."""
+    """The craft; a motor command holds until the next."""
     wind_n, dt = np.asarray(config.given.wind), config.step_ns * 1e-9
     begin = (at_rest(), np.zeros(4))
 
@@ -92,7 +93,7 @@ def craft(config: MultirotorConfig) -> Part:
 
 
 def _noise(config: MultirotorConfig, part: int, k: int, count: int) -> np.ndarray:
-    """Standard normal numbers of a part in a step, addressed and not drawn in turn."""
+    """Standard normal numbers of a part in a step, from a counter-based generator."""
     key = np.array([config.seed, part], np.uint64)
     return np.random.Generator(np.random.Philox(key=key, counter=[0, k, 0, 0])).normal(size=count)
 
@@ -102,7 +103,7 @@ def _every(config: MultirotorConfig, seconds: float) -> int:
 
 
 def imu(config: MultirotorConfig) -> Part:
-    """The inertial unit: a sample a step, in which compass and barometer are now and then."""
+    """The inertial unit: one sample per step; compass and barometer at their own period."""
     given, every = config.given, _every(config, SLOW_S)
 
     def act(state: None, k: int, inputs: Inputs):
@@ -125,7 +126,7 @@ def imu(config: MultirotorConfig) -> Part:
 
 
 def gnss(config: MultirotorConfig) -> Part:
-    """The receiver, five times a second."""
+    """The GNSS receiver, with five fixes per second."""
     given, every = config.given, _every(config, FIX_S)
 
     def act(state: None, k: int, inputs: Inputs):

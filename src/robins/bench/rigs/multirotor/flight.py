@@ -20,9 +20,9 @@ from robins.scenario import Parameters, Quantity, default
 class Multirotor(Parameters):
     """Hover point, wind, and noise of the instruments (standard deviations).
 
-    It starts on the ground at ``lat``, ``lon``, ``alt`` (above mean sea level), level and with its
-    nose to the north; ``wind`` is north, east, down. Errors are those against the point ``height``
-    above its start, from ``counted_from`` on. ``year`` is that of the magnetic field.
+    It starts on the ground at ``lat``, ``lon``, ``alt`` (above mean sea level), level and heading
+    north; ``wind`` is north, east, down. Errors are relative to the point ``height`` above its
+    start, from ``counted_from`` on. ``year`` is that of the magnetic field.
     """
 
     duration: Annotated[float, Quantity("time", above="0 s", most="1 h")] = default("20 s")
@@ -57,7 +57,7 @@ class MultirotorConfig(NamedTuple):
     given: Multirotor
     seed: int
     autopilot: str
-    address: str  # where another program finds its end of the line
+    address: str  # to which another program connects
     port: int
     field_n_T: np.ndarray  # (3,) of the Earth
     m_per_rad: np.ndarray  # (2,) of latitude and longitude

@@ -1,12 +1,12 @@
-"""The satellite on the bench: seven parts, each a function of what reaches it over its line.
+"""The satellite on the bench: seven parts, each a function of the messages on its line.
 
 - `messages`: their messages.
-- `config`: the numbers that they are given before a run.
+- `config`: their input before a run.
 - `vehicle`: plant, rate table, actuators, gyro, star sensor.
 - `computers`: attitude determination and control. `reference`: target attitude.
 - `judging`: evaluation of a run, and its page.
 
-What processes of parts do not need is imported where it is used, so they start sooner.
+Modules that parts do not need are imported where they are used, so that processes start sooner.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class RateTableParameters(Parameters):
-    """A rate table that is a little late; without one the gyro turns with the craft exactly."""
+    """A rate table with a lag; without one the gyro turns with the craft exactly."""
 
     lag: Annotated[float, Quantity("time", above="0 s")] = default("20 ms")
     rate_limit: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("100 deg/s")
@@ -48,7 +48,7 @@ _SECOND_NS = 1_000_000_000
 
 
 def _turned(said: Values, fault: Any, _: int) -> Values:
-    """Times a turn about body z."""
+    """Attitude turned about body z."""
     from robins.rotation import multiply
 
     half = 0.5 * fault.angle
@@ -57,7 +57,7 @@ def _turned(said: Values, fault: Any, _: int) -> Values:
 
 
 def _sign(said: Values, _: Any, now_ns: int) -> Values:
-    """The opposite sign in every other second."""
+    """Quaternion of opposite sign in every other second."""
     odd = (now_ns + 1) // _SECOND_NS % 2 == 1
     return {**said, "q_ib": -said["q_ib"]} if odd else said
 
@@ -80,9 +80,9 @@ SAID: dict[str, DeviceFault] = {
         "actuators", "actuation", "said", _without_wheel, ("wheel",), needs="wheel"
     ),
 }
-"""A star sensor that says again and again what it said last, whose attitude is turned by ``angle``
-about its boresight z, that says none, or one of the other sign, which is no fault; a wheel, by its
-number from 0, that gives no torque."""
+"""Star sensor that repeats its last attitude, that sends one turned by ``angle`` about its
+boresight z, none at all, or one of the opposite sign, which is no fault; a wheel, by its number
+from 0, without torque."""
 
 _WHEEL: Any = Annotated[int, pydantic.Field(ge=0, lt=WHEELS)]
 PARAMETERS: dict[str, Any] = {
@@ -141,7 +141,7 @@ class SatelliteRig(Rig):
         return ["mekf", *(name for name in names if name != "mekf")]
 
     def options(self) -> dict[str, Any]:
-        """A rate table that lags, and what the parts compute by."""
+        """Rate table with a lag, and the machine by which parts compute."""
         return {
             "table": (RateTableParameters | None, None),
             "machine": (Literal["jax", "vm", "c"], "jax"),

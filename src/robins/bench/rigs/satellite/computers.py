@@ -1,10 +1,10 @@
 """The computers on board: attitude determination by any filter of the family, and control.
 
-When a sensor fails: the star sensor may be silent for any time, then the attitude is that of the
-gyro alone. A gyro's sample stands for one period more. After that the rate is not known: the
-estimate is flagged "safe: do not steer by this", control lets wheels and magnetorquers rest, and
-when the gyro is back the filter starts again from the next star frame. It does the same when the
-operator resets it, with the bias of its first start.
+When a sensor fails: without star frames, for any time, the attitude follows the gyro alone. A
+missing gyro sample is replaced by the last one for one period. After that the rate is not known:
+the estimate is flagged "safe: do not steer by this", control commands zero to wheels and
+magnetorquers, and when the gyro is back the filter restarts from the next star frame. It does the
+same when the operator resets it, with the bias of its first start.
 """
 
 from __future__ import annotations
@@ -56,22 +56,22 @@ from robins.systems.satellite.model import GATE, make_filter, start
 from robins.systems.satellite.nodes import NO_GAIN, STAR, ActuatorCommand, LoopConstants, StepInputs
 
 StateT = TypeVar("StateT")
-SILENT_PERIODS = 4  # of the star sensor without a frame, after which it is flagged as silent
+SILENT_PERIODS = 4  # star sensor periods without a frame, after which it is flagged as silent
 _LIMIT = float(chi_square(GATE, 3))
 
 
 def sample_of(gyro: Values | None) -> np.ndarray | None:
-    """The turn that a gyro reports; None if it did not come, or not of all axes."""
+    """Turn that the gyro reports; None if it did not come, or an axis is missing."""
     if gyro is None or not np.all(np.isfinite(gyro["theta_b"])):
         return None
     return gyro["theta_b"]
 
 
 def late(part: Part, forgets: Callable[[StateT], StateT]) -> Part:
-    """Wrap a part so that it forgets its state where its first step is not that of the run.
+    """Wrap a part so that it resets its state if its first step is not the first of the run.
 
-    It has lost its power: determination then waits for a star frame to start from, and control
-    rests until it receives an estimate.
+    The part has then lost power: determination waits for a star frame to start from, and control
+    commands zero until it receives an estimate.
     """
     first = part.begin()
 
@@ -101,7 +101,7 @@ class _Determination:
         )
         self.first = self.online.state
         self.period = int(np.max(np.diff(np.flatnonzero(config.due)), initial=1))
-        # A filter that refuses a frame gives no distance; one without rules does.
+        # A filter with rules gives no distance of a refused frame; one without does.
         self.plain = make_filter("quaternion" if self.additive else "mekf")
         self.sensor = config.model.sensor(STAR)
         self.believable = compiled(config, nodes.believable)
@@ -160,7 +160,7 @@ class _Determination:
         return DeterminationState(online.state, gyro, since, lost), [*sent, ("estimate", estimate)]
 
     def _update(self, frame: Values, y: Rotation, received: bool):
-        """Flags of an update, and the innovation of a frame that was received."""
+        """Update with a star frame: its flags, and the innovation of a received frame."""
         sent, factor = [], _factor(self.config, frame)
         if received:
             judged = self.judge(self.online.belief, y, factor)
@@ -174,7 +174,7 @@ class _Determination:
 def adm(config: SatelliteConfig) -> Part:
     """Attitude determination: predicts with the gyro, updates with the star sensor."""
     made = _Determination(config)
-    # The rate before the first sample is that which the gyro reported last.
+    # Before the first sample the rate is the last that the gyro reported.
     begin = DeterminationState(made.first, LatchedInput(np.asarray(config.vehicle.theta)))
     q_ib = np.asarray(jax.jit(config.form.attitude)(made.first.belief.mean))
     example = {
@@ -193,7 +193,7 @@ def adm(config: SatelliteConfig) -> Part:
 
 
 def _factor(config: SatelliteConfig, frame: Values) -> np.ndarray | None:
-    """Factor of the covariance of a frame, where frames bring theirs."""
+    """Factor of the measurement covariance of a frame; None if frames do not carry it."""
     return None if config.given.lens is None else frame["factor"].reshape(3, 3)
 
 
@@ -209,7 +209,7 @@ def _innovation(innovation: Numbers, sigma: Numbers, nis: Numbers | float) -> Va
 class ControlState(NamedTuple):
     """State of the attitude control: its last inputs, and the target."""
 
-    estimate: LatchedInput  # q_ib, bias, whether it may be steered by
+    estimate: LatchedInput  # q_ib, bias, whether it is fit for control
     theta: LatchedInput
     wheel_h: Any
     plan: SlewPlan | None = None  # None: the course of the scenario
@@ -223,7 +223,7 @@ def _steers(
 
 
 def acm(config: SatelliteConfig) -> Part:
-    """Attitude control: a torque of the wheels, a dipole of the magnetorquers."""
+    """Attitude control: commands torques of the wheels and a dipole of the magnetorquers."""
     steers = driven(config, _steers)
     vehicle = config.vehicle
     wheels = len(vehicle.craft.wheel_h)
@@ -261,7 +261,7 @@ def acm(config: SatelliteConfig) -> Part:
         heard = trusted(state.estimate) and trusted(state.theta)
         if state.stands_by or not (steered and heard):
             return state, [("command", zero_command())]
-        # A row begins with where the craft is to point.
+        # A row begins with the target attitude.
         at = () if state.plan is None else np.concatenate(attitude_target(config, state.plan, k))
         command = steers(k, q, bias, state.theta.values, state.wheel_h, begins=at)
         torque = per_wheel(np.asarray(command.wheel_torque))

@@ -1,6 +1,6 @@
-"""Input of the parts of the satellite before a run: numbers only, so that it can be sent.
+"""Input of the parts of the satellite for a run: numbers only, so that it can be pickled.
 
-The bench computes it once, and hands each process a copy; a part started by hand on another
+The bench computes it once, and gives each process a copy; a part started by hand on another
 machine computes the same.
 """
 
@@ -32,7 +32,7 @@ from robins.systems.satellite.nodes import (
 )
 from robins.systems.satellite.parameters import AttitudeLoop
 
-_BLOCK = 1024  # rows of a run that a part has as vectors at a time
+_BLOCK = 1024  # rows of a run that a part converts to vectors at a time
 
 
 class SatelliteConfig(NamedTuple):
@@ -46,9 +46,9 @@ class SatelliteConfig(NamedTuple):
     build: Build
     model: Model
     start: Belief | FilterState
-    attitude_rad: float  # believed of an attitude from a single star frame
-    table: RateTable | None  # None: it goes with the craft exactly
-    machine: str = "jax"  # that parts compute by
+    attitude_rad: float  # assumed sigma of the attitude from a single star frame
+    table: RateTable | None  # None: the gyro turns with the craft exactly
+    machine: str = "jax"  # by which parts compute
 
     @property
     def filter(self) -> Filter:
@@ -62,7 +62,7 @@ class SatelliteConfig(NamedTuple):
 
     @property
     def form(self) -> StateForm:
-        """Form of its state."""
+        """Form of the state."""
         return ADDITIVE if self.build == "quaternion" else MULTIPLICATIVE
 
     @property
@@ -92,14 +92,14 @@ def prepare(setup: Any, given: AttitudeLoop) -> SatelliteConfig:
 def satellite_config(
     given: AttitudeLoop, name: str, seed: int, index: int = 0, table: RateTable | None = None
 ) -> SatelliteConfig:
-    """The config of a run: the same numbers that run ``index`` of a campaign of this seed has.
+    """Config of a run, with the numbers of run ``index`` of a campaign of this seed.
 
     Args:
         given: the satellite.
         name: of its filter.
         seed: of all noise.
         index: number of the run.
-        table: what carries the gyro, if it lags.
+        table: rate table that turns the gyro with a lag; None: no lag.
 
     Raises:
         ValueError: no such filter, more wheels than the wire carries, or what the study refuses.
@@ -114,7 +114,7 @@ def satellite_config(
         )
     course = lay_out(given)
     of = contender(given, course, name)
-    # Compiled as in a campaign of one run, whose bits the bench is to have.
+    # Compiled as in a campaign of one run, for the same bits.
     world = jax.jit(lambda k: simulate(given, course, seed, k))(jnp.asarray(index))
     case = of.case(world)
     loop = case.loop
@@ -135,10 +135,10 @@ def satellite_config(
 
 
 def compiled(config: SatelliteConfig, function: Callable) -> Callable:
-    """A pure function as the parts of a run compute it: by JAX, or as a program."""
+    """Compile a pure function for the parts of a run: by JAX, or as a program."""
     if config.machine == "jax":
         return jax.jit(function)
-    # what runs by JAX does not need it
+    # not needed with JAX
     from robins.program import compiled_step, interpreted_step, native
 
     engine = compiled_step if config.machine == "c" else interpreted_step
@@ -153,19 +153,19 @@ def compiled(config: SatelliteConfig, function: Callable) -> Callable:
 
 
 def driven(config: SatelliteConfig, node: Callable) -> Callable:
-    """A node compiled, driven by the rows of a run.
+    """Compile a node that is driven by the rows of a run.
 
-    A row travels as one vector: to be given an array more costs compiled code more than most nodes
-    compute.
+    A row is passed as one vector: each further array argument costs compiled code more time than
+    most nodes compute.
 
     Args:
         config: with the rows.
-        node: ``(given, *args, row) -> out``, kept apart as `robins.systems.satellite.nodes.react`
-            does.
+        node: ``(given, *args, row) -> out``, compiled separately as
+            `robins.systems.satellite.nodes.react` does.
 
     Returns:
-        ``(step, *args, begins=()) -> out``; a step beyond the last has the row of the last, so that
-        a part may compute beyond it. ``begins`` takes the place of the first numbers of the row.
+        ``(step, *args, begins=()) -> out``; a step beyond the last uses the row of the last, so
+        that a part may compute beyond it. ``begins`` replaces the first numbers of the row.
     """
     columns, shape = jax.tree_util.tree_flatten(config.rows)
     steps = len(config.due)
@@ -181,7 +181,7 @@ def driven(config: SatelliteConfig, node: Callable) -> Callable:
         some = [x[number * _BLOCK : (number + 1) * _BLOCK] for x in columns]
         return np.concatenate([x.reshape(len(x), -1).astype(float) for x in some], axis=1)
 
-    # JAX is given what stays the same, as `react` is; in a program it is folded.
+    # Constants are arguments for JAX, as in `react`; in a program they are folded.
     by_jax = config.machine == "jax"
     call = (
         partial(jax.jit(run), config.given)

@@ -60,7 +60,7 @@ Arrays = Mapping[str, np.ndarray]
 
 
 def turn(q_from: np.ndarray, q_to: np.ndarray) -> np.ndarray:
-    """(E, 3) rotation vectors [rad] of conj(q_from) q_to, in the axes of the first."""
+    """(E, 3) rotation vectors [rad] of conj(q_from) q_to, in the axes of q_from."""
     return np.asarray(to_rotvec(multiply(conjugate(q_from), q_to)))
 
 
@@ -70,19 +70,19 @@ def attitude_error(series: Arrays) -> np.ndarray:
 
 
 def flag(series: Arrays, text: str) -> np.ndarray:
-    """(E,) bool, whether a flag of the estimate was set; by its text in `FLAGS`."""
+    """(E,) bool: flag of the estimate, named by its text in `FLAGS`."""
     return (series["estimate.flags"] >> FLAGS.index(text)) & 1 == 1
 
 
 def rms_arcsec(error: np.ndarray, counted: slice) -> float:
-    """Root sum square of the three axes, root mean over the counted steps."""
+    """RMS over the counted steps of the root sum square of three axes [arcsec]."""
     some = error[counted]
     some = some[np.all(np.isfinite(some), -1)]
     return float(np.sqrt(np.mean(np.sum(some**2, -1)))) / ARCSEC if len(some) else float("nan")
 
 
 def peak_arcsec(error: np.ndarray, counted: slice) -> float:
-    """Greatest length over the counted steps."""
+    """Greatest norm over the counted steps [arcsec]."""
     size = np.linalg.norm(error[counted], axis=-1)
     return float(np.nanmax(size)) / ARCSEC if np.any(np.isfinite(size)) else float("nan")
 
@@ -94,9 +94,9 @@ _AXES = ("x", "y", "z (boresight)")
 
 
 def judge(flight: LoadedRun, result: RunResult) -> RunFigures:
-    """Errors of attitude determination and of pointing, over the steps that count.
+    """Errors of attitude determination and of pointing, over the counted steps.
 
-    Those of the determination are of the estimates that it does not itself call unfit for use.
+    Those of the determination exclude estimates that it flags as unfit for use.
     """
     series, counted = result.series, slice(counted_from(flight, result.steps), None)
     attitude, unfit = attitude_error(series), flag(series, UNFIT)
@@ -135,7 +135,7 @@ def warnings(error: np.ndarray, unfit: np.ndarray) -> list[str]:
 
     Args:
         error: (E, 3) of the attitude, over the counted steps; NaN where it is not known.
-        unfit: (E,) true where the estimate was marked as not to be steered by.
+        unfit: (E,) true where the estimate was flagged as unfit for control.
     """
     known = np.all(np.isfinite(error), axis=-1)
     unusable = (
@@ -200,7 +200,7 @@ def arrays(result: RunResult, attitude: np.ndarray, pointing: np.ndarray) -> dic
 
 @lru_cache
 def _reacts(react: Callable, form: StateForm) -> Callable:
-    """One function for each form, so that it is compiled once."""
+    """Loop of one step for a form of the state; cached, so that each is compiled once."""
     return partial(react, form)
 
 
@@ -223,10 +223,10 @@ def inside(
 
     Args:
         config: of the run.
-        steps: number of first steps that are done; None: all.
+        steps: number of steps to run; None: all.
         said: messages of the operator. One program cannot put computers on standby or reset them:
-            the result is then None.
-        react: the loop one step on, as of `robins.systems.satellite.nodes`.
+            then the result is None.
+        react: one step of the loop, as in `robins.systems.satellite.nodes`.
     """
     if any(one.message != "reference" for one in said):
         return None
@@ -297,7 +297,7 @@ def signals(given: AttitudeLoop) -> list[Signal]:
 
 
 def sample(series: MessageSeries, config: SatelliteConfig, since: int, step: int) -> list[float]:
-    """The signals of a step; of star frames, which are rarer than samples, the latest."""
+    """Values of the signals in a step; those of star frames are the latest since step `since`."""
     now = slice(step, step + 1)
     q_ib = series["motion.q_ib"][now]
     error = turn(series["estimate.q_ib"][now], q_ib)[0] / ARCSEC
@@ -330,11 +330,11 @@ def counts(series: MessageSeries, done: int) -> dict[str, int]:
 
 
 class Alarms:
-    """Listens to the flags of one estimate after another."""
+    """Watches the flags of the estimates and raises notices."""
 
     def __init__(self) -> None:
-        self._stands = 0  # flags whose start was reported and whose end was not
-        self._frames = 0  # refused in a row
+        self._stands = 0  # flags whose start was reported, but not yet their end
+        self._frames = 0  # frames refused in a row
 
     def observe(self, series: MessageSeries, step: int) -> list[Alert]:
         """Notices of the estimate of a step."""
@@ -348,7 +348,7 @@ class Alarms:
         is used again.
         """
         now, begun = flags, self._stands
-        if not flags & _OF_FRAMES:  # no frame: the flags of the last one stand
+        if not flags & _OF_FRAMES:  # no frame: the flags of the last one remain
             now |= begun & (REFUSED | SHORT | KEPT)
         new, over = now & ~begun, begun & ~now
         if flags & REFUSED:
@@ -373,7 +373,7 @@ class Alarms:
 def _turned(
     series: MessageSeries, config: SatelliteConfig, step: int, turn_rad: np.ndarray
 ) -> tuple[str, Values]:
-    """Attitude turned from the present target; it stays inertial."""
+    """Command to an inertially fixed attitude, turned from the present target."""
     now = target_after(config, series, step + 1).q_ib
     return "reference", {"q_ib": np.asarray(multiply(now, from_rotvec(jnp.asarray(turn_rad))))}
 
@@ -404,7 +404,7 @@ _IMU = "sensor_msgs/msg/Imu"
 
 
 def topics(config: SatelliteConfig) -> Sequence[Topic]:
-    """Rates, and attitudes with their covariance, along the body's own axes, from inertial ones."""
+    """Conversions of rates and attitudes with covariance; body and inertial axes stay."""
     step_s = config.step_ns * 1e-9
     return (
         Topic("gyro", "/gyro/imu", _IMU, lambda v: imu(v["theta_b"] / step_s), "body"),

@@ -9,8 +9,8 @@ WHEELS = 4
 PARTS = ("plant", "table", "gyro", "star", "adm", "acm", "actuators")
 
 _QUATERNION = "body to inertial, scalar first"
-# Limits are far beyond what a craft does and far from where squares and products overflow. They
-# refuse what cannot be; whether a frame is plausible is for the filter to judge.
+# Limits are far beyond the motion of any craft and far below overflow of squares and products. They
+# refuse impossible values; the filter judges whether a frame is plausible.
 _UNIT, _TURN, _RATE, _SIGMA, _ACTS = 2.0, 10.0, 1e3, 1e6, 1e6
 FLAGS = (
     "star used",

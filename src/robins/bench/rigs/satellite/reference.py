@@ -1,8 +1,8 @@
-"""Target attitude: along the course of the scenario, or as the operator commands.
+"""Target attitude: along the course of the scenario, or as commanded by the operator.
 
-A commanded attitude is reached by a turn about one axis, from rest to rest, from the target
-attitude of that moment; back to the course likewise. It is a pure function of the commands, with
-the same bits in the control, in the run inside one program, and in the evaluation of a run.
+A commanded attitude is reached by a rest-to-rest slew about one axis, from the target attitude at
+the time of the command; the return to the course is such a slew too. The target is a pure function
+of the commands, with the same bits in control, in the run inside one program, and in evaluation.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from robins.sim.attitude_reference import (
 )
 from robins.systems.satellite.nodes import UNIT
 
-SHARE = 0.5  # of what the wheels can give, that a slew takes
-_AS_IT_CAN = 0.5  # of the greatest rate, where none is commanded
-_OFF = 2.0 * UNIT  # of the square of the length of a quaternion
-_BRAKES = 4.0  # greatest acceleration times length over rate, of a rate that dies away; 3.94
+SHARE = 0.5  # of the capacity of the wheels that a slew uses
+_DEFAULT_RATE = 0.5  # of the greatest rate, if no rate is commanded
+_OFF = 2.0 * UNIT  # greatest error of the squared norm of a quaternion
+_BRAKES = 4.0  # peak acceleration times duration over initial rate, for a decaying rate: 3.94
 
 Said = tuple[int, np.ndarray, float]  # first step that received it, q_ib, rate
 
 
 class AttitudeTarget(NamedTuple):
-    """Target attitude at an edge of two steps; in the order of a row of the course."""
+    """Target attitude at the boundary of two steps; in the order of a row of the course."""
 
     q_ib: Any  # (4,)
     omega_b: Any  # (3,) rad/s
@@ -41,13 +41,13 @@ class AttitudeTarget(NamedTuple):
 
 
 class SlewPlan(NamedTuple):
-    """Last command of the operator, and the turn to it."""
+    """Last command of the operator, and the slew to it."""
 
-    edge: int  # at which it was received: the beginning of the step of that number
-    q_ib: np.ndarray  # (4,) to point at; NaN: the course
-    turn: np.ndarray  # (3,) rad from there to the target attitude at the edge
-    rate: np.ndarray  # (3,) rad/s of the latter against the former
-    length_s: float  # of the way
+    edge: int  # at which it was received: the start of the step of that number
+    q_ib: np.ndarray  # (4,) commanded attitude; NaN: the course
+    turn: np.ndarray  # (3,) rad from the commanded to the target attitude at the edge
+    rate: np.ndarray  # (3,) rad/s of the latter relative to the former
+    length_s: float  # duration of the slew
 
 
 _STILL = np.zeros(3)
@@ -80,11 +80,11 @@ def plan_after_command(
 
     Args:
         config: of the run.
-        plan: until then.
-        edge: at which it was received.
-        q_ib: (4,) to point at; NaN: back to the course. One whose length is not one is not
-            followed, as by `believable` for the star sensor.
-        rate: greatest of the slew [rad/s]; 0: half of what the wheels allow.
+        plan: before the command.
+        edge: at which the command was received.
+        q_ib: (4,) commanded attitude; NaN: back to the course. One whose norm is not one is
+            ignored, as by `believable` for the star sensor.
+        rate: greatest rate of the slew [rad/s]; 0: half of what the wheels allow.
     """
     square = float(np.sum(q_ib * q_ib))
     if abs(square - 1.0) > _OFF:
@@ -94,7 +94,7 @@ def plan_after_command(
     turn, against = (np.asarray(x) for x in _between(there, now))
     angle, speed = float(np.sqrt(np.sum(turn**2))), float(np.sqrt(np.sum(against**2)))
     most, acceleration = limits(config)
-    at_most = min(rate or _AS_IT_CAN * most, most)
+    at_most = min(rate or _DEFAULT_RATE * most, most)
     way_s = max(
         PEAK_RATE * angle / at_most,
         (PEAK_ACCELERATION * angle / acceleration) ** 0.5,
@@ -106,7 +106,7 @@ def plan_after_command(
 
 @jax.jit
 def _between(there: AttitudeTarget, now: AttitudeTarget):
-    """Turn and rate of the second against the first, in the axes of the second."""
+    """Rotation vector [rad] and rate [rad/s] of the second relative to the first, in its axes."""
     turn = multiply(conjugate(there.q_ib), now.q_ib)
     return to_rotvec(turn), now.omega_b - rotate(conjugate(turn), there.omega_b)
 
@@ -114,12 +114,12 @@ def _between(there: AttitudeTarget, now: AttitudeTarget):
 def limits(config: SatelliteConfig) -> tuple[float, float]:
     """Greatest rate [rad/s] and acceleration [rad/s^2] of a slew about any axis.
 
-    They take half of the momentum and of the torque of the wheels, about the axis where the
-    allocation gives least, for the greatest inertia (bounded by its rows).
+    They use half of the momentum and of the torque of the wheels, about the axis where the
+    allocation gives least, for the greatest moment of inertia (bounded by the row sums).
     """
     craft = config.given.craft
     inertia = float(np.max(np.sum(np.abs(np.asarray(craft.inertia_b)), axis=1)))
-    shares = np.sqrt(np.sum(np.asarray(config.given.pinv) ** 2, axis=1))  # of a torque of one
+    shares = np.sqrt(np.sum(np.asarray(config.given.pinv) ** 2, axis=1))  # of a unit torque
     used = shares > 0.0
     h, tau = (
         float(np.min(np.asarray(x)[used] / shares[used]))
@@ -133,7 +133,7 @@ def target_attitudes(config: SatelliteConfig, said: Iterable[Said]) -> list[Atti
 
     Args:
         config: of the run.
-        said: commands of the operator, in their order; of two in one step the later one stands.
+        said: commands of the operator, in order; of two in one step the later applies.
     """
     heard = {step: (q_ib, rate) for step, q_ib, rate in said}
     out: list[AttitudeTarget] = []
@@ -146,8 +146,8 @@ def target_attitudes(config: SatelliteConfig, said: Iterable[Said]) -> list[Atti
 
 
 def commands_until(series: Mapping[str, np.ndarray], steps: int) -> list[Said]:
-    """Commands sent by the end of so many steps; their rate is a number, even where the attitude is
-    NaN.
+    """Commands sent by the end of a number of steps; a finite rate marks a command, since its
+    attitude may be NaN.
     """
     rate = series["reference.rate"][:steps]
     heard = np.flatnonzero(np.isfinite(rate))
@@ -157,7 +157,7 @@ def commands_until(series: Mapping[str, np.ndarray], steps: int) -> list[Said]:
 def target_after(
     config: SatelliteConfig, series: Mapping[str, np.ndarray], steps: int
 ) -> AttitudeTarget:
-    """Target attitude after so many steps."""
+    """Target attitude after a number of steps."""
     plan = None
     for step, q_ib, rate in commands_until(series, steps):
         plan = plan_after_command(config, plan, step, q_ib, rate)
@@ -174,7 +174,7 @@ def reference_q_ib(
 
 
 def refuses(message: str, values: Values) -> str:
-    """Reason why the operator cannot send this; empty if it can be sent."""
+    """Reason to refuse an operator message; empty if it can be sent."""
     q = values.get("q_ib", np.full(4, np.nan))
     square = float(np.sum(q * q))
     if not np.any(np.isfinite(q)) or abs(square - 1.0) <= _OFF:
@@ -184,6 +184,6 @@ def refuses(message: str, values: Values) -> str:
 
 
 def precompile(config: SatelliteConfig) -> None:
-    """Compile what is computed at a command."""
+    """Compile the functions that run at a command."""
     plan = plan_after_command(config, None, 0, np.array([0.5, 0.5, 0.5, 0.5]), 0.0)
     attitude_target(config, plan, 1)

@@ -1,4 +1,4 @@
-"""The vehicle: its dynamics, the rate table that plays them to the gyro, its actuators."""
+"""The vehicle: dynamics, actuators, gyro, star sensor, and the rate table that turns the gyro."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from robins.systems.satellite import nodes
 from robins.systems.satellite.nodes import Actuation, ActuatorCommand, LoopConstants, StepInputs
 
 Numbers = Array | np.ndarray
-HELD = 1  # steps for which what came last stands for what did not come
+HELD = 1  # steps for which the last values replace missing ones
 
 
 class LatchedInput(NamedTuple):
@@ -32,7 +32,7 @@ class LatchedInput(NamedTuple):
 
 
 def latched(held: LatchedInput, came: Values | np.ndarray | tuple | None) -> LatchedInput:
-    """Values to act on in this step; `trusted` limits for how long."""
+    """Values to use in this step: those received, else the last; `trusted` limits their age."""
     return LatchedInput(held.values, held.age + 1) if came is None else LatchedInput(came, 0)
 
 
@@ -47,7 +47,7 @@ def stale(held: LatchedInput) -> LatchedInput:
 
 
 def per_wheel(torque: np.ndarray) -> np.ndarray:
-    """Numbers of each wheel, as the wire has them."""
+    """Torques of the wheels, padded with zeros to the wheels of the wire."""
     out = np.zeros(WHEELS)
     out[: len(torque)] = torque
     return out
@@ -61,7 +61,7 @@ def zero_command() -> dict[str, np.ndarray]:
 def acting_command(
     held: LatchedInput, came: Values | None, wheels: int
 ) -> tuple[LatchedInput, Any, Any]:
-    """Torques and dipole that act in this step: those that came, the last ones, or none."""
+    """Torques and dipole that act in this step: those received, the last ones, or zero."""
     held = latched(held, came)
     use = held.values if trusted(held) else zero_command()
     return held, use["wheel_torque"][:wheels], use["dipole_b"]
@@ -94,19 +94,19 @@ def plant(config: SatelliteConfig) -> Part:
 
 @jax.jit
 def _follow(given: RateTable, state: TableState, q_ib: Array, omega_b: Array, dt_s: Array):
-    # The rate to be where the craft is at the end of the step.
+    # The rate that leads to the attitude of the craft at the end of the step.
     wanted = to_rotvec(multiply(conjugate(state.q_ib), q_ib)) / dt_s
     return step(given, state, wanted, dt_s)
 
 
 @jax.jit
 def _turn_on(given: RateTable, state: TableState, dt_s: Array):
-    # It stays in the rate that it has.
+    # The table keeps its rate.
     return step(given, state, state.rate_b, dt_s)
 
 
 def table(config: SatelliteConfig) -> Part:
-    """The rate table: it turns its sensors as the craft turns, exactly or a little late."""
+    """The rate table: it turns its sensors with the craft, exactly or with a lag."""
     first = np.asarray(config.vehicle.craft.q_ib)
     rate = rate_b(config.given.craft, config.vehicle.craft)
     dt = jnp.asarray(config.step_ns * 1e-9)
@@ -136,7 +136,7 @@ def _gives(
 
 
 def actuators(config: SatelliteConfig) -> Part:
-    """Wheels and magnetorquers; a command stands for a step longer, then they give nothing."""
+    """Wheels and magnetorquers; a command is held for one more step, then they give zero."""
     wheels = len(config.vehicle.craft.wheel_h)
     gives = driven(config, _gives)
 
@@ -168,7 +168,7 @@ def gyro(config: SatelliteConfig) -> Part:
 
     def act(state: tuple[Numbers, Numbers], k: int, inputs: Inputs):
         before, residue = state
-        if (mounted := inputs["mounted"]) is None:  # what it turned comes with the next sample
+        if (mounted := inputs["mounted"]) is None:  # the next sample includes this turn
             return state, []
         theta, residue = reads(k, before, mounted["q_ib"], residue)
         return (mounted["q_ib"], residue), [("gyro", {"theta_b": np.asarray(theta)})]
@@ -178,9 +178,9 @@ def gyro(config: SatelliteConfig) -> Part:
 
 
 def star(config: SatelliteConfig) -> Part:
-    """The star sensor; a camera is given the direction in which to look for its stars."""
+    """The star sensor; a camera is given the predicted attitude to identify its stars."""
     lens = config.given.lens
-    # An image has no place in a program.
+    # A program of scalars cannot hold an image.
     sees = driven(config if lens is None else config._replace(machine="jax"), nodes.star)
     takes = {"motion": 0} if lens is None else {"motion": 0, "gyro": 0, "estimate": 1}
     at_first = np.asarray(config.vehicle.star_q_ib)
