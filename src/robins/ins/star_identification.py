@@ -1,12 +1,11 @@
 """Identification of stars without a prior attitude (lost in space).
 
 The angle between two stars is the same in all axes, so it can be looked up. `index_pairs` makes the
-table of all pairs of a catalogue that fit into a field of view, sorted by angle, with the k-vector
-of Mortari & Neta (2000) to find a range of it without search. `identify` looks up the angles of a
-triangle of directions, keeps the triangles of stars that have all three and the same handedness,
-and checks the other directions: a fourth star where the triangle predicts it makes it a pyramid
-(Mortari, Samaan, Bruccoleri & Junkins 2004). Triangles are tried in their order, which drops a
-false star after one attempt where nested loops would try it again and again.
+table of all pairs of a catalogue that fit into a field of view, sorted by angle. `identify` looks
+up the angles of a triangle of directions, keeps the triangles of stars that have all three and the
+same handedness, and checks the other directions: a fourth star where the triangle predicts it makes
+it a pyramid (Mortari, Samaan, Bruccoleri & Junkins 2004). Triangles are tried in their order, which
+drops a false star after one attempt where nested loops would try it again and again.
 
 Nothing is guessed. With p the probability that some star lies by chance within the tolerance of a
 direction, m of n other directions agree by chance with probability P(Binomial(n, p) >= m); times
@@ -61,8 +60,6 @@ class PairIndex(NamedTuple):
     first: np.ndarray  # (P,) int, place of a star in the catalogue
     second: np.ndarray  # (P,) int, of the other
     angle_rad: np.ndarray  # (P,) between them, ascending
-    k_vector: np.ndarray  # (P + 1,) int, how many angles are at or below each step of the line
-    line: tuple[float, float]  # start and step of that line [rad]
     tree: Any  # to find the star nearest to a direction
 
 
@@ -104,38 +101,15 @@ def index_pairs(stars: Stars, field_rad: float) -> PairIndex:
         raise ValueError(f"no two stars are within the field of {np.degrees(field):g} deg")
     angle = _angle(unit[pairs[:, 0]], unit[pairs[:, 1]])
     order = np.argsort(angle, kind="stable")
-    pairs, angle = pairs[order], angle[order]
-    # A straight line from just below the first angle to just above the last, a step for each.
-    margin = 1e-12 + 1e-3 * field / len(angle)
-    start = angle[0] - margin
-    step = (angle[-1] + margin - start) / len(angle)
-    k_vector = np.searchsorted(angle, start + step * np.arange(len(angle) + 1), side="right")
-    return PairIndex(
-        unit,
-        np.asarray(stars.magnitude, float),
-        np.asarray(stars.identifier, int),
-        pairs[:, 0],
-        pairs[:, 1],
-        angle,
-        k_vector,
-        (float(start), float(step)),
-        tree,
-    )
+    magnitude, identifier = np.asarray(stars.magnitude, float), np.asarray(stars.identifier, int)
+    return PairIndex(unit, magnitude, identifier, *pairs[order].T, angle[order], tree)
 
 
 def pairs_between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[Any, Any]:
-    """Pairs of stars with an angle from low to high: places in the catalogue of both.
-
-    The k-vector gives the range of their rows at once, with a few rows too many at either end.
-    """
-    start, step = index.line
-    last = len(index.k_vector) - 1
-    below = min(max(int(np.floor((low_rad - start) / step)), 0), last)
-    above = min(max(int(np.ceil((high_rad - start) / step)), 0), last)
-    rows = slice(index.k_vector[below], index.k_vector[above])
-    angle = index.angle_rad[rows]
-    inside = (angle >= low_rad) & (angle <= high_rad)
-    return index.first[rows][inside], index.second[rows][inside]
+    """Pairs of stars with an angle from low to high: places in the catalogue of both."""
+    first = np.searchsorted(index.angle_rad, low_rad, side="left")
+    rows = slice(first, np.searchsorted(index.angle_rad, high_rad, side="right"))
+    return index.first[rows], index.second[rows]
 
 
 def identify(
