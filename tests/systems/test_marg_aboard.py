@@ -56,6 +56,7 @@ def test_it_is_the_filter_of_a_replay(ran):
 def test_its_samples_are_of_its_truth():
     """Without the errors that the truth tells, gyros turn and accelerometers push as they must."""
     _, whole, case = of(seed=3)
+    whole = jax.tree_util.tree_map(np.asarray, whole)
     u, truth = case.u, case.truth
     turn = np.einsum("ij,knj->kni", np.eye(3) + whole.gyro_gain[0], u.theta_b)
     turn = turn - whole.gyro_bias[0] * u.dt_s[..., None]

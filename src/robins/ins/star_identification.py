@@ -102,7 +102,8 @@ def index_pairs(stars: Stars, field_rad: float) -> PairIndex:
     angle = _angle(unit[pairs[:, 0]], unit[pairs[:, 1]])
     order = np.argsort(angle, kind="stable")
     magnitude, identifier = np.asarray(stars.magnitude, float), np.asarray(stars.identifier, int)
-    return PairIndex(unit, magnitude, identifier, *pairs[order].T, angle[order], tree)
+    first, second = pairs[order].T
+    return PairIndex(unit, magnitude, identifier, first, second, angle[order], tree)
 
 
 def pairs_between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[Any, Any]:

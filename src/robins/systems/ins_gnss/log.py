@@ -305,13 +305,10 @@ def _answers(
     The smoother of one hypothesis takes that which the bank thinks likely in hindsight: it does not
     see positions that were off, and has the bank's process noise.
     """
-
-    def navigated(
-        pieces: Sequence[LogSegment], wanted: Sequence[str]
-    ) -> dict[str, FilterEstimates]:
-        made = partial(contender, parameters, fix_step_s)
-        return replaying.run_filters(pieces, wanted, made, SMOOTHED, progress)
-
+    made = partial(contender, parameters, fix_step_s)
+    navigated = partial(
+        replaying.run_filters, contender=made, smoothers=SMOOTHED, progress=progress
+    )
     smooths = [name for name in wanted if SMOOTHED.get(name) == WEIGHED]
     causal = [name for name in wanted if name not in smooths]
     wants_robust = bool(smooths) and ROBUST not in causal
@@ -436,7 +433,7 @@ def replay(
     for name in wanted:
         require_known("filter", name, NAMES, "this system")
     answers, found, doubts = _answers(pieces, parameters, interval_s, wanted, progress)
-    epoch_s = replaying.epochs_of(pieces)
+    epoch_s, origin_ns = replaying.epochs_of(pieces), int(dataset.imu.time_ns[0])
     rate, withheld = replaying.end_to_end([(piece.rate_b, piece.withheld) for piece in pieces])
     mount = model.mount_of(parameters.gnss, parameters.aids)
     antennas = {name: antenna_of(mount, answer.mean, rate) for name, answer in answers.items()}
@@ -462,12 +459,10 @@ def replay(
         + sigma_notes(dataset, parameters)
         + found
         + [f"Not navigated, {problem}." for problem in problems],
-        origin_ns=int(dataset.imu.time_ns[0]),
+        origin_ns=origin_ns,
     )
     outcome.warnings[:0] = doubts
-    origin_ns, files = int(dataset.imu.time_ns[0]), {}
-    if parameters.every_sample:
-        files = as_files(log.time_s, origin_ns, pieces, answers)
+    files = as_files(log.time_s, origin_ns, pieces, answers) if parameters.every_sample else {}
     word = verdict(answers, outcome.metrics, outcome.warnings)
     return replace(outcome, verdict=word, files=files)
 

@@ -150,11 +150,10 @@ def simulated_hand(parameters: MargReplay, seed: int, run: int) -> tuple[Dataset
     imu = ImuTable(time_ns, rows(gyro), rows(accel), "rate")
     log = Dataset(name="hand", imu=imu, mag=MagTable(time_ns, rows(raw)))
     q = Rotation(np.roll(q_nb.as_quat(), 1, axis=-1))
-    same = bias, gain, accel_bias, 0.0, FIELD_N[[0, 2]], np.zeros(model.SITES)
-    constant = (
-        np.broadcast_to(x, (len(time), *np.shape(x))) for x in (*same, p.accelerometer.gravity)
-    )
-    return log, model.MargState(q, v_n, p_n, *constant)
+    gravity = p.accelerometer.gravity
+    same = bias, gain, accel_bias, 0.0, FIELD_N[[0, 2]], np.zeros(model.SITES), gravity
+    each = (jnp.broadcast_to(jnp.asarray(x), (len(time), *np.shape(x))) for x in same)
+    return log, model.MargState(q, jnp.asarray(v_n), jnp.asarray(p_n), *each)
 
 
 def case_of(parameters: MargReplay, log: Dataset, truth: model.MargState) -> Case:
@@ -162,7 +161,7 @@ def case_of(parameters: MargReplay, log: Dataset, truth: model.MargState) -> Cas
     made: PreparedMargLog = prepare(log, parameters)
     world, samples = made.world, made.samples
     u = BoardInput(samples.dt_s, samples.theta, samples.dv, *world.u[1:])
-    at_ends = jax.tree_util.tree_map(lambda a: jnp.asarray(a[made.rows]), truth)
+    at_ends = jax.tree_util.tree_map(lambda a: jnp.asarray(a)[made.rows], truth)
     return Case(world.start, u, world.y, world.aux, at_ends)
 
 
