@@ -222,18 +222,17 @@ def measured_fixes(
 
     def sorted_in(values: np.ndarray, fill: float = np.nan) -> np.ndarray:
         out = np.full((len(epochs), *values.shape[1:]), fill)
-        out[at] = values[given]
+        out[at] = values
         return out
 
-    y: dict[str, Any] = {model.POSITION: Geodetic(*map(sorted_in, (g.lat_rad, g.lon_rad, g.alt_m)))}
-    aux: dict[str, Any] = {model.POSITION: model.Fix(sorted_in(log.sigma_m, 1.0), rate)}
+    place = (sorted_in(x[given]) for x in (g.lat_rad, g.lon_rad, g.alt_m))
+    y: dict[str, Any] = {model.POSITION: Geodetic(*place)}
+    aux: dict[str, Any] = {model.POSITION: model.Fix(sorted_in(log.sigma_m[given], 1.0), rate)}
     if log.v_n is not None and log.sigma_v is not None:
-        gained = np.zeros((len(epochs), 3)), np.zeros(len(epochs))
-        found = gained_in_window(log.increments, log.time_s, epochs[at], window_s)
-        for all_, some in zip(gained, found, strict=True):
-            all_[at] = some
-        y[model.VELOCITY] = sorted_in(log.v_n)
-        aux[model.VELOCITY] = model.Velocity(sorted_in(log.sigma_v, 1.0), rate, *gained)
+        gained = gained_in_window(log.increments, log.time_s, epochs[at], window_s)
+        about = sorted_in(log.sigma_v[given], 1.0), rate, *(sorted_in(x, 0.0) for x in gained)
+        y[model.VELOCITY] = sorted_in(log.v_n[given])
+        aux[model.VELOCITY] = model.Velocity(*about)
     return y, aux
 
 
