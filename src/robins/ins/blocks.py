@@ -84,11 +84,7 @@ def _shares(
 
 
 def cut(
-    increments: Increments,
-    time_s: np.ndarray,
-    start_s: float,
-    epoch_s: np.ndarray,
-    least: int = 8,
+    increments: Increments, time_s: np.ndarray, start_s: float, epoch_s: np.ndarray, least: int = 8
 ) -> Blocks:
     """Group increments by epoch, splitting those that an epoch falls into.
 

@@ -46,9 +46,8 @@ _CROWDED = 3.0
 """Density of stars over its mean, as near the Milky Way."""
 
 _MOST_TRIANGLES = 400
-_LEAST_SIDES = (
-    0.03  # of a triangle, twice its area over its longest side [rad]: else it is ill-defined
-)
+# of a triangle, twice its area over its longest side [rad]: else it is ill-defined
+_LEAST_SIDES = 0.03
 
 
 class PairIndex(NamedTuple):
@@ -141,7 +140,8 @@ def identify(
     """
     b, sigma, light = _checked(vectors_b, sigma_rad, magnitude, magnitude_tolerance, most_chance)
     there = np.flatnonzero(~np.isnan(b[:, 0]))
-    nothing = _nothing(len(b))
+    none = np.full(len(b), -1)
+    nothing = Identification(none, none.copy(), np.full(4, np.nan), 0, 1.0, 0, "nothing was tried")
     if len(there) < 4:
         return nothing._replace(refusal=f"{len(there)} stars are seen; a pyramid has four")
     image = _Image(b[there], sigma[there], None if light is None else light[there])
@@ -262,11 +262,6 @@ def _named(index, n, there, star, rotation, chance, tried) -> Identification:
     identifier = np.where(whole >= 0, index.identifier[whole], -1)
     q_ib = rotation.as_quat(canonical=True, scalar_first=True)
     return Identification(whole, identifier, q_ib, int(np.sum(star >= 0)), chance, tried, "")
-
-
-def _nothing(n: int) -> Identification:
-    none = np.full(n, -1)
-    return Identification(none, none.copy(), np.full(4, np.nan), 0, 1.0, 0, "nothing was tried")
 
 
 def _alike(index: PairIndex, star, magnitude, tolerance):

@@ -219,7 +219,7 @@ def replay(
         notes=[
             f"{counts['pseudoranges']} pseudoranges of {counts['satellites']} satellites in "
             f"{len(there)} epochs over {given.way_m[-1]:.0f} m; the start is a fix by least "
-            "squares, of unknown heading.",
+            "squares, of unknown heading."
         ],
     )
 
@@ -251,7 +251,4 @@ def accuracy(answer: FilterEstimates, true: np.ndarray) -> dict[str, float | int
 
 
 def _estimates(mean: GnssState) -> Mapping[str, np.ndarray]:
-    return {
-        "position": np.asarray(mean.position),
-        "euler": heading_rad(mean.direction)[:, None],
-    }
+    return {"position": np.asarray(mean.position), "euler": heading_rad(mean.direction)[:, None]}

@@ -149,7 +149,7 @@ def signals(city: City, course: GnssCourse, key: Array) -> tuple[Array, Array]:
     loss = s.loss_db + 3.0 * jax.random.normal(keys[4], (count, n))[block]
     cn0 = 38.0 + 10.0 * np.sin(course.elevation_rad)[None, :]
     cn0 = cn0 + 1.5 * jax.random.normal(keys[5], (e, n)) - jnp.where(blocked, loss, 0.0)
-    return jnp.where(blocked, late, 0.0) + rough, cn0
+    return jnp.where(blocked, late, 0.0) + rough, jnp.asarray(cn0)
 
 
 def simulate(city: City, course: GnssCourse, seed: int, index: Array) -> GnssWorld:
@@ -198,13 +198,7 @@ def simulate(city: City, course: GnssCourse, seed: int, index: Array) -> GnssWor
     y = jnp.where(present, exact + sigma * draw(white, (e, n)), jnp.nan)
     wanted: dict[str, Any] = {RANGES: y, LENGTH: length_once(city, course.way_m)}
     u = MotionStep(
-        dt,
-        speed,
-        rate,
-        jnp.full(e, city.speed_noise),
-        jnp.full(e, city.yaw_noise),
-        mean,
-        spread,
+        dt, speed, rate, jnp.full(e, city.speed_noise), jnp.full(e, city.yaw_noise), mean, spread
     )
     here = Sky(sky.satellite_e[0], sky.sigma[0])
     fix = first_fix(y[0], here, course.member, b.clock.system_bias)

@@ -48,15 +48,7 @@ from robins.systems.ins_gnss.recording import axes_of
 from robins.systems.ins_gnss.rest import UsualIntervals
 from robins.systems.ins_gnss.robust import navigation
 from robins.systems.parts import ImuBlock
-from robins.systems.streaming import (
-    Flag,
-    Live,
-    LiveError,
-    TimestampGate,
-    numbers,
-    online,
-    stamp,
-)
+from robins.systems.streaming import Flag, Live, LiveError, TimestampGate, numbers, online, stamp
 from robins.systems.study import Case
 
 _PATIENCE_S = 0.1

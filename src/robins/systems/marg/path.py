@@ -344,7 +344,7 @@ class SamplePath:
             model.REST: _zeros_where(still, 6),
         }
         aux: dict[str, Any] = {
-            model.REST: np.concatenate([mean_rate(u.samples), sigma[:, None]], axis=1),
+            model.REST: np.concatenate([mean_rate(u.samples), sigma[:, None]], axis=1)
         }
         if p.use_magnetometer != "never":
             there = np.all(np.isfinite(field_b), axis=1)
