@@ -58,5 +58,3 @@ def test_refuses_what_the_imu_does_not_cover(stream):
         cut(increments, time, 0.0, np.array([time[-1] + 1.0]))
     with pytest.raises(ValueError, match="does not cover"):
         cut(increments, time, -1.0, np.array([1.0]))
-    with pytest.raises(ValueError, match="width 8"):
-        cut(increments, time, 0.0, time[[100]], width=8)

@@ -67,7 +67,7 @@ def _walk(rest_s, go_s, roll, pitch, heading_rest, course):
 def test_start_carries_the_tilt_by_gyro_and_takes_the_heading_from_the_course():
     roll, pitch, course = 0.2, -0.1, 2.0
     log = _walk(8.0, 4.0, roll, pitch, 0.5, course)
-    still, _ = standstill(log.increments, *Aids().quiet)
+    still, *_ = standstill(log.increments, *Aids().quiet)
     assert np.all(still[100:790])
     assert not np.any(still[900:])
     found = find_start(log, InsGnssStart(), Aids())

@@ -103,21 +103,15 @@ def is_static(
     sigma_omega, sigma_f = omega.std(0, ddof=1), f.std(0, ddof=1)
     size_omega, size_f = np.linalg.norm(mean_omega), np.linalg.norm(mean_f)
     reasons = []
-    if np.max(sigma_omega) > largest_sigma_omega:
-        reasons.append(
-            f"the rates scatter by {np.max(sigma_omega):.3g} rad/s, at rest at most "
-            f"{largest_sigma_omega:g} rad/s are expected"
-        )
-    if np.max(sigma_f) > largest_sigma_f:
-        reasons.append(
-            f"the specific force scatters by {np.max(sigma_f):.3g} m/s^2, at rest at most "
-            f"{largest_sigma_f:g} m/s^2 are expected"
-        )
-    if size_omega > largest_omega:
-        reasons.append(
-            f"the mean rate is {size_omega:.3g} rad/s, at rest at most {largest_omega:g} rad/s "
-            "are expected"
-        )
+    for what, size, most, unit in (
+        ("the rates scatter by", np.max(sigma_omega), largest_sigma_omega, "rad/s"),
+        ("the specific force scatters by", np.max(sigma_f), largest_sigma_f, "m/s^2"),
+        ("the mean rate is", size_omega, largest_omega, "rad/s"),
+    ):
+        if size > most:
+            reasons.append(
+                f"{what} {size:.3g} {unit}, at rest at most {most:g} {unit} are expected"
+            )
     if abs(size_f - g) > largest_g_error:
         reasons.append(
             f"the mean specific force is {size_f:.4g} m/s^2, {g:.4g} m/s^2 within "

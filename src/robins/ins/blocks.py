@@ -84,12 +84,7 @@ def _shares(
 
 
 def cut(
-    increments: Increments,
-    time_s: np.ndarray,
-    start_s: float,
-    epoch_s: np.ndarray,
-    width: int | None = None,
-    least: int = 8,
+    increments: Increments, time_s: np.ndarray, start_s: float, epoch_s: np.ndarray, least: int = 8
 ) -> Blocks:
     """Group increments by epoch, splitting those that an epoch falls into.
 
@@ -102,12 +97,11 @@ def cut(
         time_s: (N,) end of each increment; it begins at ``time_s - dt``.
         start_s: beginning of the first block.
         epoch_s: (E,) end of each block, increasing.
-        width: pad every block to this many pieces; by default to the longest block, rounded up
-            to a multiple of 8 so that logs of like rate share a compilation.
-        least: pad to this many at least, where no width is given.
+        least: pad every block to this many pieces, or to the longest block, rounded up to a
+            multiple of 8 so that logs of like rate share a compilation.
 
     Raises:
-        ValueError: the increments do not cover (start_s, last epoch], or width is too small.
+        ValueError: the increments do not cover (start_s, last epoch].
     """
     dt, theta, dv = (np.asarray(a, dtype=float) for a in increments[:3])
     time_s, epoch_s = np.asarray(time_s, dtype=float), np.asarray(epoch_s, dtype=float)
@@ -127,11 +121,7 @@ def cut(
         piece_dv[late] = turned(turn.as_matrix(), piece_dv[late])
     block = np.searchsorted(epoch_s, ends - _SLACK_S)
     count = np.bincount(block, minlength=len(epoch_s))
-    needed = int(count.max(initial=1))
-    if width is None:
-        width = max(-(-needed // 8) * 8, least)
-    elif needed > width:
-        raise ValueError(f"a block holds {needed} IMU increments, more than the width {width}")
+    width = max(-(-int(count.max(initial=1)) // 8) * 8, least)
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
     column = np.arange(len(block)) - first[block]
     shape = (len(epoch_s), width)

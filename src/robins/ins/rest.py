@@ -50,11 +50,6 @@ def _moving_sum(rows: np.ndarray, width: int) -> np.ndarray:
     return head + before
 
 
-def _width(dt: np.ndarray, window_s: float, usual_s: float | None) -> int:
-    """Samples in a window."""
-    return max(2, round(window_s / (float(np.median(dt)) if usual_s is None else usual_s)))
-
-
 def standstill(
     increments: Increments,
     window_s: float,
@@ -62,7 +57,7 @@ def standstill(
     quiet_force: float,
     usual_s: float | None = None,
     first: int = 0,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """True where the unit stood still over the window up to each increment.
 
     Still means: on every axis the spread of turn rate and specific force is below its threshold,
@@ -77,33 +72,16 @@ def standstill(
         first: number of increments of the record before these.
 
     Returns:
-        (N,) bool, and (N, 3) mean gyro rate over the window [rad/s].
+        (N,) bool, (N, 3) mean gyro rate over the window [rad/s], and (N,) unrest: the spread, in
+        thresholds, of the axis that is the farthest from still.
     """
     dt, theta, dv = increments[:3]
-    width = _width(dt, window_s, usual_s)
+    width = max(2, round(window_s / (float(np.median(dt)) if usual_s is None else usual_s)))
     mean_rate, spread_rate = moving_statistics(theta / dt[:, None], width, first)
     _, spread_force = moving_statistics(dv / dt[:, None], width, first)
     still = np.all(spread_rate < quiet_rate, axis=1)
     still &= np.all(spread_force < quiet_force, axis=1)
     still &= np.all(np.abs(mean_rate) < 4.0 * quiet_rate, axis=1)
     still[: max(width - 1 - first, 0)] = False
-    return still, mean_rate
-
-
-def unrest(
-    increments: Increments,
-    window_s: float,
-    quiet_rate: float,
-    quiet_force: float,
-    usual_s: float | None = None,
-    first: int = 0,
-) -> np.ndarray:
-    """(N,) spread over the window up to each increment, in thresholds of `standstill`; the axis
-    that is the farthest from still. Arguments as of `standstill`.
-    """
-    dt, theta, dv = increments[:3]
-    width = _width(dt, window_s, usual_s)
-    _, spread_rate = moving_statistics(theta / dt[:, None], width, first)
-    _, spread_force = moving_statistics(dv / dt[:, None], width, first)
     each = np.concatenate([spread_rate / quiet_rate, spread_force / quiet_force], axis=1)
-    return np.max(each, axis=1)
+    return still, mean_rate, np.max(each, axis=1)

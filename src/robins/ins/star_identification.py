@@ -1,12 +1,11 @@
 """Identification of stars without a prior attitude (lost in space).
 
 The angle between two stars is the same in all axes, so it can be looked up. `index_pairs` makes the
-table of all pairs of a catalogue that fit into a field of view, sorted by angle, with the k-vector
-of Mortari & Neta (2000) to find a range of it without search. `identify` looks up the angles of a
-triangle of directions, keeps the triangles of stars that have all three and the same handedness,
-and checks the other directions: a fourth star where the triangle predicts it makes it a pyramid
-(Mortari, Samaan, Bruccoleri & Junkins 2004). Triangles are tried in their order, which drops a
-false star after one attempt where nested loops would try it again and again.
+table of all pairs of a catalogue that fit into a field of view, sorted by angle. `identify` looks
+up the angles of a triangle of directions, keeps the triangles of stars that have all three and the
+same handedness, and checks the other directions: a fourth star where the triangle predicts it makes
+it a pyramid (Mortari, Samaan, Bruccoleri & Junkins 2004). Triangles are tried in their order, which
+drops a false star after one attempt where nested loops would try it again and again.
 
 Nothing is guessed. With p the probability that some star lies by chance within the tolerance of a
 direction, m of n other directions agree by chance with probability P(Binomial(n, p) >= m); times
@@ -47,9 +46,8 @@ _CROWDED = 3.0
 """Density of stars over its mean, as near the Milky Way."""
 
 _MOST_TRIANGLES = 400
-_LEAST_SIDES = (
-    0.03  # of a triangle, twice its area over its longest side [rad]: else it is ill-defined
-)
+# of a triangle, twice its area over its longest side [rad]: else it is ill-defined
+_LEAST_SIDES = 0.03
 
 
 class PairIndex(NamedTuple):
@@ -61,8 +59,6 @@ class PairIndex(NamedTuple):
     first: np.ndarray  # (P,) int, place of a star in the catalogue
     second: np.ndarray  # (P,) int, of the other
     angle_rad: np.ndarray  # (P,) between them, ascending
-    k_vector: np.ndarray  # (P + 1,) int, how many angles are at or below each step of the line
-    line: tuple[float, float]  # start and step of that line [rad]
     tree: Any  # to find the star nearest to a direction
 
 
@@ -104,38 +100,16 @@ def index_pairs(stars: Stars, field_rad: float) -> PairIndex:
         raise ValueError(f"no two stars are within the field of {np.degrees(field):g} deg")
     angle = _angle(unit[pairs[:, 0]], unit[pairs[:, 1]])
     order = np.argsort(angle, kind="stable")
-    pairs, angle = pairs[order], angle[order]
-    # A straight line from just below the first angle to just above the last, a step for each.
-    margin = 1e-12 + 1e-3 * field / len(angle)
-    start = angle[0] - margin
-    step = (angle[-1] + margin - start) / len(angle)
-    k_vector = np.searchsorted(angle, start + step * np.arange(len(angle) + 1), side="right")
-    return PairIndex(
-        unit,
-        np.asarray(stars.magnitude, float),
-        np.asarray(stars.identifier, int),
-        pairs[:, 0],
-        pairs[:, 1],
-        angle,
-        k_vector,
-        (float(start), float(step)),
-        tree,
-    )
+    magnitude, identifier = np.asarray(stars.magnitude, float), np.asarray(stars.identifier, int)
+    first, second = pairs[order].T
+    return PairIndex(unit, magnitude, identifier, first, second, angle[order], tree)
 
 
 def pairs_between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[Any, Any]:
-    """Pairs of stars with an angle from low to high: places in the catalogue of both.
-
-    The k-vector gives the range of their rows at once, with a few rows too many at either end.
-    """
-    start, step = index.line
-    last = len(index.k_vector) - 1
-    below = min(max(int(np.floor((low_rad - start) / step)), 0), last)
-    above = min(max(int(np.ceil((high_rad - start) / step)), 0), last)
-    rows = slice(index.k_vector[below], index.k_vector[above])
-    angle = index.angle_rad[rows]
-    inside = (angle >= low_rad) & (angle <= high_rad)
-    return index.first[rows][inside], index.second[rows][inside]
+    """Pairs of stars with an angle from low to high: places in the catalogue of both."""
+    first = np.searchsorted(index.angle_rad, low_rad, side="left")
+    rows = slice(first, np.searchsorted(index.angle_rad, high_rad, side="right"))
+    return index.first[rows], index.second[rows]
 
 
 def identify(
@@ -166,7 +140,8 @@ def identify(
     """
     b, sigma, light = _checked(vectors_b, sigma_rad, magnitude, magnitude_tolerance, most_chance)
     there = np.flatnonzero(~np.isnan(b[:, 0]))
-    nothing = _nothing(len(b))
+    none = np.full(len(b), -1)
+    nothing = Identification(none, none.copy(), np.full(4, np.nan), 0, 1.0, 0, "nothing was tried")
     if len(there) < 4:
         return nothing._replace(refusal=f"{len(there)} stars are seen; a pyramid has four")
     image = _Image(b[there], sigma[there], None if light is None else light[there])
@@ -287,11 +262,6 @@ def _named(index, n, there, star, rotation, chance, tried) -> Identification:
     identifier = np.where(whole >= 0, index.identifier[whole], -1)
     q_ib = rotation.as_quat(canonical=True, scalar_first=True)
     return Identification(whole, identifier, q_ib, int(np.sum(star >= 0)), chance, tried, "")
-
-
-def _nothing(n: int) -> Identification:
-    none = np.full(n, -1)
-    return Identification(none, none.copy(), np.full(4, np.nan), 0, 1.0, 0, "nothing was tried")
 
 
 def _alike(index: PairIndex, star, magnitude, tolerance):

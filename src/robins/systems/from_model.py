@@ -26,15 +26,7 @@ from robins.filters import Belief, Filter, Model, Sensor
 from robins.manifold import State
 from robins.sim.random import Component, stream, unit
 from robins.systems.judgement import Claim
-from robins.systems.study import (
-    Case,
-    Contender,
-    Scenario,
-    SensorAxes,
-    StateBlock,
-    Study,
-    View,
-)
+from robins.systems.study import Case, Contender, Scenario, SensorAxes, StateBlock, Study, View
 
 ParametersT = TypeVar("ParametersT", bound=Scenario)
 Faults = Callable[[Array, Mapping[str, Any]], Mapping[str, Any]]

@@ -229,17 +229,12 @@ def _runs_of(drawn: Sequence[Metrics]) -> int:
     return next(iter(drawn[0].values()))[RUNS]
 
 
-def rms_by_component(statistics: Any) -> np.ndarray:
-    """(r,) RMS error of each component that is reported [SI], over runs and epochs that count."""
-    return statistics.pooled_rms
-
-
 def rms_by_axis(statistics: Any, all_axes: Sequence[str] = ()) -> dict[str, Metric]:
     """RMS error of every axis of every block in its display unit, over runs and epochs that count.
 
     Of the blocks in `all_axes` the RMS over all axes is reported too.
     """
-    rms, out = rms_by_component(statistics), {}
+    rms, out = statistics.pooled_rms, {}
     for block in statistics.blocks:
         ending = "mps" if block.display_unit == "m/s" else units.as_ending(block.display_unit)
         sizes = units.convert(rms[block.where], block.units, block.display_unit)
@@ -251,7 +246,7 @@ def rms_by_axis(statistics: Any, all_axes: Sequence[str] = ()) -> dict[str, Metr
 
 def standard_metrics(statistics: Any) -> dict[str, Metric]:
     """RMS error of every block, consistency of the filter, and number of diverged runs."""
-    rms, errors = rms_by_component(statistics), {}
+    rms, errors = statistics.pooled_rms, {}
     for block in statistics.blocks:
         size = float(np.linalg.norm(rms[block.where]))  # pooled over the axes
         shown = units.convert(size, block.units, block.display_unit)
@@ -289,7 +284,9 @@ def consistency_claims(texts: Mapping[str, str], judged: str | None = None) -> d
         return [metrics[name] for name in needs or metrics]
 
     def farthest(metrics: Metrics) -> float:
-        return max((_farthest(m) for m in of(metrics)), key=lambda nis: abs(nis - 1.0))
+        """The grand mean NIS that is farthest from one."""
+        every = [1.0, *(m[k] for m in of(metrics) for k in _grand_means(m))]
+        return max(every, key=lambda nis: abs(nis - 1.0))
 
     return {
         "sigma": Claim(
@@ -327,13 +324,6 @@ def _proven(metrics: Mapping[str, Any]) -> float:
 
 def _grand_means(metrics: Mapping[str, Any]) -> list[str]:
     return [k for k in metrics if k.startswith("nis_") and f"{k}_band" in metrics]
-
-
-def _farthest(metrics: Mapping[str, Any]) -> float:
-    """The grand mean NIS that is farthest from one."""
-    return max(
-        [1.0, *(metrics[k] for k in _grand_means(metrics))], key=lambda value: abs(value - 1.0)
-    )
 
 
 def _nis_inside(metrics: Mapping[str, Any]) -> bool:

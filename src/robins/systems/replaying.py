@@ -104,10 +104,7 @@ class ReportedItems(NamedTuple):
 
 
 def prepare_pieces(
-    time_s: np.ndarray,
-    dt_s: np.ndarray,
-    longest_gap_s: float,
-    prepare: Callable[[slice], PieceT],
+    time_s: np.ndarray, dt_s: np.ndarray, longest_gap_s: float, prepare: Callable[[slice], PieceT]
 ) -> tuple[list[PieceT], list[str]]:
     """The pieces of a log that can be run, and a sentence on each that cannot.
 
@@ -236,9 +233,7 @@ def _joined(parts: Sequence[FilterEstimates]) -> FilterEstimates:
     kept = "mean", "sigma", "updates", "wrong"
     whole = end_to_end([{name: getattr(a, name) for name in kept} for a in parts])
     return parts[-1]._replace(
-        **whole,
-        log_likelihood=sum(a.log_likelihood for a in parts),
-        tally=_tally_of(parts),
+        **whole, log_likelihood=sum(a.log_likelihood for a in parts), tally=_tally_of(parts)
     )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from enum import IntFlag
 from functools import partial
@@ -185,6 +185,9 @@ class Live:
     _parameters: ClassVar[type[Any]]  # those it is made with
     _kept: ClassVar[tuple[str, ...]]  # names of attributes that change, plain values or arrays
     _parts: ClassVar[tuple[str, ...]]  # names of objects whose attributes are such
+    _on: Callable[[Belief | FilterState], OnlineFilter]  # the filter, from a start on
+    _compiled_state: PyTree = None  # some state of the filter
+    _online: OnlineFilter | None = None  # from the start on
 
     def __init__(self, parameters: Parameters, **made_with: Any):
         """Remember what it is made with, for the file."""
@@ -192,13 +195,13 @@ class Live:
         self.counts: Counter[str] = Counter()
         self._made_with = made_with
 
-    def _state_now(self) -> PyTree:
-        """State of the filter, or None before there is one."""
-        raise NotImplementedError
+    def _known_states(self) -> list[PyTree]:
+        """States of the filter, the present one last; none before there is one."""
+        return [] if self._online is None else [self._online.state]
 
-    def _go_on_from(self, state: PyTree) -> None:
-        """Take a state of the filter whose leaves are these."""
-        raise NotImplementedError
+    def _go_on_from(self, states: list[PyTree]) -> None:
+        """Take states of the filter, as of `_known_states`."""
+        self._online = self._on(states[-1])
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all that is known into one file, whole or not at all.
@@ -233,22 +236,20 @@ class Live:
 
     def _all_known(self) -> tuple[str, dict[str, Any]]:
         """Parameters as TOML, and all else."""
-        now = self._state_now()
+        leaves = [np.asarray(x) for x in jax.tree_util.tree_leaves(self._known_states())]
         state = {
             "made_with": self._made_with,
             "counts": dict(self.counts),
             "own": {name: getattr(self, name) for name in self._kept},
             "parts": {name: _state_of(getattr(self, name)) for name in self._parts},
-            "filter": None
-            if now is None
-            else [np.asarray(x) for x in jax.tree_util.tree_leaves(now)],
+            "filter": leaves or None,
         }
-        return text_of(_plain(self.parameters.model_dump(exclude_none=True))), state
+        return text_of(self.parameters.model_dump(exclude_none=True)), state
 
 
 def _made_again(cls: type[LiveT], parameters: str, state: Mapping[str, Any]) -> LiveT:
     """The object of which this is known."""
-    given = cls._parameters.model_validate(_tuples(mapping_of(parameters)))
+    given = cls._parameters.model_validate(mapping_of(parameters), strict=False)
     made = cls(given, **state["made_with"])
     _compare(cls.__name__, cls._kept, state["own"])
     _compare(cls.__name__, cls._parts, state["parts"])
@@ -257,8 +258,10 @@ def _made_again(cls: type[LiveT], parameters: str, state: Mapping[str, Any]) -> 
         setattr(made, name, value)
     for name, part in state["parts"].items():
         _go_on(getattr(made, name), part)
-    if state["filter"] is not None:
-        made._go_on_from([jnp.asarray(x) for x in state["filter"]])
+    if (leaves := state["filter"]) is not None:
+        each = len(jax.tree_util.tree_leaves(made._compiled_state))
+        pieces = [leaves[k : k + each] for k in range(0, len(leaves), each)]
+        made._go_on_from([restored(made._compiled_state, piece) for piece in pieces])
     return made
 
 
@@ -300,16 +303,4 @@ def restored(like: PyTree, leaves: Sequence[ArrayLike]) -> PyTree:
     own, structure = jax.tree_util.tree_flatten(like)
     if [np.shape(x) for x in own] != [np.shape(x) for x in leaves]:
         raise ValueError("the filter's state has other components")
-    return jax.tree_util.tree_unflatten(structure, leaves)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    return [_plain(v) for v in value] if isinstance(value, list | tuple) else value
-
-
-def _tuples(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _tuples(v) for k, v in value.items()}
-    return tuple(_tuples(v) for v in value) if isinstance(value, list | tuple) else value
+    return jax.tree_util.tree_unflatten(structure, list(map(jnp.asarray, leaves)))

@@ -85,9 +85,8 @@ class Contender(Generic[WorldT]):
     filter: Filter
     model: Model
     case: Callable[[WorldT], Case] = as_simulated  # from what the problem simulates
-    reported: np.ndarray | Array | None = (
-        None  # (r, n) reported = this @ tangent error; None: all of it
-    )
+    # (r, n) reported = this @ tangent error; None: all of it
+    reported: np.ndarray | Array | None = None
     bounds: bool = False  # it states bounds of an H-infinity filter, not standard deviations
     lasting: bool = False  # its gain is not that of least variance, so innovations are correlated
     # figures known without a run, put among its metrics

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -42,16 +42,15 @@ CAUSES = (
 )
 
 
-class PreparedRangeLog(NamedTuple):
-    """A log by epoch, and where its state has its origin."""
+@dataclass(frozen=True, kw_only=True)
+class PreparedRangeLog(LogPiece):
+    """A log by epoch, and where its state has its origin; the world is a `GnssWorld`."""
 
-    epoch_s: np.ndarray  # (E,) since the first epoch
     time_ns: np.ndarray  # (E,)
     place: LocalFrame
     member: np.ndarray  # (N, K)
     satellites: tuple[str, ...]
     way_m: np.ndarray  # (E,)
-    world: GnssWorld
 
 
 def arrange(log: RangeLog, believed: GnssAssumptions) -> PreparedRangeLog:
@@ -88,6 +87,7 @@ def arrange(log: RangeLog, believed: GnssAssumptions) -> PreparedRangeLog:
     first = Sky(sky.satellite_e[0], sky.sigma[0])
     fix = first_fix(y[epochs][0], first, member, believed.clock.system_bias)
     return PreparedRangeLog(
+        begin_s=0.0,
         epoch_s=(time_ns - time_ns[0]) * 1e-9,
         time_ns=time_ns,
         place=LocalFrame.at(fix[:3]),
@@ -166,12 +166,8 @@ def recorded(log: RangeLog, parameters: GnssReplay) -> PreparedLog:
     Raises:
         ValueError: the log cannot be navigated; the message gives the reason.
     """
-    return _recorded(arrange(log, parameters), parameters)
-
-
-def _recorded(given: PreparedRangeLog, parameters: GnssReplay) -> PreparedLog:
-    piece = LogPiece(world=given.world, begin_s=0.0, epoch_s=given.epoch_s)
-    return PreparedLog([piece], partial(contender, parameters, given.place, given.member))
+    given = arrange(log, parameters)
+    return PreparedLog([given], partial(contender, parameters, given.place, given.member))
 
 
 def replay(
@@ -192,9 +188,9 @@ def replay(
         ValueError: the log cannot be navigated; the message gives the reason.
     """
     given = arrange(log, parameters)
-    pieces, make = _recorded(given, parameters)
+    make = partial(contender, parameters, given.place, given.member)
     wanted = filters or parameters.filters
-    answers = replaying.run_filters(pieces, wanted, make, SMOOTHERS, progress)
+    answers = replaying.run_filters([given], wanted, make, SMOOTHERS, progress)
     places = {name: given.place.geodetic(a.mean.position) for name, a in answers.items()}
     variables = track_arrays(places.values())
     true = None if log.truth is None else truth_at(log.truth, given)
@@ -223,7 +219,7 @@ def replay(
         notes=[
             f"{counts['pseudoranges']} pseudoranges of {counts['satellites']} satellites in "
             f"{len(there)} epochs over {given.way_m[-1]:.0f} m; the start is a fix by least "
-            "squares, of unknown heading.",
+            "squares, of unknown heading."
         ],
     )
 
@@ -255,7 +251,4 @@ def accuracy(answer: FilterEstimates, true: np.ndarray) -> dict[str, float | int
 
 
 def _estimates(mean: GnssState) -> Mapping[str, np.ndarray]:
-    return {
-        "position": np.asarray(mean.position),
-        "euler": heading_rad(mean.direction)[:, None],
-    }
+    return {"position": np.asarray(mean.position), "euler": heading_rad(mean.direction)[:, None]}

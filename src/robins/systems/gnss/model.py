@@ -196,10 +196,6 @@ def pseudoranges(place: LocalFrame, member: Array, x: GnssState, sky: Sky) -> Ar
     return rho + x.delay if x.delay.shape[0] else rho
 
 
-def _read(numbers: tuple[LocalFrame, Array], x: GnssState, sky: Sky) -> Array:
-    return pseudoranges(*numbers, x, sky)
-
-
 def _sigma(x: GnssState, sky: Sky) -> Array:
     return sky.sigma
 
@@ -227,7 +223,7 @@ def gnss_model(
     return Model(
         Motion(Partial(_step, scales), noise),
         (
-            Sensor(Partial(_read, (place, membership)), _sigma, len(member), RANGES),
+            Sensor(Partial(pseudoranges, place, membership), _sigma, len(member), RANGES),
             Sensor(_length, jnp.array([believed.wheels.scale]), 1, LENGTH),
         ),
     )

@@ -118,15 +118,8 @@ def _constellation(city: City, place: LocalFrame) -> tuple[np.ndarray, np.ndarra
     return azimuth, elevation, o + far[:, None] * line_e
 
 
-class Signals(NamedTuple):
-    """Arrival of the signals in a run, (E, N)."""
-
-    delay: Any  # m, NaN where a signal is lost
-    cn0_dbhz: Any
-
-
-def signals(city: City, course: GnssCourse, key: Array) -> Signals:
-    """Draw the walls, and find what they do to every signal."""
+def signals(city: City, course: GnssCourse, key: Array) -> tuple[Array, Array]:
+    """Draw the walls; delays (E, N) [m] of the signals, NaN where one is lost, and C/N0 [dBHz]."""
     s = city.streets
     count = int(course.way_m[-1] / s.block) + 1
     block = jnp.asarray((course.way_m / s.block).astype(int))
@@ -156,14 +149,14 @@ def signals(city: City, course: GnssCourse, key: Array) -> Signals:
     loss = s.loss_db + 3.0 * jax.random.normal(keys[4], (count, n))[block]
     cn0 = 38.0 + 10.0 * np.sin(course.elevation_rad)[None, :]
     cn0 = cn0 + 1.5 * jax.random.normal(keys[5], (e, n)) - jnp.where(blocked, loss, 0.0)
-    return Signals(jnp.where(blocked, late, 0.0) + rough, cn0)
+    return jnp.where(blocked, late, 0.0) + rough, jnp.asarray(cn0)
 
 
 def simulate(city: City, course: GnssCourse, seed: int, index: Array) -> GnssWorld:
     """One run, from its number; pure."""
     key = partial(stream, seed, index)
-    arriving = signals(city, course, key(Component.GNSS))
-    e, n = arriving.delay.shape
+    late, cn0 = signals(city, course, key(Component.GNSS))
+    e, n = late.shape
     white, first, oscillator, scale_key, odometer, gyro = jax.random.split(
         key(Component.ODOMETER), 6
     )
@@ -185,10 +178,10 @@ def simulate(city: City, course: GnssCourse, seed: int, index: Array) -> GnssWor
     moving = jnp.asarray(course.speed > 0.01)
     speed = jnp.where(moving, jnp.maximum(speed, 0.0), 0.0)
 
-    present = jnp.isfinite(arriving.delay)
-    delay = jnp.where(present, arriving.delay, 0.0)
-    sigma = city.satellites.noise * 10.0 ** ((45.0 - arriving.cn0_dbhz) / 40.0)
-    mean, spread = delay_law(b.delays, course.elevation_rad[None, :], arriving.cn0_dbhz)
+    present = jnp.isfinite(late)
+    delay = jnp.where(present, late, 0.0)
+    sigma = city.satellites.noise * 10.0 ** ((45.0 - cn0) / 40.0)
+    mean, spread = delay_law(b.delays, course.elevation_rad[None, :], cn0)
     c = (1.0 + scale) * jnp.stack(
         [jnp.cos(course.heading_rad), jnp.sin(course.heading_rad)], axis=1
     )
@@ -205,13 +198,7 @@ def simulate(city: City, course: GnssCourse, seed: int, index: Array) -> GnssWor
     y = jnp.where(present, exact + sigma * draw(white, (e, n)), jnp.nan)
     wanted: dict[str, Any] = {RANGES: y, LENGTH: length_once(city, course.way_m)}
     u = MotionStep(
-        dt,
-        speed,
-        rate,
-        jnp.full(e, city.speed_noise),
-        jnp.full(e, city.yaw_noise),
-        mean,
-        spread,
+        dt, speed, rate, jnp.full(e, city.speed_noise), jnp.full(e, city.yaw_noise), mean, spread
     )
     here = Sky(sky.satellite_e[0], sky.sigma[0])
     fix = first_fix(y[0], here, course.member, b.clock.system_bias)

@@ -19,10 +19,8 @@ from robins.systems.ins_gnss.recording import Log
 LEAST = 0.3  # share of the variance from which on it is taken to last; less may be chance
 MOST = 0.99  # the rest is white, however small the scatter
 _FEWEST = 100  # differences that scatter is estimated from, in each axis
-_QUANTILE, _NORMAL = (
-    0.8,
-    1.2816,
-)  # of absolute values; the smaller ones are those of a receiver at rest
+# of absolute values; the smaller ones are those of a receiver at rest
+_QUANTILE, _NORMAL = 0.8, 1.2816
 _THIRD = np.sqrt(20.0)  # sigma of a third difference of white noise, over its own
 
 

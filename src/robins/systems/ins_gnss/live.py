@@ -32,10 +32,10 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from robins.errors import require
-from robins.filters import Belief, Code, Filter, FilterState, Model, OnlineFilter
+from robins.filters import Belief, Code, Filter, FilterState, Model
 from robins.filters.kalman import WRONG
 from robins.filters.machine import usual
 from robins.filters.run import Step
@@ -48,16 +48,7 @@ from robins.systems.ins_gnss.recording import axes_of
 from robins.systems.ins_gnss.rest import UsualIntervals
 from robins.systems.ins_gnss.robust import navigation
 from robins.systems.parts import ImuBlock
-from robins.systems.streaming import (
-    Flag,
-    Live,
-    LiveError,
-    TimestampGate,
-    numbers,
-    online,
-    restored,
-    stamp,
-)
+from robins.systems.streaming import Flag, Live, LiveError, TimestampGate, numbers, online, stamp
 from robins.systems.study import Case
 
 _PATIENCE_S = 0.1
@@ -223,7 +214,7 @@ class LiveInsGnss(Live):
         self._last_step: Any = None  # stamp, vector and sensors of the last step
         self.start, self._begun_s, self.epoch = "", math.nan, None
         self.passed: list[Navigation] = []
-        self._online: OnlineFilter | None = None
+        self._online = None
 
     def push_imu(
         self, time_ns: Any, gyro_rad_s: Any, accel_m_s2: Any, field_t: Any = None
@@ -427,13 +418,10 @@ class LiveInsGnss(Live):
             self._compiled_state = None if self._online is None else self._online.state
             self.start_over()
 
-    def _state_now(self) -> PyTree:
-        return None if self._online is None else self._states
+    def _known_states(self) -> list[PyTree]:
+        return self._states
 
-    def _go_on_from(self, state: list[Array]) -> None:
-        count = len(self._past)
-        each = len(state) // count
-        like = self._compiled_state
-        self._states = [restored(like, state[k * each : (k + 1) * each]) for k in range(count)]
-        self._online = self._on(self._states[-1])
+    def _go_on_from(self, states: list[PyTree]) -> None:
+        super()._go_on_from(states)
+        self._states = states
         self.epoch = None if self._last_step is None else self._epoch()

@@ -222,18 +222,17 @@ def measured_fixes(
 
     def sorted_in(values: np.ndarray, fill: float = np.nan) -> np.ndarray:
         out = np.full((len(epochs), *values.shape[1:]), fill)
-        out[at] = values[given]
+        out[at] = values
         return out
 
-    y: dict[str, Any] = {model.POSITION: Geodetic(*map(sorted_in, (g.lat_rad, g.lon_rad, g.alt_m)))}
-    aux: dict[str, Any] = {model.POSITION: model.Fix(sorted_in(log.sigma_m, 1.0), rate)}
+    place = (sorted_in(x[given]) for x in (g.lat_rad, g.lon_rad, g.alt_m))
+    y: dict[str, Any] = {model.POSITION: Geodetic(*place)}
+    aux: dict[str, Any] = {model.POSITION: model.Fix(sorted_in(log.sigma_m[given], 1.0), rate)}
     if log.v_n is not None and log.sigma_v is not None:
-        gained = np.zeros((len(epochs), 3)), np.zeros(len(epochs))
-        found = gained_in_window(log.increments, log.time_s, epochs[at], window_s)
-        for all_, some in zip(gained, found, strict=True):
-            all_[at] = some
-        y[model.VELOCITY] = sorted_in(log.v_n)
-        aux[model.VELOCITY] = model.Velocity(sorted_in(log.sigma_v, 1.0), rate, *gained)
+        gained = gained_in_window(log.increments, log.time_s, epochs[at], window_s)
+        about = sorted_in(log.sigma_v[given], 1.0), rate, *(sorted_in(x, 0.0) for x in gained)
+        y[model.VELOCITY] = sorted_in(log.v_n[given])
+        aux[model.VELOCITY] = model.Velocity(*about)
     return y, aux
 
 
@@ -305,13 +304,10 @@ def _answers(
     The smoother of one hypothesis takes that which the bank thinks likely in hindsight: it does not
     see positions that were off, and has the bank's process noise.
     """
-
-    def navigated(
-        pieces: Sequence[LogSegment], wanted: Sequence[str]
-    ) -> dict[str, FilterEstimates]:
-        made = partial(contender, parameters, fix_step_s)
-        return replaying.run_filters(pieces, wanted, made, SMOOTHED, progress)
-
+    made = partial(contender, parameters, fix_step_s)
+    navigated = partial(
+        replaying.run_filters, contender=made, smoothers=SMOOTHED, progress=progress
+    )
     smooths = [name for name in wanted if SMOOTHED.get(name) == WEIGHED]
     causal = [name for name in wanted if name not in smooths]
     wants_robust = bool(smooths) and ROBUST not in causal
@@ -436,7 +432,7 @@ def replay(
     for name in wanted:
         require_known("filter", name, NAMES, "this system")
     answers, found, doubts = _answers(pieces, parameters, interval_s, wanted, progress)
-    epoch_s = replaying.epochs_of(pieces)
+    epoch_s, origin_ns = replaying.epochs_of(pieces), int(dataset.imu.time_ns[0])
     rate, withheld = replaying.end_to_end([(piece.rate_b, piece.withheld) for piece in pieces])
     mount = model.mount_of(parameters.gnss, parameters.aids)
     antennas = {name: antenna_of(mount, answer.mean, rate) for name, answer in answers.items()}
@@ -462,12 +458,10 @@ def replay(
         + sigma_notes(dataset, parameters)
         + found
         + [f"Not navigated, {problem}." for problem in problems],
-        origin_ns=int(dataset.imu.time_ns[0]),
+        origin_ns=origin_ns,
     )
     outcome.warnings[:0] = doubts
-    origin_ns, files = int(dataset.imu.time_ns[0]), {}
-    if parameters.every_sample:
-        files = as_files(log.time_s, origin_ns, pieces, answers)
+    files = as_files(log.time_s, origin_ns, pieces, answers) if parameters.every_sample else {}
     word = verdict(answers, outcome.metrics, outcome.warnings)
     return replace(outcome, verdict=word, files=files)
 

@@ -138,9 +138,8 @@ def fitted(
             q_nb = with_heading(q_nb, heading)
     p, v, spread = _lines(time_s, place - (moved + arms)[None], sigma)
     lasted = -float(np.nanmin(time_s))
-    drift = (
-        _G * tilt_rad * np.array([lasted / 2.0, lasted**2 / 12.0])
-    )  # of velocity and place at the end
+    # of velocity and place at the end
+    drift = _G * tilt_rad * np.array([lasted / 2.0, lasted**2 / 12.0])
     return q_nb, p[0], v[0], spread[0] + np.outer(drift, drift)
 
 

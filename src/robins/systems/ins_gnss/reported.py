@@ -26,10 +26,7 @@ from robins.systems.tables import place_arrays
 
 DIVERGED = "the estimate was off and took the word of positions that stayed away"
 NIS_MOST, FAR = 4.0, 6.0  # beyond which a replay is not to be trusted
-_OTHERS = {
-    "velocity": "gnss.velocity_sigma",
-    "place, velocity": "gnss.sigma, gnss.velocity_sigma",
-}
+_OTHERS = {"velocity": "gnss.velocity_sigma", "place, velocity": "gnss.sigma, gnss.velocity_sigma"}
 _RANK = {1: 0, 6: 1, 2: 2, 3: 3, 4: 3, 5: 4}  # of a quality, by its usual sigma
 RTK_QUALITY = {1: "fix", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp"}
 
@@ -97,9 +94,7 @@ def _rms(x: np.ndarray) -> float:
 def fix_arrays(log: Log) -> Variables:
     """The fixes of a log, on its clock."""
     g = log.gnss
-    out: dict[str, Any] = {
-        "gnss_time": variable("gnss_time", log.gnss_s, "s", "time of the fixes"),
-    }
+    out: dict[str, Any] = {"gnss_time": variable("gnss_time", log.gnss_s, "s", "time of the fixes")}
     out |= place_arrays("gnss", (g.lat_rad, g.lon_rad, g.alt_m), "{} of the fixes")
     if g.quality is not None:
         known = [q for q in RTK_QUALITY if np.any(g.quality == q)]

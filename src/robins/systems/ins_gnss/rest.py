@@ -15,7 +15,7 @@ import numpy as np
 
 from robins.earth.wgs84 import A_M, E2
 from robins.ins.increments import usual_interval
-from robins.ins.rest import standstill, unrest
+from robins.ins.rest import standstill
 from robins.systems.ins_gnss.parameters import Aids
 from robins.systems.ins_gnss.recording import Log
 
@@ -55,7 +55,11 @@ _Observed = tuple[np.ndarray, np.ndarray, np.ndarray, list[Evidence], float]
 
 
 def at_rest(
-    log: Log, aids: Aids, usual: UsualIntervals, at_s: np.ndarray | None = None
+    log: Log,
+    aids: Aids,
+    usual: UsualIntervals,
+    at_s: np.ndarray | None = None,
+    lenient: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Tell whether the vehicle certainly stands still (E,), and its mean rate (E, 3) [rad/s].
 
@@ -64,32 +68,25 @@ def at_rest(
         aids: what rest is.
         usual: of the whole log.
         at_s: (E,) times; None: the end of each increment.
+        lenient: where fixes that come say nothing, the spread of the samples decides.
     """
-    still, mean_rate, unrest_, evidence, wait_s = _observed(log, aids, usual)
+    still, mean_rate, unrest, evidence, wait_s = _observed(log, aids, usual)
+    if lenient:
+        for k, one in enumerate(evidence):
+            silent = np.isnan(one.moved_s) & ~one.moves
+            evidence[k] = one._replace(rests_s=np.where(silent, np.inf, one.rests_s))
     rows = rows_at(log.time_s, at_s)
-    return confirmed(still, unrest_, log.time_s, evidence, wait_s, usual, at_s), mean_rate[rows]
-
-
-def seems_at_rest(log: Log, aids: Aids, usual: UsualIntervals) -> tuple[np.ndarray, np.ndarray]:
-    """As `at_rest`, but where fixes that come say nothing, the spread of the samples decides."""
-    still, mean_rate, unrest_, evidence, wait_s = _observed(log, aids, usual)
-
-    def lenient(one: Evidence) -> Evidence:
-        silent = np.isnan(one.moved_s) & ~one.moves
-        return one._replace(rests_s=np.where(silent, np.inf, one.rests_s))
-
-    evidence = list(map(lenient, evidence))
-    return confirmed(still, unrest_, log.time_s, evidence, wait_s, usual), mean_rate
+    return confirmed(still, unrest, log.time_s, evidence, wait_s, usual, at_s), mean_rate[rows]
 
 
 def known_until(log: Log, aids: Aids, usual: UsualIntervals, since_s: float) -> UsualIntervals:
     """Numbers of a log of which only the part after a time is kept."""
-    still, _, unrest_, evidence, wait_s = _observed(log, aids, usual)
+    still, _, unrest, evidence, wait_s = _observed(log, aids, usual)
     least = usual.calmest
     for one in evidence:
         # with the two fixes that the last of these intervals is known by
         old = Evidence(*(a[: int(np.sum(one.time_s < since_s)) + 2] for a in one))
-        found = calmest_in_motion(unrest_, log.time_s, old, wait_s, usual, since_s)[-1]
+        found = calmest_in_motion(unrest, log.time_s, old, wait_s, usual, since_s)[-1]
         least = min(least, float(found))
     last = max(int(np.searchsorted(log.time_s, since_s)) - 1, 0)
     began = float(quiet_since(still, log.time_s, usual)[last])
@@ -104,9 +101,9 @@ def rows_at(time_s: np.ndarray, at_s: np.ndarray | None) -> np.ndarray:
 
 
 def _observed(log: Log, aids: Aids, usual: UsualIntervals) -> _Observed:
-    args, wait_s = (*aids.quiet, usual.sample_s, log.first), 1.5 * max(1.0, usual.fix_s)
-    evidence = evidence_of(log, aids.moving_speed, wait_s)
-    return *standstill(log.increments, *args), unrest(log.increments, *args), evidence, wait_s
+    wait_s = 1.5 * max(1.0, usual.fix_s)
+    observed = standstill(log.increments, *aids.quiet, usual.sample_s, log.first)
+    return *observed, evidence_of(log, aids.moving_speed, wait_s), wait_s
 
 
 def confirmed(

@@ -30,7 +30,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -282,15 +281,11 @@ def augmented_case(
     with_share: bool, lasting: tuple[float, float] | None, start_m: float, world: Case
 ) -> Case:
     """Case of a world whose start is about the navigation state alone, as in `augmented_belief`."""
-    if lasting is None:
-        return world._replace(
-            start=evaluated(partial(augmented_belief, with_share=with_share), world.start)
-        )
 
-    def wide(start: Belief, lasting: Array, start_m: Array) -> Belief:
-        return augmented_belief(start, with_share, lasting, start_m)
+    def wide(start: Belief, *numbers: Array) -> Belief:
+        return augmented_belief(start, with_share, *numbers)
 
-    numbers = jnp.asarray(lasting), jnp.asarray(start_m)
+    numbers = () if lasting is None else (jnp.asarray(lasting), jnp.asarray(start_m))
     return world._replace(start=evaluated(wide, world.start, *numbers))
 
 

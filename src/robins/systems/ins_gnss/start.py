@@ -21,7 +21,7 @@ from robins.systems.ins_gnss.positions import (
     with_heading,
 )
 from robins.systems.ins_gnss.recording import Log
-from robins.systems.ins_gnss.rest import WAYS_S, UsualIntervals, at_rest, seems_at_rest, usual_of
+from robins.systems.ins_gnss.rest import WAYS_S, UsualIntervals, at_rest, usual_of
 
 REST_S = 10.0  # after the first whole fix, within which a filter with a given heading levels
 UNKNOWN_SPEED = 10.0  # m/s, sigma of a velocity of which nothing is known
@@ -205,7 +205,7 @@ def _levelled(
         ValueError: the mean specific force is not gravity's.
     """
     dt, _, dv = log.increments[:3]
-    still, mean_rate = seems_at_rest(log, aids, usual)
+    still, mean_rate = at_rest(log, aids, usual, lenient=True)
     width = max(2, round(2.0 * aids.window / usual.sample_s))
     mean_force, spread = moving_statistics(dv / dt[:, None], width, log.first)
     # without a course nothing is taken from after the rest that it begins at

@@ -32,9 +32,8 @@ FILTERS = {
 SMOOTHERS = {f"{name}+rts": name for name in FILTERS}
 """Of recorded logs, by name: the filter whose run each smooths."""
 
-ADAPTIVE = (
-    "adaptive"  # a bank over the process noise; nothing is gated, and nothing can be smoothed
-)
+# a bank over the process noise; nothing is gated, and nothing can be smoothed
+ADAPTIVE = "adaptive"
 NAMES = (*FILTERS, ADAPTIVE, *SMOOTHERS)
 
 CLAIMS = consistency_claims(

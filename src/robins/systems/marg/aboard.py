@@ -108,20 +108,10 @@ def model_on_board(parameters: MargReplay) -> Model:
 # --------------------------------------------------------------------------------------- the hand
 
 
-class HandMotion(NamedTuple):
-    """A simulated log and its truth; N samples behind the first."""
-
-    log: Dataset
-    q_nb: SciRotation  # N + 1
-    v_n: np.ndarray  # (N + 1, 3) m/s
-    p_n: np.ndarray  # (N + 1, 3) m
-    gyro_bias: np.ndarray  # (3,) rad/s
-    gyro_gain: np.ndarray  # (3, 3)
-    accel_bias: np.ndarray  # (3,) m/s^2
-
-
-def simulated_hand(parameters: MargReplay, seed: int, run: int) -> HandMotion:
+def simulated_hand(parameters: MargReplay, seed: int, run: int) -> tuple[Dataset, model.MargState]:
     """A hand that turns and swings the unit; each run in another way, with other errors.
+
+    A simulated log, and the truth at each of its samples.
 
     Samples are means over the intervals that they end. What is believed of the unit is the size of
     its errors: biases within their spreads, gains and noises as normal numbers.
@@ -159,28 +149,20 @@ def simulated_hand(parameters: MargReplay, seed: int, run: int) -> HandMotion:
 
     imu = ImuTable(time_ns, rows(gyro), rows(accel), "rate")
     log = Dataset(name="hand", imu=imu, mag=MagTable(time_ns, rows(raw)))
-    return HandMotion(log, q_nb, v_n, p_n, bias, gain, accel_bias)
+    q = Rotation(np.roll(q_nb.as_quat(), 1, axis=-1))
+    gravity = p.accelerometer.gravity
+    same = bias, gain, accel_bias, 0.0, FIELD_N[[0, 2]], np.zeros(model.SITES), gravity
+    each = (jnp.broadcast_to(jnp.asarray(x), (len(time), *np.shape(x))) for x in same)
+    return log, model.MargState(q, jnp.asarray(v_n), jnp.asarray(p_n), *each)
 
 
-def case_of(parameters: MargReplay, of: HandMotion) -> Case:
+def case_of(parameters: MargReplay, log: Dataset, truth: model.MargState) -> Case:
     """Inputs and measurements of a filter on a board, and the truth at the ends of its steps."""
-    made: PreparedMargLog = prepare(of.log, parameters)
-    p = parameters.accelerometer
-    world, samples, count = made.world, made.samples, len(made.rows)
+    made: PreparedMargLog = prepare(log, parameters)
+    world, samples = made.world, made.samples
     u = BoardInput(samples.dt_s, samples.theta, samples.dv, *world.u[1:])
-    truth = model.MargState(
-        q_nb=Rotation(jnp.asarray(np.roll(of.q_nb.as_quat()[made.rows], 1, axis=-1))),
-        v_n=jnp.asarray(of.v_n[made.rows]),
-        p_n=jnp.asarray(of.p_n[made.rows]),
-        gyro_bias=jnp.tile(of.gyro_bias, (count, 1)),
-        gyro_gain=jnp.tile(of.gyro_gain, (count, 1, 1)),
-        accel_bias=jnp.tile(of.accel_bias, (count, 1)),
-        declination=jnp.zeros(count),
-        field=jnp.tile(FIELD_N[[0, 2]], (count, 1)),
-        azimuths=jnp.zeros((count, model.SITES)),
-        gravity=jnp.full(count, p.gravity),
-    )
-    return Case(world.start, u, world.y, world.aux, truth)
+    at_ends = jax.tree_util.tree_map(lambda a: jnp.asarray(a)[made.rows], truth)
+    return Case(world.start, u, world.y, world.aux, at_ends)
 
 
 def export_problem(parameters: MargReplay, seed: int) -> Problem:
@@ -189,7 +171,7 @@ def export_problem(parameters: MargReplay, seed: int) -> Problem:
     Raises:
         ValueError: the parameters allow no log of such a hand.
     """
-    cases = [case_of(parameters, simulated_hand(parameters, seed, run)) for run in range(RUNS)]
+    cases = [case_of(parameters, *simulated_hand(parameters, seed, run)) for run in range(RUNS)]
     every = jax.tree_util.tree_map(lambda *a: jnp.stack([jnp.asarray(x) for x in a]), *cases)
     known = model_on_board(parameters)
 

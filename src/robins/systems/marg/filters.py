@@ -79,10 +79,7 @@ def undisturbed(probability: float, patience: int, field_t: float) -> Rule:
 
 
 def marg_filter(
-    gate: float | None = 0.95,
-    patience: int = 20,
-    field_t: float = 1e-4,
-    sites: bool = True,
+    gate: float | None = 0.95, patience: int = 20, field_t: float = 1e-4, sites: bool = True
 ) -> Filter:
     """The filter of `marg.model_of`, for one prior.
 

@@ -27,14 +27,12 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
 
 from robins.errors import require
-from robins.filters import Code, OnlineFilter
+from robins.filters import Code
 from robins.filters.kalman import WRONG
 from robins.filters.machine import usual
 from robins.filters.run import Step
-from robins.ins.increments import Increments
 from robins.linalg.scalars import product
 from robins.systems.marg import model, monitor
 from robins.systems.marg.filters import filter_of
@@ -42,7 +40,6 @@ from robins.systems.marg.log import earth_field
 from robins.systems.marg.parameters import MargReplay
 from robins.systems.marg.path import MargSteps, SamplePath
 from robins.systems.marg.replay import stated_sigma
-from robins.systems.marg.start import first_belief, initial_alignment
 from robins.systems.replaying import kept
 from robins.systems.streaming import (
     Flag,
@@ -53,7 +50,6 @@ from robins.systems.streaming import (
     online,
     refuse_field_unit,
     refuse_units,
-    restored,
     stamp,
 )
 from robins.systems.tables import SensorUpdates
@@ -140,17 +136,13 @@ class LiveMarg(Live):
             ValueError: the rate is not positive, or there is no such machine.
         """
         require(rate_hz > 0.0, "rate_hz must be positive", rate_hz)
-        made_with = {
-            "rate_hz": rate_hz,
-            "declination_rad": declination_rad,
-            "machine": machine or usual(),
-        }
+        machine = machine or usual()
+        made_with = {"rate_hz": rate_hz, "declination_rad": declination_rad, "machine": machine}
         super().__init__(parameters, **made_with)
         p, self._usual_s = parameters, 1.0 / rate_hz
         half = 0.5 * declination_rad
         self._turn_north = (math.cos(half), 0.0, 0.0, math.sin(half))
-        self._on = partial(online, filter_of(p), model.model_of(p), machine=machine or usual())
-        self._online: OnlineFilter | None = None
+        self._on = partial(online, filter_of(p), model.model_of(p), machine=machine)
         self._door = TimestampGate(_LONGEST_GAP_S, max(3, round(_PATIENCE_S * rate_hz)))
         self._restart()
         self._compile()
@@ -181,6 +173,7 @@ class LiveMarg(Live):
         found = self._path.start(is_whole=True)
         assert found is not None
         self._online = self._on(found[1])
+        self._compiled_state = self._online.state
         self._step()
         self.counts.clear()
         self._restart()
@@ -352,16 +345,3 @@ class LiveMarg(Live):
         asked = np.flatnonzero((looks[:, 5] > 0) | (looks[:, 6] == Code.REFUSED))
         disturbed = len(asked) > 0 and looks[asked[-1], 6] == Code.REFUSED
         return flags | (Flag.DISTURBED if disturbed else Flag(0))
-
-    # ------------------------------------------------------------------------------- the file
-
-    def _state_now(self) -> PyTree:
-        return None if self._online is None else self._online.state
-
-    def _go_on_from(self, state: list[Array]) -> None:
-        increments = Increments(np.ones(1), np.zeros((1, 3)), np.array([[0.0, 0.0, -9.81]]))
-        belief = first_belief(
-            initial_alignment(increments, np.full((1, 3), np.nan), self.parameters), self.parameters
-        )
-        self._online = self._on(belief)
-        self._online.state = restored(self._online.state, state)

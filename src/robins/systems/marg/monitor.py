@@ -15,6 +15,7 @@ import numpy as np
 from robins.filters import Code
 from robins.systems.marg.model import MAGNETOMETER, TRAVEL, MargState
 from robins.systems.marg.parameters import MargReplay
+from robins.systems.suspects import edges
 from robins.systems.tables import SensorUpdates
 
 _SIGMAS = 3.0
@@ -112,11 +113,10 @@ def _too_large(update: SensorUpdates) -> np.ndarray:
 def _in_a_row(update: SensorUpdates, least: int) -> np.ndarray:
     code, dof = np.asarray(update.code), np.asarray(update.dof)
     refused = code == int(Code.REFUSED)
-    out, run = np.zeros(len(code), dtype=bool), []
-    for k in np.flatnonzero(refused | (dof > 0)):
-        run = [*run, k] if refused[k] else []
-        if len(run) >= least:
-            out[run[0] : k + 1] = True
+    out, looks = np.zeros(len(code), dtype=bool), np.flatnonzero(refused | (dof > 0))
+    for first, end in edges(refused[looks]):
+        if end - first >= least:
+            out[looks[first] : looks[end - 1] + 1] = True
     return out
 
 

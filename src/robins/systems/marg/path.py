@@ -217,7 +217,7 @@ class SamplePath:
         made = self.increments(self.time_ns, rate, accel)
         block, own, ends = slice(context, end), slice(context - 1, end - 1), slice(context - 1, end)
         dt, theta, dv = (np.array(a, float)[own] for a in made[:3])
-        turn, lost_s, gaps = not_sampled(dt, full[ends], doubt[ends], hard[ends], self._usual_s, p)
+        turn, lost_s = self._not_sampled(dt, full[ends], doubt[ends], hard[ends])
         for at in self._lost(context, end):
             across = self._across(int(at), made, field)
             if across is not None:
@@ -226,7 +226,6 @@ class SamplePath:
                 dv[k] = p.accelerometer.gravity * dt[k] * up_b
                 turn[k] = np.minimum(turn[k], spread)
         turn += p.update.gap_rate * (self._hung(end)[block] * dt)[:, None]
-        self.counts["imu_gaps"] += gaps
         self.counts["imu_saturated"] += int(np.sum((np.any(full, axis=1) | hard)[block]))
         self.counts["imu_bridged"] += int(np.sum(np.any(np.isfinite(doubt), axis=1)[block]))
         if self._begun is not None:
@@ -290,10 +289,77 @@ class SamplePath:
             still[k], sigma[k] = self._watch.look(dt, rate[k], force[k], field_b[k])
             at_home = self._watch.first is not None
             looks.append(self._sites.look(dt, bool(still[k]), at_home, force[k], field_b[k]))
-        u, falling = inputs(integrals, still, lost_turn, lost_s, p)
+        weight = p.accelerometer.gravity * np.asarray(integrals.dt_s)
+        falling = np.linalg.norm(np.asarray(integrals.dv), axis=1) < _FALLING * weight
         self.counts["blocks_in_free_fall"] += int(np.sum(falling))
-        y, aux = measurements(integrals, field_b, still, sigma, looks, p, self._pace)
-        return MargSteps(u, y, aux, still, samples)
+        lost_dv = np.hypot(p.update.gap_accel * lost_s, np.where(falling, weight, 0.0))
+        u = model.Block(integrals, still.astype(float), np.minimum(lost_turn, np.pi), lost_dv)
+        return MargSteps(u, *self._measurements(u, field_b, sigma, looks), still, samples)
+
+    def _not_sampled(
+        self, dt: np.ndarray, full: np.ndarray, doubt: np.ndarray, accel_full: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Spread of the turn that intervals did not show (N, 3) [rad], and seconds of specific
+        force that they did not show (N,).
+
+        Args:
+            dt: (N,) s, intervals between N + 1 samples.
+            full: (N + 1, 3) bool, a gyro at the end of its range, and
+            doubt: (N + 1, 3) rad/s, spread of what was put back; NaN where nothing.
+            accel_full: (N + 1,) bool.
+        """
+        p = self._parameters.update
+        gap = np.where(dt > p.gap * self._usual_s, dt, 0.0)
+        self.counts["imu_gaps"] += int(np.sum(gap > 0.0))
+        known = np.isfinite(doubt)
+        unknown = full & ~known
+        lost = gap + dt * (accel_full[1:] | accel_full[:-1])
+        # turn that a gyro at its end did not report, about its own axis; that of all samples in a
+        # gap
+        turn = p.gap_rate * (gap[:, None] + dt[:, None] * (unknown[1:] | unknown[:-1]))
+        return turn + dt[:, None] * np.where(known, doubt, 0.0)[1:], lost
+
+    def _measurements(
+        self, u: model.Block, field_b: np.ndarray, sigma: np.ndarray, looks: Sequence[Look]
+    ) -> tuple[dict[str, PyTree], dict[str, PyTree]]:
+        """Measurements at the end of each of K blocks, and what they depend on; NaN where nothing
+        is.
+
+        Args:
+            u: the blocks.
+            field_b: (K, 3) T, mean field in body axes at the end of each.
+            sigma: (K,) rad/s, of the mean rate at rest.
+            looks: K readings of sites.
+        """
+        p, pace, time = self._parameters, self._pace, np.asarray(u.samples.dt_s)
+        clock = np.cumsum(np.concatenate([[pace.clock_s], time]))[1:]
+        pace.clock_s = float(clock[-1])
+        whole, at_rest = time > 0.0, np.asarray(u.still) > 0.0
+        moves, still = whole & ~at_rest, whole & at_rest
+        # Noise that lasts is thinned out: it must be new at each reading to be what the filter
+        # thinks.
+        travels = pace.take(model.TRAVEL, clock, moves, p.travel.every)
+        y: dict[str, Any] = {
+            model.TRAVEL: _zeros_where(travels, 6),
+            model.REST: _zeros_where(still, 6),
+        }
+        aux: dict[str, Any] = {
+            model.REST: np.concatenate([mean_rate(u.samples), sigma[:, None]], axis=1)
+        }
+        if p.use_magnetometer != "never":
+            there = np.all(np.isfinite(field_b), axis=1)
+            look = pace.take(model.MAGNETOMETER, clock, there & ~still, p.travel.every)
+            y[model.MAGNETOMETER] = Angle(np.where(look, 0.0, np.nan)), _zeros_where(look, 2)
+            aux[model.MAGNETOMETER] = np.where(there[:, None], field_b, np.array([1e-5, 0.0, 0.0]))
+            number = np.array([site for site, *_ in looks])
+            y[model.REVISIT] = Angle(np.where(number >= 0, 0.0, np.nan))
+            aux[model.REVISIT] = np.array([_of_site(look, p) for look in looks])
+        return y, aux
+
+
+def _zeros_where(known: np.ndarray, size: int) -> np.ndarray:
+    """Measurements (K, size) that are zero where one is known (K,), else NaN."""
+    return np.where(known[:, None], np.zeros((len(known), size)), np.nan)
 
 
 def joined(steps: Sequence[MargSteps]) -> MargSteps:
@@ -327,64 +393,6 @@ def as_means(imu: ImuTable, usual_s: float | None = None) -> ImuTable:
     return replace(imu, gyro=imu.gyro * own, accel=imu.accel * own, kind="increment")
 
 
-def not_sampled(
-    dt: np.ndarray,
-    full: np.ndarray,
-    doubt: np.ndarray,
-    accel_full: np.ndarray,
-    usual: float,
-    parameters: MargReplay,
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Spread of the turn that intervals did not show (N, 3) [rad], seconds of specific force that
-    they did not show (N,), and how many are gaps.
-
-    Args:
-        dt: (N,) s, intervals between N + 1 samples.
-        full: (N + 1, 3) bool, a gyro at the end of its range, and
-        doubt: (N + 1, 3) rad/s, spread of what was put back; NaN where nothing.
-        accel_full: (N + 1,) bool.
-        usual: s, sampling interval.
-        parameters: of gaps.
-    """
-    p = parameters.update
-    gap = np.where(dt > p.gap * usual, dt, 0.0)
-    known = np.isfinite(doubt)
-    unknown = full & ~known
-    lost = gap + dt * (accel_full[1:] | accel_full[:-1])
-    # turn that a gyro at its end did not report, about its own axis; that of all samples in a gap
-    turn = p.gap_rate * (gap[:, None] + dt[:, None] * (unknown[1:] | unknown[:-1]))
-    turn = turn + dt[:, None] * np.where(known, doubt, 0.0)[1:]
-    return turn, lost, int(np.sum(gap > 0.0))
-
-
-def inputs(
-    integrals: model.Integrals,
-    still: np.ndarray,
-    lost_turn: np.ndarray,
-    lost_s: np.ndarray,
-    parameters: MargReplay,
-) -> tuple[model.Block, np.ndarray]:
-    """Inputs of the motion for K blocks, and mask of those in free fall (K,) bool.
-
-    Args:
-        integrals: of the blocks.
-        still: (K,) bool.
-        lost_turn: (K, 3) rad, spread of the turn that was not sampled.
-        lost_s: (K,) s, for how long the specific force was not sampled.
-        parameters: of gaps, and gravity.
-    """
-    weight = parameters.accelerometer.gravity * np.asarray(integrals.dt_s)
-    falling = np.linalg.norm(np.asarray(integrals.dv), axis=1) < _FALLING * weight
-    fall = np.where(falling, weight, 0.0)
-    u = model.Block(
-        integrals,
-        still=still.astype(float),
-        lost_turn=np.minimum(lost_turn, np.pi),
-        lost_dv=np.hypot(parameters.update.gap_accel * lost_s, fall),
-    )
-    return u, falling
-
-
 class MeasurementPace:
     """Times of the last use of travel and field, so that they are used once in an interval."""
 
@@ -401,54 +409,6 @@ class MeasurementPace:
                 out[k] = True
                 self.due_s[name] = clock_s[k] + every_s * (1.0 - 1e-9)
         return out
-
-
-def measurements(
-    integrals: model.Integrals,
-    field_b: np.ndarray,
-    still: np.ndarray,
-    sigma: np.ndarray,
-    looks: Sequence[Look],
-    parameters: MargReplay,
-    pace: MeasurementPace,
-) -> tuple[dict[str, PyTree], dict[str, PyTree]]:
-    """Measurements at the end of each of K blocks, and what they depend on; NaN where nothing is.
-
-    Args:
-        integrals: of the blocks.
-        field_b: (K, 3) T, mean field in body axes at the end of each.
-        still: (K,) bool.
-        sigma: (K,) rad/s, of the mean rate at rest.
-        looks: K readings of sites.
-        parameters: as of a replay.
-        pace: goes on with these blocks.
-    """
-    p, time = parameters, np.asarray(integrals.dt_s)
-    blocks, clock = len(time), np.cumsum(np.concatenate([[pace.clock_s], time]))[1:]
-    pace.clock_s = float(clock[-1])
-    still = still & (time > 0.0)
-    travel = np.full((blocks, 6), np.nan)
-    # Noise that lasts is thinned out: it must be new at each reading to be what the filter thinks.
-    travel[pace.take(model.TRAVEL, clock, (time > 0.0) & ~still, p.travel.every)] = 0.0
-    y: dict[str, Any] = {
-        model.TRAVEL: travel,
-        model.REST: np.where(still[:, None], np.zeros((blocks, 6)), np.nan),
-    }
-    aux: dict[str, Any] = {
-        model.REST: np.concatenate([mean_rate(integrals), sigma[:, None]], axis=1),
-    }
-    if p.use_magnetometer != "never":
-        there = np.all(np.isfinite(field_b), axis=1)
-        look = pace.take(model.MAGNETOMETER, clock, there & ~still, p.travel.every)
-        y[model.MAGNETOMETER] = (
-            Angle(np.where(look, 0.0, np.nan)),
-            np.where(look[:, None], np.zeros((blocks, 2)), np.nan),
-        )
-        aux[model.MAGNETOMETER] = np.where(there[:, None], field_b, np.array([1e-5, 0.0, 0.0]))
-        number = np.array([site for site, *_ in looks])
-        y[model.REVISIT] = Angle(np.where(number >= 0, 0.0, np.nan))
-        aux[model.REVISIT] = np.array([_of_site(look, p) for look in looks])
-    return y, aux
 
 
 def _of_site(look: Look, parameters: MargReplay) -> np.ndarray:

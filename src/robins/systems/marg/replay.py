@@ -143,20 +143,20 @@ def replay(
         answers = {name: _turned_answer(answer, north) for name, answer in answers.items()}
     doubt = {name: _doubt(answer, seen[name], parameters) for name, answer in answers.items()}
     variables, errors = _variables(log, answers, doubt) | _attitudes(log, q_nb), {}
-    if dataset.attitude is not None:
-        errors = {name: _errors(dataset.attitude, log, q) for name, q in q_nb.items()}
+    truth = None if dataset.attitude is None else truth_at(dataset.attitude, log.time_ns)
+    if truth is not None:
+        errors = {name: _errors(*(x[log.rows] for x in (q, *truth))) for name, q in q_nb.items()}
         variables |= _error_arrays(answers, errors)
 
     def metrics(answer: FilterEstimates) -> dict[str, float | int]:
         share = {"rest_share": float(np.mean(log.still))}
-        if dataset.attitude is None:
+        if truth is None:
             return share
-        found = _accuracy(dataset.attitude, log, q_nb[answer.name])
         moving = errors[answer.name].counts
         ratio = errors[answer.name].heading[moving] / answer.sigma[moving, 2]
         # one where the stated spread of the heading is right
         nees = float(np.mean(ratio**2)) if ratio.size else float("nan")
-        return found | {"heading_nees": nees} | share
+        return _accuracy(q_nb[answer.name], *truth) | {"heading_nees": nees} | share
 
     lasted = np.asarray(log.world.u.samples.dt_s)
     warned = monitor.of_samples(log.counts, len(log.time_ns))
@@ -329,10 +329,7 @@ REPORTED = ReportedItems(
 )
 
 
-def _accuracy(
-    attitude: AttitudeTable, log: PreparedMargLog, q_nb: np.ndarray
-) -> dict[str, float | int]:
-    q_true, counts = truth_at(attitude, log.time_ns)
+def _accuracy(q_nb: np.ndarray, q_true: np.ndarray, counts: np.ndarray) -> dict[str, float | int]:
     e = orientation_errors(q_nb[counts], q_true[counts])
     return {
         "total_rmse_deg": rms_deg(e.total),
@@ -343,9 +340,7 @@ def _accuracy(
     }
 
 
-def _errors(attitude: AttitudeTable, log: PreparedMargLog, q_nb: np.ndarray) -> Errors:
-    q_true, counts = truth_at(attitude, log.time_ns[log.rows])
-    q = q_nb[log.rows]
+def _errors(q: np.ndarray, q_true: np.ndarray, counts: np.ndarray) -> Errors:
     # how the true vertical leans against the estimated one, along estimated north and east
     true_down = rotation.to_dcm(q_true)[:, 2]
     north, east, _ = np.moveaxis(rotation.to_dcm(q), 1, 0)
@@ -381,22 +376,15 @@ def _variables(
 ) -> Variables:
     still = log.still.astype(np.int8)
     data = array("context", still, "rest", unit="1", long_name="unit lies still")
-    data |= array(
-        "context",
-        np.stack([doubt[name].any.astype(np.int8) for name in answers]),
-        "doubtful",
-        unit="1",
-        long_name="states or innovations beyond what was assumed",
-        dims="filter time",
-    )
-    return data | array(
-        "context",
-        np.stack([_refused(log, answer).astype(np.int8) for answer in answers.values()]),
-        "magnetic_disturbance",
-        unit="1",
-        long_name="magnetometer refused",
-        dims="filter time",
-    )
+    doubtful = [doubt[name].any for name in answers]
+    refused = [_refused(log, answer) for answer in answers.values()]
+    for name, rows, words in (
+        ("doubtful", doubtful, "states or innovations beyond what was assumed"),
+        ("magnetic_disturbance", refused, "magnetometer refused"),
+    ):
+        values = np.stack(rows).astype(np.int8)
+        data |= array("context", values, name, unit="1", long_name=words, dims="filter time")
+    return data
 
 
 def _attitudes(log: PreparedMargLog, q_nb: Mapping[str, np.ndarray]) -> Variables:

@@ -18,6 +18,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from robins.systems.suspects import edges
+
 _LEVEL = 0.005  # share of the level that its samples lie within
 _JUMP = 0.05  # share of the level, more than a smooth peak can fall by
 _LEAST_RATE = 1.0  # rad/s; no gyro ends below
@@ -62,8 +64,7 @@ def levels(rate: np.ndarray, step_s: float = 0.0) -> np.ndarray:
 
 def _has_plateau(x: np.ndarray, top: float, step_s: float) -> bool:
     """True if a stay at the top of (N,) is that of a range and of no smooth peak."""
-    high = np.concatenate([[False], x > (1.0 - _LEVEL) * top, [False]])
-    for begin, end in np.flatnonzero(np.diff(high)).reshape(-1, 2):
+    for begin, end in edges(x > (1.0 - _LEVEL) * top):
         long = end - 1 - begin
         before, after = begin - long, end - 1 + long
         if not _PLATEAU_S[0] <= long * step_s <= _PLATEAU_S[1] or before < 0 or after >= len(x):
@@ -177,8 +178,7 @@ def bridged(
     """
     out, doubt = rate.copy(), np.full(rate.shape, np.nan)
     for axis in range(3):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], full[:, axis], [False]])))
-        for begin, end in edges.reshape(-1, 2):
+        for begin, end in edges(full[:, axis]):
             if begin < FLANK or end + FLANK > len(rate):
                 continue
             before, after = slice(begin - FLANK, begin), slice(end, end + FLANK)

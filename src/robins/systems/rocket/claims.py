@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from robins.systems.judgement import Band, Metric, ratio_claims, rms_by_component
+from robins.systems.judgement import Band, Metric, ratio_claims
 from robins.systems.rocket.world import BODY, EULER, RocketCourse
 
 PAPER, SCALAR, UKF = "federated-vector-stukf", "federated-scalar-ukf", "ukf"
@@ -47,7 +47,7 @@ def angle_metrics(course: RocketCourse, statistics: Any) -> dict[str, Metric]:
 
     ``settled_s`` is when the RMS error over runs and angles falls below 0.5 deg for the first time.
     """
-    rms = np.degrees(rms_by_component(statistics))
+    rms = np.degrees(statistics.pooled_rms)
     out = _common_metrics(course, statistics)
     out |= _each(EULER, "deg", rms[:3]) | _each(("p", "q", "r"), "deg_s", rms[3:])
     below = np.degrees(np.sqrt(np.mean(statistics.rms[:, :3] ** 2, axis=1))) < 0.5
@@ -61,7 +61,7 @@ def field_metrics(course: RocketCourse, statistics: Any) -> dict[str, Metric]:
     ``total_rms_deg`` is the RMS of the error angle, ``across_field_rms_deg`` of its component
     across the field.
     """
-    rms = np.degrees(rms_by_component(statistics))
+    rms = np.degrees(statistics.pooled_rms)
     out = _common_metrics(course, statistics) | _each(BODY, "deg", rms[:3])
     out[TOTAL] = float(np.linalg.norm(rms[:3]))
     out[ABOUT] = float(rms[3])

@@ -28,7 +28,6 @@ from robins.systems.judgement import (
     consistency,
     consistency_claims,
     rms_by_axis,
-    rms_by_component,
 )
 from robins.systems.parts import FRD, NED, ImuBlock, during, refuse_unsettled
 from robins.systems.study import Case, Contender, Limit, Recipe, StateBlock, Study, View
@@ -228,7 +227,7 @@ def product_metrics(statistics: Any) -> dict[str, Metric]:
         last = units.convert(statistics.sigma[-1][block.where], block.units, block.display_unit)
         out[f"{name}_last_sigma_arcmin"] = last.tolist()
         if name == "attitude":
-            rms, sigma = rms_by_component(statistics), statistics.pooled_sigma
+            rms, sigma = statistics.pooled_rms, statistics.pooled_sigma
             error, stated = (np.linalg.norm(x[block.where]) for x in (rms, sigma))
             out["attitude_over_sigma"] = float(error / stated)
             for key in ("attitude_rms_arcmin", "attitude_last_sigma_arcmin"):
