@@ -16,7 +16,7 @@ import numpy as np
 
 from robins.program.c import function, header, part
 from robins.program.precision import DOUBLE, Precision
-from robins.program.walk import Leaf, Program, lengths
+from robins.program.walk import Leaf, Program, lengths, slots
 from robins.program.wrap import COLUMNS, wrapped
 
 EXTERN_C = '#ifdef __cplusplus\nextern "C" {\n#endif', "#ifdef __cplusplus\n}\n#endif"
@@ -83,19 +83,17 @@ class StructField(NamedTuple):
 
 def fields_of(leaves: Sequence[Leaf], which: int) -> list[StructField]:
     """The fields of one of the arguments or results; empty arrays have none."""
-    counted, found, taken = {True: 0, False: 0}, [], set()
-    for leaf in leaves:
-        real, size = leaf.kind == "real", int(np.prod(leaf.shape))
+    found, taken = [], set()
+    for leaf, slot in zip(leaves, slots(leaves)[0], strict=True):
         root = re.match(r"[a-z]+\[(\d+)\]", leaf.path)
         assert root is not None
-        if int(root[1]) == which and size > 0:
+        if int(root[1]) == which and slot.last > slot.first:
             name = base = identifier(leaf.path[root.end() :])
             k = 2
             while name in taken:
                 name, k = f"{base}_{k}", k + 1
             taken.add(name)
-            found.append(StructField(name, leaf, counted[real]))
-        counted[real] += size
+            found.append(StructField(name, leaf, slot.first))
     return found
 
 

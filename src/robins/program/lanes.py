@@ -125,17 +125,11 @@ class CompiledRounds:
             np.ascontiguousarray(numbers_of(array), _dtype(leaf.dtype))
             for (array, _), leaf in zip(given, inputs, strict=True)
         ]
-        made = [
-            np.empty(
-                (
-                    1 if k in named else runs,
-                    *((self.length,) if k >= self.carried else ()),
-                    *leaf.shape,
-                ),
-                _dtype(leaf.dtype),
-            )
-            for k, leaf in enumerate(results)
-        ]
+        made = []
+        for k, leaf in enumerate(results):
+            rows = (self.length,) if k >= self.carried else ()
+            shape = 1 if k in named else runs, *rows, *leaf.shape
+            made.append(np.empty(shape, _dtype(leaf.dtype)))
         first = self.carried + self.stays
         taken = [
             _rows(a, batched, k >= first, leaf)
