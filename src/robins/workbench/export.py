@@ -146,12 +146,7 @@ def _aboard(rig: Rig, name: str, filter_name: str, seed: int, settings: Sequence
 
 
 def _requested(
-    rig: Rig | None,
-    float32: bool,
-    name: str,
-    filter_name: str,
-    seed: int,
-    settings: Sequence[str],
+    rig: Rig | None, float32: bool, name: str, filter_name: str, seed: int, settings: Sequence[str]
 ) -> Request:
     if rig is None or rig.aboard is None:
         return _export_request(name, filter_name, seed, settings)

@@ -21,7 +21,7 @@ from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo, is_failure
-from robins.filters.kalman import Around, Filter, FilterState, Prediction
+from robins.filters.kalman import Advanced, Around, Filter, FilterState, Updated
 from robins.filters.model import Data, Model, Motion, Sensor
 from robins.filters.trees import select
 from robins.filters.values import kind, value
@@ -137,9 +137,7 @@ class Delayed(Around):
     # The filter itself knows whether its prediction was taken: what comes late can change that.
 
     @jax.jit
-    def predict(
-        self, state: FilterState, motion: Motion, u: Data = None
-    ) -> tuple[FilterState, Prediction]:
+    def predict(self, state: FilterState, motion: Motion, u: Data = None) -> Advanced:
         """Predict, and begin a row of the buffer."""
         held = state.memory
         _check_same("the motion", motion, held.model.motion)
@@ -168,9 +166,7 @@ class Delayed(Around):
         return jax.tree_util.tree_map(lambda a, x: a.at[at].set(x), past, entry)
 
     @jax.jit
-    def update(
-        self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None
-    ) -> tuple[FilterState, StepInfo]:
+    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None) -> Updated:
         """Enter a measurement in its step, and filter again from there."""
         held = state.memory
         which, known = self.recognised(held.model, sensor, aux)

@@ -45,14 +45,7 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo, is_failure
 from robins.filters.checks import sensor_names
-from robins.filters.kalman import (
-    Advanced,
-    Composite,
-    Filter,
-    FilterState,
-    Prediction,
-    Updated,
-)
+from robins.filters.kalman import Advanced, Composite, Filter, FilterState, Prediction, Updated
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.trees import select
 from robins.filters.values import Numbers, kind, number, value

@@ -32,7 +32,15 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo
 from robins.filters.composite.mixture import Innovation, innovation, log_normalised, matched
-from robins.filters.kalman import Filter, FilterState, Prediction, predicted_factor, updated
+from robins.filters.kalman import (
+    Advanced,
+    Filter,
+    FilterState,
+    Prediction,
+    Updated,
+    predicted_factor,
+    updated,
+)
 from robins.filters.linearise import Linearisation, taylor
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.trees import finite, select
@@ -134,9 +142,7 @@ class Particle(Filter):
         xi = jax.random.normal(key, (self.count, k))
         return particles._replace(mean=each_row(one, particles.mean, xi))
 
-    def _predict(
-        self, state: FilterState, motion: Motion, u: Data
-    ) -> tuple[FilterState, Prediction]:
+    def _predict(self, state: FilterState, motion: Motion, u: Data) -> Advanced:
         key, choose, jitter, draw = _split(state.memory.key, 3)
         before, log_weight = self.refreshed(state, choose, jitter)
 
@@ -154,9 +160,7 @@ class Particle(Filter):
         code = jnp.where(taken, int(Code.DONE), int(Code.NOT_FINITE))
         return new, Prediction(None, new.belief, code)
 
-    def _update(
-        self, state: FilterState, sensor: Sensor, y: Data, aux: Data
-    ) -> tuple[FilterState, StepInfo]:
+    def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data) -> Updated:
         before, log_prior, key = state.memory
 
         def one(b: Belief):
