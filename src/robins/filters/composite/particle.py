@@ -43,7 +43,7 @@ from robins.filters.kalman import (
 )
 from robins.filters.linearise import Linearisation, taylor
 from robins.filters.model import Data, Motion, Sensor
-from robins.filters.trees import finite, select
+from robins.filters.trees import finite, repeated, row_of, select
 from robins.filters.values import Numbers, is_known, kind, number, value
 from robins.linalg.rows import each_row
 from robins.manifold import State
@@ -97,11 +97,9 @@ class Particle(Filter):
     def spread(self, belief: Belief, key: Array) -> FilterState:
         """A new cloud from a Gaussian belief."""
         key, now = _split(key, 1)
-        same = jax.tree_util.tree_map(
-            lambda x: jnp.broadcast_to(x, (self.count, *jnp.shape(x))), belief
-        )
         weight = jnp.full(self.count, self.even())
-        return FilterState(belief, ParticleCloud(self.drawn(now, *same), weight, key))
+        drawn = self.drawn(now, *repeated(belief, self.count))
+        return FilterState(belief, ParticleCloud(drawn, weight, key))
 
     def gaussian(self, cloud: ParticleCloud) -> Belief:
         """The cloud's moments."""
@@ -122,7 +120,7 @@ class Particle(Filter):
         weight = jnp.exp(cloud.log_weight)
         due = _effective(weight) < jnp.asarray(self.resample) * float(self.count)
         index = jnp.where(due, _systematic(choose, weight), jnp.arange(self.count))
-        particles = jax.tree_util.tree_map(lambda x: x[index], cloud.particles)
+        particles = row_of(cloud.particles, index)
         if self.moves:
             particles = select(due, self.jittered(particles, state.belief, jitter), particles)
         return particles, jnp.where(due, self.even(), cloud.log_weight)
@@ -284,7 +282,7 @@ def _effective(weight: Array) -> Array:
 
 def _moments(cloud: ParticleCloud, k: int) -> Belief:
     """The cloud's Gaussian; the first k columns of its factors are zero."""
-    best = jax.tree_util.tree_map(lambda x: x[jnp.argmax(cloud.log_weight)], cloud.particles.mean)
+    best = row_of(cloud.particles.mean, jnp.argmax(cloud.log_weight))
     slim = cloud.particles._replace(factor=cloud.particles.factor[:, :, k:])
     return matched(slim, jnp.exp(cloud.log_weight), best)
 
@@ -316,18 +314,10 @@ def _update_info(
     best = jnp.argmax(cloud.log_weight)
     wrong = infos.code[best] == int(Code.CONTRADICTED)
     lost = ~jnp.isfinite(total)
-    return StepInfo(
-        innovation=expected.mean,
-        expected=expected.expected,
-        factor=expected.factor,
-        gain=jnp.where(used[None], gain, 0.0),
-        used=used,
-        nis=jnp.where(wrong, jnp.inf, expected.nis),
-        dof=expected.dof,
-        log_likelihood=total,
-        code=jnp.where(lost & ~wrong, int(Code.NOT_FINITE), infos.code[best]),
-        notes={"particle.ess": _effective(jnp.exp(cloud.log_weight))},
-    )
+    gain = jnp.where(used[None], gain, 0.0)
+    code = jnp.where(lost & ~wrong, int(Code.NOT_FINITE), infos.code[best])
+    info = expected.info(used, gain, code, wrong, total)
+    return info.noted("particle", ess=_effective(jnp.exp(cloud.log_weight)))
 
 
 def _gain(
