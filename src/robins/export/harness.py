@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from importlib.resources import files
 from string import Template
 from typing import Any, NamedTuple
 
@@ -19,7 +18,16 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from robins.export.library import C_TYPES, CODE, EntryPoint, Library, StructField, fields_of, number
+from robins.export.library import (
+    C_TYPES,
+    CODE,
+    EntryPoint,
+    Library,
+    StructField,
+    fields_of,
+    number,
+    template,
+)
 from robins.program.precision import DOUBLE, SINGLE, Precision
 from robins.program.wrap import wrapped
 
@@ -73,11 +81,6 @@ class RecordedSteps(NamedTuple):
     sizes: Mapping[Key, float] = {}
     ends: Mapping[str, Sequence[Any]] = {}
     ruined: str = ""
-
-
-def template(name: str) -> str:
-    """Text of a template of this room."""
-    return (files("robins.export") / name).read_text("utf-8")
 
 
 def makefile(library: Library) -> str:

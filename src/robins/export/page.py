@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from robins import __version__
-from robins.export.harness import template
-from robins.export.library import Library
+from robins.export.library import Library, template
 from robins.export.single_precision import PrecisionCost
 from robins.filters import SENTENCES, Code
 

@@ -152,7 +152,7 @@ def gathered(equation: Equation, indices: np.ndarray, places: np.ndarray) -> np.
 
 
 def _updates(equation: Equation, rank: int, new: Nodes) -> tuple[Nodes, SIZES, Axes]:
-    """What is scattered, with the axes of its windows last; the sizes and axes of a window."""
+    """Numbers to be scattered, window axes last; the sizes of a window, and its axes."""
     d = equation.params["dimension_numbers"]
     windows = [int(k) for k in d.update_window_dims]
     rows = new.transpose([*(k for k in range(new.ndim) if k not in windows), *windows])
