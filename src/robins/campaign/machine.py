@@ -221,7 +221,7 @@ class LaneMachine:
         begins, ahead_by = range(width, runs, width), workers + 1
         with threads(workers) as pool:
 
-            def submitted(begin: int) -> Future[Any]:
+            def submitted(begin: int) -> Future[dict[str, PyTree]]:
                 count = min(width, runs - begin)
                 of = partial(self._chunk, begin, width, count, self._filters, taken)
                 return pool.submit(of, runs - begin - count)
