@@ -241,16 +241,9 @@ class NativeState:
             more = np.zeros(max(0, wanted[1] - len(self._k)), np.int64)
             self._k = np.append(self._k, more)
         x, k = map(address, (self._x, self._k))
-        return _Call(
-            tree,
-            forms,
-            [slot.view(self._x, self._k) for slot in given],
-            step(),
-            (x, k, x, k),
-            begin,
-            (begin[0] + end[0], begin[1] + end[1]),
-            Reader(result_slots, result),
-        )
+        views = [slot.view(self._x, self._k) for slot in given]
+        ends, read = (begin[0] + end[0], begin[1] + end[1]), Reader(result_slots, result)
+        return _Call(tree, forms, views, step(), (x, k, x, k), begin, ends, read)
 
     def _made(self, key: Hashable, function: Function, args: tuple) -> Made:
         """A program of a function; that of the interpreter from the user's cache, if it is there.

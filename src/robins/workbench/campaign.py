@@ -224,19 +224,13 @@ def campaign_status(where: Where) -> CampaignStatus:
     """Read and check all shards of a campaign, and report its progress."""
     store, plan = opened(where)
     found, there = gather(store, plan), kept(store, by_stem(plan.shards))
+    shards, damaged = sum(map(len, plan.shards.values())), [shard.name for shard in found.damaged]
+    diverged = {name: diverged_of(found, name) for name in plan.filters}
+    runs = {name: there.get(name, []) for name in plan.filters}
+    asked = plan.scenario, plan.seed, plan.machine, list(plan.filters), plan.runs
+    lacking = found.lacking - len(damaged)
     return CampaignStatus(
-        plan.scenario,
-        plan.seed,
-        plan.machine,
-        list(plan.filters),
-        plan.runs,
-        found.done,
-        sum(map(len, plan.shards.values())),
-        found.lacking - len(found.damaged),
-        [shard.name for shard in found.damaged],
-        {name: diverged_of(found, name) for name in plan.filters},
-        {name: there.get(name, []) for name in plan.filters},
-        found.digest,
+        *asked, found.done, shards, lacking, damaged, diverged, runs, found.digest
     )
 
 
