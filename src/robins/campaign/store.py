@@ -10,11 +10,10 @@ import errno
 import os
 import socket
 import uuid
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import time
-from typing import Any
 
 from robins.errors import RobinsError
 from robins.foreign import decoding
@@ -155,46 +154,41 @@ class ObjectStore:
     def put(self, name: str, content: bytes, *, overwrite: bool = False) -> bool:
         """Put an object; see `FolderStore`."""
         mode = "overwrite" if overwrite else "create"
-        try:
+        taken = self._obstore.exceptions.AlreadyExistsError
+        with suppress(taken), self._naming(f"write {name}"):
             self._obstore.put(self._store, name, content, mode=mode)
-        except self._obstore.exceptions.AlreadyExistsError:
-            return False
-        except self._obstore.exceptions.BaseError as error:
-            raise self._cannot(f"write {name}", error) from error
-        return True
+            return True
+        return False
 
     def get(self, name: str) -> bytes | None:
         """Read an object; see `FolderStore`."""
-        try:
+        with suppress(FileNotFoundError), self._naming(f"read {name}"):
             return bytes(self._obstore.get(self._store, name).bytes())
-        except FileNotFoundError:
-            return None
-        except self._obstore.exceptions.BaseError as error:
-            raise self._cannot(f"read {name}", error) from error
+        return None
 
     def names(self, group: str) -> set[str]:
         """List a group; see `FolderStore`."""
-
-        def listed() -> set[str]:
+        with self._naming(f"list {group}"):
             found = (one for some in self._obstore.list(self._store, group) for one in some)
             return {one["path"].removeprefix(f"{group}/") for one in found}
 
-        return self._tried(f"list {group}", listed)
-
     def drop(self, name: str) -> None:
         """Remove an object; see `FolderStore`."""
-        with suppress(FileNotFoundError):
-            self._tried(f"remove {name}", lambda: self._obstore.delete(self._store, name))
+        with suppress(FileNotFoundError), self._naming(f"remove {name}"):
+            self._obstore.delete(self._store, name)
 
     def sweep(self) -> None:
         """Do nothing: object storage never shows half-written objects."""
 
-    def _tried(self, what: str, function: Callable[[], Any]) -> Any:
+    @contextmanager
+    def _naming(self, what: str) -> Iterator[None]:
+        """State what failed; that an object is there, or is not, is no failure."""
+        errors = self._obstore.exceptions
         try:
-            return function()
-        except FileNotFoundError:
+            yield
+        except (FileNotFoundError, errors.AlreadyExistsError):
             raise
-        except self._obstore.exceptions.BaseError as error:
+        except errors.BaseError as error:
             raise self._cannot(what, error) from error
 
     def _cannot(self, what: str, error: Exception) -> RobinsError:
