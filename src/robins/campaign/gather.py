@@ -41,9 +41,7 @@ class CampaignState(NamedTuple):
 
 def blank_statistics(problem: Problem | None) -> Statistics:
     """Statistics of no runs; without a problem they can be joined, and give no figures."""
-    if problem is None:
-        return Statistics(())
-    return Statistics.of(problem)
+    return Statistics(()) if problem is None else Statistics.of(problem)
 
 
 def gather(store: Store, plan: CampaignPlan, problem: Problem | None = None) -> CampaignState:
@@ -61,9 +59,8 @@ def gather(store: Store, plan: CampaignPlan, problem: Problem | None = None) -> 
     for shards in plan.shards.values():
         for shard in shards:
             of_chunk = blank_statistics(problem)
-            content = None
-            if PurePosixPath(shard.name).name in there:
-                content = store.get(shard.name)
+            is_there = PurePosixPath(shard.name).name in there
+            content = store.get(shard.name) if is_there else None
             if content is None:
                 lacking += 1
                 continue

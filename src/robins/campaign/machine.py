@@ -12,7 +12,7 @@ import os
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import partial
@@ -220,6 +220,12 @@ class LaneMachine:
         workers = concurrent_chunks(self.bytes_of_run, width, available_cores())
         begins, ahead_by = range(width, runs, width), workers + 1
         with threads(workers) as pool:
+
+            def submitted(begin: int) -> Future[dict[str, PyTree]]:
+                count = min(width, runs - begin)
+                of = partial(self._chunk, begin, width, count, self._filters, taken)
+                return pool.submit(of, runs - begin - count)
+
             # The first chunk compiles: each filter on a core of its own.
             count = min(width, runs)
             world = pool.submit(self._worlds, 0, width, count).result()
@@ -228,17 +234,14 @@ class LaneMachine:
             del world
             yield named, count, lambda name: first[name].result()
             wait(first.values())
-            ahead = deque(
-                pool.submit(self._chunk, begin, width, runs, taken) for begin in begins[:ahead_by]
-            )
+            ahead = deque(map(submitted, begins[:ahead_by]))
             returned = monotonic()
             for k, begin in enumerate(begins):
                 found = ahead.popleft().result()
                 if monotonic() - returned > BETWEEN_S:
                     release_memory()
                     returned = monotonic()
-                for later in begins[k + ahead_by : k + ahead_by + 1]:
-                    ahead.append(pool.submit(self._chunk, later, width, runs, taken))
+                ahead.extend(map(submitted, begins[k + ahead_by : k + ahead_by + 1]))
                 yield None, min(width, runs - begin), found.__getitem__
 
     def compute(
@@ -258,14 +261,8 @@ class LaneMachine:
             taken: from the record of a filter.
             left: runs that are still to be computed after these.
         """
-
-        def computed() -> dict[str, PyTree]:
-            begun, world = thread_time(), self._worlds(chunk.begin, width, chunk.runs)
-            found = {name: self._of(name, world, chunk.runs, taken) for name in names}
-            self._took(width, begun, left)
-            return found
-
-        return with_stack(computed)
+        of = partial(self._chunk, chunk.begin, width, chunk.runs)
+        return with_stack(partial(of, names, taken, left))
 
     def histories(self, chunk: Chunk, width: int, names: Sequence[str]) -> dict[str, PyTree]:
         """All that was recorded of some filters over one chunk."""
@@ -284,17 +281,15 @@ class LaneMachine:
         """Run a filter, and keep what is `taken` of its record without the runs that fill up."""
         return taken(name, rejoined_record(*first_runs(self._filters[name](world), count)))
 
-    def _chunk(self, begin: int, width: int, runs: int, taken: Taken) -> dict[str, PyTree]:
-        begun, count = thread_time(), min(width, runs - begin)
-        world = self._worlds(begin, width, count)
-        found = {name: self._of(name, world, count, taken) for name in self._filters}
-        self._took(width, begun, runs - begin - count)
-        return found
-
-    def _took(self, runs: int, begun: float, left: int) -> None:
-        """Note how long some runs took a thread that began then."""
+    def _chunk(
+        self, begin: int, width: int, count: int, names: Iterable[str], taken: Taken, left: int
+    ) -> dict[str, PyTree]:
+        """Compute the filters of some runs, and note how long that took; as of `compute`."""
+        begun, world = thread_time(), self._worlds(begin, width, count)
+        found = {name: self._of(name, world, count, taken) for name in names}
         if self._hand_over is not None:
-            self._hand_over.took(runs, thread_time() - begun, left)
+            self._hand_over.took(width, thread_time() - begun, left)
+        return found
 
 
 @contextmanager
@@ -384,11 +379,9 @@ def machine_for(problem: Problem, name: str = "") -> JaxMachine | LaneMachine:
         if why := contender_.on_host:
             if not name:
                 return JaxMachine(problem)
-            raise RobinsError(
-                f"filter '{which}' cannot be a program: {why}",
-                f"--machine {name}",
-                "say jax, or choose other filters by --filters",
-            )
+            what = f"filter '{which}' cannot be a program: {why}"
+            fix = "say jax, or choose other filters by --filters"
+            raise RobinsError(what, f"--machine {name}", fix)
     if not name:
         try:
             interpreter_of_many()

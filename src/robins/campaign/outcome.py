@@ -165,10 +165,7 @@ def _metrics(
 
 
 def _claims(
-    problem: Problem,
-    found: dict[str, Statistics],
-    bound: np.ndarray | None,
-    metrics: Metrics,
+    problem: Problem, found: dict[str, Statistics], bound: np.ndarray | None, metrics: Metrics
 ) -> Verdicts:
     """Verdicts, with intervals by draws of the runs, the same runs for all filters."""
     claims, runs = problem.claims(metrics), {s.runs for s in found.values()}

@@ -137,17 +137,12 @@ def read(store: Store) -> CampaignPlan | None:
         plan = CampaignPlan(**data | {"filters": tuple(data["filters"])})
         _check(plan)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise RobinsError(
-            f"{NAME} is damaged ({error})",
-            store.where,
-            "begin the campaign again in another folder; shards are found by their names.",
-        ) from None
+        fix = "begin the campaign again in another folder; shards are found by their names."
+        raise RobinsError(f"{NAME} is damaged ({error})", store.where, fix) from None
     if schema != SCHEMA:
-        raise RobinsError(
-            f"{NAME} has schema {schema}, this robins reads {SCHEMA}",
-            store.where,
-            "use the version of robins that wrote it.",
-        )
+        what = f"{NAME} has schema {schema}, this robins reads {SCHEMA}"
+        fix = "use the version of robins that wrote it."
+        raise RobinsError(what, store.where, fix)
     return plan
 
 
@@ -173,11 +168,8 @@ def require_plan(store: Store) -> CampaignPlan:
     """
     plan = read(store)
     if plan is None:
-        raise RobinsError(
-            f"is no campaign: it has no {NAME}",
-            store.where,
-            "`robins campaign run SCENARIO --out DIR --runs N` begins one.",
-        )
+        fix = "`robins campaign run SCENARIO --out DIR --runs N` begins one."
+        raise RobinsError(f"is no campaign: it has no {NAME}", store.where, fix)
     return plan
 
 
@@ -218,8 +210,5 @@ def check_code(store: Store, plan: CampaignPlan) -> None:
     """
     here = code_of(plan.asked, plan.text)
     if here != plan.code:
-        raise RobinsError(
-            f"was begun by code {plan.code}, this is {here}",
-            store.where,
-            "use the same robins, packages and system, or begin in another folder.",
-        )
+        fix = "use the same robins, packages and system, or begin in another folder."
+        raise RobinsError(f"was begun by code {plan.code}, this is {here}", store.where, fix)

@@ -39,10 +39,7 @@ def pack(about: Mapping[str, Any], statistics: Statistics) -> bytes:
         f"example {k:04}": np.asarray(x)
         for k, x in enumerate(jax.tree_util.tree_leaves(statistics.example))
     }
-    header = {
-        **about,
-        **{name: int(getattr(statistics, name)) for name in _COUNTS},
-    }
+    header = {**about, **{name: int(getattr(statistics, name)) for name in _COUNTS}}
     header["sha256"] = _seal(header, arrays)
     file = io.BytesIO()
     np.savez(file, **{_ABOUT: np.array(json.dumps(header, sort_keys=True))}, **arrays)

@@ -57,12 +57,9 @@ class Statistics:
     bins: dict[str, np.ndarray] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, view: View) -> Statistics:
-        """Statistics of no runs yet, of what a problem wants."""
-        return cls(
-            *(view.blocks, view.count_from, view.limits, view.count_to, view.norms, view.windows),
-            view.faults,
-        )
+    def of(cls, view: View | Statistics) -> Statistics:
+        """Statistics of no runs yet, of what a problem wants, or other statistics."""
+        return cls(**{name: getattr(view, name) for name in _WANTED})
 
     def add(self, record: dict[str, PyTree]) -> None:
         """Take in a chunk as `robins.campaign.record` gives it."""
@@ -121,10 +118,7 @@ class Statistics:
 
     def blank(self) -> Statistics:
         """Statistics of no runs yet, with the settings of these: for a chunk, to be merged."""
-        return Statistics(
-            *(self.blocks, self.count_from, self.limits, self.count_to, self.norms, self.windows),
-            self.faults,
-        )
+        return Statistics.of(self)
 
     def resampled(self, draws: np.ndarray) -> Iterator[Statistics]:
         """The statistics of other choices of the runs, for a bootstrap.
@@ -411,6 +405,7 @@ class Statistics:
         return [name.removeprefix("dof of ") for name in names if np.sum(self._all(name)) > 0]
 
 
+_WANTED = ("blocks", "count_from", "limits", "count_to", "norms", "windows", "faults")
 Numbers = float | np.ndarray
 TALLY = " counted of "
 PERCENTS = (5, 50, 95, 99)

@@ -10,11 +10,10 @@ import errno
 import os
 import socket
 import uuid
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import time
-from typing import Any, Protocol, runtime_checkable
 
 from robins.errors import RobinsError
 from robins.foreign import decoding
@@ -26,11 +25,15 @@ _PARTIAL = ".partial"  # what is being written
 _OLD_S = 3600.0  # what is older was left by a writer that died
 
 
-@runtime_checkable
-class Store(Protocol):
-    """Objects by name; a slash in a name parts a group from what is in it."""
+class FolderStore:
+    """Objects as files of a folder: written under another name, synced, linked into place.
 
-    where: str
+    A slash in the name of an object parts a group from what is in it.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]):
+        self.path = Path(path)
+        self.where = str(path)
 
     def put(self, name: str, content: bytes, *, overwrite: bool = False) -> bool:
         """Put an object in place whole, or leave the one that is there; True if it was put.
@@ -43,34 +46,6 @@ class Store(Protocol):
         Raises:
             RobinsError: the disk is full, or it cannot be written.
         """
-        ...
-
-    def get(self, name: str) -> bytes | None:
-        """All of an object; None where there is none."""
-        ...
-
-    def names(self, group: str) -> set[str]:
-        """Names of what is in a group, without that of the group."""
-        ...
-
-    def drop(self, name: str) -> None:
-        """Remove an object, if it is there."""
-        ...
-
-    def sweep(self) -> None:
-        """Remove what writers that died have left half-written."""
-        ...
-
-
-class FolderStore:
-    """Objects as files of a folder: written under another name, synced, linked into place."""
-
-    def __init__(self, path: str | os.PathLike[str]):
-        self.path = Path(path)
-        self.where = str(path)
-
-    def put(self, name: str, content: bytes, *, overwrite: bool = False) -> bool:
-        """Put an object; see `Store`."""
         target = self.path / name
         if not overwrite and target.exists():
             return False
@@ -92,7 +67,7 @@ class FolderStore:
         return placed
 
     def get(self, name: str) -> bytes | None:
-        """Read an object; see `Store`."""
+        """All of an object; None where there is none."""
         try:
             return (self.path / name).read_bytes()
         except FileNotFoundError:
@@ -101,7 +76,7 @@ class FolderStore:
             raise self._cannot(f"read {name}", error) from error
 
     def names(self, group: str) -> set[str]:
-        """List a group; see `Store`."""
+        """Names of what is in a group, without that of the group."""
         try:
             return {entry.name for entry in os.scandir(self.path / group)}
         except FileNotFoundError:
@@ -110,7 +85,7 @@ class FolderStore:
             raise self._cannot(f"list {group}", error) from error
 
     def drop(self, name: str) -> None:
-        """Remove an object; see `Store`."""
+        """Remove an object, if it is there."""
         (self.path / name).unlink(missing_ok=True)
 
     def sweep(self) -> None:
@@ -177,48 +152,43 @@ class ObjectStore:
             self._store = obstore.store.from_url(url)
 
     def put(self, name: str, content: bytes, *, overwrite: bool = False) -> bool:
-        """Put an object; see `Store`."""
+        """Put an object; see `FolderStore`."""
         mode = "overwrite" if overwrite else "create"
-        try:
+        taken = self._obstore.exceptions.AlreadyExistsError
+        with suppress(taken), self._naming(f"write {name}"):
             self._obstore.put(self._store, name, content, mode=mode)
-        except self._obstore.exceptions.AlreadyExistsError:
-            return False
-        except self._obstore.exceptions.BaseError as error:
-            raise self._cannot(f"write {name}", error) from error
-        return True
+            return True
+        return False
 
     def get(self, name: str) -> bytes | None:
-        """Read an object; see `Store`."""
-        try:
+        """Read an object; see `FolderStore`."""
+        with suppress(FileNotFoundError), self._naming(f"read {name}"):
             return bytes(self._obstore.get(self._store, name).bytes())
-        except FileNotFoundError:
-            return None
-        except self._obstore.exceptions.BaseError as error:
-            raise self._cannot(f"read {name}", error) from error
+        return None
 
     def names(self, group: str) -> set[str]:
-        """List a group; see `Store`."""
-
-        def listed() -> set[str]:
+        """List a group; see `FolderStore`."""
+        with self._naming(f"list {group}"):
             found = (one for some in self._obstore.list(self._store, group) for one in some)
             return {one["path"].removeprefix(f"{group}/") for one in found}
 
-        return self._tried(f"list {group}", listed)
-
     def drop(self, name: str) -> None:
-        """Remove an object; see `Store`."""
-        with suppress(FileNotFoundError):
-            self._tried(f"remove {name}", lambda: self._obstore.delete(self._store, name))
+        """Remove an object; see `FolderStore`."""
+        with suppress(FileNotFoundError), self._naming(f"remove {name}"):
+            self._obstore.delete(self._store, name)
 
     def sweep(self) -> None:
         """Do nothing: object storage never shows half-written objects."""
 
-    def _tried(self, what: str, function: Callable[[], Any]) -> Any:
+    @contextmanager
+    def _naming(self, what: str) -> Iterator[None]:
+        """State what failed; that an object is there, or is not, is no failure."""
+        errors = self._obstore.exceptions
         try:
-            return function()
-        except FileNotFoundError:
+            yield
+        except (FileNotFoundError, errors.AlreadyExistsError):
             raise
-        except self._obstore.exceptions.BaseError as error:
+        except errors.BaseError as error:
             raise self._cannot(what, error) from error
 
     def _cannot(self, what: str, error: Exception) -> RobinsError:
@@ -228,7 +198,10 @@ class ObjectStore:
         return failure
 
 
-def open_store(where: str | os.PathLike[str]) -> FolderStore | ObjectStore:
+Store = FolderStore | ObjectStore
+
+
+def open_store(where: str | os.PathLike[str]) -> Store:
     """A folder, or for an address such as ``s3://bucket/campaign`` object storage.
 
     Raises:

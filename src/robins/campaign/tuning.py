@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Hashable, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -262,24 +262,17 @@ def _least(slopes: ObjectiveGradient, p: int) -> np.ndarray:
             value, each = slopes.gradients(x)
             return (value, np.mean(each, axis=0)) if np.isfinite(value) else (_LOST, np.zeros(p))
 
-        found = optimize.minimize(
-            whole,
-            np.zeros(p),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=edge,
-            options={"maxiter": 60, "ftol": 1e-9, "gtol": 1e-5},
-        )
-        return found.x
-    corners = np.vstack([np.zeros(p), 0.7 * np.eye(p)])
-    found = optimize.minimize(
-        lambda x: min(slopes.total(slopes.parts([x])[0]), _LOST),
-        np.zeros(p),
-        method="Nelder-Mead",
-        bounds=edge,
-        options={"initial_simplex": corners, "maxfev": 60 * p, "xatol": 0.01, "fatol": 1e-6},
-    )
-    return found.x
+        how = {"maxiter": 60, "ftol": 1e-9, "gtol": 1e-5}
+        solve = partial(optimize.minimize, whole, jac=True, method="L-BFGS-B")
+    else:
+
+        def total(x: np.ndarray) -> float:
+            return min(slopes.total(slopes.parts([x])[0]), _LOST)
+
+        corners = np.vstack([np.zeros(p), 0.7 * np.eye(p)])
+        how = {"initial_simplex": corners, "maxfev": 60 * p, "xatol": 0.01, "fatol": 1e-6}
+        solve = partial(optimize.minimize, total, method="Nelder-Mead")
+    return solve(np.zeros(p), bounds=edge, options=how).x
 
 
 def _sigma(slopes: ObjectiveGradient, x: np.ndarray, names: Sequence[str]) -> np.ndarray:

@@ -11,39 +11,27 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from string import Template
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from robins.export.library import C_TYPES, CODE, EntryPoint, Library, StructField, fields_of, number
+from robins.export.library import (
+    C_TYPES,
+    CODE,
+    EntryPoint,
+    Library,
+    StructField,
+    fields_of,
+    number,
+    template,
+)
 from robins.program.precision import DOUBLE, SINGLE, Precision
 from robins.program.wrap import wrapped
 
 TOLERANCE = 1e-9  # of the size of a field; of a library of doubles
-
-MAKEFILE = """\
-# make check   compiles {name}.c and a test of it, and runs the test on recorded steps
-# make stack   lists the stack of each function (gcc, clang)
-CC ?= cc
-CFLAGS ?= -std=c99 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Wpedantic -Wdouble-promotion
-
-.PHONY: check stack clean
-
-check: test
-\t./test
-
-test: test.c recorded.h {name}.c {name}.h
-\t$(CC) $(CFLAGS) -o test test.c {name}.c -lm
-
-stack: {name}.c {name}.h
-\t$(CC) $(CFLAGS) -fstack-usage -c {name}.c
-\tcut -f 1,2 {name}.su
-
-clean:
-\trm -f test {name}.o {name}.su
-"""
 
 # The word that holds the bits of a real, that of any NaN, and how it is printed: newlib's small
 # printf knows nothing wider than a long.
@@ -61,64 +49,6 @@ BITS = {
         "printed": '"%08lx %.17g\\n", (unsigned long)word, size',
     },
 }
-
-BEGIN = """\
-#include "{name}.h"
-#include <math.h>
-#include <stdio.h>
-#include <string.h>
-#include "recorded.h"
-
-static double worst = 0.0; /* difference, in parts of a field */
-static int wrong = 0;      /* calls of which a code, a count or a flag differs */
-static int beyond = 0;     /* reals that differ by more than they may */
-static const char *where = ""; /* the first of these */
-static uint64_t bits = 14695981039346656037u;
-
-static void compare(const char *field, const {name}_real *found, const double *expected, int n,
-                    double size, double tolerance)
-{{
-    for (int i = 0; i < n; ++i) {{
-        const double here = (double)found[i];
-        const double off = fabs(here - expected[i]);
-        const double part = size > 0.0 ? off / size : off;
-        const int same = here == expected[i] || (isnan(here) && isnan(expected[i]));
-        {word} word = {nan};
-        if (!isnan(here)) {{ memcpy(&word, &found[i], sizeof word); }}
-        bits = (bits ^ word) * 1099511628211u;
-#ifdef PRINT_BITS
-        printf({printed});
-#endif
-        if (!same && !(part <= worst)) {{ worst = isnan(part) ? (double)INFINITY : part; }}
-        if (!same && !(part <= tolerance) && !isinf(tolerance)) {{
-            ++beyond;
-            where = *where ? where : field;
-        }}
-    }}
-}}
-
-static int differ(const char *field, int yes)
-{{
-    if (yes && CODES_OFF == 0 && !*where) {{ where = field; }}
-    return yes != 0;
-}}
-"""
-
-END = """\
-    const int good = wrong <= CODES_OFF && beyond == 0;
-    printf("%d steps: %d codes differ, numbers differ by %.1e of a field at most: %s\\n",
-           STEPS, wrong, worst, good ? "passed" : "FAILED");
-    if (!good) {
-        printf("first in %s\\n", where);
-    }
-    printf("bits of all numbers: %08lx%08lx\\n", (unsigned long)(bits >> 32),
-           (unsigned long)(bits & 0xffffffffu));
-    if (sizeof RUINED > 1) {
-        printf("FAILED: %s\\n", RUINED);
-    }
-    return good && sizeof RUINED == 1 ? 0 : 1;
-}
-"""
 
 COUNTED = ("    wrong += off;", "}", "")
 
@@ -155,7 +85,7 @@ class RecordedSteps(NamedTuple):
 
 def makefile(library: Library) -> str:
     """The Makefile of the folder."""
-    return MAKEFILE.format(name=library.name)
+    return template("check.mk").format(name=library.name)
 
 
 def recorded_h(library: Library, record: RecordedSteps) -> str:
@@ -233,8 +163,7 @@ def _table(name: str, f: StructField, leaf: np.ndarray, precision: Precision) ->
 def check_c(library: Library, record: RecordedSteps) -> str:
     """The test."""
     name = library.name
-    lines = BEGIN.format(name=name, **BITS[library.precision]).split("\n")
-    lines += [f"static void call_init({name}_state *state, int t)", "{", "    int off = 0;"]
+    lines = [f"static void call_init({name}_state *state, int t)", "{", "    int off = 0;"]
     lines += [f"    {name}_init(state);", *_compared("init", library.state, "state"), *COUNTED]
     for entry in library.entries:
         lines += _called(library, entry)
@@ -243,7 +172,9 @@ def check_c(library: Library, record: RecordedSteps) -> str:
     calls = {entry.name: f"call_{entry.symbol}(&state," for entry in library.entries}
     lines += [f"        {call} t);" for entry, call in calls.items() if entry not in record.ends]
     lines += ["    }", *(f"    {calls[entry]} 0);" for entry in record.ends)]
-    return "\n".join([*(part for line in lines for part in wrapped(line)), END])
+    bits, calls = BITS[library.precision], "\n".join(lines)
+    text = Template(template("check.c")).substitute(name=name, calls=calls, **bits)
+    return "\n".join(part for line in text.split("\n") for part in wrapped(line))
 
 
 def _called(library: Library, entry: EntryPoint) -> list[str]:

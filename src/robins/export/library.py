@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from importlib.resources import files
 from typing import Any, NamedTuple
 
 import jax
@@ -16,23 +17,19 @@ import numpy as np
 
 from robins.program.c import function, header, part
 from robins.program.precision import DOUBLE, Precision
-from robins.program.walk import Leaf, Program, lengths
+from robins.program.walk import Leaf, Program, lengths, slots
 from robins.program.wrap import COLUMNS, wrapped
+
+
+def template(name: str) -> str:
+    """A text among the files of this room."""
+    return (files("robins.export") / name).read_text("utf-8")
+
 
 EXTERN_C = '#ifdef __cplusplus\nextern "C" {\n#endif', "#ifdef __cplusplus\n}\n#endif"
 
 # Words that name no field: those of C and C++, and what compilers and widespread headers define.
-_WORDS = """
-auto break case char const continue default do double else enum extern float for goto if inline int
-long register restrict return short signed sizeof static struct switch typedef union unsigned void
-volatile while asm typeof alignas alignof and and_eq bitand bitor bool catch class compl concept
-const_cast constexpr decltype delete dynamic_cast explicit export false friend mutable namespace new
-noexcept not not_eq nullptr operator or or_eq private protected public reinterpret_cast requires
-static_assert static_cast template this thread_local throw true try typeid typename using virtual
-wchar_t xor xor_eq complex errno far i386 imaginary interface linux near small stderr stdin stdout
-unix
-"""
-RESERVED = frozenset(_WORDS.split())
+RESERVED = frozenset(template("reserved.txt").split())
 
 C_TYPES = {"flag": "int", "whole": "int64_t", "word": "uint32_t", "word64": "uint64_t"}
 CODE = "code"  # of a result: what the entry point returns
@@ -83,19 +80,17 @@ class StructField(NamedTuple):
 
 def fields_of(leaves: Sequence[Leaf], which: int) -> list[StructField]:
     """The fields of one of the arguments or results; empty arrays have none."""
-    counted, found, taken = {True: 0, False: 0}, [], set()
-    for leaf in leaves:
-        real, size = leaf.kind == "real", int(np.prod(leaf.shape))
+    found, taken = [], set()
+    for leaf, slot in zip(leaves, slots(leaves)[0], strict=True):
         root = re.match(r"[a-z]+\[(\d+)\]", leaf.path)
         assert root is not None
-        if int(root[1]) == which and size > 0:
+        if int(root[1]) == which and slot.last > slot.first:
             name = base = identifier(leaf.path[root.end() :])
             k = 2
             while name in taken:
                 name, k = f"{base}_{k}", k + 1
             taken.add(name)
-            found.append(StructField(name, leaf, counted[real]))
-        counted[real] += size
+            found.append(StructField(name, leaf, slot.first))
     return found
 
 

@@ -24,7 +24,7 @@ from robins.filters import Belief
 from robins.filters.analysis.consistency import normalised_sq
 from robins.manifold import local
 from robins.program import FLAGS, Program, build
-from robins.program.walk import counts
+from robins.program.walk import counts, slots
 from robins.systems.study import Contender, Problem
 
 NONE: Mapping[str, float] = {}
@@ -199,12 +199,10 @@ def _flat(leaves: Sequence[Any], dtype: Any, steps: int) -> list[np.ndarray]:
 
 def _as_tree(kept: Sequence[np.ndarray], program: Program) -> Any:
     """Results of all calls of a program as it gives them, in doubles."""
-    at, found = [0, 0], []
-    for leaf in program.results:
-        pool, size = int(leaf.kind != "real"), math.prod(leaf.shape)
-        part = kept[pool][:, at[pool] : at[pool] + size]
-        at[pool] += size
-        found.append(part.reshape(len(part), *leaf.shape).astype(leaf.dtype))
+    found = []
+    for slot in slots(program.results)[0]:
+        part = kept[not slot.is_real][:, slot.first : slot.last]
+        found.append(part.reshape(len(part), *slot.shape).astype(slot.dtype))
     return jax.tree_util.tree_unflatten(program.structure[1], found)
 
 

@@ -127,9 +127,7 @@ class Filter:
         """
 
     @jax.jit
-    def predict(
-        self, state: FilterState, motion: Motion, u: Data = None
-    ) -> tuple[FilterState, Prediction]:
+    def predict(self, state: FilterState, motion: Motion, u: Data = None) -> Advanced:
         """Predict over one step; the state remembers whether the prediction was taken."""
         state, prediction = self._predict(state, motion, u)
         # of a type of its own: with a weak one a stream would compile again after the first step
@@ -137,9 +135,7 @@ class Filter:
         return state._replace(current=current), prediction
 
     @jax.jit
-    def update(
-        self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None
-    ) -> tuple[FilterState, StepInfo]:
+    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None) -> Updated:
         """Use a measurement, but none after a prediction that was not taken.
 
         The belief is then of an earlier time than the measurement: to fuse it would be to leave out

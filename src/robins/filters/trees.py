@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeVar
 
 import jax
@@ -24,6 +25,21 @@ def equal(a: Data, b: Data) -> Array:
     """() bool: two pytrees hold the same numbers."""
     pairs = zip(jax.tree_util.tree_leaves(a), jax.tree_util.tree_leaves(b), strict=True)
     return jnp.all(jnp.stack([jnp.all(x == y) for x, y in pairs]))
+
+
+def row_of(tree: T, i: ArrayLike) -> T:
+    """Row i of each array; rows, where i is an array."""
+    return jax.tree_util.tree_map(lambda a: a[i], tree)
+
+
+def stack(trees: Sequence[T]) -> T:
+    """Arrays of JAX with a leading axis of trees."""
+    return jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *trees)
+
+
+def repeated(tree: T, count: int) -> T:
+    """The same with a leading axis of so many copies."""
+    return jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), tree)
 
 
 def select(condition: ArrayLike, new: T, old: T) -> T:

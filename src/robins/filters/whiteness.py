@@ -40,11 +40,7 @@ _COUNT, _PRODUCT, _SQUARE, _SEEN, _ABOVE, _LATE, _LATE_ABOVE, _FAR, _NIS, _DOF, 
 
 
 def innovation_sums(
-    innovation: ArrayLike,
-    sigma: ArrayLike,
-    nis: ArrayLike,
-    dof: ArrayLike,
-    readings: State = None,
+    innovation: ArrayLike, sigma: ArrayLike, nis: ArrayLike, dof: ArrayLike, readings: State = None
 ) -> np.ndarray:
     """Sums (..., m, 11) over the updates of a sensor in a run, for `suspicions`.
 

@@ -21,14 +21,7 @@ from robins.program.c import function, header, to_c
 from robins.program.flags import FLAGS, LANE_FLAGS
 from robins.program.interpreter import interpreted_step
 from robins.program.memory import NativeState
-from robins.program.native import (
-    CPP,
-    Native,
-    build,
-    compiled_step,
-    compiler,
-    native,
-)
+from robins.program.native import CPP, Native, build, compiled_step, compiler, native
 from robins.program.nodes import Graph
 from robins.program.precision import DOUBLE, SINGLE, Precision
 from robins.program.refusal import BuildError, ProgramError

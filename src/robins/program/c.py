@@ -37,10 +37,7 @@ def part(name: str) -> str:
 
 
 def function(
-    program: Program,
-    name: str = "robins_step",
-    linkage: str = "",
-    precision: Precision = DOUBLE,
+    program: Program, name: str = "robins_step", linkage: str = "", precision: Precision = DOUBLE
 ) -> str:
     """The function of a program: ``void name(const real *x, const whole *k, real *y, whole *m)``.
 

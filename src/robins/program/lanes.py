@@ -19,13 +19,12 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Collection, Sequence
-from importlib.resources import files
 from typing import Any
 
 import jax
 import numpy as np
 
-from robins.program.c import function, header
+from robins.program.c import function, header, part
 from robins.program.flags import LANE_FLAGS
 from robins.program.kinds import is_key, numbers_of
 from robins.program.native import CPP, build
@@ -33,18 +32,6 @@ from robins.program.trace import positive_zeros
 from robins.program.walk import Leaf, Program, lengths
 
 KINDS = {"f8": 0, "b1": 1, "i4": 2, "i8": 3, "u4": 4, "u8": 5}  # of arrays, as `scan.h` counts them
-
-
-# Behind the program, whose counts of numbers are NX, NK (taken) and NY, NM (given).
-SCAN = """
-extern "C" int robins_scan(const scan *s)
-{
-    real x[NX], y[NY];
-    whole k[NK], m[NM];
-    return scanned<LANES>(s, robins_step, x, k, y, m);
-}
-extern "C" int robins_lanes(void) { return LANES; }
-"""
 
 
 Given = tuple[np.ndarray | jax.Array, bool]  # an array, and whether it has a leading axis of runs
@@ -125,17 +112,11 @@ class CompiledRounds:
             np.ascontiguousarray(numbers_of(array), _dtype(leaf.dtype))
             for (array, _), leaf in zip(given, inputs, strict=True)
         ]
-        made = [
-            np.empty(
-                (
-                    1 if k in named else runs,
-                    *((self.length,) if k >= self.carried else ()),
-                    *leaf.shape,
-                ),
-                _dtype(leaf.dtype),
-            )
-            for k, leaf in enumerate(results)
-        ]
+        made = []
+        for k, leaf in enumerate(results):
+            rows = (self.length,) if k >= self.carried else ()
+            shape = 1 if k in named else runs, *rows, *leaf.shape
+            made.append(np.empty(shape, _dtype(leaf.dtype)))
         first = self.carried + self.stays
         taken = [
             _rows(a, batched, k >= first, leaf)
@@ -180,6 +161,6 @@ def _text(program: Program) -> str:
     sizes = *lengths(program.inputs), *lengths(program.results)
     names = ("NX", "NK", "NY", "NM")
     defined = "\n".join(f"#define {n} {size}" for n, size in zip(names, sizes, strict=True))
-    rounds = (files("robins.program") / "scan.h").read_text("utf-8")
     step = function(program, linkage="static ")
-    return f"#include <stdlib.h>\n{header('lanes.h')}\n{step}\n{defined}\n{rounds}\n{SCAN}"
+    rounds = f"{part('scan.h')}\n{part('lane_rounds.h')}"
+    return f"#include <stdlib.h>\n{header('lanes.h')}\n{step}\n{defined}\n{rounds}"

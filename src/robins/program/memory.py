@@ -24,10 +24,10 @@ from robins.program.interpreter import interpreted_step, interpreter_of_one
 from robins.program.kept import cached_by_name, second_result
 from robins.program.kinds import kind_of
 from robins.program.names import Tree
-from robins.program.native import Engine, Step
+from robins.program.native import Engine, Step, address
 from robins.program.refusal import ProgramError
 from robins.program.trace import trace
-from robins.program.walk import Leaf, Program
+from robins.program.walk import Leaf, MemorySlot, Program, slots
 
 Function = Callable[..., Any]  # of a state and arguments
 # A program, the structure of its result apart from the state, and what makes steps of it.
@@ -37,40 +37,6 @@ _MOST = 128  # programs remembered; the least recently used are forgotten
 _known: OrderedDict[Hashable, Made] = OrderedDict()
 _FLOAT = np.dtype(float)
 _PYTHON = {float: _FLOAT, int: np.dtype(np.int64), bool: np.dtype(bool)}
-
-
-class MemorySlot(NamedTuple):
-    """Place of an array in the memory of the reals, or in that of all else."""
-
-    is_real: bool
-    first: int
-    last: int
-    shape: tuple[int, ...]
-    dtype: Any
-
-    def view(self, reals: np.ndarray, others: np.ndarray) -> np.ndarray:
-        """The array in memory, to be written to."""
-        pool = reals if self.is_real else others
-        return pool[self.first : self.last].reshape(self.shape)
-
-
-def slots(
-    leaves: list[Leaf], counted: tuple[int, int] = (0, 0)
-) -> tuple[list[MemorySlot], int, int]:
-    """The slots of arrays one after the other, and how many reals and others there are then.
-
-    Args:
-        leaves: the arrays.
-        counted: reals and others before them.
-    """
-    reals, others = counted
-    found = []
-    for leaf in leaves:
-        size, real = int(np.prod(leaf.shape)), leaf.kind == "real"
-        at = reals if real else others
-        found.append(MemorySlot(real, at, at + size, leaf.shape, np.dtype(leaf.dtype)))
-        reals, others = (reals + size, others) if real else (reals, others + size)
-    return found, reals, others
 
 
 class Reader:
@@ -89,7 +55,7 @@ class Reader:
             (k, s.first) for k, s in enumerate(result_slots) if s.is_real and not s.shape
         ]
         self._others = [
-            (k, slice(s.first, s.last) if s.shape else s.first, s.shape, s.dtype)
+            (k, slice(s.first, s.last) if s.shape else s.first, s.shape, np.dtype(s.dtype))
             for k, s in enumerate(result_slots)
             if not s.is_real
         ]
@@ -274,17 +240,10 @@ class NativeState:
             self._x = np.append(self._x, np.zeros(max(0, wanted[0] - len(self._x))))
             more = np.zeros(max(0, wanted[1] - len(self._k)), np.int64)
             self._k = np.append(self._k, more)
-        x, k = (ctypes.c_void_p(a.ctypes.data) for a in (self._x, self._k))
-        return _Call(
-            tree,
-            forms,
-            [slot.view(self._x, self._k) for slot in given],
-            step(),
-            (x, k, x, k),
-            begin,
-            (begin[0] + end[0], begin[1] + end[1]),
-            Reader(result_slots, result),
-        )
+        x, k = map(address, (self._x, self._k))
+        views = [slot.view(self._x, self._k) for slot in given]
+        ends, read = (begin[0] + end[0], begin[1] + end[1]), Reader(result_slots, result)
+        return _Call(tree, forms, views, step(), (x, k, x, k), begin, ends, read)
 
     def _made(self, key: Hashable, function: Function, args: tuple) -> Made:
         """A program of a function; that of the interpreter from the user's cache, if it is there.

@@ -27,7 +27,7 @@ from robins.program.flags import FASTER, FASTER_IN_GCC, FLAGS, SHARED
 from robins.program.kinds import array_of, numbers_of
 from robins.program.refusal import BuildError, ProgramError
 from robins.program.trace import UNROLL, trace
-from robins.program.walk import Leaf, Program
+from robins.program.walk import Leaf, Program, slots
 
 NO_COMPILER = (
     "install one (Debian: `apt install g++`; anywhere: `pip install 'robins[compiler]'`), "
@@ -136,11 +136,7 @@ def _named(*words: str) -> Path:
 
 
 def _compiled(
-    library: Path,
-    command: tuple[str, ...],
-    text: str,
-    flags: tuple[str, ...],
-    language: Language,
+    library: Path, command: tuple[str, ...], text: str, flags: tuple[str, ...], language: Language
 ) -> Path:
     with tempfile.TemporaryDirectory(dir=library.parent) as own:
         source, made = Path(own) / f"program{language.suffix}", Path(own) / library.name
@@ -208,11 +204,9 @@ class Native:
             view[...] = numbers_of(value) if leaf.kind == "word64" else value
         for view, mask, path in self._zeros:
             if np.any(view[mask]):
-                raise ProgramError(
-                    "a number is not zero that is zero in all states that follow from the first",
-                    path,
-                    "trace the step with a state like this one, or use `trace`",
-                )
+                what = "a number is not zero that is zero in all states that follow from the first"
+                fix = "trace the step with a state like this one, or use `trace`"
+                raise ProgramError(what, path, fix)
         self._step(*self._buffers)
         made = [
             array_of(view, leaf.dtype) if leaf.kind == "word64" else view.astype(leaf.dtype)
@@ -228,16 +222,9 @@ def address(array: np.ndarray) -> ctypes.c_void_p:
 
 def _laid_out(leaves: list[Leaf]) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Memory for the reals and for all else of some leaves, and the view of each into it."""
-    sizes = [int(np.prod(leaf.shape)) for leaf in leaves]
-    totals = [0, 0]
-    places = []
-    for leaf, size in zip(leaves, sizes, strict=True):
-        pool = int(leaf.kind != "real")
-        places.append((pool, totals[pool], size, leaf.shape))
-        totals[pool] += size
-    memory = np.zeros(max(totals[0], 1)), np.zeros(max(totals[1], 1), dtype=np.int64)
-    views = [memory[pool][at : at + n].reshape(shape) for pool, at, n, shape in places]
-    return *memory, views
+    found, reals, others = slots(leaves)
+    memory = np.zeros(max(reals, 1)), np.zeros(max(others, 1), dtype=np.int64)
+    return *memory, [slot.view(*memory) for slot in found]
 
 
 def native(

@@ -72,6 +72,12 @@ def _threefry(key: np.uint64, number: np.uint64) -> np.uint64:
     return high << np.uint64(32) | low
 
 
+_OF_NUMPY = (
+    *("abs", "sign", "sqrt", "cbrt", "floor", "ceil", "sin", "cos", "tan", "sinh", "cosh", "tanh"),
+    *("exp", "exp2", "expm1", "log", "log1p", "nextafter"),
+)
+_INVERSE = ("sin", "cos", "tan", "tan2", "sinh", "cosh", "tanh")  # with an "a", in NumPy an "arc"
+
 OPERATIONS: dict[str, Operation] = {
     "add": Operation(lambda a, b: a + b, "+", commutes=True),
     "sub": Operation(lambda a, b: a - b, "-"),
@@ -79,8 +85,6 @@ OPERATIONS: dict[str, Operation] = {
     "div": Operation(_div),
     "rem": Operation(_rem),
     "neg": Operation(lambda a: -a, "-"),
-    "abs": Operation(np.abs),
-    "sign": Operation(np.sign),
     "max": Operation(np.maximum),  # NaN if either is
     "min": Operation(np.minimum),
     "pow": Operation(np.power),
@@ -97,35 +101,14 @@ OPERATIONS: dict[str, Operation] = {
     "shift_left": Operation(np.left_shift),
     "shift_right": Operation(np.right_shift),
     "is_finite": Operation(np.isfinite, gives="flag"),
-    "sqrt": Operation(np.sqrt),
-    "cbrt": Operation(np.cbrt),
-    "floor": Operation(np.floor),
-    "ceil": Operation(np.ceil),
     "round_even": Operation(np.round),
     "round_away": Operation(_away),
-    "sin": Operation(np.sin),
-    "cos": Operation(np.cos),
-    "tan": Operation(np.tan),
-    "asin": Operation(np.arcsin),
-    "acos": Operation(np.arccos),
-    "atan": Operation(np.arctan),
-    "atan2": Operation(np.arctan2),
-    "sinh": Operation(np.sinh),
-    "cosh": Operation(np.cosh),
-    "tanh": Operation(np.tanh),
-    "asinh": Operation(np.arcsinh),
-    "acosh": Operation(np.arccosh),
-    "atanh": Operation(np.arctanh),
-    "exp": Operation(np.exp),
-    "exp2": Operation(np.exp2),
-    "expm1": Operation(np.expm1),
-    "log": Operation(np.log),
-    "log1p": Operation(np.log1p),
+    **{name: Operation(getattr(np, name)) for name in _OF_NUMPY},
+    **{f"a{name}": Operation(getattr(np, f"arc{name}")) for name in _INVERSE},
     "erf": Operation(scipy.special.erf),
     "erfc": Operation(scipy.special.erfc),
     "erf_inv": Operation(lambda a: np.float64(jax.lax.erf_inv(a))),
     "lgamma": Operation(scipy.special.gammaln),
-    "nextafter": Operation(np.nextafter),
     "wrap": Operation(_wrap),
     "threefry": Operation(_threefry),
 }

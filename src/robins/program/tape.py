@@ -123,16 +123,9 @@ class Writer:
         count: int = 1,
     ) -> None:
         place = self.place
-        self.written.append(
-            Instruction(
-                code,
-                None if result is None else place(result),
-                tuple([place(v) for v in args]),
-                tuple([place(v) for v in listed]),
-                numbers,
-                count,
-            )
-        )
+        made = None if result is None else place(result)
+        read, more = (tuple([place(v) for v in some]) for some in (args, listed))
+        self.written.append(Instruction(code, made, read, more, numbers, count))
 
     def _scope(self, scope: int, only: set[Node]) -> None:
         products = set(self.joined.values())

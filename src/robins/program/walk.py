@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -58,12 +58,43 @@ class Leaf:
     path: str
 
 
+class MemorySlot(NamedTuple):
+    """Place of an array in the memory of the reals, or in that of all else."""
+
+    is_real: bool
+    first: int
+    last: int
+    shape: tuple[int, ...]
+    dtype: Any
+
+    def view(self, reals: np.ndarray, others: np.ndarray) -> np.ndarray:
+        """The array in memory, to be written to."""
+        pool = reals if self.is_real else others
+        return pool[self.first : self.last].reshape(self.shape)
+
+
+def slots(
+    leaves: Sequence[Leaf], counted: tuple[int, int] = (0, 0)
+) -> tuple[list[MemorySlot], int, int]:
+    """The slots of arrays one after the other, and how many reals and others there are then.
+
+    Args:
+        leaves: the arrays.
+        counted: reals and others before them.
+    """
+    reals, others = counted
+    found = []
+    for leaf in leaves:
+        size, real = int(np.prod(leaf.shape)), leaf.kind == "real"
+        at = reals if real else others
+        found.append(MemorySlot(real, at, at + size, leaf.shape, leaf.dtype))
+        reals, others = (reals + size, others) if real else (reals, others + size)
+    return found, reals, others
+
+
 def counts(leaves: Sequence[Leaf]) -> tuple[int, int]:
     """Number of reals, and of all other numbers, of some arrays."""
-    sizes = {True: 0, False: 0}
-    for leaf in leaves:
-        sizes[leaf.kind == "real"] += int(np.prod(leaf.shape))
-    return sizes[True], sizes[False]
+    return slots(leaves)[1:]
 
 
 def lengths(leaves: Sequence[Leaf]) -> tuple[int, int]:
@@ -211,11 +242,9 @@ class JaxprWriter:
         """
         name = equation.primitive.name
         if name not in RULES:
-            raise ProgramError(
-                f"'{name}' has no place in a program of scalars: {REFUSED.get(name, UNKNOWN)}",
-                line_of(equation),
-                "write it with other operations, or run this filter by JAX",
-            )
+            what = f"'{name}' has no place in a program of scalars: {REFUSED.get(name, UNKNOWN)}"
+            fix = "write it with other operations, or run this filter by JAX"
+            raise ProgramError(what, line_of(equation), fix)
         try:
             found = RULES[name](self, equation, *args)
         except ProgramError as error:

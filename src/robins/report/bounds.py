@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -129,16 +129,10 @@ def information(solution: xr.Dataset) -> Picture:
     clock = series.clock(time)
     figure, grid = style.new_figure(1, 1, 1.1 + 0.19 * len(names))
     axes = grid[0, 0]
-    shown = axes.pcolormesh(
-        time[pick] / clock.seconds,
-        np.arange(len(names)),
-        np.minimum(np.asarray(array.values, float)[:, pick], _FULL),
-        shading="nearest",
-        cmap="viridis",
-        vmin=0.0,
-        vmax=_FULL,
-        rasterized=True,
-    )
+    x, values = time[pick] / clock.seconds, np.asarray(array.values, float)[:, pick]
+    look: dict[str, Any] = {"shading": "nearest", "cmap": "viridis", "rasterized": True}
+    look |= {"vmin": 0.0, "vmax": _FULL}
+    shown = axes.pcolormesh(x, np.arange(len(names)), np.minimum(values, _FULL), **look)
     axes.set_yticks(np.arange(len(names)), names)
     axes.invert_yaxis()
     axes.grid(visible=False)
@@ -210,17 +204,10 @@ def rows(solution: xr.Dataset, at: Sequence[int]) -> list[BoundRow]:
         start = np.asarray(find(solution, "bound_left")[block], float)
         every, prior, unaided, without = (line(solution, block, role) for role in _ROLES)
         for k, axis in enumerate(series.coordinate(solution, f"axis_{block}")):
-            out.append(
-                BoundRow(
-                    f"{words(block)} {axis}",
-                    every.unit,
-                    float(prior.values[k]),
-                    every.values[list(at), k].tolist(),
-                    float(unaided.values[at[-1], k]),
-                    without.values[: len(names), at[-1], k].tolist(),
-                    float(start[k]),
-                )
-            )
+            sigma, least = every.values[list(at), k].tolist(), float(unaided.values[at[-1], k])
+            others = without.values[: len(names), at[-1], k].tolist()
+            known = f"{words(block)} {axis}", every.unit, float(prior.values[k])
+            out.append(BoundRow(*known, sigma, least, others, float(start[k])))
     return out
 
 

@@ -53,14 +53,8 @@ def comparison(summary: Mapping[str, Any]) -> Picture | None:
             if (chance := chances[i]) is not None:
                 axes.plot([chance.low, chance.high], [i, i], color=style.TRUTH, linewidth=1.0)
                 ends[i], uncertain = chance.high, True
-            axes.annotate(
-                numbers.show(value),
-                (max(ends[i], 0.0), i),
-                (4, 0),
-                textcoords="offset points",
-                va="center",
-                fontsize=8.0,
-            )
+            look: dict[str, Any] = {"textcoords": "offset points", "va": "center", "fontsize": 8.0}
+            axes.annotate(numbers.show(value), (max(ends[i], 0.0), i), (4, 0), **look)
         low, high = min(0.0, *ends), max(0.0, *ends)
         axes.set_xlim(low * 1.1, (high or 1.0) * 1.45)  # room for the numbers behind the bars
         axes.set_ylim(len(filters) - 0.5, -0.5)

@@ -5,6 +5,8 @@ Two show shares: runs within a limit, and the local bound of an H-infinity filte
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -124,16 +126,10 @@ def _limit(axes: Axes, x: np.ndarray, lines: list[np.ndarray], centred: bool = T
         return False
     top = 1.25 * later
     axes.set_ylim(-top if centred else -0.02 * top, top)
-    axes.annotate(
-        f"starts at {most:.3g}",
-        (0.006, 0.95),
-        xycoords="axes fraction",
-        va="top",
-        fontsize=8.0,
-        color=style.TRUTH,
-        bbox={"facecolor": "white", "edgecolor": style.GREY, "linewidth": 0.5, "pad": 2.0},
-        zorder=6,
-    )
+    box = {"facecolor": "white", "edgecolor": style.GREY, "linewidth": 0.5, "pad": 2.0}
+    look: dict[str, Any] = {"va": "top", "fontsize": 8.0, "color": style.TRUTH, "zorder": 6}
+    text, place = f"starts at {most:.3g}", (0.006, 0.95)
+    axes.annotate(text, place, xycoords="axes fraction", bbox=box, **look)
     return True
 
 

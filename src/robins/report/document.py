@@ -51,35 +51,22 @@ def _page(summary: Mapping[str, Any], figures: str, origin: ReportOrigin) -> str
         f"robins {escape(origin.versions.get('robins', ''))}",
         escape(origin.created_utc),
     ]
-    css = (Path(__file__).with_name("page.css")).read_text("utf-8")
-    return f"""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy" content="{_LOCKED}">
-<title>{title} · robins</title>
-<style>
-{css}</style>
-</head>
-<body>
-<main>
-<header>
-<h1>{title}</h1>
-<p class="meta">{" · ".join(meta)}</p>
-{_verdict(summary["claims"], summary.get("verdict", ""))}
-{_sentences("warning", summary.get("warnings", ()))}
-{_sentences("note", origin.notes)}
-</header>
-{_metrics(summary["filters"])}
-{_claims(summary["claims"])}
-{figures}
-{_counts(summary["counts"])}
-{_reproduce(summary, origin)}
-</main>
-</body>
-</html>
-"""
+    here = Path(__file__)
+    texts = {name: here.with_name(name).read_text("utf-8") for name in ("page.html", "page.css")}
+    return texts["page.html"].format(
+        locked=_LOCKED,
+        title=title,
+        css=texts["page.css"],
+        meta=" · ".join(meta),
+        verdict=_verdict(summary["claims"], summary.get("verdict", "")),
+        warnings=_sentences("warning", summary.get("warnings", ())),
+        notes=_sentences("note", origin.notes),
+        metrics=_metrics(summary["filters"]),
+        claims=_claims(summary["claims"]),
+        figures=figures,
+        counts=_counts(summary["counts"]),
+        reproduce=_reproduce(summary, origin),
+    )
 
 
 def _verdict(claims: Sequence[Mapping[str, Any]], sentence: str) -> str:

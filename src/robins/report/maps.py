@@ -152,14 +152,8 @@ def _ends(axes: Axes, path: Path, scale: float) -> list:
     good = np.flatnonzero(np.isfinite(path.north + path.east))
     keys = []
     for name, at, mark in (("start", good[0], "o"), ("end", good[-1], "s")):
-        look = {
-            "linestyle": "",
-            "marker": mark,
-            "markersize": 7.0,
-            "markerfacecolor": "white",
-            "markeredgecolor": style.TRUTH,
-            "markeredgewidth": 1.4,
-        }
+        look = {"linestyle": "", "marker": mark, "markersize": 7.0, "markerfacecolor": "white"}
+        look |= {"markeredgecolor": style.TRUTH, "markeredgewidth": 1.4}
         axes.plot(path.east[at] * scale, path.north[at] * scale, zorder=5, **look)
         keys.append(style.key(name, **look))
     return keys

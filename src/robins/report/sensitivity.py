@@ -88,13 +88,9 @@ def scatter(solution: xr.Dataset, block: str) -> Picture:
         for label, side in zip(axes.get_xticklabels(), ("left", "right"), strict=True):
             label.set_horizontalalignment(side)  # within their axes
         axes.set_xlabel(name)
-    style.legend(
-        figure,
-        [
-            style.key("point", color=style.colour(0), marker=".", linestyle=""),
-            style.key("mean of a slice", color=style.colour(1), linewidth=1.8),
-        ],
-    )
+    point = style.key("point", color=style.colour(0), marker=".", linestyle="")
+    mean = style.key("mean of a slice", color=style.colour(1), linewidth=1.8)
+    style.legend(figure, [point, mean])
     caption = (
         "Each point is the RMS error over the runs, with all parameters drawn at once. How far the "
         "line goes up and down is the first order of a parameter; how far points scatter about it "
@@ -195,11 +191,8 @@ def csv(solution: xr.Dataset, laws: Sequence[str]) -> bytes:
     head = "filter block unit rms_mean rms_std parameter low high parameter_unit distribution"
     orders = [f"{o}{end}" for o in _ORDERS for end in ("", "_low", "_high")]
     rows: list[list[Any]] = [[*head.split(), *orders, "samples", "runs"]]
-    names, spread, ends = (
-        series.coordinate(solution, "parameter"),
-        _spread(solution),
-        _ends(solution),
-    )
+    names, spread = series.coordinate(solution, "parameter"), _spread(solution)
+    ends = _ends(solution)
     for block, first in find(solution, "sobol_first").items():
         about = first.attrs
         counts = [int(about["samples"]), int(about["runs"])]

@@ -102,15 +102,9 @@ def maps(solution: xr.Dataset, block: str) -> Picture:
         image = axes.imshow(values.T, norm=norm, cmap="cividis_r", origin="lower", aspect="auto")
         for (k, j), value in np.ndenumerate(values):
             dark = np.isfinite(value) and norm(value) > 0.55
-            axes.text(
-                k,
-                j,
-                f"{value:.3g}" if np.isfinite(value) else "lost",
-                ha="center",
-                va="center",
-                fontsize=7.0,
-                color="white" if dark else style.TRUTH,
-            )
+            text = f"{value:.3g}" if np.isfinite(value) else "lost"
+            colour = "white" if dark else style.TRUTH
+            axes.text(k, j, text, ha="center", va="center", fontsize=7.0, color=colour)
         axes.set_title(name)
         axes.grid(visible=False)
         axes.set_xticks(range(len(along)), along)

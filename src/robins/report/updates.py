@@ -156,13 +156,8 @@ def _round_up(value: float) -> float:
     return float(min(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= value))
 
 
-_CROSS = {
-    "linestyle": "",
-    "marker": "x",
-    "markersize": 4.5,
-    "color": style.TRUTH,
-    "markeredgewidth": 0.9,
-}
+_CROSS = {"linestyle": "", "marker": "x", "markersize": 4.5, "markeredgewidth": 0.9}
+_CROSS |= {"color": style.TRUTH}
 
 
 def _dot(name: str, i: int):
@@ -204,15 +199,9 @@ def _statistic(
     width = np.where(np.isfinite(limits.high), limits.high - limits.low, -np.inf).max(axis=1)
     widest = int(np.argmax(width))
     finite = np.isfinite(limits.high[widest])
-    axes.fill_between(
-        x[finite],
-        limits.low[widest][finite],
-        limits.high[widest][finite],
-        color=style.BAND,
-        linewidth=0,
-        zorder=0.5,
-        step=None if joined else "mid",
-    )
+    low, high = (edge[widest][finite] for edge in (limits.low, limits.high))
+    step: Any = None if joined else "mid"
+    axes.fill_between(x[finite], low, high, color=style.BAND, linewidth=0, zorder=0.5, step=step)
     top = np.nanmax(values) if np.isfinite(values).any() else 0.0
     if top > _STEEP * np.nanmax(limits.high):
         axes.set_yscale("log")

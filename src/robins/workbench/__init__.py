@@ -37,44 +37,31 @@ if TYPE_CHECKING:  # the functions that are named as their file, for editors
     from robins.workbench.sweep import sweep as sweep
     from robins.workbench.tune import tune as tune
 
-_WHERE = {
-    "InputError": "errors",
-    "align": "replay",
+_FILES = {
     "allan": "allan",
-    "bench_node": "bench",
-    "bench_replay": "bench",
-    "bench_up": "bench",
+    "bench": "bench_node bench_replay bench_up",
     "bound": "bound",
     "calibrate": "calibrate",
-    "campaign_run": "workers",
-    "campaign_show": "campaign",
-    "campaign_status": "campaign",
-    "campaign_verify": "campaign",
-    "campaign_work": "campaign",
-    "compare": "compare",
-    "demo": "run",
+    "campaign": "campaign_show campaign_status campaign_verify campaign_work plan_campaign",
+    "compare": "compare verify",
     "design": "design",
-    "examine": "doctor",
-    "export": "formats",
-    "export_filter": "export",
+    "doctor": "examine",
+    "errors": "InputError",
+    "export": "export_filter",
+    "formats": "export",
     "guess": "guess",
-    "inventory": "list",
-    "overview": "list",
-    "plan_campaign": "campaign",
-    "publish": "publication",
-    "publishing": "publication",
-    "replay": "replay",
-    "report": "sweep",
-    "run": "run",
+    "list": "inventory overview",
+    "publication": "publish publishing",
+    "replay": "align replay",
+    "run": "demo run",
     "sensitivity": "sensitivity",
-    "status": "sweep",
-    "sweep": "sweep",
+    "sweep": "report status sweep",
     "tune": "tune",
-    "verify": "compare",
-    "work_here": "workers",
+    "workers": "campaign_run work_here",
 }
+_WHERE = {name: file for file, names in _FILES.items() for name in names.split()}
 
-__all__ = list(_WHERE)  # pyright: ignore[reportUnsupportedDunderAll]
+__all__ = sorted(_WHERE)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 __getattr__ = lazy(__name__, {name: f"{__name__}.{file}" for name, file in _WHERE.items()})

@@ -190,8 +190,7 @@ def calibrate(
     log: Logs,
     *,
     field: Annotated[
-        str | None,
-        Option('Its strength at the place, "48.5 uT"; sets the scale.', metavar="FIELD"),
+        str | None, Option('Its strength at the place, "48.5 uT"; sets the scale.', metavar="FIELD")
     ] = None,
     begin: Annotated[
         str | None, Option('Use samples from "20 s" after the first one on.', metavar="TIME")

@@ -8,7 +8,7 @@ import random
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -56,11 +56,8 @@ def _check_same(where: Where, before: CampaignPlan, text: str, seed: int, machin
     ):
         if was != now:
             shown = "" if what == "scenario" else f": {was} there, {now} asked for"
-            raise InputError(
-                f"holds a campaign of another {what}{shown}",
-                where,
-                "ask for the same to go on with it, or choose another folder.",
-            )
+            fix = "ask for the same to go on with it, or choose another folder."
+            raise InputError(f"holds a campaign of another {what}{shown}", where, fix)
 
 
 def plan_campaign(
@@ -115,9 +112,8 @@ def plan_campaign(
         _check_same(where, before, text, seed, machine)
         plan = replace(before.with_more(wanted, chosen), text=text)
     if beyond := [run for run in plan.keep if run >= plan.runs]:
-        raise InputError(
-            f"has runs 0 to {plan.runs - 1}", where, f"keep = {beyond} names none of them."
-        )
+        fix = f"keep = {beyond} names none of them."
+        raise InputError(f"has runs 0 to {plan.runs - 1}", where, fix)
     if plan != before:
         write(store, plan)
     store.sweep()
@@ -160,11 +156,8 @@ def opened(where: Where) -> tuple[Store, CampaignPlan]:
         robins.errors.RobinsError: there is none, or there are several.
     """
     if sweep := sweep_of(where):
-        raise InputError(
-            f"holds the {len(sweep[1])} campaigns of a sweep",
-            where,
-            f"name one, such as {where}/{sweep[1][0]}.",
-        )
+        fix = f"name one, such as {where}/{sweep[1][0]}."
+        raise InputError(f"holds the {len(sweep[1])} campaigns of a sweep", where, fix)
     store = open_store(where)
     return store, require_plan(store)
 
@@ -231,19 +224,13 @@ def campaign_status(where: Where) -> CampaignStatus:
     """Read and check all shards of a campaign, and report its progress."""
     store, plan = opened(where)
     found, there = gather(store, plan), kept(store, by_stem(plan.shards))
+    shards, damaged = sum(map(len, plan.shards.values())), [shard.name for shard in found.damaged]
+    diverged = {name: diverged_of(found, name) for name in plan.filters}
+    runs = {name: there.get(name, []) for name in plan.filters}
+    asked = plan.scenario, plan.seed, plan.machine, list(plan.filters), plan.runs
+    lacking = found.lacking - len(damaged)
     return CampaignStatus(
-        plan.scenario,
-        plan.seed,
-        plan.machine,
-        list(plan.filters),
-        plan.runs,
-        found.done,
-        sum(map(len, plan.shards.values())),
-        found.lacking - len(found.damaged),
-        [shard.name for shard in found.damaged],
-        {name: diverged_of(found, name) for name in plan.filters},
-        {name: there.get(name, []) for name in plan.filters},
-        found.digest,
+        *asked, found.done, shards, lacking, damaged, diverged, runs, found.digest
     )
 
 
@@ -269,28 +256,26 @@ def campaign_report(where: Where) -> Outcome:
     found = gather(store, plan, problem)
     # the figures show the first run of each filter
     if any(one.example is None for one in found.found.values()):
-        raise InputError(
-            "some filter has no first run",
-            where,
-            "the same `robins campaign run` computes it.",
-        )
+        fix = "the same `robins campaign run` computes it."
+        raise InputError("some filter has no first run", where, fix)
     outcome = outcome_of(problem, found.found, _bound(problem, plan.machine))
     short = {name: n for name, n in found.done.items() if n < plan.runs}
     warnings = [f"{name}: {n} of {plan.runs} runs are done" for name, n in short.items()]
     return replace(
         outcome,
-        machine=plan.machine,
-        scenario=plan.scenario,
-        seed=plan.seed,
-        runs=plan.runs,
-        parameters=plan.text,
-        device=jax.devices()[0].device_kind,
+        **fields_of(plan),
         warnings=[*outcome.warnings, *warnings],
         last_lines=[
             f"Digest: {found.digest or 'none, as long as runs are missing'}",
             f"Next:   robins campaign show {where} --run 0   one run with all its histories",
         ],
     )
+
+
+def fields_of(plan: CampaignPlan) -> dict[str, Any]:
+    """Fields of an outcome: those of a plan, and the machine that computes."""
+    own = {name: getattr(plan, name) for name in ("machine", "scenario", "seed", "runs")}
+    return own | {"parameters": plan.text, "device": jax.devices()[0].device_kind}
 
 
 def _bound(problem: Problem, machine: str) -> np.ndarray | None:
@@ -319,12 +304,7 @@ def campaign_show(where: Where, run: int, *, progress: Progress = ignore_progres
     return replace(
         outcome,
         claims=[],  # of one run there is nothing to be claimed
-        machine=plan.machine,
-        scenario=plan.scenario,
-        seed=plan.seed,
-        runs=1,
-        parameters=plan.text,
-        device=jax.devices()[0].device_kind,
+        **fields_of(plan) | {"runs": 1},
         notes=[f"Run {run} of {plan.runs}, alone.", *outcome.notes],
         last_lines=[f"Next:   robins campaign report {where}   all runs"],
     )

@@ -37,7 +37,7 @@ def as_text(gammas: Sequence[float]) -> list[str]:
     return [repr(gamma) for gamma in gammas]
 
 
-def cell(attempt: Attempt) -> Any:
+def cell(attempt: Attempt) -> str:
     """Entry of a table where a method has no design."""
     if np.isfinite(attempt.least):
         return f"cannot, least {attempt.least:.4g}"

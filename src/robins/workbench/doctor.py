@@ -116,11 +116,9 @@ def unit_file(
     found = find_unit(to_ned_frd(spread(dataset.imu)), dataset.gnss)
     found = found._replace(lasting_share=_lasting_share(dataset))
     if not any(value is not None for value in found):
-        raise InputError(
-            "the log tells nothing of its unit: there is too little motion, and no rest",
-            dataset.name,
-            "drive a figure of eight and stand for ten seconds.",
-        )
+        what = "the log tells nothing of its unit: there is too little motion, and no rest"
+        fix = "drive a figure of eight and stand for ten seconds."
+        raise InputError(what, dataset.name, fix)
     usual = InsGnssReplay().imu
     noise = {"gyro_noise": usual.gyro_noise, "accel_noise": usual.accel_noise}
     return toml_of(found, dataset.name, noise)
@@ -171,11 +169,9 @@ def parted(paths: Sequence[str | os.PathLike[str]]) -> tuple[list[Path], Path | 
     files = [path for path in given if path.suffix != ".toml"]
     configurations = [path for path in given if path.suffix == ".toml"]
     if not files:
-        raise InputError(
-            "is a configuration" if given else "no file is given",
-            given[0] if given else "",
-            "give the files of the log beside it." if given else "give those of a log",
-        )
+        what = "is a configuration" if given else "no file is given"
+        fix = "give the files of the log beside it." if given else "give those of a log"
+        raise InputError(what, given[0] if given else "", fix)
     if len(configurations) > 1:
         raise InputError(f"one configuration is wanted, got {', '.join(map(str, configurations))}")
     return files, next(iter(configurations), None)

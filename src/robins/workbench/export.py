@@ -136,29 +136,19 @@ def _built(folder: Path, part: str) -> Path:
     return folder / f"{part}_board"
 
 
-def _aboard(rig: Rig, name: str, filter_name: str, seed: int, settings: Sequence[str]) -> Request:
-    """The filter as a part of a rig has it, in a run of this scenario, and the part's loop."""
-    assert rig.aboard is not None
-    options = {"seed": seed} | ({"filter": filter_name} if filter_name else {})
-    flight = changed(read(name, tuple(settings)), options)
-    made, label = rig.aboard(flight), find_scenario(name, recorded=True)[1]
-    return Request(made.problem, flight.setup.filter, label, made.library, made.files)
-
-
 def _requested(
-    rig: Rig | None,
-    float32: bool,
-    name: str,
-    filter_name: str,
-    seed: int,
-    settings: Sequence[str],
+    rig: Rig | None, float32: bool, name: str, filter_name: str, seed: int, settings: Sequence[str]
 ) -> Request:
+    """The filter as a part of a rig has it, in a run of this scenario; else as it is tried."""
     if rig is None or rig.aboard is None:
         return _export_request(name, filter_name, seed, settings)
     if float32:
         what = f"the {rig.name} is not navigated in single precision"
         raise InputError(what, "--float32", "leave it out with --board")
-    return _aboard(rig, name, filter_name, seed, settings)
+    options = {"seed": seed} | ({"filter": filter_name} if filter_name else {})
+    flight = changed(read(name, tuple(settings)), options)
+    made, label = rig.aboard(flight), find_scenario(name, recorded=True)[1]
+    return Request(made.problem, flight.setup.filter, label, made.library, made.files)
 
 
 def _exportable(asked: Request, adjust: Sequence[str]) -> Request:

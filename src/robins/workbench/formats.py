@@ -128,11 +128,9 @@ def require_formats(formats: Sequence[str], there: Collection[str], where: str) 
         with refusing("--export"):
             require_known("format", name, FORMATS, "robins")
         if name not in possible:
-            raise InputError(
-                f"{name} is made of {_NEEDED[FORMATS[name].needs]}, and {where} has none",
-                "--export",
-                f"use {', '.join(possible)}.",
-            )
+            what = f"{name} is made of {_NEEDED[FORMATS[name].needs]}, and {where} has none"
+            fix = f"use {', '.join(possible)}."
+            raise InputError(what, "--export", fix)
 
 
 def with_exports(outcome: Outcome, formats: Sequence[str], name: str) -> Outcome:

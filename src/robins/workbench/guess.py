@@ -17,9 +17,11 @@ import json
 import math
 import os
 import re
+import tomllib
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from importlib.resources import files
 
 import numpy as np
 
@@ -37,59 +39,14 @@ from robins.workbench.errors import InputError
 from robins.workbench.options import Log
 
 _G = 9.80665
-_SPELLINGS = {
-    "m/s^2": "m/s^2 m/s2 m/s² m/s/s ms-2 ms^-2 mps2 m_s2 m_s^2 m/sec^2 m/sec2",
-    "g": "g gs",
-    "mg": "mg",
-    "rad/s": "rad/s rads rad/sec rps rad_s rads-1 rads^-1",
-    "deg/s": "deg/s dps °/s deg/sec degs deg_s degs^-1 degrees/s deg_per_s",
-    "deg/h": "deg/h °/h deg/hr deg/hour dph deg_h",
-    "mrad/s": "mrad/s",
-    "mdeg/s": "mdps mdeg/s",
-    "uT": "ut µt μt microtesla",
-    "mT": "mt",
-    "nT": "nt",
-    "G": "gauss ga",
-    "mG": "mgauss mga",
-    "s": "s sec secs second seconds",
-    "ms": "ms msec millis milliseconds",
-    "us": "us µs μs usec micros microseconds",
-    "ns": "ns nsec nanos nanoseconds",
-    "deg": "deg ° degrees degree",
-    "rad": "rad radians",
-    "m": "m metres meters",
-    "cm": "cm",
-    "mm": "mm",
-    "ft": "ft feet",
-    "m/s": "m/s mps ms-1 m_s",
-    "cm/s": "cm/s cm_s",
-    "mm/s": "mm/s mm_s",
-    "km/h": "km/h kmh kph km/hr km_h",
-    "kn": "kn kt kts knots",
-    "ft/s": "ft/s fps ft_s",
-}
-_UNIT_OF = {spelling: unit for unit, line in _SPELLINGS.items() for spelling in line.split()}
+_WORDS: dict[str, dict[str, str]] = tomllib.loads(
+    (files("robins.workbench") / "guess.toml").read_text("utf-8")
+)
+_UNIT_OF = {word: unit for unit, line in _WORDS["units"].items() for word in line.split()}
+_QUANTITY_OF = {word: of for of, line in _WORDS["quantities"].items() for word in line.split()}
+_SENSORS = {sensor: set(line.split()) for sensor, line in _WORDS["sensors"].items()}
+_NOT_RAW, _NO_HEIGHT, _NO_UNIT = (set(line.split()) for line in _WORDS["others"].values())
 _MILLI = {"mdeg/s": ("deg/s", 1e-3)}  # spelt by loggers, unknown to `robins.units`
-_SENSORS = {
-    "accel": {"a", "acc", "accel", "accelerometer", "acceleration", "f", "force"},
-    "gyro": {"g", "w", "gyr", "gyro", "gyroscope", "omega", "angular", "rotation", "rate"},
-    "mag": {"m", "b", "mag", "magn", "magnetometer", "magnetic"},
-}
-_NOT_RAW = {"user", "free", "gravity", "bias", "ref", "std", "sigma", "cov", "covariance"}
-_NOT_RAW |= {"filtered", "accuracy", "error", "dop", "msl"}
-_NO_HEIGHT = {"baro", "barometer", "barometric", "pressure", "rel", "relative", "agl", "amsl"}
-_NO_HEIGHT |= {"ground", "terrain", "takeoff", "home", "geoid", "orthometric"}
-_NO_UNIT = {"", "utc", "gps", "gpst", "unix", "epoch", "iso8601", "wgs84", "wgs-84", "hae", "raw"}
-_SINGLE = {
-    "time": "time timestamp t ts stamp times datetime seconds elapsed timeus timems unixtime epoch",
-    "lat": "lat latitude",
-    "lon": "lon lng long longitude",
-    "height": "alt altitude height hgt",
-    "v_north": "vn vnorth veln velnorth velocitynorth",
-    "v_east": "ve veast vele veleast velocityeast",
-    "v_down": "vd vdown veld veldown velocitydown",
-}
-_QUANTITY_OF = {word: quantity for quantity, line in _SINGLE.items() for word in line.split()}
 _ISO = re.compile(r'"?\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d[.,\d]*(Z|[-+]\d\d:?\d\d)?"?')
 _EPOCHS = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18}  # seconds of today since 1970, roughly
 _FIELD_T = (2.0e-5, 7.0e-5)
@@ -214,7 +171,7 @@ def _named(name: str) -> tuple[str, str, str]:
         stated = re.sub(r"[\s*·]", "", bracketed[2].lower())
         if not re.fullmatch(r":,\d+", stated):
             base, unit = bracketed[1], _UNIT_OF.get(stated, "") or _symbol(bracketed[2])
-            if stated not in _NO_UNIT:
+            if stated not in {"", *_NO_UNIT}:
                 doubt = f"UNIT NOT KNOWN: the heading states [{bracketed[2]}]"
     else:
         cuts = (m.start() for m in re.finditer("_", name))

@@ -74,11 +74,8 @@ def uncertain(text: str) -> UncertainParameter:
     except ValueError:
         found = []
     if not equals or not key.strip() or len(found) != 2:
-        raise InputError(
-            "is not key=low to high",
-            f"--vary {text}",
-            'write --vary "slave.gyro_bias=1 deg/h to 10 deg/h" or the like.',
-        )
+        fix = 'write --vary "slave.gyro_bias=1 deg/h to 10 deg/h" or the like.'
+        raise InputError("is not key=low to high", f"--vary {text}", fix)
     (low, first), (high, unit) = found
     if first not in ("", unit):
         raise InputError("has two units", f"--vary {text}", "write both ends in one unit.")
@@ -235,11 +232,8 @@ def _checked(vary: Sequence[str], samples: int) -> list[UncertainParameter]:
         raise InputError("is part of another that varies", f"--vary {nested[0]}", "name one.")
     if not 2 <= samples <= MOST or samples & (samples - 1):
         below = 1 << max(min(samples, MOST).bit_length() - 1, 1)
-        raise InputError(
-            f"must be a power of two from 2 to {MOST}",
-            f"--samples {samples}",
-            f"take {below} or {min(2 * below, MOST)}.",
-        )
+        fix = f"take {below} or {min(2 * below, MOST)}."
+        raise InputError(f"must be a power of two from 2 to {MOST}", f"--samples {samples}", fix)
     return every
 
 

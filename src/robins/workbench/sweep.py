@@ -8,7 +8,6 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 import xarray as xr
 
@@ -27,13 +26,13 @@ from robins.workbench.campaign import (
     Where,
     campaign_report,
     campaign_status,
+    fields_of,
     plan_campaign,
     problem_of,
     ready,
     sweep_of,
 )
 from robins.workbench.errors import InputError
-from robins.workbench.scenarios import request_fields
 from robins.workbench.workers import fill
 
 MOST = 400  # points; more are a campaign of another kind
@@ -69,11 +68,8 @@ def varied(text: str) -> SweptParameter:
     key, equals, rest = text.partition("=")
     values = tuple(value.strip() for value in rest.split(","))
     if not equals or not key.strip() or not all(values):
-        raise InputError(
-            "is not key=a,b,c",
-            f"--vary {text}",
-            'write --vary "slave.gyro_bias=1 deg/h,10 deg/h" or the like.',
-        )
+        fix = 'write --vary "slave.gyro_bias=1 deg/h,10 deg/h" or the like.'
+        raise InputError("is not key=a,b,c", f"--vary {text}", fix)
     if len(set(values)) < len(values):
         raise InputError("has a value twice", f"--vary {text}", "name each once.")
     return SweptParameter(key.strip(), values)
@@ -221,7 +217,6 @@ def _outcome(vary: Sequence[SweptParameter], every: Sequence[SweepPoint]) -> Out
                 rows.append([filter_, *values, b.name, b.display_unit, *shown, one.runs])
     head = ["filter", *(v.key for v in vary), "block", "unit", *RmsBounds._fields, "runs"]
     first = problem_of(plan)
-    request = request_fields(plan.text, ())
     return Outcome(
         solution=_solution(plan, vary, blocks, figures),
         metrics={
@@ -241,12 +236,7 @@ def _outcome(vary: Sequence[SweptParameter], every: Sequence[SweepPoint]) -> Out
             f"{' and '.join(v.key for v in vary)}, the last first.",
             *first.notes,
         ],
-        scenario=plan.scenario,
-        seed=plan.seed,
-        runs=plan.runs,
-        machine=plan.machine,
-        parameters=request["parameters"],
-        device=jax.devices()[0].device_kind,
+        **fields_of(plan),
         last_lines=["Table:  {out}/sweep.csv   all points, with 95 % bounds"],
     )
 

@@ -20,6 +20,7 @@ from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.kalman import WRONG, Advanced, Filter, FilterState, Prediction, Updated
 from robins.filters.model import Data, Given, Motion, Sensor
+from robins.filters.trees import stack
 from robins.filters.values import Numbers, kind, value
 from robins.linalg.rows import each_row
 
@@ -54,8 +55,7 @@ class Alternative(Filter):
         require(len(self.spread) == n, f"spread of an alternative needs {n} numbers", self.spread)
         wide = linalg.tria(belief.factor, jnp.diag(jnp.asarray(self.spread)))
         begun = [self.inner.init(b, dims) for b in (belief, belief._replace(factor=wide))]
-        states = jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *begun)
-        return FilterState(belief, (states, jnp.zeros(()), jnp.zeros((), bool)))
+        return FilterState(belief, (stack(begun), jnp.zeros(()), jnp.zeros((), bool)))
 
     def _predict(self, state: FilterState, motion: Motion, u: Data) -> Advanced:
         def predicted(one: FilterState) -> tuple[FilterState, tuple[Belief, Array]]:

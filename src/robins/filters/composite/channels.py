@@ -266,9 +266,7 @@ def disagree(beliefs: Sequence[Belief], index: int, common: int | None) -> Array
     return found
 
 
-def conclude_prediction(
-    state: FilterState, moved: JoinedPrediction
-) -> tuple[FilterState, Prediction]:
+def conclude_prediction(state: FilterState, moved: JoinedPrediction) -> Advanced:
     """The end of the `predict` of a joined filter: taken by all members, or by none.
 
     A member that cannot take the step keeps its memory of that (`Rule.settle`).

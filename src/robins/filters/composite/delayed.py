@@ -21,9 +21,9 @@ from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo, is_failure
-from robins.filters.kalman import Around, Filter, FilterState, Prediction
+from robins.filters.kalman import Advanced, Around, Filter, FilterState, Updated
 from robins.filters.model import Data, Model, Motion, Sensor
-from robins.filters.trees import select
+from robins.filters.trees import repeated, row_of, select
 from robins.filters.values import kind, value
 
 T = TypeVar("T")
@@ -115,11 +115,11 @@ class Delayed(Around):
         size, extra = self.size, _numbers(self.aux)
         asked = jnp.zeros((size, len(self.names)), bool)
         past = _StepBuffer(
-            before=_rows(inner, size),
+            before=repeated(inner, size),
             moved=jnp.zeros(size, bool),
-            u=_rows(_numbers(self.u), size),
-            y={s.name: _rows(_unread(s, inner, extra[s.name]), size) for s in known.sensors},
-            aux=_rows(extra, size),
+            u=repeated(_numbers(self.u), size),
+            y={s.name: repeated(_unread(s, inner, extra[s.name]), size) for s in known.sensors},
+            aux=repeated(extra, size),
             asked=asked,
             known=asked,
             log_likelihood=jnp.zeros(asked.shape),
@@ -137,13 +137,11 @@ class Delayed(Around):
     # The filter itself knows whether its prediction was taken: what comes late can change that.
 
     @jax.jit
-    def predict(
-        self, state: FilterState, motion: Motion, u: Data = None
-    ) -> tuple[FilterState, Prediction]:
+    def predict(self, state: FilterState, motion: Motion, u: Data = None) -> Advanced:
         """Predict, and begin a row of the buffer."""
         held = state.memory
         _check_same("the motion", motion, held.model.motion)
-        _check_same("an input u", u, _row(held.past.u, 0))
+        _check_same("an input u", u, row_of(held.past.u, 0))
         inner, now = _inner(state), held.now + 1
         past = self.opened(held.past, now % self.size, inner, u)
         inner, prediction = self.inner.predict(inner, motion, u)
@@ -160,7 +158,7 @@ class Delayed(Around):
             moved=jnp.ones((), bool),
             u=_numbers(u),
             y=jax.tree_util.tree_map(lambda a: jnp.full(a.shape[1:], jnp.nan), past.y),
-            aux=_row(past.aux, at),
+            aux=row_of(past.aux, at),
             asked=none,
             known=none,
             log_likelihood=jnp.zeros(len(self.names)),
@@ -168,9 +166,7 @@ class Delayed(Around):
         return jax.tree_util.tree_map(lambda a, x: a.at[at].set(x), past, entry)
 
     @jax.jit
-    def update(
-        self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None
-    ) -> tuple[FilterState, StepInfo]:
+    def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None) -> Updated:
         """Enter a measurement in its step, and filter again from there."""
         held = state.memory
         which, known = self.recognised(held.model, sensor, aux)
@@ -220,7 +216,7 @@ class Delayed(Around):
         self, past: _StepBuffer, place: _Place, known: Model, inner: FilterState, info: StepInfo
     ) -> _RepeatedSteps:
         """The steps from that of the measurement on, filtered again where they must be."""
-        inner = select(place.again, _row(past.before, place.at), inner)
+        inner = select(place.again, row_of(past.before, place.at), inner)
         fine = (jnp.ones((), bool), jnp.asarray(int(Code.DONE)))
         return jax.lax.fori_loop(
             0,
@@ -235,7 +231,7 @@ class Delayed(Around):
         """The step that is i steps after that of the measurement."""
         inner, before, gained, own, taken, failed = done
         j = (place.at + i) % self.size
-        row = _row(past, j)
+        row = row_of(past, j)
         before = jax.tree_util.tree_map(lambda a, x: a.at[j].set(x), before, inner)
         moved, prediction = self.inner.predict(inner, known.motion, row.u)
         inner = select(row.moved, moved, inner)
@@ -347,14 +343,6 @@ def _numbers(tree: T) -> T:
 def _plain(tree: Data) -> Data:
     """The same with arrays for numbers of Python, which are of weak types."""
     return jax.tree_util.tree_map(lambda x: x if isinstance(x, jax.Array) else np.asarray(x), tree)
-
-
-def _row(tree: T, at: ArrayLike) -> T:
-    return jax.tree_util.tree_map(lambda a: a[at], tree)
-
-
-def _rows(tree: T, count: int) -> T:
-    return jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), tree)
 
 
 def _with(

@@ -45,14 +45,7 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo, is_failure
 from robins.filters.checks import sensor_names
-from robins.filters.kalman import (
-    Advanced,
-    Composite,
-    Filter,
-    FilterState,
-    Prediction,
-    Updated,
-)
+from robins.filters.kalman import Advanced, Composite, Filter, FilterState, Prediction, Updated
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.trees import select
 from robins.filters.values import Numbers, kind, number, value
@@ -129,16 +122,9 @@ class Guarded(Composite):
             raise ValueError(f"guarded: no sensor {unknown[0]!r}; this model has {sorted(dims)}")
         count = len(_members(self.groups, belief.factor.shape[0]))
         without = {name: m for name, m in dims.items() if name not in self.assumed}
-        watch = GuardMemory(
-            self.filter.init(belief, dims),
-            self.reference.init(belief, without),
-            jnp.zeros(count),
-            jnp.full(count, 0.0 if self.trusted else _SURE * SLACK),
-            jnp.zeros(count),
-            jnp.zeros(count),
-            jnp.zeros((), int),
-        )
-        return _given_out(watch)
+        states = self.filter.init(belief, dims), self.reference.init(belief, without)
+        none, excess = jnp.zeros(count), jnp.full(count, 0.0 if self.trusted else _SURE * SLACK)
+        return _given_out(GuardMemory(*states, none, excess, none, none, jnp.zeros((), int)))
 
     def taken_over(self, watch: GuardMemory) -> FilterState:
         """The filter gone on from what the reference believes.
@@ -229,12 +215,9 @@ class Guarded(Composite):
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
         watch: GuardMemory = state.memory
-        return _given_out(
-            watch._replace(
-                filter=self.filter.reset(watch.filter, belief),
-                reference=self.reference.reset(watch.reference, belief),
-            )
-        )
+        mine = self.filter.reset(watch.filter, belief)
+        other = self.reference.reset(watch.reference, belief)
+        return _given_out(watch._replace(filter=mine, reference=other))
 
 
 def guarded(

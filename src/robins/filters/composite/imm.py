@@ -29,7 +29,7 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.composite.mixture import innovation, log_normalised, matched
 from robins.filters.kalman import WRONG, Again, Filter, FilterState, Prediction
 from robins.filters.model import Data, Given, Motion, Sensor
-from robins.filters.trees import equal, select
+from robins.filters.trees import equal, row_of, select, stack
 from robins.filters.values import Numbers, is_known, kind, value
 from robins.linalg.rows import each_row
 
@@ -84,15 +84,15 @@ class SeparateModes:
             rows: pytrees with a leading axis of modes.
         """
         done = [
-            of(mode, state, *_at(rows, i))
+            of(mode, state, *row_of(rows, i))
             for i, (mode, state) in enumerate(zip(self.modes, states, strict=True))
         ]
         after, found, notes = zip(*done, strict=True)
-        return after, _stack(found), notes
+        return after, stack(found), notes
 
     def beliefs(self, states: Data) -> Belief:
         """Beliefs with a leading axis of modes."""
-        return _stack([s.belief for s in states])
+        return stack([s.belief for s in states])
 
     def state(self, states: Data, i: int) -> FilterState:
         """State of one mode."""
@@ -138,7 +138,7 @@ class ModeFamily:
 
     def mode(self, i: int) -> Mode:
         """Mode of row i."""
-        return self.of(_at(jax.tree_util.tree_map(np.asarray, self.numbers), i))
+        return self.of(row_of(jax.tree_util.tree_map(np.asarray, self.numbers), i))
 
     def every(self, of: Of, states: Data, *rows: Data) -> Every:
         """Step of all modes, as `SeparateModes.every`: one mode is traced for all; states have a
@@ -148,7 +148,7 @@ class ModeFamily:
         after, found, notes = each_row(
             lambda row, *part: of(self.of(row), *part), numbers, states, *rows
         )
-        return after, found, [_at(notes, i) for i in range(self.size)]
+        return after, found, [row_of(notes, i) for i in range(self.size)]
 
     def beliefs(self, states: Data) -> Belief:
         """Beliefs with a leading axis of modes."""
@@ -156,7 +156,7 @@ class ModeFamily:
 
     def state(self, states: Data, i: int) -> FilterState:
         """State of one mode."""
-        return _at(states, i)
+        return row_of(states, i)
 
     def exchanged(self, i: int, filter_: Filter) -> ModeFamily:
         """The modes with another filter in one of them, which differs in numbers only."""
@@ -167,14 +167,6 @@ class ModeFamily:
 
 def _as_mode(one: Filter | Mode) -> Mode:
     return one if isinstance(one, Mode) else Mode(one)
-
-
-def _at(tree: T, i: ArrayLike) -> T:
-    return jax.tree_util.tree_map(lambda a: a[i], tree)
-
-
-def _stack(trees: Sequence[T]) -> T:
-    return jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *trees)
 
 
 _ONE = 1e-9  # how far a sum of probabilities may be off
@@ -276,10 +268,10 @@ class Imm(Filter):
         self, seen: StepInfo, log_prior: Array, log_post: Array, used: Array
     ) -> StepInfo:
         """Information of the modes as one."""
-        info = _at(seen, 0) if self.modes.size == 1 else _seen(seen, log_prior, log_post, used)
+        info = row_of(seen, 0) if self.modes.size == 1 else _seen(seen, log_prior, log_post, used)
         if not self.likeliest:
             return info
-        one = _at(seen, jnp.argmax(log_post))
+        one = row_of(seen, jnp.argmax(log_post))
         return one._replace(gain=info.gain, log_likelihood=info.log_likelihood)
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
@@ -396,7 +388,7 @@ def _among(taken: Array, log_probability: Array) -> Array:
 def _mixture(beliefs: Belief, log_probability: Array) -> Belief:
     """Moments of all modes; those of one that is certain are its own, bit for bit."""
     likely = jnp.argmax(log_probability)
-    best = _at(beliefs, likely)
+    best = row_of(beliefs, likely)
     if len(log_probability) == 1:
         return best
     weight = jnp.exp(log_probability)
@@ -410,15 +402,5 @@ def _seen(seen: StepInfo, log_prior: Array, log_post: Array, used: Array) -> Ste
     used = used & ~lost
     expected = innovation(seen, jnp.exp(log_normalised(log_prior)[0]), used)
     code = seen.code[jnp.argmax(log_post)]
-    return StepInfo(
-        innovation=expected.mean,
-        expected=expected.expected,
-        factor=expected.factor,
-        gain=jnp.einsum("r,rnm->nm", jnp.exp(log_post), seen.gain),
-        used=used,
-        nis=jnp.where(code == int(Code.CONTRADICTED), jnp.inf, expected.nis),
-        dof=expected.dof,
-        log_likelihood=log_likelihood,
-        code=code,
-        notes={},
-    )
+    gain = jnp.einsum("r,rnm->nm", jnp.exp(log_post), seen.gain)
+    return expected.info(used, gain, code, code == int(Code.CONTRADICTED), log_likelihood)

@@ -98,6 +98,14 @@ class Innovation(NamedTuple):
     nis: Array
     dof: Array
 
+    def info(
+        self, used: Array, gain: Array, code: Array, wrong: Array, log_likelihood: Array
+    ) -> StepInfo:
+        """Information of an update by it, without notes; wrong: () bool, it is contradicted."""
+        nis = jnp.where(wrong, jnp.inf, self.nis)
+        innovation = self.mean, self.expected, self.factor
+        return StepInfo(*innovation, gain, used, nis, self.dof, log_likelihood, code, {})
+
 
 def innovation(seen: StepInfo, weight: Array, used: Array) -> Innovation:
     """Moments of the innovations of several filters (leading axis), weighted."""

@@ -32,10 +32,18 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo
 from robins.filters.composite.mixture import Innovation, innovation, log_normalised, matched
-from robins.filters.kalman import Filter, FilterState, Prediction, predicted_factor, updated
+from robins.filters.kalman import (
+    Advanced,
+    Filter,
+    FilterState,
+    Prediction,
+    Updated,
+    predicted_factor,
+    updated,
+)
 from robins.filters.linearise import Linearisation, taylor
 from robins.filters.model import Data, Motion, Sensor
-from robins.filters.trees import finite, select
+from robins.filters.trees import finite, repeated, row_of, select
 from robins.filters.values import Numbers, is_known, kind, number, value
 from robins.linalg.rows import each_row
 from robins.manifold import State
@@ -89,11 +97,9 @@ class Particle(Filter):
     def spread(self, belief: Belief, key: Array) -> FilterState:
         """A new cloud from a Gaussian belief."""
         key, now = _split(key, 1)
-        same = jax.tree_util.tree_map(
-            lambda x: jnp.broadcast_to(x, (self.count, *jnp.shape(x))), belief
-        )
         weight = jnp.full(self.count, self.even())
-        return FilterState(belief, ParticleCloud(self.drawn(now, *same), weight, key))
+        drawn = self.drawn(now, *repeated(belief, self.count))
+        return FilterState(belief, ParticleCloud(drawn, weight, key))
 
     def gaussian(self, cloud: ParticleCloud) -> Belief:
         """The cloud's moments."""
@@ -114,7 +120,7 @@ class Particle(Filter):
         weight = jnp.exp(cloud.log_weight)
         due = _effective(weight) < jnp.asarray(self.resample) * float(self.count)
         index = jnp.where(due, _systematic(choose, weight), jnp.arange(self.count))
-        particles = jax.tree_util.tree_map(lambda x: x[index], cloud.particles)
+        particles = row_of(cloud.particles, index)
         if self.moves:
             particles = select(due, self.jittered(particles, state.belief, jitter), particles)
         return particles, jnp.where(due, self.even(), cloud.log_weight)
@@ -134,9 +140,7 @@ class Particle(Filter):
         xi = jax.random.normal(key, (self.count, k))
         return particles._replace(mean=each_row(one, particles.mean, xi))
 
-    def _predict(
-        self, state: FilterState, motion: Motion, u: Data
-    ) -> tuple[FilterState, Prediction]:
+    def _predict(self, state: FilterState, motion: Motion, u: Data) -> Advanced:
         key, choose, jitter, draw = _split(state.memory.key, 3)
         before, log_weight = self.refreshed(state, choose, jitter)
 
@@ -154,9 +158,7 @@ class Particle(Filter):
         code = jnp.where(taken, int(Code.DONE), int(Code.NOT_FINITE))
         return new, Prediction(None, new.belief, code)
 
-    def _update(
-        self, state: FilterState, sensor: Sensor, y: Data, aux: Data
-    ) -> tuple[FilterState, StepInfo]:
+    def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data) -> Updated:
         before, log_prior, key = state.memory
 
         def one(b: Belief):
@@ -280,7 +282,7 @@ def _effective(weight: Array) -> Array:
 
 def _moments(cloud: ParticleCloud, k: int) -> Belief:
     """The cloud's Gaussian; the first k columns of its factors are zero."""
-    best = jax.tree_util.tree_map(lambda x: x[jnp.argmax(cloud.log_weight)], cloud.particles.mean)
+    best = row_of(cloud.particles.mean, jnp.argmax(cloud.log_weight))
     slim = cloud.particles._replace(factor=cloud.particles.factor[:, :, k:])
     return matched(slim, jnp.exp(cloud.log_weight), best)
 
@@ -312,18 +314,10 @@ def _update_info(
     best = jnp.argmax(cloud.log_weight)
     wrong = infos.code[best] == int(Code.CONTRADICTED)
     lost = ~jnp.isfinite(total)
-    return StepInfo(
-        innovation=expected.mean,
-        expected=expected.expected,
-        factor=expected.factor,
-        gain=jnp.where(used[None], gain, 0.0),
-        used=used,
-        nis=jnp.where(wrong, jnp.inf, expected.nis),
-        dof=expected.dof,
-        log_likelihood=total,
-        code=jnp.where(lost & ~wrong, int(Code.NOT_FINITE), infos.code[best]),
-        notes={"particle.ess": _effective(jnp.exp(cloud.log_weight))},
-    )
+    gain = jnp.where(used[None], gain, 0.0)
+    code = jnp.where(lost & ~wrong, int(Code.NOT_FINITE), infos.code[best])
+    info = expected.info(used, gain, code, wrong, total)
+    return info.noted("particle", ess=_effective(jnp.exp(cloud.log_weight)))
 
 
 def _gain(

@@ -95,15 +95,10 @@ def isotropic(plant: Plant) -> Isotropic:
     )
     for met, why in demands:
         require(met, f"no closed form: {why}")
-    return Isotropic(
-        size,
-        plant.A / size,
-        float(np.sqrt(sw2)),
-        float(np.sqrt(ss2)),
-        float(np.linalg.norm(plant.Bn, ord=2)) if plant.Bn.size else 0.0,
-        float(np.linalg.norm(plant.L, ord=2)),
-        float(np.linalg.norm(plant.L)),
-    )
+    b = float(np.linalg.norm(plant.Bn, ord=2)) if plant.Bn.size else 0.0
+    weight, whole = float(np.linalg.norm(plant.L, ord=2)), float(np.linalg.norm(plant.L))
+    sw, ss = float(np.sqrt(sw2)), float(np.sqrt(ss2))
+    return Isotropic(size, plant.A / size, sw, ss, b, weight, whole)
 
 
 def closed_form(plant: Plant, gamma: Number) -> Design:

@@ -107,15 +107,9 @@ def current_form(
     Dv = matrix("Dv", Dv)
     n, m = len(given.A), len(given.C)
     _require_shape("Dv", Dv, (m, Dv.shape[1]), f"C says that y has {m} components")
-    return Plant(
-        given.A,
-        np.hstack([given.Bw, np.zeros((n, Dv.shape[1]))]),
-        given.Bn,
-        given.C @ given.A,
-        np.hstack([given.C @ given.Bw, Dv]),
-        given.C @ given.Bn + given.Dn,
-        given.L,
-    )
+    Bw, Dw = np.hstack([given.Bw, np.zeros((n, Dv.shape[1]))]), np.hstack([given.C @ given.Bw, Dv])
+    C, Dn = given.C @ given.A, given.C @ given.Bn + given.Dn
+    return given._replace(Bw=Bw, C=C, Dw=Dw, Dn=Dn)
 
 
 def error_system(plant: Plant, K: Matrix) -> ErrorSystem:

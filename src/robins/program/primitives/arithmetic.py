@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from robins.program.kinds import Equation, kind_of
 from robins.program.nodes import Node
 from robins.program.refusal import ProgramError
-from robins.program.walk import RULES, JaxprWriter, Nodes, rule
+from robins.program.walk import JaxprWriter, Nodes, rule
 
 # Primitives that are one operation of `OPERATIONS`, by their names in JAX.
 SAME = {
@@ -24,34 +26,24 @@ SAME = {
 }
 
 
-def _same(op: str):
-    def of(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> Nodes:
-        return walk.apply(op, *arrays)
-
-    return of
+@rule(*SAME)
+def _same(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> Nodes:
+    return walk.apply(SAME[equation.primitive.name], *arrays)
 
 
-RULES.update({name: _same(op) for name, op in SAME.items()})
+# Primitives that are a few operations.
+COMPOSED: dict[str, Callable[..., Nodes]] = {
+    "gt": lambda walk, a, b: walk.apply("lt", b, a),
+    "ge": lambda walk, a, b: walk.apply("le", b, a),
+    "square": lambda walk, a: walk.apply("mul", a, a),
+    "rsqrt": lambda walk, a: walk.apply("div", walk.constants(1.0), walk.apply("sqrt", a)),
+    "clamp": lambda walk, low, a, high: walk.apply("min", walk.apply("max", a, low), high),
+}
 
 
-@rule("gt")
-def _gt(walk: JaxprWriter, equation: Equation, a: Nodes, b: Nodes) -> Nodes:
-    return walk.apply("lt", b, a)
-
-
-@rule("ge")
-def _ge(walk: JaxprWriter, equation: Equation, a: Nodes, b: Nodes) -> Nodes:
-    return walk.apply("le", b, a)
-
-
-@rule("square")
-def _square(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
-    return walk.apply("mul", a, a)
-
-
-@rule("rsqrt")
-def _rsqrt(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
-    return walk.apply("div", walk.constants(1.0), walk.apply("sqrt", a))
+@rule(*COMPOSED)
+def _composed(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> Nodes:
+    return COMPOSED[equation.primitive.name](walk, *arrays)
 
 
 @rule("logistic")
@@ -80,11 +72,6 @@ def _integer_pow(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
 def _round(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     to_even = equation.params["rounding_method"].name == "TO_NEAREST_EVEN"
     return walk.apply("round_even" if to_even else "round_away", a)
-
-
-@rule("clamp")
-def _clamp(walk: JaxprWriter, equation: Equation, low: Nodes, a: Nodes, high: Nodes) -> Nodes:
-    return walk.apply("min", walk.apply("max", a, low), high)
 
 
 @rule("select_n")

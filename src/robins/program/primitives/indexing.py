@@ -7,8 +7,8 @@ it may be: few are chains of selects, many an array of C with an index.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, SupportsIndex
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from robins.program.nodes import Node
 from robins.program.walk import JaxprWriter, Nodes, rule
 
 SIZES = tuple[int, ...]
+# Axes of an array in which index vectors lie, and those of its batches with those of the indices.
+Axes = tuple[Sequence[Any], Sequence[Any], Sequence[Any]]
 
 
 def _clamped(walk: JaxprWriter, index: Node, most: int) -> Node:
@@ -100,15 +102,10 @@ def _drops(equation: Equation) -> bool:
 
 
 def _starts(
-    walk: JaxprWriter,
-    indices: Nodes,
-    batch: tuple[int, ...],
-    rank: int,
-    axes: Sequence[SupportsIndex],
-    along: Sequence[SupportsIndex],
-    by: Sequence[SupportsIndex],
+    walk: JaxprWriter, indices: Nodes, batch: tuple[int, ...], rank: int, of: Axes
 ) -> list[Node]:
     """Start of the window of one index vector, in all axes of the array."""
+    axes, along, by = of
     start = [walk.graph.constant(0, "whole")] * rank
     for k, axis in enumerate(axes):
         start[axis] = walk.graph.convert(indices[(*batch, k)].item(), "whole")
@@ -118,17 +115,13 @@ def _starts(
 
 
 def _windows(
-    shape: SIZES,
-    sizes: SIZES,
-    indices: np.ndarray,
-    axes: Iterable[Any],
-    along: Sequence[SupportsIndex],
-    by: Sequence[SupportsIndex],
+    shape: SIZES, sizes: SIZES, indices: np.ndarray, of: Axes
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places of the entries of windows (batch..., *sizes) in an array, for indices that are known.
 
     Windows are moved inside; also, which (batch...) lay inside before.
     """
+    axes, along, by = of
     start = np.zeros((*indices.shape[:-1], len(shape)), np.int64)
     start[..., list(axes)] = indices
     for axis, dim in zip(along, by, strict=True):
@@ -146,10 +139,8 @@ def gathered(equation: Equation, indices: np.ndarray, places: np.ndarray) -> np.
     """Places that a gather takes at indices that are known; -1 is what it gives outside."""
     p, d = equation.params, equation.params["dimension_numbers"]
     sizes = tuple(int(n) for n in p["slice_sizes"])
-    found, inside = _windows(
-        *(places.shape, sizes, indices, d.start_index_map),
-        *(d.operand_batching_dims, d.start_indices_batching_dims),
-    )
+    axes = d.start_index_map, d.operand_batching_dims, d.start_indices_batching_dims
+    found, inside = _windows(places.shape, sizes, indices, axes)
     if _drops(equation):
         found = np.where(inside.reshape(*inside.shape, *[1] * len(sizes)), found, -1)
     gone = {*d.collapsed_slice_dims, *d.operand_batching_dims}
@@ -160,20 +151,24 @@ def gathered(equation: Equation, indices: np.ndarray, places: np.ndarray) -> np.
     return np.moveaxis(found, range(found.ndim), [*others, *offsets])
 
 
-def scattered(
-    equation: Equation, indices: np.ndarray, places: np.ndarray, new: np.ndarray
-) -> np.ndarray:
-    """Places of an array, those of what is scattered into it at indices that are known put in."""
+def _updates(equation: Equation, rank: int, new: Nodes) -> tuple[Nodes, SIZES, Axes]:
+    """Numbers to be scattered, window axes last; the sizes of a window, and its axes."""
     d = equation.params["dimension_numbers"]
     windows = [int(k) for k in d.update_window_dims]
     rows = new.transpose([*(k for k in range(new.ndim) if k not in windows), *windows])
     gone = {*d.inserted_window_dims, *d.operand_batching_dims}
     kept = iter(new.shape[k] for k in windows)
-    sizes = tuple(1 if axis in gone else next(kept) for axis in range(places.ndim))
-    at, inside = _windows(
-        *(places.shape, sizes, indices, d.scatter_dims_to_operand_dims),
-        *(d.operand_batching_dims, d.scatter_indices_batching_dims),
-    )
+    sizes = tuple(1 if axis in gone else next(kept) for axis in range(rank))
+    axes = d.scatter_dims_to_operand_dims, d.operand_batching_dims, d.scatter_indices_batching_dims
+    return rows, sizes, axes
+
+
+def scattered(
+    equation: Equation, indices: np.ndarray, places: np.ndarray, new: np.ndarray
+) -> np.ndarray:
+    """Places of an array, those of what is scattered into it at indices that are known put in."""
+    rows, sizes, axes = _updates(equation, places.ndim, new)
+    at, inside = _windows(places.shape, sizes, indices, axes)
     rows = rows.reshape(at.shape)
     if _drops(equation):
         at, rows = at[inside], rows[inside]
@@ -195,11 +190,9 @@ def _gather(walk: JaxprWriter, equation: Equation, a: Nodes, indices: Nodes) -> 
     batches = indices.shape[:-1]
     found = np.zeros((*batches, *kept), dtype=np.int64)
     outside = walk.constants(filling(equation)).item()
+    axes = d.start_index_map, d.operand_batching_dims, d.start_indices_batching_dims
     for batch in np.ndindex(*batches):
-        start = _starts(
-            *(walk, indices, batch, a.ndim, d.start_index_map),
-            *(d.operand_batching_dims, d.start_indices_batching_dims),
-        )
+        start = _starts(walk, indices, batch, a.ndim, axes)
         one = window(walk, a, start, sizes).reshape(kept)
         if _drops(equation):
             inside = _inside(walk, start, a.shape, sizes)
@@ -234,19 +227,11 @@ JOINED = {
 
 @rule(*JOINED)
 def _scatter(walk: JaxprWriter, equation: Equation, a: Nodes, indices: Nodes, new: Nodes) -> Nodes:
-    d, join = equation.params["dimension_numbers"], JOINED[equation.primitive.name]
-    windows = [int(k) for k in d.update_window_dims]
-    others = [k for k in range(new.ndim) if k not in windows]
-    rows = new.transpose([*others, *windows])
-    kept = iter(new.shape[k] for k in windows)
-    gone = {*d.inserted_window_dims, *d.operand_batching_dims}
-    sizes = tuple(1 if axis in gone else next(kept) for axis in range(a.ndim))
+    join = JOINED[equation.primitive.name]
+    rows, sizes, axes = _updates(equation, a.ndim, new)
     out = a.copy()
     for batch in np.ndindex(*indices.shape[:-1]):
-        start = _starts(
-            *(walk, indices, batch, a.ndim, d.scatter_dims_to_operand_dims),
-            *(d.operand_batching_dims, d.scatter_indices_batching_dims),
-        )
+        start = _starts(walk, indices, batch, a.ndim, axes)
         if not _drops(equation):
             most = [n - size for n, size in zip(a.shape, sizes, strict=True)]
             start = [_clamped(walk, s, m) for s, m in zip(start, most, strict=True)]

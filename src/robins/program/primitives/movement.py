@@ -2,10 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from robins.program.kinds import Equation
 from robins.program.walk import JaxprWriter, Nodes, rule
+
+# Primitives that are one function of NumPy, of their parameters and arrays.
+OF_NUMPY: dict[str, Callable[..., Nodes]] = {
+    "reshape": lambda p, a: a.reshape(p["new_sizes"]),
+    "transpose": lambda p, a: a.transpose(p["permutation"]),
+    "squeeze": lambda p, a: a.squeeze(tuple(p["dimensions"])),
+    "expand_dims": lambda p, a: np.expand_dims(a, tuple(p["dimensions"])),
+    "concatenate": lambda p, *arrays: np.concatenate(arrays, axis=p["dimension"]),
+    "stack": lambda p, *arrays: np.stack(arrays, axis=p["axis"]),
+    "tile": lambda p, a: np.tile(a, p["reps"]),
+    "rev": lambda p, a: np.flip(a, tuple(p["dimensions"])),
+}
+
+
+@rule(*OF_NUMPY)
+def _moved(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> Nodes:
+    return OF_NUMPY[equation.primitive.name](equation.params, *arrays)
 
 
 @rule("broadcast_in_dim")
@@ -18,46 +37,11 @@ def _broadcast(walk: JaxprWriter, equation: Equation, a: Nodes, *dynamic: Nodes)
     return np.broadcast_to(a.reshape(wide), shape)
 
 
-@rule("reshape")
-def _reshape(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
-    return a.reshape(equation.params["new_sizes"])
-
-
-@rule("transpose")
-def _transpose(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
-    return a.transpose(equation.params["permutation"])
-
-
-@rule("squeeze")
-def _squeeze(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
-    return a.squeeze(tuple(equation.params["dimensions"]))
-
-
-@rule("expand_dims")
-def _expand(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
-    return np.expand_dims(a, tuple(equation.params["dimensions"]))
-
-
 @rule("slice")
 def _slice(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
     p = equation.params
     strides = p["strides"] or (1,) * a.ndim
     return a[tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]
-
-
-@rule("concatenate")
-def _concatenate(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> Nodes:
-    return np.concatenate(arrays, axis=equation.params["dimension"])
-
-
-@rule("stack")
-def _stack(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> Nodes:
-    return np.stack(arrays, axis=equation.params["axis"])
-
-
-@rule("tile")
-def _tile(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
-    return np.tile(a, equation.params["reps"])
 
 
 @rule("split", "unstack")
@@ -66,11 +50,6 @@ def _split(walk: JaxprWriter, equation: Equation, a: Nodes) -> list[Nodes]:
         return [np.asarray(row) for row in np.moveaxis(a, equation.params["axis"], 0)]
     ends = np.cumsum(equation.params["sizes"])[:-1]
     return np.split(a, ends, axis=equation.params["axis"])
-
-
-@rule("rev")
-def _rev(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
-    return np.flip(a, tuple(equation.params["dimensions"]))
 
 
 @rule("iota")

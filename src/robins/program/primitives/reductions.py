@@ -8,7 +8,7 @@ import numpy as np
 
 from robins.program.kinds import Equation, kind_of
 from robins.program.nodes import Node
-from robins.program.walk import RULES, JaxprWriter, Nodes, rule
+from robins.program.walk import JaxprWriter, Nodes, rule
 
 REDUCED = {
     "reduce_sum": ("add", 0),
@@ -58,33 +58,26 @@ def _finite(walk: JaxprWriter, row: list[Node]) -> list[Node]:
     return [one, *(n for n in row if graph.op[n] != "is_finite")]
 
 
-def _reduced(op: str, number: float | int):
-    def of(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
-        kind = kind_of(equation.invars[0].aval.dtype)
-        return fold(walk, op, number, a, tuple(map(int, equation.params["axes"])), kind)
+@rule(*REDUCED)
+def _reduced(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
+    op, number = REDUCED[equation.primitive.name]
+    kind = kind_of(equation.invars[0].aval.dtype)
+    return fold(walk, op, number, a, tuple(map(int, equation.params["axes"])), kind)
 
-    return of
-
-
-RULES.update({name: _reduced(*row) for name, row in REDUCED.items()})
 
 CUMULATED = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
 
 
-def _cumulated(op: str):
-    def of(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
-        axis, back = equation.params["axis"], equation.params["reverse"]
-        rows = np.moveaxis(np.flip(a, axis) if back else a, axis, 0)
-        out = [np.asarray(row) for row in rows]
-        for k in range(1, len(out)):
-            out[k] = walk.apply(op, out[k - 1], out[k])
-        found = np.moveaxis(np.stack(out), 0, axis) if out else a
-        return np.flip(found, axis) if back else found
-
-    return of
-
-
-RULES.update({name: _cumulated(op) for name, op in CUMULATED.items()})
+@rule(*CUMULATED)
+def _cumulated(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
+    op, axis = CUMULATED[equation.primitive.name], equation.params["axis"]
+    back = equation.params["reverse"]
+    rows = np.moveaxis(np.flip(a, axis) if back else a, axis, 0)
+    out = [np.asarray(row) for row in rows]
+    for k in range(1, len(out)):
+        out[k] = walk.apply(op, out[k - 1], out[k])
+    found = np.moveaxis(np.stack(out), 0, axis) if out else a
+    return np.flip(found, axis) if back else found
 
 
 @rule("argmax", "argmin")
