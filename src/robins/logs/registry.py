@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from robins.dataset import Dataset
 from robins.errors import require_kind
@@ -59,128 +59,65 @@ def _of_text(row: TextFormat) -> Format:
     return Format(row.name, row.kinds, row.about, row.recognise, partial(read_text, row), text=row)
 
 
+def _own(name: str, holds: str, recognise: Callable, read: Callable, **how: Any):
+    """A row of a format with a reader of its own, most of them binary; then a line for people."""
+    how = {"binary": True} | how
+    return lambda about: Format(name, tuple(holds.split()), about, recognise, read, **how)
+
+
 def _begins(magic: bytes) -> Callable[[Head], bool]:
     return lambda head: head.start.startswith(magic)
 
 
 FORMATS: tuple[Format, ...] = (
     *map(_of_text, TEXT_FORMATS),
-    Format(
-        "rtklib-pos",
-        ("gnss",),
-        "RTKLIB: .pos with latitude, longitude, height in degrees; GPST or UTC",
-        rtklib.is_rtklib,
-        rtklib.read_rtklib,
+    _own("rtklib-pos", "gnss", rtklib.is_rtklib, rtklib.read_rtklib, binary=False)(
+        "RTKLIB: .pos with latitude, longitude, height in degrees; GPST or UTC"
     ),
-    Format(
-        "kitti-odometry",
-        ("trajectory",),
-        "KITTI odometry: 12 numbers a line, times.txt beside it",
-        paths.is_kitti,
-        paths.read_kitti,
+    _own("kitti-odometry", "trajectory", paths.is_kitti, paths.read_kitti, binary=False)(
+        "KITTI odometry: 12 numbers a line, times.txt beside it"
     ),
-    Format(
-        "novatel-inspva",
-        ("trajectory",),
-        "NovAtel: INSPVAA and INSPVASA in ASCII, each line against its checksum",
-        paths.is_inspva,
-        paths.read_inspva,
+    _own("novatel-inspva", "trajectory", paths.is_inspva, paths.read_inspva, binary=False)(
+        "NovAtel: INSPVAA and INSPVASA in ASCII, each line against its checksum"
     ),
-    Format(
-        "phone-csv",
-        ("imu", "mag", "gnss"),
-        "phones, as strapdown-rs keeps their drives: CSV, UTC dates, Android's axes",
-        phone.is_phone,
-        phone.read_phone,
+    _own("phone-csv", "imu mag gnss", phone.is_phone, phone.read_phone, binary=False)(
+        "phones, as strapdown-rs keeps their drives: CSV, UTC dates, Android's axes"
     ),
-    Format(
-        "broad-npz",
-        ("imu", "mag", "attitude"),
-        "BROAD, the orientation benchmark of Laidig et al. (2021): .mat, .hdf5, .npz",
-        broad.is_broad,
-        broad.read_broad,
-        binary=True,
+    _own("broad-npz", "imu mag attitude", broad.is_broad, broad.read_broad)(
+        "BROAD, the orientation benchmark of Laidig et al. (2021): .mat, .hdf5, .npz"
     ),
-    Format(
-        "sbet",
-        ("trajectory",),
-        "Applanix POSPac: SBET, 17 doubles a record",
-        paths.is_sbet,
-        paths.read_sbet,
-        binary=True,
+    _own("sbet", "trajectory", paths.is_sbet, paths.read_sbet)(
+        "Applanix POSPac: SBET, 17 doubles a record"
     ),
-    Format(
+    _own(
         "arrays",
-        ("imu",),
-        "npy, npz, MATLAB, HDF5, Parquet ('robins[parquet]'): arrays named as columns of text",
+        "imu",
         lambda head: bool(kind_of_archive(head.start)) and not broad.is_broad(head),
         lambda path, findings=None: _of_names(path)(path, findings),
-        binary=True,
+    )("npy, npz, MATLAB, HDF5, Parquet ('robins[parquet]'): arrays named as columns of text"),
+    _own("px4-ulog", "imu mag gnss", _begins(ulog.MAGIC), ulog.read_ulog)(
+        "PX4: .ulg; needs the extra, pip install 'robins[logs]'"
     ),
-    Format(
-        "px4-ulog",
-        ("imu", "mag", "gnss"),
-        "PX4: .ulg; needs the extra, pip install 'robins[logs]'",
-        _begins(ulog.MAGIC),
-        ulog.read_ulog,
-        binary=True,
+    _own(
+        "ros-mcap", "imu mag gnss", _begins(ros_files.MCAP), rosbag.read_rosbag, write=write_rosbag
+    )("ROS 2: .mcap with Imu, MagneticField, NavSatFix; needs the extra 'robins[logs]'"),
+    _own("ros-db3", "imu mag gnss", _begins(ros_files.SQLITE), rosbag.read_rosbag)(
+        "ROS 2: .db3 with Imu, MagneticField, NavSatFix, or the folder of a recording"
     ),
-    Format(
-        "ros-mcap",
-        ("imu", "mag", "gnss"),
-        "ROS 2: .mcap with Imu, MagneticField, NavSatFix; needs the extra 'robins[logs]'",
-        _begins(ros_files.MCAP),
-        rosbag.read_rosbag,
-        binary=True,
-        write=write_rosbag,
+    _own("ros-bag", "imu mag gnss", _begins(ros_files.BAG), rosbag.read_rosbag)(
+        "ROS 1: .bag with Imu, MagneticField, NavSatFix; needs the extra 'robins[logs]'"
     ),
-    Format(
-        "ros-db3",
-        ("imu", "mag", "gnss"),
-        "ROS 2: .db3 with Imu, MagneticField, NavSatFix, or the folder of a recording",
-        _begins(ros_files.SQLITE),
-        rosbag.read_rosbag,
-        binary=True,
+    _own("ubx", "imu gnss", ubx.is_ubx, ubx.read_ubx)(
+        "u-blox: .ubx with NAV-PVT, and ESF-MEAS of receivers with inertial sensors"
     ),
-    Format(
-        "ros-bag",
-        ("imu", "mag", "gnss"),
-        "ROS 1: .bag with Imu, MagneticField, NavSatFix; needs the extra 'robins[logs]'",
-        _begins(ros_files.BAG),
-        rosbag.read_rosbag,
-        binary=True,
+    _own("nmea", "gnss", lambda head: nmea.is_nmea(head) and not ubx.is_ubx(head), nmea.read_nmea)(
+        "NMEA 0183: sentences GGA, GNS, RMC, VTG, GST, ZDA of any receiver"
     ),
-    Format(
-        "ubx",
-        ("imu", "gnss"),
-        "u-blox: .ubx with NAV-PVT, and ESF-MEAS of receivers with inertial sensors",
-        ubx.is_ubx,
-        ubx.read_ubx,
-        binary=True,
+    _own("ardupilot-bin", "imu mag gnss", _begins(dataflash.MAGIC), dataflash.read_dataflash)(
+        "ArduPilot: dataflash .BIN with IMU, MAG, GPS, GPA"
     ),
-    Format(
-        "nmea",
-        ("gnss",),
-        "NMEA 0183: sentences GGA, GNS, RMC, VTG, GST, ZDA of any receiver",
-        lambda head: nmea.is_nmea(head) and not ubx.is_ubx(head),
-        nmea.read_nmea,
-        binary=True,
-    ),
-    Format(
-        "ardupilot-bin",
-        ("imu", "mag", "gnss"),
-        "ArduPilot: dataflash .BIN with IMU, MAG, GPS, GPA",
-        _begins(dataflash.MAGIC),
-        dataflash.read_dataflash,
-        binary=True,
-    ),
-    Format(
-        "mavlink-tlog",
-        ("imu", "mag", "gnss"),
-        "MAVLink: .tlog of a ground station; needs the extra 'robins[logs]'",
-        tlog.is_tlog,
-        tlog.read_tlog,
-        binary=True,
+    _own("mavlink-tlog", "imu mag gnss", tlog.is_tlog, tlog.read_tlog)(
+        "MAVLink: .tlog of a ground station; needs the extra 'robins[logs]'"
     ),
 )
 """All of them."""
