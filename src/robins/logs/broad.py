@@ -21,7 +21,7 @@ import numpy as np
 
 from robins.dataset import AttitudeTable, Dataset, ImuTable, MagTable
 from robins.logs.archives import arrays_in, kind_of_archive, names_in
-from robins.logs.findings import Finding, LogError, refused
+from robins.logs.findings import AnyPath, Findings, LogError, refused
 from robins.logs.tables import unit_quaternions
 from robins.logs.text import Head
 from robins.logs.text_format import RATES_HZ
@@ -42,7 +42,7 @@ def is_broad(head: Head) -> bool:
     return bool(names_in(head.file, os.stat(head.file).st_mtime_ns) & set(_COLUMNS))
 
 
-def read_broad(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
+def read_broad(path: AnyPath, findings: Findings = None) -> Dataset:
     """Read a trial: inertial samples, magnetic field and true attitude, all along sensor axes.
 
     Args:

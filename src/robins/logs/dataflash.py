@@ -13,7 +13,6 @@ Source: ArduPilot, libraries/AP_Logger/README.md.
 
 from __future__ import annotations
 
-import os
 import re
 import struct
 from pathlib import Path
@@ -22,7 +21,8 @@ import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.logs.findings import (
-    Finding,
+    AnyPath,
+    Findings,
     LogError,
     damaged,
     finding_reporter,
@@ -51,7 +51,7 @@ _LAST_WEEK = 6000  # in 2095
 _FIX = 2  # least status of a fix
 
 
-def read_dataflash(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
+def read_dataflash(path: AnyPath, findings: Findings = None) -> Dataset:
     """Read inertial samples, and field and fixes where they were logged.
 
     Args:
@@ -89,7 +89,7 @@ def read_dataflash(path: str | os.PathLike[str], findings: list[Finding] | None 
     )
 
 
-def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[str, UlogTopic]:
+def _topics(file: str, data: Bytes, findings: Findings) -> dict[str, UlogTopic]:
     """The wanted messages; bytes that belong to none are counted.
 
     Raises:
@@ -164,7 +164,7 @@ def _definition(file: str, data: Bytes, at: int) -> tuple[int, int, str, np.dtyp
 
 
 def _instance(
-    file: str, topics: dict[str, UlogTopic], name: str, findings: list[Finding] | None
+    file: str, topics: dict[str, UlogTopic], name: str, findings: Findings
 ) -> UlogTopic | None:
     """The rows of the lowest instance; of GPS the lowest that had fixes, of GPA the same one."""
     topic, gps = topics.get(name), topics.get("GPS")
@@ -186,7 +186,7 @@ def _instance(
 
 
 def _fixes(
-    file: str, gps: UlogTopic, gpa: UlogTopic | None, findings: list[Finding] | None
+    file: str, gps: UlogTopic, gpa: UlogTopic | None, findings: Findings
 ) -> tuple[GnssTable, np.ndarray]:
     """Fixes that have a GPS time, and when each was logged."""
     week, ms = column(file, gps, "GWk"), column(file, gps, "GMS")

@@ -30,7 +30,7 @@ from typing import Any
 
 from robins.foreign import decoding
 from robins.logs.archives import head_of
-from robins.logs.findings import LogError, refused
+from robins.logs.findings import AnyPath, LogError, refused
 from robins.logs.quantities import QUANTITIES
 from robins.logs.registry import format_named, matching_formats
 from robins.logs.text import Head
@@ -40,7 +40,7 @@ from robins.units import KINDS, UnitError, parse
 NAMED = "format:"
 """What the name of a format begins with where files with declarations are given."""
 
-Paths = Iterable[str | os.PathLike[str]]
+Paths = Iterable[AnyPath]
 Types = dict[str, tuple[type, ...]]
 _KEYS: Types = {"columns": (dict,), "separator": (str,), "skip": (int,)}
 _KEYS |= {"body": (str,), "nav": (str,), "rate": (str,), "decimal": (str,)}
@@ -51,7 +51,7 @@ _MANY = re.compile(r"([-+]?\d+\.?\d*(?:[eE][-+]?\d+)?) (.+)")
 _WORDS = {dict: "a table", str: "text", int: "a whole number", float: "a number"}
 
 
-def columns_from(path: str | os.PathLike[str]) -> TextFormat:
+def columns_from(path: AnyPath) -> TextFormat:
     """Read a format from a TOML file.
 
     Raises:
@@ -180,7 +180,7 @@ def formats_of(files: Paths, columns: Paths) -> dict[str, str | TextFormat]:
     return out
 
 
-def _head(path: str | os.PathLike[str]) -> Head | None:
+def _head(path: AnyPath) -> Head | None:
     """Beginning of a text file; one of another kind cannot be in a declared format."""
     try:
         return head_of(path)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from robins.dataset import GnssTable
-from robins.logs.findings import Finding, report
+from robins.logs.findings import Finding, Findings, report
 
 PX4 = {6: 1, 5: 2, 4: 4, 3: 5, 2: 5}
 """Type of a fix in PX4 -> kind; less is no fix, 2 has no height, and 8 is extrapolated: none."""
@@ -37,7 +37,7 @@ def fixes(
     sigma_v: np.ndarray,
     kind: np.ndarray,
     flat: np.ndarray,
-    findings: list[Finding] | None,
+    findings: Findings,
 ) -> GnssTable:
     """Fixes of a receiver: NaN where it had none, and the usual sigmas where it stated none.
 
@@ -79,9 +79,7 @@ def over_ground(
     return np.stack([north, east, np.broadcast_to(down, north.shape)], axis=-1)
 
 
-def with_usual_sigmas(
-    table: GnssTable, findings: list[Finding] | None, places: bool = True
-) -> GnssTable:
+def with_usual_sigmas(table: GnssTable, findings: Findings, places: bool = True) -> GnssTable:
     """The same fixes, with the usual sigmas of their kind where none is stated, and a note.
 
     The table marks which these are (``assumed_m``, ``assumed_v``), beside those marked before.

@@ -14,7 +14,6 @@ Axes of phones are those of Android: right, forward, up of one that lies flat.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -25,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.gps_time import gps_of
-from robins.logs.findings import Finding, LogError, finding_reporter, refused
+from robins.logs.findings import AnyPath, Findings, LogError, finding_reporter, refused
 from robins.logs.fix_kinds import with_usual_sigmas
 from robins.logs.merging import interpolated
 from robins.logs.mounting import Origin
@@ -39,7 +38,6 @@ from robins.logs.text_formats import TEXT_FORMATS
 from robins.logs.timebase import dates_to_ns, stamps_to_ns
 from robins.units import to_si
 
-Findings = list[Finding] | None
 _XYZ = ("x", "y", "z")
 _TRUTH = "state_groundtruth_estimate0/data.csv"
 _ROWS = {row.name: row for row in TEXT_FORMATS}
@@ -50,7 +48,7 @@ _SEPARATORS = (",", ";", "\t")
 
 
 def read_folder(
-    path: str | os.PathLike[str], findings: Findings = None, origin: Origin | None = None
+    path: AnyPath, findings: Findings = None, origin: Origin | None = None
 ) -> Table | Dataset:
     """Read a folder that is a recording.
 

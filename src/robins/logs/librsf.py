@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from robins.dataset import Finding, OdometryTable, PlaceTable, RangeLog, RangeTable
-from robins.logs.findings import LogError, make_finding, refused
+from robins.dataset import OdometryTable, PlaceTable, RangeLog, RangeTable
+from robins.logs.findings import AnyPath, Findings, LogError, make_finding, refused
 from robins.logs.opening import Source
 from robins.logs.timebase import stamps_to_ns
 
@@ -38,7 +38,7 @@ class _Lines:
         self.rows: list[int] = []
 
 
-def _lines_of(path: str | os.PathLike[str]) -> tuple[dict[str, _Lines], dict[str, int]]:
+def _lines_of(path: AnyPath) -> tuple[dict[str, _Lines], dict[str, int]]:
     """Lines of a file by kind, and counts of lines of other kinds."""
     file, kinds, others = str(path), {name: _Lines() for name in WIDTH}, {}
     data = b"".join(Source(path))
@@ -119,7 +119,7 @@ def _odometry(file: str, lines: _Lines) -> OdometryTable:
 
 
 def read_librsf(
-    path: str | os.PathLike[str], findings: list[Finding] | None = None
+    path: AnyPath, findings: Findings = None
 ) -> dict[str, RangeTable | OdometryTable | PlaceTable]:
     """Read a file of libRSF.
 
@@ -173,9 +173,7 @@ def read_librsf(
     return out
 
 
-def load_ranges(
-    paths: Iterable[str | os.PathLike[str]], findings: list[Finding] | None = None
-) -> RangeLog:
+def load_ranges(paths: Iterable[AnyPath], findings: Findings = None) -> RangeLog:
     """Read pseudoranges and odometry of a drive, and its true places where a file has them.
 
     Raises:

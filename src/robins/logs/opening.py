@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from robins.foreign import FREE, decoding, within
-from robins.logs.findings import Finding, LogError, finding_reporter
+from robins.logs.findings import AnyPath, Findings, LogError, finding_reporter
 
 Bytes: TypeAlias = bytes | mmap.mmap
 _BLOCK, _ABOUT, _LARGEST = 1 << 20, 1 << 22, 1 << 30
@@ -106,7 +106,7 @@ class _Gunzip:
         return self._inner.unused_data
 
 
-def parts_of(path: str | os.PathLike[str]) -> list[Path]:
+def parts_of(path: AnyPath) -> list[Path]:
     """Files of a recording in their order: the file itself, or those of a folder of ROS.
 
     A folder names them in its ``metadata.yaml``, or holds one file, or files numbered _0, _1, ...
@@ -145,7 +145,7 @@ class Source:
             that holds no text.
     """
 
-    def __init__(self, path: str | os.PathLike[str], binary: bool = False):
+    def __init__(self, path: AnyPath, binary: bool = False):
         self.path = parts_of(path)[0]
         self.binary = binary
         self.cut = False
@@ -213,7 +213,7 @@ class Source:
         )
 
 
-def read_beginning(path: str | os.PathLike[str], size: int = 256) -> bytes:
+def read_beginning(path: AnyPath, size: int = 256) -> bytes:
     """The first bytes of a file, decompressed.
 
     Raises:
@@ -227,7 +227,7 @@ def read_beginning(path: str | os.PathLike[str], size: int = 256) -> bytes:
     return start[:size]
 
 
-def map_file(path: str | os.PathLike[str], findings: list[Finding] | None) -> Bytes:
+def map_file(path: AnyPath, findings: Findings) -> Bytes:
     """All bytes of a file; a compressed stream that ended early is reported.
 
     A plain file is mapped, so that it may be larger than memory; a compressed one is unpacked.
@@ -248,7 +248,7 @@ def map_file(path: str | os.PathLike[str], findings: list[Finding] | None) -> By
         return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if file.tell() else b""
 
 
-def read_whole(path: str | os.PathLike[str], limit: int) -> tuple[bytes, bool]:
+def read_whole(path: AnyPath, limit: int) -> tuple[bytes, bool]:
     """All bytes of a file, decompressed, and whether a compressed stream ended early.
 
     Raises:
@@ -267,7 +267,7 @@ def read_whole(path: str | os.PathLike[str], limit: int) -> tuple[bytes, bool]:
 _OPENERS: dict[str, Any] = {".xz": lzma.open, ".gz": gzip.open}
 
 
-def write_lines(path: str | os.PathLike[str], blocks: Iterable[str | bytes]) -> None:
+def write_lines(path: AnyPath, blocks: Iterable[str | bytes]) -> None:
     """Write text or bytes, compressed if the name ends in .xz or .gz.
 
     An earlier file stays until the end.

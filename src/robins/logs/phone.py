@@ -16,13 +16,12 @@ make give it above the sea.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
-from robins.logs.findings import Finding, LogError, refused
+from robins.logs.findings import AnyPath, Findings, LogError, refused
 from robins.logs.fix_kinds import over_ground
 from robins.logs.text import Head, TextLayout, peek, read_columns
 from robins.logs.timebase import dates_to_ns
@@ -47,7 +46,7 @@ def is_phone(head: Head) -> bool:
     return names[0] == "time" and {"acc_x", "gyro_x", "horizontalAccuracy"} <= set(names)
 
 
-def read_phone(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
+def read_phone(path: AnyPath, findings: Findings = None) -> Dataset:
     """Read inertial samples, magnetic field and fixes.
 
     Args:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import replace
 from decimal import Decimal
@@ -25,7 +24,7 @@ from robins.dataset import (
 )
 from robins.ins.frames import swap, swap_q
 from robins.logs.archives import head_of, rows_of
-from robins.logs.findings import Finding, LogError, finding_reporter, refused
+from robins.logs.findings import AnyPath, Findings, LogError, finding_reporter, refused
 from robins.logs.merging import interpolated
 from robins.logs.mounting import LocalPath, Origin, from_local
 from robins.logs.quantities import CLOCKS, DATES, QUANTITIES, TABLES, parts, words_of
@@ -70,7 +69,7 @@ class TextContents(NamedTuple):
     rows: np.ndarray
     nav: NavFrame
     body: BodyFrame
-    findings: list[Finding] | None
+    findings: Findings
 
     def has(self, group: str) -> bool:
         """True if there is such a group of columns."""
@@ -93,10 +92,7 @@ class TextContents(NamedTuple):
 
 
 def read_text(
-    format: TextFormat,
-    path: str | os.PathLike[str],
-    findings: list[Finding] | None = None,
-    origin: Origin | None = None,
+    format: TextFormat, path: AnyPath, findings: Findings = None, origin: Origin | None = None
 ) -> Table | Dataset:
     """Read a log of this format.
 

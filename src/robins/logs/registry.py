@@ -28,7 +28,7 @@ from robins.logs import (
     ulog,
 )
 from robins.logs.archives import head_of, kind_of_archive
-from robins.logs.findings import Finding, LogError, refused
+from robins.logs.findings import AnyPath, Findings, LogError, refused
 from robins.logs.folders import read_folder
 from robins.logs.mounting import Origin
 from robins.logs.opening import read_beginning
@@ -52,7 +52,7 @@ class Format(NamedTuple):
     read: Callable[..., Table | Dataset]
     binary: bool = False
     text: TextFormat | None = None  # its row, by which it is also written
-    write: Callable[[str | os.PathLike[str], Table | Dataset], None] | None = None  # no text
+    write: Callable[[AnyPath, Table | Dataset], None] | None = None  # no text
 
 
 def _of_text(row: TextFormat) -> Format:
@@ -123,7 +123,7 @@ FORMATS: tuple[Format, ...] = (
 """All of them."""
 
 
-def _of_names(path: str | os.PathLike[str]) -> Callable[..., Table | Dataset]:
+def _of_names(path: AnyPath) -> Callable[..., Table | Dataset]:
     """Reader of the one text format whose names the arrays of an archive have.
 
     Raises:
@@ -140,7 +140,7 @@ def _of_names(path: str | os.PathLike[str]) -> Callable[..., Table | Dataset]:
     return partial(read_text, rows[0])
 
 
-def matching_formats(path: str | os.PathLike[str]) -> tuple[Head, list[Format]]:
+def matching_formats(path: AnyPath) -> tuple[Head, list[Format]]:
     """Beginning of a file, and the formats that it fits.
 
     Raises:
@@ -153,7 +153,7 @@ def matching_formats(path: str | os.PathLike[str]) -> tuple[Head, list[Format]]:
     return head, [f for f in FORMATS if not f.binary and f.recognise(head)]
 
 
-def recognise(path: str | os.PathLike[str]) -> Format:
+def recognise(path: AnyPath) -> Format:
     """The format of a file, by its content.
 
     Raises:
@@ -179,9 +179,9 @@ def recognise(path: str | os.PathLike[str]) -> Format:
 
 
 def open_log(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     format: str | TextFormat | None = None,
-    findings: list[Finding] | None = None,
+    findings: Findings = None,
     *,
     origin: Origin | None = None,
 ) -> Table | Dataset:
@@ -221,7 +221,7 @@ def open_log(
 
 
 def write_log(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     table: Table | Dataset,
     format: str | TextFormat | None = None,
     *,
@@ -263,7 +263,7 @@ def write_log(
     write_text(row, path, table, week=week, origin=origin)
 
 
-def _usual(path: str | os.PathLike[str], table: Table | Dataset) -> str:
+def _usual(path: AnyPath, table: Table | Dataset) -> str:
     if str(path).endswith(".mcap"):
         return "ros-mcap"
     kinds = tuple(map(kind_in_text, tables_of(table)))
@@ -277,9 +277,7 @@ def _usual(path: str | os.PathLike[str], table: Table | Dataset) -> str:
     )
 
 
-def format_named(
-    name: str, path: str | os.PathLike[str], among: Sequence[Format] = FORMATS
-) -> Format:
+def format_named(name: str, path: AnyPath, among: Sequence[Format] = FORMATS) -> Format:
     """Format of this name; the path is for the message.
 
     Raises:

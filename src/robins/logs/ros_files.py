@@ -19,7 +19,13 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, cast
 
 from robins.foreign import decoding, largest, unpacked, within
-from robins.logs.findings import Finding, LogError, damaged, finding_reporter, report_cut_end
+from robins.logs.findings import (
+    Findings,
+    LogError,
+    damaged,
+    finding_reporter,
+    report_cut_end,
+)
 from robins.logs.opening import UNZSTD, Bytes, map_file
 
 if TYPE_CHECKING:
@@ -37,9 +43,7 @@ Raw: TypeAlias = tuple[str, str, bytes, bool]
 """Type of a message as ROS 2 spells it, topic, bytes, and whether ROS 1 serialised it."""
 
 
-def raw_messages(
-    path: Path, wanted: Collection[str], findings: list[Finding] | None
-) -> Iterator[Raw]:
+def raw_messages(path: Path, wanted: Collection[str], findings: Findings) -> Iterator[Raw]:
     """Messages of the wanted types, and one without bytes for each topic of any type.
 
     Args:
@@ -79,7 +83,7 @@ def _plain(data: bytes, refuse: Callable[[str], LogError]) -> bytes:
 
 
 def _from_mcap(
-    path: Path, data: Bytes, wanted: Collection[str], findings: list[Finding] | None
+    path: Path, data: Bytes, wanted: Collection[str], findings: Findings
 ) -> Iterator[Raw]:
     file, refuse = str(path), damaged(str(path))
     sound, closed = _sound(data)
@@ -169,7 +173,7 @@ def _records(
 
 
 def _from_db3(
-    path: Path, data: Bytes, wanted: Collection[str], findings: list[Finding] | None
+    path: Path, data: Bytes, wanted: Collection[str], findings: Findings
 ) -> Iterator[Raw]:
     file, refuse = str(path), damaged(str(path))
     waiting = path.with_name(path.name + "-wal")
@@ -225,7 +229,7 @@ def _database(path: Path, data: Bytes, refuse: Callable[[str], LogError]) -> sql
 
 
 def _from_bag(
-    path: Path, data: Bytes, wanted: Collection[str], findings: list[Finding] | None
+    path: Path, data: Bytes, wanted: Collection[str], findings: Findings
 ) -> Iterator[Raw]:
     file = str(path)
     try:

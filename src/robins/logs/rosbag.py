@@ -16,7 +16,6 @@ header: UTC since 1970, which becomes GPS time, or else a count from a start of 
 
 from __future__ import annotations
 
-import os
 from array import array
 from collections import defaultdict
 from pathlib import Path
@@ -27,7 +26,7 @@ import numpy as np
 from robins import ros
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.gps_time import GPS_EPOCH_S, gps_of
-from robins.logs.findings import Finding, LogError, damaged, finding_reporter
+from robins.logs.findings import AnyPath, Findings, LogError, damaged, finding_reporter
 from robins.logs.fix_kinds import with_usual_sigmas
 from robins.logs.merging import are_halves, merged
 from robins.logs.opening import parts_of
@@ -59,9 +58,7 @@ Topics: TypeAlias = dict[tuple[str, str], _TopicMessages]
 """Messages by type and topic."""
 
 
-def read_rosbag(
-    path: str | os.PathLike[str], findings: list[Finding] | None = None
-) -> Table | Dataset:
+def read_rosbag(path: AnyPath, findings: Findings = None) -> Table | Dataset:
     """Read inertial samples, magnetic field and fixes.
 
     Args:
@@ -93,9 +90,7 @@ def read_rosbag(
     return alone
 
 
-def _topics(
-    path: str | os.PathLike[str], findings: list[Finding] | None
-) -> tuple[Topics, set[str]]:
+def _topics(path: AnyPath, findings: Findings) -> tuple[Topics, set[str]]:
     """All messages that are read, by type and topic, and the types of all that are there.
 
     Raises:
@@ -130,7 +125,7 @@ def _topics(
 
 
 def _first(
-    file: str, topics: Topics, name: str, findings: list[Finding] | None, beside: str = ""
+    file: str, topics: Topics, name: str, findings: Findings, beside: str = ""
 ) -> _TopicMessages | None:
     """The first topic of a type, and a note of the others but that `beside` it."""
     found = [one for (of, _), one in topics.items() if of == name]
@@ -143,7 +138,7 @@ def _first(
     return found[0] if found else None
 
 
-def _inertial(file: str, topics: Topics, findings: list[Finding] | None) -> ImuTable | None:
+def _inertial(file: str, topics: Topics, findings: Findings) -> ImuTable | None:
     """Samples of the first topic, with those of another where it has one half of them only."""
 
     def known(one: _TopicMessages, place: slice, at: int) -> np.ndarray:
@@ -164,9 +159,7 @@ def _inertial(file: str, topics: Topics, findings: list[Finding] | None) -> ImuT
     return merged(first, other[1], findings) if other else first
 
 
-def _fixes(
-    file: str, gnss: _TopicMessages, topics: Topics, findings: list[Finding] | None
-) -> GnssTable:
+def _fixes(file: str, gnss: _TopicMessages, topics: Topics, findings: Findings) -> GnssTable:
     status = gnss.values[:, _STATUS]
     lost = status < 0
     variance = gnss.values[:, _VARIANCE][:, _NED]
@@ -190,7 +183,7 @@ def _fixes(
 
 
 def _velocities(
-    file: str, gnss: _TopicMessages, topics: Topics, findings: list[Finding] | None
+    file: str, gnss: _TopicMessages, topics: Topics, findings: Findings
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Velocities of the fixes and their sigmas, where the receiver's driver wrote them."""
     for (name, topic), one in topics.items():

@@ -7,13 +7,12 @@ not kept.
 
 from __future__ import annotations
 
-import os
 import re
 
 import numpy as np
 
 from robins.dataset import GnssTable
-from robins.logs.findings import Finding, LogError, finding_reporter, refused
+from robins.logs.findings import AnyPath, Findings, LogError, finding_reporter, refused
 from robins.logs.text import Head, TextLayout, peek, read_columns
 from robins.logs.timebase import calendar_to_ns, stamps_to_ns, week_to_ns, weeks_of
 
@@ -38,7 +37,7 @@ def is_rtklib(head: Head) -> bool:
     return header or any(stamp.match(text) for _, text in head.data(1))
 
 
-def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> GnssTable:
+def read_rtklib(path: AnyPath, findings: Findings = None) -> GnssTable:
     """Read a .pos file of RTKLIB, latitude/longitude/height in degrees, GPST or UTC.
 
     Calendar stamps and week/time of week both become nanoseconds since 1970 in GPS time.
@@ -102,7 +101,7 @@ def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = N
     )
 
 
-def _report_geoid(file: str, head: Head, findings: list[Finding] | None) -> None:
+def _report_geoid(file: str, head: Head, findings: Findings) -> None:
     if any("/geodetic" in line for line in head.lines if line.startswith("%")):
         finding_reporter(findings, "warning", "height_above_geoid", file, "header", "geodetic")(
             "heights are above the geoid, and robins takes them as above the WGS-84 "

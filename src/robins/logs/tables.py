@@ -20,7 +20,7 @@ from robins.dataset import (
     OdometryTable,
     Trajectory,
 )
-from robins.logs.findings import Finding, LogError, finding_reporter, refused
+from robins.logs.findings import Findings, LogError, finding_reporter, refused
 from robins.logs.timebase import LIMIT_NS
 
 Table = ImuTable | GnssTable | Trajectory | MagTable | AttitudeTable | OdometryTable
@@ -155,7 +155,7 @@ TOLERANCE = 1e-3  # how far from one a length may be by its decimals
 
 
 def unit_quaternions(
-    file: str, name: str, q: np.ndarray, rows: np.ndarray | None, findings: list[Finding] | None
+    file: str, name: str, q: np.ndarray, rows: np.ndarray | None, findings: Findings
 ) -> np.ndarray:
     """Unit quaternions; a row that is not one is taken as missing, whole, and reported.
 

@@ -13,7 +13,6 @@ and value. A number is never completed, shortened or guessed:
 from __future__ import annotations
 
 import io
-import os
 import re
 from collections.abc import Iterator
 from itertools import groupby
@@ -22,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robins.logs.findings import Finding, LogError, refused, report
+from robins.logs.findings import AnyPath, Finding, Findings, LogError, refused, report
 from robins.logs.opening import Source
 
 _PARSE_BYTES = 1 << 22
@@ -81,7 +80,7 @@ class Head(NamedTuple):
         return found[:count]
 
 
-def peek(path: str | os.PathLike[str]) -> Head:
+def peek(path: AnyPath) -> Head:
     """The first lines of a file, at most 64 KiB of it.
 
     Raises:
@@ -111,9 +110,7 @@ def peek(path: str | os.PathLike[str]) -> Head:
     return Head(file, [line.removesuffix("\r") for line in text.removesuffix("\n").split("\n")])
 
 
-def read_columns(
-    path: str | os.PathLike[str], layout: TextLayout, findings: list[Finding] | None = None
-) -> Columns:
+def read_columns(path: AnyPath, layout: TextLayout, findings: Findings = None) -> Columns:
     """Read all lines of a file.
 
     Args:

@@ -12,7 +12,6 @@ not, these are put on it by the order of arrival. Source: mavlink.io, common.xml
 
 from __future__ import annotations
 
-import os
 import re
 import struct
 from collections.abc import Iterator
@@ -24,7 +23,8 @@ import numpy as np
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.gps_time import dated, gps_of
 from robins.logs.findings import (
-    Finding,
+    AnyPath,
+    Findings,
     LogError,
     finding_reporter,
     report_cut_end,
@@ -55,7 +55,7 @@ def is_tlog(head: Head) -> bool:
     return _EARLIEST < _STAMP.unpack_from(head.start)[0] < _LATEST
 
 
-def read_tlog(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
+def read_tlog(path: AnyPath, findings: Findings = None) -> Dataset:
     """Read inertial samples, and field and fixes where they were sent.
 
     Args:
@@ -91,9 +91,7 @@ def read_tlog(path: str | os.PathLike[str], findings: list[Finding] | None = Non
     return Dataset(Path(file).name.split(".")[0], samples, gnss, mag=mag, time_unit_known=(file,))
 
 
-def _frames(
-    file: str, data: Bytes, findings: list[Finding] | None
-) -> Iterator[tuple[int, int, bytes]]:
+def _frames(file: str, data: Bytes, findings: Findings) -> Iterator[tuple[int, int, bytes]]:
     """Place, number and bytes of the frames that are read."""
     at, end, stray = 0, len(data), 0
     while at < end:
@@ -115,7 +113,7 @@ def _frames(
     report_left_out(findings, file, stray, "bytes belong to no message")
 
 
-def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[int, UlogTopic]:
+def _topics(file: str, data: Bytes, findings: Findings) -> dict[int, UlogTopic]:
     """Messages of the first vehicle with inertial samples, by their number.
 
     Raises:
@@ -164,7 +162,7 @@ def _stamps(file: str, topic: UlogTopic) -> np.ndarray:
     return gps_of(time_ns) if _dated(time_ns) else time_ns
 
 
-def _fixes(file: str, gps: UlogTopic, findings: list[Finding] | None) -> GnssTable:
+def _fixes(file: str, gps: UlogTopic, findings: Findings) -> GnssTable:
     fix, lat, lon, msl, ellipsoid, h_acc, v_acc, vel_acc, vel, cog = (
         column(file, gps, name) for name in _FIX
     )

@@ -11,7 +11,6 @@ east, as for PX4. Source: u-blox F9 HPG 1.32 interface description, UBX-22008968
 
 from __future__ import annotations
 
-import os
 import re
 import struct
 from dataclasses import replace
@@ -23,7 +22,8 @@ import numpy as np
 from robins.dataset import Dataset, GnssTable, ImuTable
 from robins.gps_time import gps_of
 from robins.logs.findings import (
-    Finding,
+    AnyPath,
+    Findings,
     LogError,
     finding_reporter,
     report_cut_end,
@@ -75,9 +75,7 @@ def is_ubx(head: Head) -> bool:
     return any(start[at + 2 : at + 3] != b"\0" and _end(start, at) for at in places)
 
 
-def read_ubx(
-    path: str | os.PathLike[str], findings: list[Finding] | None = None
-) -> Table | Dataset:
+def read_ubx(path: AnyPath, findings: Findings = None) -> Table | Dataset:
     """Read fixes, and inertial samples where they were recorded.
 
     Args:
@@ -117,7 +115,7 @@ def read_ubx(
     return Dataset(Path(file).name.split(".")[0], imu, gnss, time_unit_known=(file,))
 
 
-def _frames(file: str, data: Bytes, findings: list[Finding] | None) -> Frames:
+def _frames(file: str, data: Bytes, findings: Findings) -> Frames:
     """Place and length of the content of each message with a right checksum, by its kind."""
     found: Frames = {k: [] for k in (_PVT, _HIGH, _MEAS, _RAW)}
     at, wrong, open_at = data.find(_SYNC), 0, -1
@@ -167,7 +165,7 @@ def _rows(
 
 
 def _fixes(
-    file: str, data: Bytes, frames: Frames, findings: list[Finding] | None
+    file: str, data: Bytes, frames: Frames, findings: Findings
 ) -> tuple[GnssTable, np.ndarray]:
     """Fixes that have a date, and the place of each in the file."""
     pvt, at = _rows(data, frames[_PVT], _NAV_PVT)
@@ -211,7 +209,7 @@ def _fixes(
 
 
 def _inertial(
-    file: str, data: Bytes, frames: list[tuple[int, int]], findings: list[Finding] | None
+    file: str, data: Bytes, frames: list[tuple[int, int]], findings: Findings
 ) -> ImuTable | None:
     """Samples on the clock of the receiver."""
     halves: dict[tuple[int, ...], dict[int, list[int]]] = {_GYRO: {}, _ACCEL: {}}

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import os
 import struct
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +24,16 @@ import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.foreign import decoding
-from robins.logs.findings import Finding, LogError, damaged, finding_reporter, refused, report
+from robins.logs.findings import (
+    AnyPath,
+    Finding,
+    Findings,
+    LogError,
+    damaged,
+    finding_reporter,
+    refused,
+    report,
+)
 from robins.logs.fix_kinds import PX4
 from robins.logs.opening import read_whole
 from robins.logs.timebase import LIMIT_NS
@@ -56,7 +64,7 @@ class UlogTopic(NamedTuple):
     fields: dict[str, np.ndarray]
 
 
-def read_ulog(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
+def read_ulog(path: AnyPath, findings: Findings = None) -> Dataset:
     """Read inertial samples, and field and fixes where they were logged.
 
     Args:
@@ -168,9 +176,7 @@ def _decode(file: str, data: bytes) -> Any:
     return log
 
 
-def _first(
-    file: str, log: Any, topics: tuple[str, ...], findings: list[Finding] | None
-) -> UlogTopic | None:
+def _first(file: str, log: Any, topics: tuple[str, ...], findings: Findings) -> UlogTopic | None:
     """The first instance of the first of these topics that was logged."""
     for name in topics:
         found = sorted((d for d in log.data_list if d.name == name), key=lambda d: d.multi_id)

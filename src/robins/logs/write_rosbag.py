@@ -7,7 +7,6 @@ east-north-up. Stamps that are GPS time become UTC, others stay.
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 from robins import ros
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.gps_time import GPS_EPOCH_S, utc_of
-from robins.logs.findings import LogError, LogWarning
+from robins.logs.findings import AnyPath, LogError, LogWarning
 from robins.logs.opening import write_lines
 from robins.logs.quantities import words_of
 from robins.logs.ros_files import INSTALL, NO_PACKAGE
@@ -63,7 +62,7 @@ _TOPICS: dict[type[Any], _Topic] = {
 }
 
 
-def write_rosbag(path: str | os.PathLike[str], table: Table | Dataset) -> None:
+def write_rosbag(path: AnyPath, table: Table | Dataset) -> None:
     """Write tables; `robins.logs.rosbag.read_rosbag` reads them back.
 
     Velocities of fixes have no place in a NavSatFix: they are left out, and a `LogWarning` says so.

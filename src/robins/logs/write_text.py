@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Iterator
 from decimal import Decimal
 from typing import Any
@@ -22,7 +21,7 @@ from robins.dataset import (
     Trajectory,
 )
 from robins.ins.frames import swap
-from robins.logs.findings import LogError, refused
+from robins.logs.findings import AnyPath, LogError, refused
 from robins.logs.mounting import Origin, to_local
 from robins.logs.opening import write_lines
 from robins.logs.quantities import DATES, parts, words_of
@@ -40,7 +39,7 @@ Cells = tuple[np.ndarray, Column]
 
 def write_text(
     format: TextFormat,
-    path: str | os.PathLike[str],
+    path: AnyPath,
     table: Table | Dataset,
     *,
     week: int | None = None,
@@ -75,7 +74,7 @@ def write_text(
     write_lines(path, _blocks(format, comments, columns, _cells(columns, time_ns, values, week)))
 
 
-def _check(format: TextFormat, path: str | os.PathLike[str], table: Table) -> None:
+def _check(format: TextFormat, path: AnyPath, table: Table) -> None:
     """Refuse what the format does not hold."""
     kind = kind_in_text(table)
     if kind not in format.kinds:
@@ -184,7 +183,7 @@ def _turned(format: TextFormat, q_nb: np.ndarray, nav: str) -> dict[str, Any]:
 
 
 def _together(
-    format: TextFormat, path: str | os.PathLike[str], parts_: list[tuple[Table, Values]]
+    format: TextFormat, path: AnyPath, parts_: list[tuple[Table, Values]]
 ) -> tuple[np.ndarray, Values]:
     """Stamps and values of all tables, row by row."""
     times = [table.time_ns for table, _ in parts_]
@@ -210,11 +209,7 @@ def _wanted(column: Column, values: Values) -> bool:
 
 
 def _refuse_missing(
-    format: TextFormat,
-    path: str | os.PathLike[str],
-    time_ns: np.ndarray,
-    columns: list[Column],
-    values: Values,
+    format: TextFormat, path: AnyPath, time_ns: np.ndarray, columns: list[Column], values: Values
 ) -> None:
     held = [values[c.holds] for c in columns if c.holds in values]
     good = np.all([np.isfinite(v) for v in held], axis=0)
