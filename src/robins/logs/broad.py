@@ -15,14 +15,13 @@ stands for the sensor's own axes, of samples and of the attitude alike, so nothi
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import numpy as np
 
 from robins.dataset import AttitudeTable, Dataset, ImuTable, MagTable
 from robins.logs.archives import arrays_in, kind_of_archive, names_in
 from robins.logs.findings import AnyPath, Findings, LogError, refused
-from robins.logs.tables import unit_quaternions
+from robins.logs.tables import stem_of, unit_quaternions
 from robins.logs.text import Head
 from robins.logs.text_format import RATES_HZ
 from robins.units import to_si
@@ -72,17 +71,13 @@ def read_broad(path: AnyPath, findings: Findings = None) -> Dataset:
     if movement.ndim != 1 or movement.dtype.kind != "b":
         raise _misfit(file, "movement", movement, f"({n},) of bool")
     time_ns = np.round(np.arange(n) * (1e9 / rate)).astype(np.int64)
+    gyro, accel, field, q = tables.values()
+    q_nb = unit_quaternions(file, "opt_quat", q, None, findings)
     return Dataset(
-        name=Path(file).name.split(".")[0],
-        imu=ImuTable(time_ns, tables["imu_gyr"], tables["imu_acc"], "rate", source=file),
-        mag=MagTable(time_ns, to_si(tables["imu_mag"], "uT"), source=file),
-        attitude=AttitudeTable(
-            time_ns,
-            unit_quaternions(file, "opt_quat", tables["opt_quat"], None, findings),
-            nav="ENU",
-            moving=movement.copy(),
-            source=file,
-        ),
+        stem_of(file),
+        ImuTable(time_ns, gyro, accel, "rate", source=file),
+        mag=MagTable(time_ns, to_si(field, "uT"), source=file),
+        attitude=AttitudeTable(time_ns, q_nb, "ENU", moving=movement.copy(), source=file),
     )
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import re
 import struct
-from pathlib import Path
 
 import numpy as np
 
@@ -34,6 +33,7 @@ from robins.logs.findings import (
 from robins.logs.fix_kinds import MAVLINK, fixes, over_ground
 from robins.logs.merging import gps_clock
 from robins.logs.opening import Bytes, map_file
+from robins.logs.tables import recording
 from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS
 from robins.logs.ulog import UlogTopic, column, stamps, triad
 from robins.units import to_si
@@ -79,14 +79,10 @@ def read_dataflash(path: AnyPath, findings: Findings = None) -> Dataset:
         else:
             gnss = None
     gyro, accel = triad(file, imu, "Gyr{}", "XYZ"), triad(file, imu, "Acc{}", "XYZ")
-    field = mag and to_si(triad(file, mag, "Mag{}", "XYZ"), "mG")
-    return Dataset(
-        name=Path(file).name.split(".")[0],
-        imu=ImuTable(imu_ns, gyro, accel, "rate", source=file),
-        mag=None if mag_ns is None or field is None else MagTable(mag_ns, field, source=file),
-        gnss=gnss,
-        time_unit_known=(file,),
-    )
+    samples, field = ImuTable(imu_ns, gyro, accel, "rate", source=file), None
+    if mag is not None and mag_ns is not None:
+        field = MagTable(mag_ns, to_si(triad(file, mag, "Mag{}", "XYZ"), "mG"), source=file)
+    return recording(file, samples, gnss, mag=field)
 
 
 def _topics(file: str, data: Bytes, findings: Findings) -> dict[str, UlogTopic]:
@@ -210,16 +206,12 @@ def _fixes(
     if np.isnan(separation).any():
         report_geoid_heights(findings, file, "A newer version of ArduPilot logs the geoid.")
         separation = np.zeros_like(separation)
-    down = np.where(beside("VV") == 0.0, np.nan, column(file, gps, "VZ"))
-    table = fixes(
-        file,
-        GPS_EPOCH_NS + time_ns,
-        (column(file, gps, "Lat"), column(file, gps, "Lng"), column(file, gps, "Alt") - separation),
-        (beside("HAcc"), beside("HAcc"), beside("VAcc")),
-        over_ground(column(file, gps, "Spd"), column(file, gps, "GCrs"), down),
-        beside("SAcc"),
-        np.array([MAVLINK.get(int(k), 0) for k in status]),
-        status == 2,
-        findings,
+    lat, lon, alt, speed, course, down = (
+        column(file, gps, name) for name in ("Lat", "Lng", "Alt", "Spd", "GCrs", "VZ")
     )
+    v_n = over_ground(speed, course, np.where(beside("VV") == 0.0, np.nan, down))
+    place, sigma_m = (lat, lon, alt - separation), (beside("HAcc"), beside("HAcc"), beside("VAcc"))
+    kind = np.array([MAVLINK.get(int(k), 0) for k in status])
+    time_ns, flat = GPS_EPOCH_NS + time_ns, status == 2
+    table = fixes(file, time_ns, place, sigma_m, v_n, beside("SAcc"), kind, flat, findings)
     return table, arrived

@@ -33,6 +33,7 @@ from robins.logs.archives import head_of
 from robins.logs.findings import AnyPath, LogError, refused
 from robins.logs.quantities import QUANTITIES
 from robins.logs.registry import format_named, matching_formats
+from robins.logs.tables import stem_of
 from robins.logs.text import Head
 from robins.logs.text_format import Column, TextFormat, columns_of, header_of, one_of
 from robins.units import KINDS, UnitError, parse
@@ -87,7 +88,7 @@ def format_of(text: str, file: str) -> TextFormat:
         except UnitError as error:
             raise refused(file, field="rate")(str(error), "give it like 100 Hz") from error
         del content["rate"]
-    name = Path(file).name.split(".")[0]
+    name = stem_of(file)
     row = TextFormat(name, f"declared in {file}", columns, others=True, source=file, **content)
     # a file of several sensors has gaps where one is slower
     return replace(row, sparse=len(row.kinds) > 1 or any(c.where[0] for c in columns))

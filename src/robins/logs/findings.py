@@ -109,9 +109,11 @@ def report_cut_end(findings: Findings, file: str, at: int) -> None:
     )
 
 
-def report_geoid_heights(findings: Findings, file: str, fix: str) -> None:
+def report_geoid_heights(
+    findings: Findings, file: str, fix: str, where: str = "", value: Value = "geoid"
+) -> None:
     """Report heights that are not above the ellipsoid."""
-    finding_reporter(findings, "warning", "height_above_geoid", file, value="geoid")(
+    finding_reporter(findings, "warning", "height_above_geoid", file, where, value)(
         "heights are above the geoid, and robins takes them as above the WGS-84 ellipsoid. "
         f"Differences of height stay right; gravity errs by 3e-6 m/s^2 per metre. {fix}"
     )

@@ -54,19 +54,12 @@ def fixes(
     """
     there, solid = kind > 0, (kind > 0) & ~flat
     lat, lon = (np.deg2rad(np.where(there, value, np.nan)) for value in place[:2])
-    sigma = np.stack(sigma_m, axis=-1)
-    table = GnssTable(
-        time_ns=time_ns,
-        lat_rad=lat,
-        lon_rad=lon,
-        alt_m=np.where(solid, place[2], np.nan),
-        sigma_m=np.where(sigma > 0.0, sigma, np.nan),
-        v_n=np.where(solid[:, None], v_n, np.nan),
-        sigma_v=np.repeat(np.where(sigma_v > 0.0, sigma_v, np.nan)[:, None], 3, axis=1),
-        quality=kind.astype(np.int64),
-        source=file,
-    )
-    return with_usual_sigmas(table, findings)
+    height, v_n = np.where(solid, place[2], np.nan), np.where(solid[:, None], v_n, np.nan)
+    stated = np.stack([*sigma_m, sigma_v, sigma_v, sigma_v], axis=-1)
+    sigma = np.where(stated > 0.0, stated, np.nan)
+    quality = kind.astype(np.int64)
+    table = GnssTable(time_ns, lat, lon, height, sigma[:, :3], v_n, sigma[:, 3:], quality)
+    return with_usual_sigmas(dataclasses.replace(table, source=file), findings)
 
 
 def over_ground(

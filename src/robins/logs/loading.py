@@ -13,7 +13,7 @@ from robins.logs.findings import AnyPath, Finding, LogError, finding_reporter
 from robins.logs.merging import are_halves, merged
 from robins.logs.mounting import Mounting, turned
 from robins.logs.registry import matching_formats, open_log
-from robins.logs.tables import Table, kind_of, tables_of
+from robins.logs.tables import Table, kind_of, stem_of, tables_of
 from robins.logs.text_format import TextFormat
 
 Formats = Mapping[str, str | TextFormat]
@@ -64,7 +64,7 @@ def load_dataset(
         given = ", ".join(paths) or "(no file)"
         raise LogError(given, "no IMU log among the files", "give one IMU log")
     dataset = Dataset(
-        name=name or Path(held["imu"].source).name.split(".")[0],
+        name=name or stem_of(held["imu"].source),
         **held,
         findings=findings,
         time_unit_known=tuple(known),
@@ -156,13 +156,8 @@ def load_pair(
         raise _exchanged(master, "no path of a master INS", "--master")
     if not isinstance(imu, ImuTable):
         raise _exchanged(slave, "no inertial samples", "--slave")
-    return Dataset(
-        name=name or Path(imu.source).name.split(".")[0],
-        imu=imu,
-        master=path,
-        findings=findings,
-        master_delay_s=delay_s,
-    )
+    name = name or stem_of(imu.source)
+    return Dataset(name, imu, master=path, findings=findings, master_delay_s=delay_s)
 
 
 def _open_as(

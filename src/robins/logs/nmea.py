@@ -108,17 +108,12 @@ def fixes_of(file: str, data: Bytes, findings: Findings) -> tuple[GnssTable, np.
             f"no fix states a height; 0 m is assumed, with a sigma of {_ANY_HEIGHT_M:g} m. Switch "
             "on GGA for heights."
         )
-    table = fixes(
-        file,
-        gps_of(utc_ns) if days[0] >= 0 else utc_ns + _DAY_NS,
-        (of_place("lat"), of_place("lon"), height),
-        (column("north"), column("east"), up),
-        over_ground(speed, course),
-        nothing,
-        np.array([_KIND.get(int(one), 0) for one in quality]),
-        np.zeros(len(kept), bool),
-        findings,
-    )
+    time_ns = gps_of(utc_ns) if days[0] >= 0 else utc_ns + _DAY_NS
+    place = of_place("lat"), of_place("lon"), height
+    sigma_m = column("north"), column("east"), up
+    v_n, kind = over_ground(speed, course), np.array([_KIND.get(int(one), 0) for one in quality])
+    flat = np.zeros(len(kept), bool)
+    table = fixes(file, time_ns, place, sigma_m, v_n, nothing, kind, flat, findings)
     if unknown:
         marks = np.zeros((len(kept), 3), bool) if table.assumed_m is None else table.assumed_m
         table = replace(table, assumed_m=marks | [False, False, True])

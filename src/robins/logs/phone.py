@@ -16,13 +16,12 @@ make give it above the sea.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.logs.findings import AnyPath, Findings, LogError, refused
 from robins.logs.fix_kinds import over_ground
+from robins.logs.tables import recording
 from robins.logs.text import Head, TextLayout, peek, read_columns
 from robins.logs.timebase import dates_to_ns
 from robins.units import to_si
@@ -85,16 +84,12 @@ def read_phone(path: AnyPath, findings: Findings = None) -> Dataset:
         if not lines.any():
             raise LogError(file, f"no line has {what}", "record that sensor as well")
     (imu, mag, gnss), rows = have.values(), columns.rows
-    return Dataset(
-        name=Path(file).name.split(".")[0],
-        imu=ImuTable(
-            time_ns[imu], stack(*_GYRO)[imu], stack(*_ACCEL)[imu], "rate", "RFU", file, rows[imu]
-        ),
-        mag=MagTable(time_ns[mag], to_si(stack(*_MAG)[mag], "uT"), "RFU", file, rows[mag]),
-        gnss=fixes_of(
-            file, time_ns[gnss], stack(*_PLACE)[gnss], stack(*_VELOCITY)[gnss], rows[gnss]
-        ),
-        time_unit_known=(file,),
+    gyro, accel, field = stack(*_GYRO)[imu], stack(*_ACCEL)[imu], to_si(stack(*_MAG)[mag], "uT")
+    fixed, moved = stack(*_PLACE)[gnss], stack(*_VELOCITY)[gnss]
+    samples = ImuTable(time_ns[imu], gyro, accel, "rate", "RFU", file, rows[imu])
+    fixes = fixes_of(file, time_ns[gnss], fixed, moved, rows[gnss])
+    return recording(
+        file, samples, fixes, mag=MagTable(time_ns[mag], field, "RFU", file, rows[mag])
     )
 
 
@@ -110,22 +105,16 @@ def fixes_of(
         velocity: (n, 4) speed [m/s], bearing [deg] and their sigmas.
         rows: (n,) line numbers.
     """
-    lat_deg, lon_deg, alt_m, radius_m, sigma_alt_m = place.T
+    lat, lon = np.deg2rad(place[:, :2]).T.copy()
+    alt_m, radius_m, sigma_alt_m = place[:, 2:].T
     speed, bearing_deg, sigma_speed, sigma_bearing_deg = velocity.T
     # A bearing that is 180 deg unsure says nothing: the error is at most twice the speed.
     across = speed * np.minimum(np.deg2rad(sigma_bearing_deg), 2.0)
     sigma = np.hypot(sigma_speed, across)
-    missing = np.full(len(speed), np.nan)
-    sigma_m = radius_m / _RADIUS_68
+    sigma_v = np.stack([sigma, sigma, np.full(len(speed), np.nan)], axis=-1)
+    sigma_m = np.stack([radius_m / _RADIUS_68, radius_m / _RADIUS_68, sigma_alt_m], axis=-1)
+    alt_m, v_n = alt_m.copy(), over_ground(speed, bearing_deg)
+    quality = np.full(len(speed), _SINGLE, np.int64)
     return GnssTable(
-        time_ns=time_ns,
-        lat_rad=np.deg2rad(lat_deg),
-        lon_rad=np.deg2rad(lon_deg),
-        alt_m=alt_m.copy(),
-        sigma_m=np.stack([sigma_m, sigma_m, sigma_alt_m], axis=-1),
-        v_n=over_ground(speed, bearing_deg),
-        sigma_v=np.stack([sigma, sigma, missing], axis=-1),
-        quality=np.full(len(speed), _SINGLE, np.int64),
-        source=file,
-        rows=rows,
+        time_ns, lat, lon, alt_m, sigma_m, v_n, sigma_v, quality, source=file, rows=rows
     )

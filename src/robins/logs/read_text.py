@@ -5,8 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from decimal import Decimal
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -28,7 +27,7 @@ from robins.logs.findings import AnyPath, Findings, LogError, finding_reporter, 
 from robins.logs.merging import interpolated
 from robins.logs.mounting import LocalPath, Origin, from_local
 from robins.logs.quantities import CLOCKS, DATES, QUANTITIES, TABLES, parts, words_of
-from robins.logs.tables import Table, kind_of, unit_quaternions
+from robins.logs.tables import Table, kind_of, stem_of, unit_quaternions
 from robins.logs.text import COMMENTS, Columns, Head, TextLayout, read_columns
 from robins.logs.text_format import (
     PAIRS,
@@ -263,11 +262,8 @@ def _tables(
         made.append(_path(part, origin) if kind == "trajectory" else _MAKERS[kind](part))
     if len(format.kinds) == 1 or len(made) == 1:
         return made[0]
-    return Dataset(
-        name=Path(read.file).name.split(".")[0],
-        **{kind_of(table): table for table in made},
-        time_unit_known=(read.file,) if known else (),
-    )
+    tables = {kind_of(table): table for table in made}
+    return Dataset(stem_of(read.file), **tables, time_unit_known=(read.file,) if known else ())
 
 
 def _imu(read: TextContents) -> ImuTable:
@@ -279,14 +275,8 @@ def _imu(read: TextContents) -> ImuTable:
     if rate and turns.any() and forces.any() and not (turns & forces).any():
         force = interpolated(read.time_ns[turns], read.time_ns[forces], force[forces])
         read, turn = read.of(turns), turn[turns]
-    return ImuTable(
-        read.time_ns,
-        turn,
-        force,
-        kind="rate" if rate else "increment",
-        body=read.body,
-        **read.origin,
-    )
+    kind: Literal["rate", "increment"] = "rate" if rate else "increment"
+    return ImuTable(read.time_ns, turn, force, kind, read.body, **read.origin)
 
 
 def _mag(read: TextContents) -> MagTable:
@@ -297,16 +287,12 @@ def _gnss(read: TextContents) -> GnssTable:
     quality = read.values.get("quality")
     if quality is not None:
         quality = np.where(np.abs(quality) < 100.0, quality, 0.0).astype(np.int64)
-    moves = read.has("velocity")
-    return GnssTable(
-        read.time_ns,
-        *(read.values[q] for q in parts("place")),
-        sigma_m=read.stack("sigma"),
-        v_n=read.stack("velocity") if moves else None,
-        sigma_v=read.stack("sigma_v") if moves else None,
-        quality=quality,
-        **read.origin,
-    )
+    v_n = sigma_v = None
+    if read.has("velocity"):
+        v_n, sigma_v = read.stack("velocity"), read.stack("sigma_v")
+    (lat, lon, height), sigma_m = (read.values[q] for q in parts("place")), read.stack("sigma")
+    now = read.time_ns
+    return GnssTable(now, lat, lon, height, sigma_m, v_n, sigma_v, quality, **read.origin)
 
 
 def _attitude(read: TextContents) -> AttitudeTable:
@@ -329,16 +315,10 @@ def _path(read: TextContents, origin: Origin | None) -> Trajectory:
         local = LocalPath(read.time_ns, read.stack("local"), swap(v_n), q_nb)
         path = from_local(local, origin or NOWHERE, source=read.file)
         return replace(path, body=read.body, omega_ib_b=omega, rows=read.rows)
-    return Trajectory(
-        read.time_ns,
-        *(read.values[q] for q in parts("place")),
-        v_n=swap(v_n) if read.nav == "ENU" else v_n,
-        q_nb=q_nb,
-        nav=read.nav,
-        body=read.body,
-        omega_ib_b=omega,
-        **read.origin,
-    )
+    v_n = swap(v_n) if read.nav == "ENU" else v_n
+    lat, lon, height = (read.values[q] for q in parts("place"))
+    origin_of = {"omega_ib_b": omega, "nav": read.nav, "body": read.body} | read.origin
+    return Trajectory(read.time_ns, lat, lon, height, v_n, q_nb, **origin_of)
 
 
 def _odometry(read: TextContents) -> OdometryTable:

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from array import array
 from collections import defaultdict
-from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -31,7 +30,7 @@ from robins.logs.fix_kinds import with_usual_sigmas
 from robins.logs.merging import are_halves, merged
 from robins.logs.opening import parts_of
 from robins.logs.ros_files import raw_messages
-from robins.logs.tables import Table
+from robins.logs.tables import Table, recording
 
 _FLU = np.array([1.0, -1.0, -1.0])  # forward-left-up <-> forward-right-down
 _NED = [1, 0, 2]  # of east, north, up: variances have no sign
@@ -79,8 +78,7 @@ def read_rosbag(path: AnyPath, findings: Findings = None) -> Table | Dataset:
     field = mag and MagTable(mag.time_ns, mag.values[:, :3] * _FLU, source=file)
     gnss = fixes and _fixes(file, fixes, topics, findings)
     if imu is not None:
-        name = Path(file).name.split(".")[0]
-        return Dataset(name=name, imu=imu, mag=field, gnss=gnss, time_unit_known=(file,))
+        return recording(file, imu, gnss, mag=field)
     alone = field if gnss is None else gnss
     if alone is None or (field is not None and gnss is not None):
         held = ", ".join(sorted(kinds)) or "no messages"
@@ -166,19 +164,11 @@ def _fixes(file: str, gnss: _TopicMessages, topics: Topics, findings: Findings) 
     unknown = gnss.values[:, _KIND] == 0
     with np.errstate(invalid="ignore"):  # a negative variance is none
         sigma_m = np.where(unknown[:, None], np.nan, np.sqrt(variance))
-    lat_deg, lon_deg, alt_m = np.where(lost[:, None], np.nan, gnss.values[:, _PLACE]).T.copy()
+    place = np.where(lost[:, None], np.nan, gnss.values[:, _PLACE]).T.copy()
+    lat, lon, alt = np.deg2rad(place[0]), np.deg2rad(place[1]), place[2]
     v_n, sigma_v = _velocities(file, gnss, topics, findings)
-    table = GnssTable(
-        time_ns=gnss.time_ns,
-        lat_rad=np.deg2rad(lat_deg),
-        lon_rad=np.deg2rad(lon_deg),
-        alt_m=alt_m,
-        sigma_m=sigma_m,
-        v_n=v_n,
-        sigma_v=sigma_v,
-        quality=np.array([_QUALITY.get(int(k), 0) for k in status], np.int64),
-        source=file,
-    )
+    quality = np.array([_QUALITY.get(int(k), 0) for k in status], np.int64)
+    table = GnssTable(gnss.time_ns, lat, lon, alt, sigma_m, v_n, sigma_v, quality, source=file)
     return with_usual_sigmas(table, findings, places=False)
 
 

@@ -12,7 +12,14 @@ import re
 import numpy as np
 
 from robins.dataset import GnssTable
-from robins.logs.findings import AnyPath, Findings, LogError, finding_reporter, refused
+from robins.logs.findings import (
+    AnyPath,
+    Findings,
+    LogError,
+    finding_reporter,
+    refused,
+    report_geoid_heights,
+)
 from robins.logs.text import Head, TextLayout, peek, read_columns
 from robins.logs.timebase import calendar_to_ns, stamps_to_ns, week_to_ns, weeks_of
 
@@ -85,13 +92,13 @@ def read_rtklib(path: AnyPath, findings: Findings = None) -> GnssTable:
                 "they are left out. Heading will be found from the positions alone; set "
                 "out-outvel = on."
             )
-    _report_geoid(file, head, findings)
-    quality = column("Q")
+    if any("/geodetic" in line for line in head.lines if line.startswith("%")):
+        fix = "Set out-height = ellipsoidal in RTKLIB."
+        report_geoid_heights(findings, file, fix, "header", "geodetic")
+    time_ns = _times(file, columns.texts, columns.rows, calendar, utc)
+    lat, lon, quality = np.deg2rad(column("latitude")), np.deg2rad(column("longitude")), column("Q")
     return GnssTable(
-        time_ns=_times(file, columns.texts, columns.rows, calendar, utc),
-        lat_rad=np.deg2rad(column("latitude")),
-        lon_rad=np.deg2rad(column("longitude")),
-        alt_m=column("height").copy(),
+        *(time_ns, lat, lon, column("height").copy()),
         sigma_m=vectors("sdn", "sde", "sdu", 1.0),
         v_n=v_n,
         sigma_v=sigma_v,
@@ -99,15 +106,6 @@ def read_rtklib(path: AnyPath, findings: Findings = None) -> GnssTable:
         source=file,
         rows=columns.rows,
     )
-
-
-def _report_geoid(file: str, head: Head, findings: Findings) -> None:
-    if any("/geodetic" in line for line in head.lines if line.startswith("%")):
-        finding_reporter(findings, "warning", "height_above_geoid", file, "header", "geodetic")(
-            "heights are above the geoid, and robins takes them as above the WGS-84 "
-            "ellipsoid. Differences of height stay right; gravity errs by 3e-6 m/s^2 per "
-            "metre. Set out-height = ellipsoidal in RTKLIB."
-        )
 
 
 def _header(head: Head) -> tuple[list[str], bool]:

@@ -7,7 +7,8 @@ missing whole, or not believed.
 from __future__ import annotations
 
 import dataclasses
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -58,6 +59,16 @@ def tables_of(opened: Table | Dataset) -> list[Table]:
         return [opened]
     tables = [getattr(opened, kind) for kind in KINDS.values()]
     return [table for table in tables if table is not None]
+
+
+def recording(file: str, imu: ImuTable, gnss: GnssTable | None = None, **others: Any) -> Dataset:
+    """Dataset of a file that states the unit of its stamps, called by the name of the file."""
+    return Dataset(stem_of(file), imu, gnss, **others, time_unit_known=(file,))
+
+
+def stem_of(file: str) -> str:
+    """Name of a file without its folder and whatever follows the first dot."""
+    return Path(file).name.split(".")[0]
 
 
 AnyTable = TypeVar("AnyTable", bound=Table)

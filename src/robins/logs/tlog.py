@@ -15,7 +15,6 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,6 +33,7 @@ from robins.logs.findings import (
 from robins.logs.fix_kinds import MAVLINK, fixes, over_ground
 from robins.logs.merging import gps_clock
 from robins.logs.opening import Bytes, map_file
+from robins.logs.tables import recording
 from robins.logs.text import Head
 from robins.logs.ulog import UlogTopic, column, stamps, triad
 from robins.units import to_si
@@ -88,7 +88,7 @@ def read_tlog(path: AnyPath, findings: Findings = None) -> Dataset:
     there = field.any(axis=1)  # zeros: there is no magnetometer
     mag = MagTable(time_ns[there], field[there], source=file) if there.any() else None
     samples = ImuTable(time_ns, gyro, accel, "rate", source=file)
-    return Dataset(Path(file).name.split(".")[0], samples, gnss, mag=mag, time_unit_known=(file,))
+    return recording(file, samples, gnss, mag=mag)
 
 
 def _frames(file: str, data: Bytes, findings: Findings) -> Iterator[tuple[int, int, bytes]]:
@@ -170,14 +170,8 @@ def _fixes(file: str, gps: UlogTopic, findings: Findings) -> GnssTable:
         report_geoid_heights(findings, file, "Set the telemetry to MAVLink 2.")
         ellipsoid = msl
     speed, course = (np.where(x < 65535.0, x * 1e-2, np.nan) for x in (vel, cog))
-    return fixes(
-        file,
-        _stamps(file, gps),
-        (lat * 1e-7, lon * 1e-7, ellipsoid * 1e-3),
-        (h_acc * 1e-3, h_acc * 1e-3, v_acc * 1e-3),
-        over_ground(speed, course),
-        vel_acc * 1e-3,
-        np.array([MAVLINK.get(int(k), 0) for k in fix]),
-        fix == 2,
-        findings,
-    )
+    place = lat * 1e-7, lon * 1e-7, ellipsoid * 1e-3
+    sigma_m, sigma_v = (h_acc * 1e-3, h_acc * 1e-3, v_acc * 1e-3), vel_acc * 1e-3
+    v_n, kind = over_ground(speed, course), np.array([MAVLINK.get(int(k), 0) for k in fix])
+    time_ns = _stamps(file, gps)
+    return fixes(file, time_ns, place, sigma_m, v_n, sigma_v, kind, fix == 2, findings)

@@ -14,7 +14,6 @@ from __future__ import annotations
 import re
 import struct
 from dataclasses import replace
-from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
@@ -35,7 +34,7 @@ from robins.logs.merging import gps_clock, merged
 from robins.logs.nmea import fixes_of
 from robins.logs.opening import Bytes, foreign, map_file, read_beginning
 from robins.logs.rtcm import end_of_frame
-from robins.logs.tables import Table
+from robins.logs.tables import Table, recording
 from robins.logs.text import Head
 from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS
 from robins.units import to_si
@@ -112,7 +111,7 @@ def read_ubx(path: AnyPath, findings: Findings = None) -> Table | Dataset:
     if (known := before >= 0).any():
         clock = gps_clock(file, tags[before[known]], gnss.time_ns[known], findings)
         imu = replace(imu, time_ns=clock(imu.time_ns))
-    return Dataset(Path(file).name.split(".")[0], imu, gnss, time_unit_known=(file,))
+    return recording(file, imu, gnss)
 
 
 def _frames(file: str, data: Bytes, findings: Findings) -> Frames:
@@ -194,18 +193,10 @@ def _fixes(
         lon[mine], lat[mine] = (place * 1e-7 + digits[:, :2] * 1e-9).T
         height_m[mine] = high["h_m"][more] * 1e-3 + digits[:, 2] * 1e-4
         horizontal[mine], vertical[mine] = high["acc"][more].T * 1e-4
-    table = fixes(
-        file,
-        GPS_EPOCH_NS + week * WEEK_NS + tow_ns,
-        (lat, lon, height_m),
-        (horizontal, horizontal, vertical),
-        pvt["v"] * 1e-3,
-        pvt["s_acc"] * 1e-3,
-        np.where(there, kind, 0),
-        pvt["fix"] == 2,
-        findings,
-    )
-    return table, at
+    time_ns, place = GPS_EPOCH_NS + week * WEEK_NS + tow_ns, (lat, lon, height_m)
+    sigma_m, sigma_v = (horizontal, horizontal, vertical), pvt["s_acc"] * 1e-3
+    kind, flat, v_n = np.where(there, kind, 0), pvt["fix"] == 2, pvt["v"] * 1e-3
+    return fixes(file, time_ns, place, sigma_m, v_n, sigma_v, kind, flat, findings), at
 
 
 def _inertial(
@@ -229,8 +220,8 @@ def _inertial(
     if not (len(gyro[0]) and len(accel[0])):
         return None
     rates, forces = to_si(gyro[1] * _GYRO_DEG_S, "deg/s"), accel[1] * _ACCEL_M_S2
-    turns = ImuTable(gyro[0], rates, np.full_like(rates, np.nan), "rate", source=file)
     if np.array_equal(gyro[0], accel[0]):
         return ImuTable(gyro[0], rates, forces, "rate", source=file)
+    turns = ImuTable(gyro[0], rates, np.full_like(rates, np.nan), "rate", source=file)
     other = ImuTable(accel[0], np.full_like(forces, np.nan), forces, "rate", source=file)
     return merged(turns, other, findings)

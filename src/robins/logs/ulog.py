@@ -36,6 +36,7 @@ from robins.logs.findings import (
 )
 from robins.logs.fix_kinds import PX4
 from robins.logs.opening import read_whole
+from robins.logs.tables import recording
 from robins.logs.timebase import LIMIT_NS
 from robins.units import to_si
 
@@ -91,19 +92,10 @@ def read_ulog(path: AnyPath, findings: Findings = None) -> Dataset:
         raise LogError(file, cause, "log that topic and fly again")
     time_ns = stamps(file, imu)
     mag, gnss = (_first(file, log, topics, findings) for topics in (_MAG, _GNSS))
-    return Dataset(
-        name=Path(file).name.split(".")[0],
-        imu=ImuTable(
-            time_ns,
-            triad(file, imu, "gyro_rad[{}]", "012"),
-            triad(file, imu, "accelerometer_m_s2[{}]", "012"),
-            "rate",
-            source=file,
-        ),
-        mag=None if mag is None else _field(file, mag),
-        gnss=None if gnss is None else _fixes(file, gnss),
-        time_unit_known=(file,),
-    )
+    gyro = triad(file, imu, "gyro_rad[{}]", "012")
+    accel = triad(file, imu, "accelerometer_m_s2[{}]", "012")
+    samples = ImuTable(time_ns, gyro, accel, "rate", source=file)
+    return recording(file, samples, gnss and _fixes(file, gnss), mag=mag and _field(file, mag))
 
 
 def _sound(data: bytes) -> int:
@@ -237,8 +229,7 @@ def _fixes(file: str, topic: UlogTopic) -> GnssTable:
         return column(file, topic, new) if new in topic.fields else column(file, topic, old) * scale
 
     fix = column(file, topic, "fix_type")
-    lat_deg = either("latitude_deg", "lat", 1e-7)
-    lon_deg = either("longitude_deg", "lon", 1e-7)
+    lat, lon = (either(f"{x}itude_deg", x[:3], 1e-7) for x in ("lat", "long"))
     alt_m = either("altitude_ellipsoid_m", "alt_ellipsoid", 1e-3)
     eph, epv, speed = (column(file, topic, name) for name in ("eph", "epv", "s_variance_m_s"))
     v_n = triad(file, topic, "vel_{}_m_s", "ned")
@@ -247,14 +238,8 @@ def _fixes(file: str, topic: UlogTopic) -> GnssTable:
     def known(values: np.ndarray, least: int) -> np.ndarray:
         return np.where(fix >= least, values, np.nan)
 
-    return GnssTable(
-        time_ns=stamps(file, topic),
-        lat_rad=np.deg2rad(known(lat_deg, _NO_FIX)),
-        lon_rad=np.deg2rad(known(lon_deg, _NO_FIX)),
-        alt_m=known(alt_m, _FLAT_FIX),
-        sigma_m=np.stack([eph, eph, epv], axis=-1),
-        v_n=v_n,
-        sigma_v=np.repeat(speed[:, None], 3, axis=1),
-        quality=np.array([PX4.get(int(k), 0) for k in fix], np.int64),
-        source=file,
-    )
+    lat, lon = (np.deg2rad(known(x, _NO_FIX)) for x in (lat, lon))
+    time_ns, alt = stamps(file, topic), known(alt_m, _FLAT_FIX)
+    sigma_m, sigma_v = (np.stack(x, axis=-1) for x in ([eph, eph, epv], [speed] * 3))
+    quality = np.array([PX4.get(int(k), 0) for k in fix], np.int64)
+    return GnssTable(time_ns, lat, lon, alt, sigma_m, v_n, sigma_v, quality, source=file)
