@@ -30,7 +30,7 @@ from typing import Any
 
 from robins.foreign import decoding
 from robins.logs.archives import head_of
-from robins.logs.findings import AnyPath, LogError, refused
+from robins.logs.findings import AnyPath, LogError, os_errors, refused
 from robins.logs.quantities import QUANTITIES
 from robins.logs.registry import format_named, matching_formats
 from robins.logs.tables import stem_of
@@ -61,10 +61,8 @@ def columns_from(path: AnyPath) -> TextFormat:
     """
     file = os.fspath(path)
     try:
-        text = Path(path).read_text("utf-8")
-    except OSError as error:
-        why = error.strerror or str(error)
-        raise LogError(file, f"cannot be read: {why}", "check path and permissions") from error
+        with os_errors(file):
+            text = Path(path).read_text("utf-8")
     except UnicodeDecodeError as error:
         raise LogError(file, f"is no TOML: {error}", "repair it") from error
     return format_of(text, file)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
 
@@ -19,6 +20,7 @@ AnyPath: TypeAlias = str | os.PathLike[str]
 Findings: TypeAlias = list[Finding] | None
 """Takes what a reader leaves out or doubts; None: that is issued as `LogWarning`."""
 Value = float | int | str
+FETCH_AGAIN = "fetch it again; nothing of it was used, for no number in it can be trusted"
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 
@@ -53,6 +55,25 @@ def refused(
     return lambda what, fix: LogError(file, what, fix, where=where, field=field, value=value)
 
 
+@contextmanager
+def os_errors(file: str, done: str = "read", fix: str = "check path and permissions"):
+    """Turn an error of the operating system into a `LogError`."""
+    try:
+        yield
+    except OSError as error:
+        raise LogError(file, f"cannot be {done}: {error.strerror or error}", fix) from error
+
+
+@contextmanager
+def extra_package(file: str, what: str, package: str = "the package that reads it"):
+    """Turn the failed import of a package of the extra `logs` into a `LogError`."""
+    try:
+        yield
+    except ImportError as error:
+        cause = f"is {what}, and {package} is not installed"
+        raise LogError(file, cause, "install it with: pip install 'robins[logs]'") from error
+
+
 class LogWarning(UserWarning):
     """A finding of a reader that was given no list to put it in."""
 
@@ -83,8 +104,7 @@ def finding_reporter(
 
 def damaged(file: str) -> Callable[[str], LogError]:
     """Makes the error about a damaged file of the reason."""
-    fix = "fetch it again; nothing of it was used, for no number in it can be trusted"
-    return lambda why: LogError(file, f"is damaged ({why})", fix)
+    return lambda why: LogError(file, f"is damaged ({why})", FETCH_AGAIN)
 
 
 def report_left_out(findings: Findings, file: str, count: int, what: str) -> None:

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.gps_time import gps_of
-from robins.logs.findings import AnyPath, Findings, LogError, finding_reporter, refused
+from robins.logs.findings import AnyPath, Findings, LogError, finding_reporter, os_errors, refused
 from robins.logs.fix_kinds import with_usual_sigmas
 from robins.logs.merging import interpolated
 from robins.logs.mounting import Origin
@@ -63,7 +63,7 @@ def read_folder(
             origin, and nothing in local metres.
     """
     folder = Path(path)
-    try:
+    with os_errors(str(path), fix="check its permissions"):
         for mark, read in _FOLDERS.items():
             for place in (folder, folder / "mav0", folder / "oxts"):
                 if (place / mark).exists():
@@ -73,9 +73,6 @@ def read_folder(
         names = sorted(p.name for p in folder.iterdir())
         if "metadata.yaml" in names or any(map(RECORDING.fullmatch, names)):
             return _without(origin, folder, read_rosbag(folder, findings))
-    except OSError as error:
-        why = error.strerror or str(error)
-        raise LogError(str(path), f"cannot be read: {why}", "check its permissions") from error
     held = ", ".join(names[:5]) or "nothing"
     remedy = "give files, or the folder of a recording (ROS, EuRoC, KITTI, phones)"
     raise LogError(str(path), f"is a folder with {held}", remedy)
@@ -220,9 +217,8 @@ def _phone(folder: Path, findings: Findings) -> Dataset:
         fix_ns, v, fix_rows = samples("Location", _LOCATION, 2)
         for k in range(3, 9):
             v[v[:, k] < 0.0, k] = np.nan  # what is not known
-        gnss = with_usual_sigmas(
-            fixes_of(str(path), fix_ns, v[:, :5], v[:, 5:], fix_rows), findings
-        )
+        fixes = fixes_of(str(path), fix_ns, v[:, :5], v[:, 5:], fix_rows)
+        gnss = with_usual_sigmas(fixes, findings)
         if gnss.v_n is None or np.isnan(gnss.v_n).all():
             gnss = replace(gnss, v_n=None, sigma_v=None)
     name = folder.resolve().name

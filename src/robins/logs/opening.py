@@ -13,7 +13,7 @@ import lzma
 import mmap
 import os
 import re
-import tempfile
+import secrets
 import zlib
 from collections.abc import Iterable, Iterator
 from functools import partial
@@ -21,7 +21,14 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from robins.foreign import FREE, decoding, within
-from robins.logs.findings import AnyPath, Findings, LogError, finding_reporter
+from robins.logs.findings import (
+    FETCH_AGAIN,
+    AnyPath,
+    Findings,
+    LogError,
+    finding_reporter,
+    os_errors,
+)
 
 Bytes: TypeAlias = bytes | mmap.mmap
 _BLOCK, _ABOUT, _LARGEST = 1 << 20, 1 << 22, 1 << 30
@@ -151,29 +158,15 @@ class Source:
         self.cut = False
 
     def __iter__(self) -> Iterator[bytes]:
-        try:
-            with self.path.open("rb") as file:
-                head = file.read(8)
-                file.seek(0)
-                packed = head.startswith((_XZ, _GZIP))
-                blocks = self._expand(file, head.startswith(_XZ)) if packed else self._plain(file)
-                for count, block in enumerate(blocks):
-                    if not (count or self.binary):
-                        self._refuse_foreign(block)
-                    yield block
-        except OSError as error:
-            why = error.strerror or str(error)
-            raise LogError(
-                str(self.path), f"cannot be read: {why}", "check path and permissions"
-            ) from error
-
-    def _plain(self, file) -> Iterator[bytes]:
-        while block := file.read(_BLOCK):
-            yield block
-
-    def _refuse_foreign(self, start: bytes) -> None:
-        if found := foreign(start):
-            raise LogError(str(self.path), f"is {found[0]}, not a text log", found[1])
+        with os_errors(str(self.path)), self.path.open("rb") as file:
+            head = file.read(8)
+            file.seek(0)
+            packed, plain = head.startswith((_XZ, _GZIP)), iter(partial(file.read, _BLOCK), b"")
+            blocks = self._expand(file, head.startswith(_XZ)) if packed else plain
+            for count, block in enumerate(blocks):
+                if not (count or self.binary) and (found := foreign(block)):
+                    raise LogError(str(self.path), f"is {found[0]}, not a text log", found[1])
+                yield block
 
     def _expand(self, file, xz: bool) -> Iterator[bytes]:
         new = partial(lzma.LZMADecompressor, memlimit=2 * FREE) if xz else _Gunzip
@@ -206,11 +199,8 @@ class Source:
         self.cut = not between
 
     def _damaged(self, why: str) -> LogError:
-        return LogError(
-            str(self.path),
-            f"is damaged: the compressed stream does not decode ({why})",
-            "fetch it again; nothing of it was used, for no number in it can be trusted",
-        )
+        cause = f"is damaged: the compressed stream does not decode ({why})"
+        return LogError(str(self.path), cause, FETCH_AGAIN)
 
 
 def read_beginning(path: AnyPath, size: int = 256) -> bytes:
@@ -276,39 +266,27 @@ def write_lines(path: AnyPath, blocks: Iterable[str | bytes]) -> None:
         LogError: the file cannot be written; no part of it is left behind.
     """
     path = Path(path)
-    try:
+    with os_errors(str(path), "written", "check the folder, its permissions and the disk"):
         if path.exists() and not path.is_file():  # a device must not be replaced by a file
             _write(path, path.suffix, blocks)
         else:
             _write_and_rename(path, blocks)
-    except OSError as error:
-        why = error.strerror or str(error)
-        raise LogError(
-            str(path), f"cannot be written: {why}", "check the folder, its permissions and the disk"
-        ) from error
 
 
-def _write(path: str | Path, suffix: str, blocks: Iterable[str | bytes]) -> None:
+def _write(path: Path, suffix: str, blocks: Iterable[str | bytes]) -> None:
     with _OPENERS.get(suffix, open)(path, "wb") as file:
         for block in blocks:
             file.write(block.encode() if isinstance(block, str) else block)
 
 
 def _write_and_rename(path: Path, blocks: Iterable[str | bytes]) -> None:
-    handle, temporary = tempfile.mkstemp(prefix=".", dir=path.parent)
-    os.close(handle)
+    temporary = path.with_name(f".{secrets.token_hex(8)}")  # with the permissions of any new file
+    temporary.touch(exist_ok=False)
     try:
         _write(temporary, path.suffix, blocks)
-        with open(temporary, "rb+") as file:
+        with temporary.open("rb+") as file:
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
+        temporary.replace(path)
     except BaseException:
-        os.unlink(temporary)
+        temporary.unlink()
         raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

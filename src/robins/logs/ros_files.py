@@ -14,6 +14,7 @@ import sqlite3
 import struct
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, cast
@@ -23,6 +24,7 @@ from robins.logs.findings import (
     Findings,
     LogError,
     damaged,
+    extra_package,
     finding_reporter,
     report_cut_end,
 )
@@ -35,8 +37,8 @@ if TYPE_CHECKING:
 MCAP, SQLITE, BAG = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"#ROSBAG V2.0\n"
 _RECORD, _FOOTER = struct.Struct("<BQ"), 2  # opcode and length of a record; the last one's opcode
 _ZSTD = b"\x28\xb5\x2f\xfd"
-NO_PACKAGE = "is an MCAP file, and the package for these is not installed"
-INSTALL = "install it with: pip install 'robins[logs]'"
+_FOR_THESE = "the package for these"
+mcap_package = partial(extra_package, what="an MCAP file", package=_FOR_THESE)
 
 
 Raw: TypeAlias = tuple[str, str, bytes, bool]
@@ -132,12 +134,10 @@ def _records(
     Raises:
         LogError: the package is not installed, or a record is damaged.
     """
-    try:
+    with mcap_package(file):
         from mcap.exceptions import EndOfFile
         from mcap.records import Chunk
         from mcap.stream_reader import StreamReader, breakup_chunk
-    except ImportError as error:
-        raise LogError(file, NO_PACKAGE, INSTALL) from error
     plain = at = 0
 
     def read(size: int) -> bytes:  # no byte behind the last whole record
@@ -232,11 +232,8 @@ def _from_bag(
     path: Path, data: Bytes, wanted: Collection[str], findings: Findings
 ) -> Iterator[Raw]:
     file = str(path)
-    try:
+    with extra_package(file, "a bag of ROS 1", _FOR_THESE):
         from rosbags.rosbag1 import Reader
-    except ImportError as error:
-        cause = "is a bag of ROS 1, and the package for these is not installed"
-        raise LogError(file, cause, INSTALL) from error
 
     def refuse(why: str) -> LogError:
         fix = "fetch it again, or restore its index: rosbag reindex FILE"

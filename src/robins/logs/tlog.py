@@ -25,6 +25,7 @@ from robins.logs.findings import (
     AnyPath,
     Findings,
     LogError,
+    extra_package,
     finding_reporter,
     report_cut_end,
     report_geoid_heights,
@@ -119,11 +120,8 @@ def _topics(file: str, data: Bytes, findings: Findings) -> dict[int, UlogTopic]:
     Raises:
         LogError: pymavlink is not installed.
     """
-    try:
+    with extra_package(file, "telemetry of MAVLink"):
         from pymavlink.dialects.v20 import common
-    except ImportError as error:
-        cause = "is telemetry of MAVLink, and the package that reads it is not installed"
-        raise LogError(file, cause, "install it with: pip install 'robins[logs]'") from error
     decoder, wrong = common.MAVLink(None), 0
     senders: dict[tuple[int, int, int], dict[int, list[list[float]]]] = {}
     for at, number, frame in _frames(file, data, findings):

@@ -30,6 +30,7 @@ from robins.logs.findings import (
     Findings,
     LogError,
     damaged,
+    extra_package,
     finding_reporter,
     refused,
     report,
@@ -50,12 +51,6 @@ _IMU, _MAG = ("sensor_combined",), ("vehicle_magnetometer", "sensor_mag")
 _GNSS = ("vehicle_gps_position", "sensor_gps")
 _TO_CSV = "this version of the autopilot is not known; export the topic to CSV"
 _NO_FIX, _FLAT_FIX = 2, 3  # below these there is no fix, or none of the height
-
-
-_EARLY = (
-    "{name} breaks off at byte {sound} of {size}: what follows is half a message, or none. The "
-    "recording or the copy was interrupted, or a crash report is appended; all before it was read."
-)
 
 
 class UlogTopic(NamedTuple):
@@ -81,7 +76,11 @@ def read_ulog(path: AnyPath, findings: Findings = None) -> Dataset:
         raise refused(file, "byte 0")("is no ULog", "leave the format to be recognised")
     sound = _sound(data)
     if sound < len(data) or cut:
-        sentence = _EARLY.format(name=Path(file).name, sound=sound, size=len(data))
+        sentence = (
+            f"{Path(file).name} breaks off at byte {sound} of {len(data)}: what follows is half a "
+            "message, or none. The recording or the copy was interrupted, or a crash report is "
+            "appended; all before it was read."
+        )
         report(findings, Finding("warning", "ends_early", file, f"byte {sound}", sound, sentence))
     _check_formats(file, data[:sound])
     log = _decode(file, data[:sound])
@@ -149,22 +148,15 @@ def _check_formats(file: str, data: bytes) -> None:
 
 
 def _decode(file: str, data: bytes) -> Any:
-    try:
+    with extra_package(file, "a PX4 ULog"):
         from pyulog import ULog
-    except ImportError as error:
-        raise LogError(
-            file,
-            "is a PX4 ULog, and the package that reads it is not installed",
-            "install it with: pip install 'robins[logs]'",
-        ) from error
     printed = io.StringIO()
     # it prints what it doubts
     with decoding(damaged(file)), contextlib.redirect_stdout(printed):
         log = ULog(io.BytesIO(data), [*_IMU, *_MAG, *_GNSS], disable_str_exceptions=False)
     if log.file_corruption:
-        raise damaged(file)(
-            " ".join(printed.getvalue().split()) or "messages contradict each other"
-        )
+        why = " ".join(printed.getvalue().split())
+        raise damaged(file)(why or "messages contradict each other")
     return log
 
 
@@ -194,10 +186,8 @@ def column(file: str, topic: UlogTopic, name: str) -> np.ndarray:
             raise refused(file, field=f"{topic.name}.{name}")("holds text, no numbers", _TO_CSV)
         with np.errstate(invalid="ignore"):  # a NaN that signals stays a NaN
             return values.astype(np.float64)
-    raise refused(file, field=topic.name)(
-        f"has no field {name}; it has {', '.join(sorted(topic.fields))}",
-        _TO_CSV,
-    )
+    cause = f"has no field {name}; it has {', '.join(sorted(topic.fields))}"
+    raise refused(file, field=topic.name)(cause, _TO_CSV)
 
 
 def triad(file: str, topic: UlogTopic, pattern: str, parts: str) -> np.ndarray:
