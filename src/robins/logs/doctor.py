@@ -329,7 +329,9 @@ def examine(subject: Subject, use: Use = "any") -> list[Finding]:
     unit_known = {file for dataset in datasets for file in dataset.time_unit_known}
     with np.errstate(all="ignore"):  # nonsense is looked at on purpose here
         tables = [checked(table) for part in parts for table in _tables(part)]
-        in_vehicle = use != "attitude" and _in_vehicle(tables)
+        # a vehicle has a top; a sensor by itself may lie any way
+        moved = any(isinstance(table, GnssTable | Trajectory) for table in tables)
+        in_vehicle = moved and use != "attitude"
         evens: list[Table] = []
         imu: ImuTable | None = None
         all_of_them: dict[str, Any] = {"others": evens}
@@ -365,11 +367,6 @@ def _asked(
 def _tables(part: Table | Dataset) -> list[Table]:
     master = part.master if isinstance(part, Dataset) else None
     return tables_of(part) + ([] if master is None else [master])
-
-
-def _in_vehicle(tables: list[Table]) -> bool:
-    """True where there is a vehicle, which has a top; a sensor by itself may lie any way."""
-    return any(isinstance(table, GnssTable | Trajectory) for table in tables)
 
 
 def _stamped_as(table: Table, imu: ImuTable | None) -> bool:
