@@ -128,12 +128,10 @@ def rows_of(head: Head, layout: TextLayout) -> Columns:
     Raises:
         LogError: they are of several lengths, or hold dates where numbers are needed.
     """
-    wanted = layout.texts + (layout.numbers if layout.numbers is not None else ())
     numbers = layout.numbers
     if numbers is None:
         numbers = tuple(k for k in range(len(head.names)) if k not in layout.texts)
-        wanted = layout.texts + numbers
-    sizes = {head.names[k]: len(head.arrays[k]) for k in wanted}
+    sizes = {head.names[k]: len(head.arrays[k]) for k in layout.texts + numbers}
     if len(set(sizes.values())) != 1:
         listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
         remedy = "declare columns of one sensor, which have one length"

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -69,8 +69,8 @@ def _lines_of(path: AnyPath) -> tuple[dict[str, _Lines], dict[str, int]]:
 
 def _columns(
     file: str, name: str, lines: _Lines, *variances: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-    """Stamps [ns], numbers, roots of the variances in these columns, and source of a table.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Stamps [ns], numbers, roots of the variances in these columns, and line numbers.
 
     Raises:
         LogError: a stamp is no number, time falls, or a number is not what it should be.
@@ -87,7 +87,7 @@ def _columns(
         bad = ~good.reshape(len(rows), -1).all(axis=1)
         if bad.any():
             raise refused(file, f"line {rows[np.argmax(bad)]}")(f"{name} {cause}", fix)
-    return time_ns, values, np.sqrt(squares), {"source": file, "rows": rows}
+    return time_ns, values, np.sqrt(squares), rows
 
 
 def read_librsf(path: AnyPath, findings: Findings = None) -> RangeTables:
@@ -107,17 +107,18 @@ def read_librsf(path: AnyPath, findings: Findings = None) -> RangeTables:
     kinds, others = _lines_of(path)
     out: RangeTables = {}
     if (lines := kinds["pseudorange3"]).rows:
-        time_ns, v, sigma, origin = _columns(file, "pseudorange3", lines, 1)
+        time_ns, v, sigma, rows = _columns(file, "pseudorange3", lines, 1)
         number, system = v[:, 5].astype(np.int64), v[:, 6].astype(np.int64)
         sky = v[:, 2:5], number, system, np.radians(v[:, 7]), v[:, 8]
-        out["ranges"] = RangeTable(time_ns, v[:, 0], sigma[:, 0], *sky, **origin)
+        out["ranges"] = RangeTable(time_ns, v[:, 0], sigma[:, 0], *sky, file, rows)
     if (lines := kinds["odom3"]).rows:
-        time_ns, v, sigma, origin = _columns(file, "odom3", lines, 6, 11)
+        time_ns, v, sigma, rows = _columns(file, "odom3", lines, 6, 11)
         down = -v[:, 5]  # the file's z is up
-        out["odometry"] = OdometryTable(time_ns, v[:, 0], down, *sigma.T, **origin)
+        noise = sigma[:, 0], sigma[:, 1]
+        out["odometry"] = OdometryTable(time_ns, v[:, 0], down, *noise, file, rows)
     if (lines := kinds["point3"]).rows:
-        time_ns, v, _, origin = _columns(file, "point3", lines)
-        out["truth"] = PlaceTable(time_ns, v[:, :3], **origin)
+        time_ns, v, _, rows = _columns(file, "point3", lines)
+        out["truth"] = PlaceTable(time_ns, v[:, :3], file, rows)
     if not out:
         remedy = "give text of libRSF: a word that says what is measured, then its numbers"
         raise LogError(file, "holds no pseudorange3, odom3 or point3", remedy)

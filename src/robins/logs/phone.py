@@ -58,16 +58,13 @@ def read_phone(path: AnyPath, findings: Findings = None) -> Dataset:
     """
     file, head = str(path), peek(path)
     line, names = _header(head)
+    at = refused(file, f"line {line}")
     if lacking := [name for name in _NEEDED if name not in names]:
-        raise refused(file, f"line {line}")(
-            f"the header lacks {', '.join(lacking)}", "is it of another format?"
-        )
+        raise at(f"the header lacks {', '.join(lacking)}", "is it of another format?")
     if twice := sorted({name for name in _NEEDED if names.count(name) > 1}):
-        raise refused(file, f"line {line}")(
-            f"the header names {', '.join(twice)} twice", "keep one"
-        )
+        raise at(f"the header names {', '.join(twice)} twice", "keep one")
     if names[0] != "time":
-        raise refused(file, f"line {line}")("the first column is not the time", "put it first")
+        raise at("the first column is not the time", "put it first")
     columns = read_columns(path, TextLayout(tuple(names), ",", skip=line, all_named=True), findings)
     place = {name: k - 1 for k, name in enumerate(names)}
 

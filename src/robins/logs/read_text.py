@@ -225,10 +225,9 @@ def _frames(format: TextFormat, head: Head) -> tuple[NavFrame, BodyFrame]:
         words = set(re.findall(r"[A-Z]{3}", matched[1]))
         fitting = [pair for pair in PAIRS if words and words <= set(pair)]
         if len(fitting) != 1:
-            raise refused(head.file, f"line {number}", "frames", matched[1].strip())(
-                "is neither NED FRD nor ENU RFU",
-                "convert the columns to one of the two and say which",
-            )
+            remedy = "convert the columns to one of the two and say which"
+            at = refused(head.file, f"line {number}", "frames", matched[1].strip())
+            raise at("is neither NED FRD nor ENU RFU", remedy)
         return fitting[0]
     return nav, body
 
@@ -327,23 +326,15 @@ def _odometry(read: TextContents) -> OdometryTable:
     return OdometryTable(read.time_ns, speed, unknown, sigma, unknown, **read.origin)
 
 
-_MAKERS = {
-    "imu": _imu,
-    "mag": _mag,
-    "gnss": _gnss,
-    "attitude": _attitude,
-    "odometry": _odometry,
-}
+_MAKERS = {"imu": _imu, "mag": _mag, "gnss": _gnss, "attitude": _attitude, "odometry": _odometry}
 
 
 def _quaternions(read: TextContents) -> np.ndarray:
     """As recorded, or from roll, pitch and heading, the same in both pairs of frames."""
     if read.has("quaternion"):
-        names = [read.columns[q].name for q in parts("quaternion")]
-        q = read.stack("quaternion")
-        return unit_quaternions(
-            read.file, f"{names[0]} .. {names[-1]}", q, read.rows, read.findings
-        )
+        first, *_, last = (read.columns[q].name for q in parts("quaternion"))
+        name, q = f"{first} .. {last}", read.stack("quaternion")
+        return unit_quaternions(read.file, name, q, read.rows, read.findings)
     q = np.asarray(rotation.from_euler(*read.stack("euler").T))
     return np.asarray(swap_q(q)) if read.nav == "ENU" else q
 

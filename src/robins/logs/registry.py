@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from robins.dataset import Dataset
 from robins.errors import require_kind
@@ -59,10 +59,14 @@ def _of_text(row: TextFormat) -> Format:
     return Format(row.name, row.kinds, row.about, row.recognise, partial(read_text, row), text=row)
 
 
-def _own(name: str, holds: str, recognise: Callable, read: Callable, **how: Any):
-    """A row of a format with a reader of its own, most of them binary; then a line for people."""
-    how = {"binary": True} | how
-    return lambda about: Format(name, tuple(holds.split()), about, recognise, read, **how)
+def _own(name: str, holds: str, *functions: Callable, binary: bool = True):
+    """A row of a format that text rows do not describe, and then a line for people.
+
+    Its functions recognise it, read it and, if there are three, write it.
+    """
+    recognise, read, *write = functions
+    kinds, write = tuple(holds.split()), write[0] if write else None
+    return lambda about: Format(name, kinds, about, recognise, read, binary, write=write)
 
 
 def _begins(magic: bytes) -> Callable[[Head], bool]:
@@ -98,9 +102,9 @@ FORMATS: tuple[Format, ...] = (
     _own("px4-ulog", "imu mag gnss", _begins(ulog.MAGIC), ulog.read_ulog)(
         "PX4: .ulg; needs the extra, pip install 'robins[logs]'"
     ),
-    _own(
-        "ros-mcap", "imu mag gnss", _begins(ros_files.MCAP), rosbag.read_rosbag, write=write_rosbag
-    )("ROS 2: .mcap with Imu, MagneticField, NavSatFix; needs the extra 'robins[logs]'"),
+    _own("ros-mcap", "imu mag gnss", _begins(ros_files.MCAP), rosbag.read_rosbag, write_rosbag)(
+        "ROS 2: .mcap with Imu, MagneticField, NavSatFix; needs the extra 'robins[logs]'"
+    ),
     _own("ros-db3", "imu mag gnss", _begins(ros_files.SQLITE), rosbag.read_rosbag)(
         "ROS 2: .db3 with Imu, MagneticField, NavSatFix, or the folder of a recording"
     ),

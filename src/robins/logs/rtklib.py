@@ -71,10 +71,8 @@ def read_rtklib(path: AnyPath, findings: Findings = None) -> GnssTable:
     layout = TextLayout((*time_names, *names), "," if comma else None, tuple(range(texts)))
     columns = read_columns(path, layout, findings)
     if missing := [n for n in _NEEDED if n not in names]:
-        raise refused(file, "header")(
-            f"has no column {', '.join(missing)}",
-            "write latitude, longitude, height, Q and the standard deviations",
-        )
+        remedy = "write latitude, longitude, height, Q and the standard deviations"
+        raise refused(file, "header")(f"has no column {', '.join(missing)}", remedy)
 
     def column(name: str) -> np.ndarray:
         return columns.values[:, names.index(name)]
@@ -115,9 +113,8 @@ def _header(head: Head) -> tuple[list[str], bool]:
             fields = line[1:].replace(",", " ").split()
             for mark, (what, remedy) in _UNSUPPORTED.items():
                 if any(mark in field for field in fields) and "ns" in fields:
-                    raise refused(head.file, f"line {number}")(
-                        what, f"set {remedy} in RTKLIB and solve again"
-                    )
+                    remedy = f"set {remedy} in RTKLIB and solve again"
+                    raise refused(head.file, f"line {number}")(what, remedy)
             if fields[:1] in (["GPST"], ["UTC"]):
                 names = [field.split("(")[0] for field in fields[1:]]
                 return names, fields[0] == "UTC"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -61,9 +61,11 @@ def tables_of(opened: Table | Dataset) -> list[Table]:
     return [table for table in tables if table is not None]
 
 
-def recording(file: str, imu: ImuTable, gnss: GnssTable | None = None, **others: Any) -> Dataset:
+def recording(
+    file: str, imu: ImuTable, gnss: GnssTable | None = None, mag: MagTable | None = None
+) -> Dataset:
     """Dataset of a file that states the unit of its stamps, called by the name of the file."""
-    return Dataset(stem_of(file), imu, gnss, **others, time_unit_known=(file,))
+    return Dataset(stem_of(file), imu, gnss, mag=mag, time_unit_known=(file,))
 
 
 def stem_of(file: str) -> str:
@@ -111,23 +113,21 @@ def checked(table: AnyTable) -> AnyTable:
             continue
         array = np.asarray(value)
         if array.dtype.kind not in "fiu":
-            raise refused(_name(table), field=field)(
-                f"holds {array.dtype}, not real numbers",
-                "give an array of floats, nan where a number is missing",
-            )
+            remedy = "give an array of floats, nan where a number is missing"
+            cause = f"holds {array.dtype}, not real numbers"
+            raise refused(_name(table), field=field)(cause, remedy)
         shape = (n, components) if components else (n,)
         out[field] = np.ascontiguousarray(_shaped(table, field, array, shape), np.float64)
     for field in ("quality", "rows"):
         if getattr(table, field, None) is not None:
             out[field] = _shaped(table, field, _integers(table, field, "give integers"), (n,))
-    for field, components in (("moving", 0), ("assumed_m", 3), ("assumed_v", 3)):
+    for field, shape in (("moving", (n,)), ("assumed_m", (n, 3)), ("assumed_v", (n, 3))):
         if (value := getattr(table, field, None)) is not None:
             marks = np.asarray(value)
             if marks.dtype.kind != "b":
-                raise refused(_name(table), field=field)(
-                    f"is {marks.dtype}, not bool", "give True and False"
-                )
-            out[field] = _shaped(table, field, marks, (n, components) if components else (n,))
+                cause = f"is {marks.dtype}, not bool"
+                raise refused(_name(table), field=field)(cause, "give True and False")
+            out[field] = _shaped(table, field, marks, shape)
     return dataclasses.replace(table, **out)
 
 
@@ -183,9 +183,8 @@ def unit_quaternions(
     length = np.linalg.norm(q, axis=-1)
     known = ~np.isnan(length)
     wrong = known & ~(np.abs(length - 1.0) < TOLERANCE)
-    out = np.where(
-        (known & ~wrong)[:, None], q / np.where(wrong | ~known, 1.0, length)[:, None], np.nan
-    )
+    good = (known & ~wrong)[:, None]
+    out = np.where(good, q / np.where(good, length[:, None], 1.0), np.nan)
     if not wrong.any():
         return out
     k = int(np.argmax(wrong))

@@ -97,16 +97,14 @@ def peek(path: AnyPath) -> Head:
     _refuse_nul(file, start[:_LONGEST_LINE], 1)
     start = start[:_LONGEST_LINE].removeprefix(_BOM)
     if b"\r" in start and _LF not in start:
-        raise refused(file, "line 1")(
-            "its lines end in CR alone", "save it with line ends LF or CR LF"
-        )
+        remedy = "save it with line ends LF or CR LF"
+        raise refused(file, "line 1")("its lines end in CR alone", remedy)
     try:
         text = start[: start.rfind(_LF) + 1 or None].decode("utf-8")
     except UnicodeDecodeError as error:
         line = start[: error.start].count(_LF) + 1
-        raise refused(file, f"line {line}")(
-            "is not text in UTF-8", "is this the log itself?"
-        ) from error
+        at = refused(file, f"line {line}")
+        raise at("is not text in UTF-8", "is this the log itself?") from error
     return Head(file, [line.removesuffix("\r") for line in text.removesuffix("\n").split("\n")])
 
 
@@ -229,14 +227,10 @@ class _BlockReader:
         if self.layout.decimal != ".":
             block = block.replace(self.layout.decimal.encode(), b".")
         try:
-            table = np.loadtxt(
-                io.BytesIO(block),
-                dtype=self.dtype,
-                delimiter=self.layout.delimiter,
-                comments=None,
-                ndmin=1,
-                encoding="latin1",
-            ) if block.strip() else np.zeros(0, self.dtype)  # fmt: skip
+            table, separator = np.zeros(0, self.dtype), self.layout.delimiter
+            if block.strip():
+                lines = io.BytesIO(block)
+                table = np.loadtxt(lines, self.dtype, None, separator, ndmin=1, encoding="latin1")
         except Exception:  # of the decoder of NumPy: the lines say where
             table = None
         if table is None or len(table) != block.count(_LF):
@@ -263,7 +257,10 @@ class _BlockReader:
                 continue
             fields = _fields(text, self.layout.delimiter)
             if len(fields) != self.width:
-                raise self._wrong_width(number, fields)
+                raise refused(self.file, f"line {number}")(
+                    f"{len(fields)} fields where the first lines have {self.width}",
+                    "bytes are missing, or numbers have decimal commas; delete or repair the line",
+                )
             texts.append([self._text(number, k, fields[k]) for k in self._places(_TEXT)])
             values.append([self._number(number, k, fields[k]) for k in self._places(_NUMBER_TYPE)])
             rows.append(number)
@@ -287,25 +284,16 @@ class _BlockReader:
         if not field:
             return np.nan
         if not _NUMBER.fullmatch(field):
-            cause = "is not a number"
-            if b"," in field:
-                cause += " (a decimal comma?)"
-            raise self._no_number(line, k, field, cause)
+            comma = " (a decimal comma?)" if b"," in field else ""
+            raise self._no_number(line, k, field, f"is not a number{comma}")
         return float(field)
 
     def _no_number(self, line: int, k: int, field: bytes, cause: str) -> LogError:
-        names = self.layout.names
-        return refused(
-            self.file,
-            f"line {line}",
-            names[k] if k < len(names) else f"column {k + 1}",
-            field[:_TEXT_BYTES].decode("utf-8", "replace"),
-        )(cause, "write numbers with a decimal point, nan where one is missing; or delete the line")
-
-    def _wrong_width(self, line: int, fields: list[bytes]) -> LogError:
-        return refused(self.file, f"line {line}")(
-            f"{len(fields)} fields where the first lines have {self.width}",
-            "bytes are missing, or numbers have decimal commas; delete or repair the line",
+        names, shown = self.layout.names, field[:_TEXT_BYTES].decode("utf-8", "replace")
+        name = names[k] if k < len(names) else f"column {k + 1}"
+        return refused(self.file, f"line {line}", name, shown)(
+            cause,
+            "write numbers with a decimal point, nan where one is missing; or delete the line",
         )
 
 
