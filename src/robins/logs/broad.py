@@ -86,10 +86,8 @@ def _rate(file: str, value: np.ndarray) -> float:
         raise _misfit(file, "sampling_rate", value, "() of a real number")
     rate = float(value.reshape(()))
     if not RATES_HZ[0] <= rate <= RATES_HZ[1]:
-        raise refused(file, field="sampling_rate", value=rate)(
-            f"is not between {RATES_HZ[0]:g} and {RATES_HZ[1]:g} Hz, and time is made from it",
-            "give samples a second",
-        )
+        cause = f"is not between {RATES_HZ[0]:g} and {RATES_HZ[1]:g} Hz, and time is made from it"
+        raise refused(file, field="sampling_rate", value=rate)(cause, "give samples a second")
     return rate
 
 

@@ -97,11 +97,8 @@ def clean_imu(imu: ImuTable) -> tuple[ImuTable, dict[str, int], list[tuple[int, 
     if np.count_nonzero(keep) < 2:
         reasons = {k.removeprefix("imu_"): n for k, n in counts.items() if n and k != "imu_spread"}
         counted = ", ".join(f"{n} {reason}" for reason, n in reasons.items()) or "none"
-        raise LogError(
-            imu.source or "ImuTable",
-            f"fewer than two of {len(imu)} samples can be used (refused: {counted})",
-            "the doctor tells what is wrong with them",
-        )
+        cause = f"fewer than two of {len(imu)} samples can be used (refused: {counted})"
+        raise LogError(imu.source or "ImuTable", cause, "the doctor tells what is wrong with them")
     return rows_where(imu, keep), counts, _gaps(imu, keep)
 
 

@@ -106,9 +106,8 @@ def _table(
     places = [place(name) for name in names]
     wanted = [*names[:needed], *([clock] if clock else ())]
     if lacking := [name for name in wanted if place(name) < 0]:
-        raise refused(str(path), f"line {line}")(
-            f"no column fits {lacking[0]}; there are {', '.join(held)}", "export it again"
-        )
+        cause = f"no column fits {lacking[0]}; there are {', '.join(held)}"
+        raise refused(str(path), f"line {line}")(cause, "export it again")
     numbers = tuple(sorted({at for at in places if at >= 0}))
     texts = (place(clock),) if clock else ()
     comma = separator != "," and re.search(r"\d,\d", "".join(t for _, t in peek(path).data(3)[1:]))

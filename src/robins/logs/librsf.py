@@ -51,10 +51,8 @@ def _lines_of(path: AnyPath) -> tuple[dict[str, _Lines], dict[str, int]]:
                 others[name] = others.get(name, 0) + 1
             continue
         if len(fields) < WIDTH[name]:
-            raise refused(file, f"line {row}")(
-                f"{name} has {len(fields)} numbers and needs {WIDTH[name]}",
-                "was the file cut? Remove the line",
-            )
+            cause = f"{name} has {len(fields)} numbers and needs {WIDTH[name]}"
+            raise refused(file, f"line {row}")(cause, "was the file cut? Remove the line")
         into = kinds[name]
         into.stamps.append(fields[0])
         into.rows.append(row)

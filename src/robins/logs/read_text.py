@@ -155,9 +155,8 @@ def _marks(file: str, header: ColumnHeader, columns: dict[str, FoundColumn]) -> 
     """
     names = {f.column.where[0] for f in columns.values()} - {""}
     if lacking := sorted(names - set(header.names)):
-        raise refused(file, f"line {header.line}")(
-            f"the header lacks {lacking[0]}; it has {', '.join(header.names)}", "name it as it is"
-        )
+        cause = f"the header lacks {lacking[0]}; it has {', '.join(header.names)}"
+        raise refused(file, f"line {header.line}")(cause, "name it as it is")
     return {name: header.names.index(name) for name in names}
 
 
@@ -358,10 +357,9 @@ def _within_limits(read: TextContents, quantity: str) -> None:
     if 2 * beyond.sum() > np.isfinite(values).sum():
         radians = found.unit == "rad"
         other = "degrees under a name that says radians" if radians else "another unit"
-        raise refused(read.file, f"line {read.rows[k]}", found.name, shown)(
-            f"beyond {allowed}, as in {count}: probably {other}, or another column",
-            "name the column with the unit it is in",
-        )
+        cause = f"beyond {allowed}, as in {count}: probably {other}, or another column"
+        remedy = "name the column with the unit it is in"
+        raise refused(read.file, f"line {read.rows[k]}", found.name, shown)(cause, remedy)
     values[beyond] = np.nan
     finding_reporter(
         read.findings, "warning", "angle_range", read.file, f"line {read.rows[k]}", shown

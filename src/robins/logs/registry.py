@@ -218,9 +218,8 @@ def open_log(
     if origin is None:
         return known.read(path, findings)
     if known.text is None or not known.text.local:
-        raise LogError(
-            str(path), f"{known.name} has no local metres to put at an origin", "give no origin"
-        )
+        cause = f"{known.name} has no local metres to put at an origin"
+        raise LogError(str(path), cause, "give no origin")
     return known.read(path, findings, origin)
 
 
@@ -274,11 +273,8 @@ def _usual(path: AnyPath, table: Table | Dataset) -> str:
     for name in ("named-imu", "named-path"):
         if kinds == format_named(name, path).holds:
             return name
-    raise LogError(
-        str(path),
-        f"no named format holds {' and '.join(map(words_of, kinds))}",
-        f"choose a format: {', '.join(f.name for f in FORMATS if f.text or f.write)}",
-    )
+    remedy = f"choose a format: {', '.join(f.name for f in FORMATS if f.text or f.write)}"
+    raise LogError(str(path), f"no named format holds {' and '.join(map(words_of, kinds))}", remedy)
 
 
 def format_named(name: str, path: AnyPath, among: Sequence[Format] = FORMATS) -> Format:
@@ -289,7 +285,6 @@ def format_named(name: str, path: AnyPath, among: Sequence[Format] = FORMATS) ->
     """
     named = {f.name: f for f in among}
     if name not in named:
-        raise LogError(
-            str(path), f"no format is called {name!r}", f"choose one of {', '.join(named)}"
-        )
+        cause = f"no format is called {name!r}"
+        raise LogError(str(path), cause, f"choose one of {', '.join(named)}")
     return named[name]

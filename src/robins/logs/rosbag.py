@@ -82,9 +82,8 @@ def read_rosbag(path: AnyPath, findings: Findings = None) -> Table | Dataset:
     alone = field if gnss is None else gnss
     if alone is None or (field is not None and gnss is not None):
         held = ", ".join(sorted(kinds)) or "no messages"
-        raise LogError(
-            file, f"has no messages {_IMU}; it holds {held}", "record that topic as well"
-        )
+        cause = f"has no messages {_IMU}; it holds {held}"
+        raise LogError(file, cause, "record that topic as well")
     return alone
 
 

@@ -131,8 +131,7 @@ def _times(file: str, texts: np.ndarray, rows: np.ndarray, calendar: bool, utc: 
         try:
             out[i] = calendar_to_ns(*stamp.split(), utc=utc)
         except (ValueError, TypeError) as error:
-            raise refused(file, f"line {rows[i]}", "time", stamp)(
-                f"is not a time stamp year/month/day hour:minute:second ({error})",
-                "repair or delete the line",
-            ) from error
+            cause = f"is not a time stamp year/month/day hour:minute:second ({error})"
+            remedy = "repair or delete the line"
+            raise refused(file, f"line {rows[i]}", "time", stamp)(cause, remedy) from error
     return out

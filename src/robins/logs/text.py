@@ -147,10 +147,9 @@ def _refuse_nul(file: str, data: bytes, line: int) -> None:
     """Raise if the bytes, whose first line has this number, cannot be text."""
     if b"\0" in data:
         utf16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
-        raise refused(file, f"line {line + data[: data.index(bytes(1))].count(_LF)}")(
-            "is UTF-16 text" if utf16 else "holds NUL bytes: a binary file, or one with a hole",
-            "save it as UTF-8" if utf16 else "copy it again, or cut it before this line",
-        )
+        cause = "is UTF-16 text" if utf16 else "holds NUL bytes: a binary file, or one with a hole"
+        remedy = "save it as UTF-8" if utf16 else "copy it again, or cut it before this line"
+        raise refused(file, f"line {line + data[: data.index(bytes(1))].count(_LF)}")(cause, remedy)
 
 
 def _blocks_of_lines(file: str, source: Source) -> Iterator[tuple[bytes, bool]]:
@@ -165,10 +164,8 @@ def _blocks_of_lines(file: str, source: Source) -> Iterator[tuple[bytes, bool]]:
         lines, rest = _split(b"".join(pending), line)
         line += lines.count(_LF)
         if len(rest) > _LONGEST_LINE:
-            raise refused(file, f"line {line}")(
-                f"is longer than {_LONGEST_LINE} bytes",
-                "is this a text log with one sample a line?",
-            )
+            cause = f"is longer than {_LONGEST_LINE} bytes"
+            raise refused(file, f"line {line}")(cause, "is this a text log with one sample a line?")
         yield lines, True
         pending = [rest]
     lines, rest = _split(b"".join(pending), line)

@@ -17,20 +17,13 @@ _RATE, _FORCE, _TURN, _ANGLE = ("rad/s", "deg/s"), ("m/s^2", "g"), ("rad", "deg"
 
 
 def _columns(names: str, holds: str, *units: str) -> tuple[Column, ...]:
-    """Columns of these units; @ stands for x, y, z in a name and in what it holds."""
+    """Columns of these units; @ in them stands for x, y, z, and % in a name for X, Y, Z."""
     pairs = [
-        (name.replace("@", axis), quantity.replace("@", axis))
+        (name.replace("@", axis).replace("%", axis.upper()), quantity.replace("@", axis))
         for name, quantity in zip(names.split(", "), holds.split(), strict=True)
         for axis in ("xyz" if "@" in quantity else " ")
     ]
     return tuple(Column(quantity, name, units) for name, quantity in pairs)
-
-
-def _triad(names: str, holds: str, *units: str) -> tuple[Column, ...]:
-    """Three columns, with @ for X, Y, Z in the names."""
-    return tuple(
-        Column(holds.replace("@", axis), names.replace("@", axis.upper()), units) for axis in "xyz"
-    )
 
 
 def _format(name: str, looks: Looks | None = None, rows: Looks | None = None, **how: Any):
@@ -224,29 +217,29 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
     _format("xsens-mt", separator="\t", others=True)(
         "Xsens MT Manager: tab-separated text, ticks of 0.1 ms, axes of the sensor",
         (Column("time", "SampleTimeFine", ("ms",), scale=0.1),),
-        _triad("Acc_@", "accel_@", "m/s^2"),
-        _triad("Gyr_@", "gyro_@", "rad/s"),
+        _columns("Acc_%", "accel_@", "m/s^2"),
+        _columns("Gyr_%", "gyro_@", "rad/s"),
     ),
     _format("xsens-dot", others=True)(
         "Xsens DOT: CSV below lines about the device, microseconds, axes of the sensor",
         _columns("SampleTimeFine", "time", "us"),
-        _triad("Acc_@", "accel_@", "m/s^2"),
-        _triad("Gyr_@", "gyro_@", "deg/s"),
+        _columns("Acc_%", "accel_@", "m/s^2"),
+        _columns("Gyr_%", "gyro_@", "deg/s"),
     ),
     _format("microstrain-csv", others=True, choice=True)(
         "MicroStrain MIP Monitor: CSV below DATA_START, week and second of GPS",
         _columns("GPS Week", "week"),
         _columns("GPS TOW", "time_of_week", "s"),
-        _triad("@ Accel [x8004]", "accel_@", "g"),
-        _triad("@ Gyro [x8005]", "gyro_@", "rad/s"),
-        _triad("@ Mag [x8006]", "mag_@", "G"),
+        _columns("% Accel [x8004]", "accel_@", "g"),
+        _columns("% Gyro [x8005]", "gyro_@", "rad/s"),
+        _columns("% Mag [x8006]", "mag_@", "G"),
     ),
     _format("vectornav-csv", others=True, choice=True)(
         "VectorNav: CSV of its uncompensated sensors, as INSTINCT writes it too",
         _columns("TimeStartup | TimeStartup [ns]", "time", "ns"),
-        _triad("UncompAcc@ | UnCompAcc@ | UnCompAcc@ [m/s^2]", "accel_@", "m/s^2"),
-        _triad("UncompGyro@ | UnCompGyro@ | UnCompGyro@ [rad/s]", "gyro_@", "rad/s"),
-        _triad("UncompMag@ | UnCompMag@ | UnCompMag@ [Gauss]", "mag_@", "G"),
+        _columns("UncompAcc% | UnCompAcc% | UnCompAcc% [m/s^2]", "accel_@", "m/s^2"),
+        _columns("UncompGyro% | UnCompGyro% | UnCompGyro% [rad/s]", "gyro_@", "rad/s"),
+        _columns("UncompMag% | UnCompMag% | UnCompMag% [Gauss]", "mag_@", "G"),
     ),
     _format("xio-csv", choice=True)(
         "x-io sensors and Fusion: CSV with any units in its header, axes of the sensor",

@@ -90,10 +90,9 @@ def stamps_to_ns(
         bad = int(np.argmin(good))
         shown = text[bad].decode("utf-8", "replace").strip()
         large = _exactly(text[bad], 0) is not None
-        raise refused(file, f"line {rows[bad]}", field, shown)(
-            "does not fit: the time may be in ns, us or ms" if large else "is not a time stamp",
-            "convert the time column to seconds" if large else "repair or delete the line",
-        )
+        cause = "does not fit: the time may be in ns, us or ms" if large else "is not a time stamp"
+        remedy = "convert the time column to seconds" if large else "repair or delete the line"
+        raise refused(file, f"line {rows[bad]}", field, shown)(cause, remedy)
     return time_ns
 
 
@@ -165,10 +164,9 @@ def dates_to_ns(
             out[k] = calendar_to_ns(date, clock, utc=zone != "GPS", ahead_s=ahead_s)
         except ValueError as error:
             form = "a date and time" if zone else "a date and time with its offset from UTC"
-            raise refused(file, f"line {rows[k]}", field, shown)(
-                f"is not {form} ({error})",
-                f"write it like 2025-06-11 20:34:27{'' if zone else '+00:00'}",
-            ) from error
+            cause = f"is not {form} ({error})"
+            remedy = f"write it like 2025-06-11 20:34:27{'' if zone else '+00:00'}"
+            raise refused(file, f"line {rows[k]}", field, shown)(cause, remedy) from error
     return out
 
 

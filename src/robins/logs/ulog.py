@@ -200,9 +200,8 @@ def stamps(file: str, topic: UlogTopic) -> np.ndarray:
     sample = topic.fields.get("timestamp_sample")
     stamps = topic.fields.get("timestamp") if sample is None or not np.all(sample) else sample
     if stamps is None or stamps.dtype.kind != "u" or np.any(stamps >= LIMIT_NS // 1000):
-        raise refused(file, field=f"stamps of {topic.name}")(
-            "are no microseconds since power-up", "fetch it again"
-        )
+        cause = "are no microseconds since power-up"
+        raise refused(file, field=f"stamps of {topic.name}")(cause, "fetch it again")
     return stamps.astype(np.int64) * 1000
 
 
