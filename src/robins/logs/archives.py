@@ -25,7 +25,7 @@ from robins.foreign import (
     arrays_of_matlab,
     columns_of_parquet,
 )
-from robins.logs.findings import LogError
+from robins.logs.findings import AnyPath, LogError
 from robins.logs.opening import read_beginning, read_whole
 from robins.logs.text import Columns, Head, TextLayout, peek
 
@@ -71,9 +71,7 @@ def _damaged(path: str, size: int, why: str) -> LogError:
     return LogError(path, f"is cut short or damaged after {size} bytes: {why}", remedy)
 
 
-def arrays_in(
-    path: str | os.PathLike[str], names: Collection[str] | None = None
-) -> dict[str, np.ndarray]:
+def arrays_in(path: AnyPath, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
     """Arrays of numbers of an archive by name.
 
     Args:
@@ -96,7 +94,7 @@ def arrays_in(
     return arrays_of_hdf5(data, damaged) if kind == "hdf5" else arrays_of_matlab(data, damaged)
 
 
-def head_of(path: str | os.PathLike[str]) -> Head:
+def head_of(path: AnyPath) -> Head:
     """Beginning of a text file, or names and columns of an archive.
 
     Raises:
@@ -130,12 +128,10 @@ def rows_of(head: Head, layout: TextLayout) -> Columns:
     Raises:
         LogError: they are of several lengths, or hold dates where numbers are needed.
     """
-    wanted = layout.texts + (layout.numbers if layout.numbers is not None else ())
     numbers = layout.numbers
     if numbers is None:
         numbers = tuple(k for k in range(len(head.names)) if k not in layout.texts)
-        wanted = layout.texts + numbers
-    sizes = {head.names[k]: len(head.arrays[k]) for k in wanted}
+    sizes = {head.names[k]: len(head.arrays[k]) for k in layout.texts + numbers}
     if len(set(sizes.values())) != 1:
         listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
         remedy = "declare columns of one sensor, which have one length"

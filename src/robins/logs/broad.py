@@ -15,14 +15,13 @@ stands for the sensor's own axes, of samples and of the attitude alike, so nothi
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import numpy as np
 
 from robins.dataset import AttitudeTable, Dataset, ImuTable, MagTable
 from robins.logs.archives import arrays_in, kind_of_archive, names_in
-from robins.logs.findings import Finding, LogError, refused
-from robins.logs.tables import unit_quaternions
+from robins.logs.findings import AnyPath, Findings, LogError, refused
+from robins.logs.tables import stem_of, unit_quaternions
 from robins.logs.text import Head
 from robins.logs.text_format import RATES_HZ
 from robins.units import to_si
@@ -42,7 +41,7 @@ def is_broad(head: Head) -> bool:
     return bool(names_in(head.file, os.stat(head.file).st_mtime_ns) & set(_COLUMNS))
 
 
-def read_broad(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
+def read_broad(path: AnyPath, findings: Findings = None) -> Dataset:
     """Read a trial: inertial samples, magnetic field and true attitude, all along sensor axes.
 
     Args:
@@ -72,17 +71,13 @@ def read_broad(path: str | os.PathLike[str], findings: list[Finding] | None = No
     if movement.ndim != 1 or movement.dtype.kind != "b":
         raise _misfit(file, "movement", movement, f"({n},) of bool")
     time_ns = np.round(np.arange(n) * (1e9 / rate)).astype(np.int64)
+    gyro, accel, field, q = tables.values()
+    q_nb = unit_quaternions(file, "opt_quat", q, None, findings)
     return Dataset(
-        name=Path(file).name.split(".")[0],
-        imu=ImuTable(time_ns, tables["imu_gyr"], tables["imu_acc"], "rate", source=file),
-        mag=MagTable(time_ns, to_si(tables["imu_mag"], "uT"), source=file),
-        attitude=AttitudeTable(
-            time_ns,
-            unit_quaternions(file, "opt_quat", tables["opt_quat"], None, findings),
-            nav="ENU",
-            moving=movement.copy(),
-            source=file,
-        ),
+        stem_of(file),
+        ImuTable(time_ns, gyro, accel, "rate", source=file),
+        mag=MagTable(time_ns, to_si(field, "uT"), source=file),
+        attitude=AttitudeTable(time_ns, q_nb, "ENU", moving=movement.copy(), source=file),
     )
 
 
@@ -91,10 +86,8 @@ def _rate(file: str, value: np.ndarray) -> float:
         raise _misfit(file, "sampling_rate", value, "() of a real number")
     rate = float(value.reshape(()))
     if not RATES_HZ[0] <= rate <= RATES_HZ[1]:
-        raise refused(file, field="sampling_rate", value=rate)(
-            f"is not between {RATES_HZ[0]:g} and {RATES_HZ[1]:g} Hz, and time is made from it",
-            "give samples a second",
-        )
+        cause = f"is not between {RATES_HZ[0]:g} and {RATES_HZ[1]:g} Hz, and time is made from it"
+        raise refused(file, field="sampling_rate", value=rate)(cause, "give samples a second")
     return rate
 
 

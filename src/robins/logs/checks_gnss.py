@@ -48,13 +48,8 @@ def _missing(gnss: GnssTable) -> Iterator[Finding]:
             k = int(np.argmax(bad))
             # Phones know speed and bearing, but no vertical velocity, and need none.
             never = name.startswith("velocity") and bool(np.isnan(column).all())
-            yield finding(
-                "note" if never else "error" if bad.all() else "warning",
-                gnss,
-                "gnss_missing",
-                int(bad.sum()),
-                k,
-            )(
+            severity = "note" if never else "error" if bad.all() else "warning"
+            yield finding(severity, gnss, "gnss_missing", int(bad.sum()), k)(
                 f"{name} is {column[k]:g} here, missing or impossible in {bad.sum()} of "
                 f"{len(gnss)} fixes. The receiver had none, or the columns are others; `clean` "
                 "leaves it out and keeps the other components of those fixes."
@@ -87,13 +82,13 @@ def _place(gnss: GnssTable) -> Iterator[Finding]:
             f"latitude and longitude are both exactly 0 in {zero.sum()} of {len(gnss)} fixes. The "
             "receiver had no fix and wrote zeros; delete those lines, or write nan."
         )
-    elif np.all(np.abs(np.rad2deg(lat[known])) <= np.pi / 2) and np.all(
-        np.abs(np.rad2deg(lon[known])) <= np.pi
-    ):
-        yield warning(gnss, "position_in_radians", float(np.rad2deg(lat[known][0])))(
-            f"all places lie within latitude {np.rad2deg(lat[known][0]):.5f} deg, longitude "
-            f"{np.rad2deg(lon[known][0]):.5f} deg or so, in the Gulf of Guinea. The file probably "
-            "holds radians where degrees are expected; convert them, unless you were there."
+        return
+    lat_deg, lon_deg = np.rad2deg(lat[known]), np.rad2deg(lon[known])
+    if np.all(np.abs(lat_deg) <= np.pi / 2) and np.all(np.abs(lon_deg) <= np.pi):
+        yield warning(gnss, "position_in_radians", float(lat_deg[0]))(
+            f"all places lie within latitude {lat_deg[0]:.5f} deg, longitude {lon_deg[0]:.5f} deg "
+            "or so, in the Gulf of Guinea. The file probably holds radians where degrees are "
+            "expected; convert them, unless you were there."
         )
 
 
@@ -242,12 +237,9 @@ def _wrong_axes(gnss: GnssTable, change: str) -> Finding:
 
 def _late(gnss: GnssTable, track: FixTrack, late: float) -> Finding:
     epoch = float(np.median(np.diff(track.time_s)))
-    half = abs(late - epoch / 2) < 0.2 * epoch
-    cause = (
-        " That is half an epoch: the receiver gives the mean velocity of the last epoch."
-        if half
-        else ""
-    )
+    cause = ""
+    if abs(late - epoch / 2) < 0.2 * epoch:
+        cause = " That is half an epoch: the receiver gives the mean velocity of the last epoch."
     return warning(gnss, "velocity_late", late)(
         f"the velocities are {abs(late):.2f} s {'older' if late > 0 else 'younger'} than their "
         f"stamps, judged by the positions.{cause} At 2 m/s^2 that is {2 * abs(late):.2f} m/s of "

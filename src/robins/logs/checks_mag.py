@@ -93,9 +93,8 @@ def _missing(mag: MagTable, good: np.ndarray) -> Finding:
 def _zero(mag: MagTable, zero: np.ndarray) -> Finding:
     count = int(np.count_nonzero(zero))
     everywhere = count == len(mag)
-    return finding(
-        "error" if everywhere else "warning", mag, "field_zero", count, int(np.argmax(zero))
-    )(
+    severity = "error" if everywhere else "warning"
+    return finding(severity, mag, "field_zero", count, int(np.argmax(zero)))(
         f"the magnetic field is exactly 0 0 0 in {count} of {len(mag)} samples"
         f"{'' if everywhere else ', this one first'}. The sensor was not connected or not yet "
         "measuring; write nan there, for a field of zero has no direction."

@@ -94,10 +94,8 @@ def _missing(master: Trajectory) -> Iterator[Finding]:
     ):
         bad = ~np.isfinite(values).all(axis=1)
         if bad.any():
-            k = int(np.argmax(bad))
-            yield finding(
-                "error" if bad.all() else "warning", master, "master_missing", int(bad.sum()), k
-            )(
+            severity, k = "error" if bad.all() else "warning", int(np.argmax(bad))
+            yield finding(severity, master, "master_missing", int(bad.sum()), k)(
                 f"the {name} is not whole here, nor in {bad.sum()} of {len(master)} records. The "
                 "rest of those records is used."
             )
@@ -198,9 +196,8 @@ def _late(imu: ImuTable, master: Trajectory, fit: TurningFit, delay_s: float) ->
         if total_s >= 0.0
         else f"Add {-total_s:.3f} s to their stamps, and state no delay"
     )
-    return finding(
-        "error" if abs(fit.late_s) > _TOO_LATE_S else "warning", master, "master_late", fit.late_s
-    )(
+    severity = "error" if abs(fit.late_s) > _TOO_LATE_S else "warning"
+    return finding(severity, master, "master_late", fit.late_s)(
         f"its attitudes are {1e3 * abs(fit.late_s):.0f} ms (one sigma {1e3 * fit.sigma_s:.1f} ms) "
         f"{'older' if fit.late_s > 0 else 'younger'} than {stamps_text}, judged by the gyros of "
         f"{name_of(imu)}. {remedy}."
@@ -247,12 +244,10 @@ def _force(imu: ImuTable, master: Trajectory, shared: SharedMotion | None) -> It
     left = np.array([_left(wanted, measured @ m.T) for m in tried])
     k = int(np.argmax(left < np.min(left) + 1e-3))
     if left[k] > _RIGHT:
-        code, cause = (
-            "force_disagrees",
-            (
-                "No usual unit or order of the axes makes them fit: another recording, a nominal "
-                "mounting that is another, or gravity taken off"
-            ),
+        code = "force_disagrees"
+        cause = (
+            "No usual unit or order of the axes makes them fit: another recording, a nominal "
+            "mounting that is another, or gravity taken off"
         )
     elif k >= len(maps):
         _, code, unit, remedy = units[k - len(maps)]

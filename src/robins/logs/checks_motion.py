@@ -198,37 +198,35 @@ def _unclear(
     imu: ImuTable, gnss: GnssTable, verdict: ModelChoice, left: float, found: dict
 ) -> Iterator[Finding]:
     """A motion that is explained by two causes alike, or by none."""
-    if verdict.nothing.left(verdict.views) < _GOOD:
+    before = verdict.nothing.left(verdict.views)
+    if before < _GOOD:
         return
-    tried = {
-        "clock": "a shift of {0[0]:+.2f} +- {0[1]:.2f} s",
-        "scale": "a factor of {1[0]:.3g} +- {1[1]:.2g} of the gyros",
-        "gyros": "another gyro unit, exchanged or reversed axes",
-        "forces": "other accelerometers",
-    }
-    if not verdict.rival and explained(verdict):
-        yield warning(imu, "motion_disagrees", left)(
-            f"the IMU does not explain the velocities of {name_of(gnss)} as it is "
-            f"({_all(verdict.nothing.left(verdict.views))} of their change is left); only other "
-            "gyros together with other accelerometers do. Compare units and axes of both triads "
-            "with the data sheet."
+    if verdict.rival:
+        (shift, s), (factor, of_factor) = found["offset"], found["gyros"]
+        tried = {
+            "clock": f"a shift of {shift:+.2f} +- {s:.2f} s",
+            "scale": f"a factor of {factor:.3g} +- {of_factor:.2g} of the gyros",
+            "gyros": "another gyro unit, exchanged or reversed axes",
+            "forces": "other accelerometers",
+        }
+        rest = (
+            f" as it is; {tried[verdict.free[0]]} and {tried[verdict.rival]} explain them about "
+            "equally. Drive more turns and stops to tell which."
         )
-    elif not verdict.rival:
-        yield warning(imu, "motion_disagrees", left)(
-            f"the IMU does not explain the velocities of {name_of(gnss)} ({_all(left)} of their "
-            "change is left), and neither another gyro unit, exchanged or reversed axes, nor a "
-            "shift of the clock explains it. Are the files of one recording, and is the IMU fixed "
-            "to the vehicle?"
+    elif explained(verdict):
+        rest = (
+            f" as it is ({_all(before)} of their change is left); only other gyros together with "
+            "other accelerometers do. Compare units and axes of both triads with the data sheet."
         )
     else:
-        causes = [
-            tried[b].format(found["offset"], found["gyros"])
-            for b in (verdict.free[0], verdict.rival)
-        ]
-        yield warning(imu, "motion_disagrees", left)(
-            f"the IMU does not explain the velocities of {name_of(gnss)} as it is; {causes[0]} and "
-            f"{causes[1]} explain them about equally. Drive more turns and stops to tell which."
+        rest = (
+            f" ({_all(left)} of their change is left), and neither another gyro unit, exchanged or "
+            "reversed axes, nor a shift of the clock explains it. Are the files of one recording, "
+            "and is the IMU fixed to the vehicle?"
         )
+    yield warning(imu, "motion_disagrees", left)(
+        f"the IMU does not explain the velocities of {name_of(gnss)}{rest}"
+    )
 
 
 def _all(share: float) -> str:

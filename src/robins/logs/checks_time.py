@@ -34,6 +34,8 @@ _STEPS = {
 }
 _GAP = 2.5  # usual steps
 _SLOWEST_IMU_S = 0.25
+# The longest and the shortest step; a path may be as fast as the cameras of motion capture.
+_STEPS_S = {ImuTable: (_SLOWEST_IMU_S, 2e-5), GnssTable: (45.0, 5e-3), Trajectory: (45.0, 2e-4)}
 _LONGEST_BATCH_S = 1.5
 _PART = 500  # rows
 _WHY_GAPS = {
@@ -42,6 +44,10 @@ _WHY_GAPS = {
     AttitudeTable: "Nothing is compared there",
     OdometryTable: "The wheels tell nothing there",
 }
+_LOST = (
+    "The logger lost data (buffer, card or cable too slow); a run must bridge it blindly, and "
+    "after about a second its heading and position are no longer worth much"
+)
 _LEAP = 18.0  # s between UTC and GPS time since 2017
 _BLIP = 3  # refused samples that count as a slip, not as a clock set anew
 
@@ -54,11 +60,15 @@ def check_time(table: Table, unit_known: bool = False) -> Iterator[Finding]:
         unit_known: the format says in which unit its stamps are, so slow ones are just that.
     """
     if len(table) < 2:
-        yield error(table, "too_short", len(table))(_SHORT.format(n=len(table)))
+        yield error(table, "too_short", len(table))(
+            f"only {len(table)} sample(s). Nothing can be run on that; is it the right file?"
+        )
         return
     usual = usual_step_s(table.time_ns)
     if not np.isfinite(usual):
-        yield error(table, "time_stands", 0.0)(_STANDS)
+        yield error(table, "time_stands", 0.0)(
+            "time never goes forward. The time column is constant or another one; name the format."
+        )
         return
     if (first := batches_of(table)) is not None:
         even = spread(table)
@@ -73,10 +83,6 @@ def check_time(table: Table, unit_known: bool = False) -> Iterator[Finding]:
     yield from _jitter(table, keep, usual)
 
 
-_SHORT = "only {n} sample(s). Nothing can be run on that; is it the right file?"
-_STANDS = "time never goes forward. The time column is constant or another one; name the format."
-
-
 def _slow(table: Table, usual: float) -> Iterator[Finding]:
     """Stamps whose unit is beyond doubt: inertial samples too far apart to navigate by."""
     if isinstance(table, ImuTable) and usual > _SLOWEST_IMU_S:
@@ -87,19 +93,9 @@ def _slow(table: Table, usual: float) -> Iterator[Finding]:
         )
 
 
-def _limits_s(table: Table) -> tuple[float, float]:
-    """The longest and the shortest step that such a sensor makes."""
-    if isinstance(table, ImuTable):
-        return _SLOWEST_IMU_S, 2e-5
-    if isinstance(table, GnssTable):
-        return 45.0, 5e-3
-    # A path may be as fast as the cameras of motion capture.
-    return (45.0, 2e-4) if isinstance(table, Trajectory) else (2.0, 2e-5)
-
-
 def _unit(table: Table, usual: float) -> Iterator[Finding]:
     """A rate no such sensor has tells the unit of time."""
-    slowest, fastest = _limits_s(table)
+    slowest, fastest = _STEPS_S.get(type(table), (2.0, 2e-5))
     for factor, unit in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
         if usual > slowest and fastest < usual * factor < slowest:
             yield error(table, "time_unit", usual)(
@@ -129,13 +125,12 @@ def _shared(table: Table, size: float, step_s: float) -> Finding:
         else f"`clean` spreads each batch evenly, {step_s * 1e3:.4g} ms apart; all may be early or "
         f"late by up to {many_s * 1e3:.4g} ms, so log the sensor's own counter, or all digits"
     )
-    return finding(
-        "error" if many_s > _LONGEST_BATCH_S else "warning",
-        table,
-        "stamps_shared",
-        size,
-        int(np.argmax(again)) + 1 if again.any() else None,
-    )(f"{how}. A buffer was read at once and stamped on arrival, or stamps were rounded. {remedy}.")
+    severity = "error" if many_s > _LONGEST_BATCH_S else "warning"
+    row = int(np.argmax(again)) + 1 if again.any() else None
+    return finding(severity, table, "stamps_shared", size, row)(
+        f"{how}. A buffer was read at once and stamped on arrival, or stamps were rounded. "
+        f"{remedy}."
+    )
 
 
 def _duplicates(table: Table) -> Iterator[Finding]:
@@ -221,18 +216,10 @@ def _gaps(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
         return
     worst = max(gaps, key=lambda k: step[k])
     total = sum(step[k] for k in gaps)
-    cause = (
-        _WHY_GAPS.get(type(table))
-        or "The logger lost data (buffer, card or cable too slow); a run must bridge it blindly, "
-        "and after about a second its heading and position are no longer worth much"
-    )
-    yield finding(
-        "note" if harmless or total < 0.05 else "warning",
-        table,
-        "gap_long" if step[worst] >= 1.0 else "gap_short",
-        float(step[worst]),
-        rows[worst + 1],
-    )(
+    cause = _WHY_GAPS.get(type(table), _LOST)
+    severity = "note" if harmless or total < 0.05 else "warning"
+    code = "gap_long" if step[worst] >= 1.0 else "gap_short"
+    yield finding(severity, table, code, float(step[worst]), rows[worst + 1])(
         f"no sample for {step[worst]:.6g} s before this one, where {usual:.6g} s is usual "
         f"({len(gaps)} gaps, {total:.6g} s in all, the first at {place(table, rows[gaps[0]])}). "
         f"{cause}."

@@ -97,11 +97,8 @@ def clean_imu(imu: ImuTable) -> tuple[ImuTable, dict[str, int], list[tuple[int, 
     if np.count_nonzero(keep) < 2:
         reasons = {k.removeprefix("imu_"): n for k, n in counts.items() if n and k != "imu_spread"}
         counted = ", ".join(f"{n} {reason}" for reason, n in reasons.items()) or "none"
-        raise LogError(
-            imu.source or "ImuTable",
-            f"fewer than two of {len(imu)} samples can be used (refused: {counted})",
-            "the doctor tells what is wrong with them",
-        )
+        cause = f"fewer than two of {len(imu)} samples can be used (refused: {counted})"
+        raise LogError(imu.source or "ImuTable", cause, "the doctor tells what is wrong with them")
     return rows_where(imu, keep), counts, _gaps(imu, keep)
 
 
@@ -129,17 +126,11 @@ def clean_master(master: Trajectory) -> tuple[Trajectory, dict[str, int]]:
     if master.omega_ib_b is not None:
         parts["omega_ib_b"] = (master.omega_ib_b, GYRO_LIMIT)
     kept: dict[str, np.ndarray] = {}
-    bad = {reason: np.zeros(len(master), bool) for reason in ("nan", "inf", "absurd")}
+    bad: dict[str, Rows] = {}
     for name, (values, limit) in parts.items():
-        nan, inf = np.isnan(values), np.isinf(values)
-        with np.errstate(invalid="ignore"):
-            absurd = (np.abs(values) > limit) & ~inf
-        missing = nan | inf | absurd
-        if name == "q_nb":
-            missing = missing.any(axis=1, keepdims=True)
-        kept[name] = np.where(missing, np.nan, values)
-        for reason, mask in zip(bad, (nan, inf, absurd), strict=True):
-            bad[reason] |= mask.any(axis=1)
+        kept[name], more = _numbers(values, limit)
+        bad = {reason: rows | bad.get(reason, rows) for reason, rows in more.items()}
+    kept["q_nb"][np.isnan(kept["q_nb"]).any(axis=1)] = np.nan
     have = np.any([np.isfinite(values).any(axis=1) for values in kept.values()], axis=0)
     keep, counts = refusals("master", master.time_ns, have, bad)
     lat, lon, alt = kept.pop("place").T
@@ -190,6 +181,16 @@ def _whole_rows(values: np.ndarray, limit: np.ndarray) -> tuple[Rows, dict[str, 
     return ~(nan | inf | absurd), {"nan": nan, "inf": inf, "absurd": absurd}
 
 
+def _numbers(values: np.ndarray, limit: np.ndarray | float) -> tuple[np.ndarray, dict[str, Rows]]:
+    """Values, NaN where one is not finite or beyond its limit, and rows with such by reason."""
+    nan, inf = np.isnan(values), np.isinf(values)
+    with np.errstate(invalid="ignore"):
+        absurd = (np.abs(values) > limit) & ~inf
+    bad = {"nan": nan, "inf": inf, "absurd": absurd}
+    kept = np.where(nan | inf | absurd, np.nan, values)
+    return kept, {reason: mask.any(axis=1) for reason, mask in bad.items()}
+
+
 def _components(
     values: np.ndarray, sigma: np.ndarray, limit: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
@@ -238,10 +239,7 @@ def clean_mag(mag: MagTable) -> tuple[MagTable, dict[str, int]]:
     """
     read = checked(mag)
     mag = spread(read)
-    nan, inf = np.isnan(mag.field_t), np.isinf(mag.field_t)
-    absurd = (np.abs(mag.field_t) > FIELD_LIMIT_T) & ~inf
-    field_t = np.where(inf | absurd, np.nan, mag.field_t)
-    bad = {"nan": nan.any(axis=1), "inf": inf.any(axis=1), "absurd": absurd.any(axis=1)}
+    field_t, bad = _numbers(mag.field_t, FIELD_LIMIT_T)
     keep, counts = refusals("mag", mag.time_ns, np.ones(len(mag), bool), bad)
     counts |= spread_counts("mag", read, mag)
     return rows_where(dataclasses.replace(mag, field_t=field_t), keep), counts

@@ -13,16 +13,15 @@ Source: ArduPilot, libraries/AP_Logger/README.md.
 
 from __future__ import annotations
 
-import os
 import re
 import struct
-from pathlib import Path
 
 import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.logs.findings import (
-    Finding,
+    AnyPath,
+    Findings,
     LogError,
     damaged,
     finding_reporter,
@@ -34,6 +33,7 @@ from robins.logs.findings import (
 from robins.logs.fix_kinds import MAVLINK, fixes, over_ground
 from robins.logs.merging import gps_clock
 from robins.logs.opening import Bytes, map_file
+from robins.logs.tables import recording
 from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS
 from robins.logs.ulog import UlogTopic, column, stamps, triad
 from robins.units import to_si
@@ -51,7 +51,7 @@ _LAST_WEEK = 6000  # in 2095
 _FIX = 2  # least status of a fix
 
 
-def read_dataflash(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
+def read_dataflash(path: AnyPath, findings: Findings = None) -> Dataset:
     """Read inertial samples, and field and fixes where they were logged.
 
     Args:
@@ -79,17 +79,13 @@ def read_dataflash(path: str | os.PathLike[str], findings: list[Finding] | None 
         else:
             gnss = None
     gyro, accel = triad(file, imu, "Gyr{}", "XYZ"), triad(file, imu, "Acc{}", "XYZ")
-    field = mag and to_si(triad(file, mag, "Mag{}", "XYZ"), "mG")
-    return Dataset(
-        name=Path(file).name.split(".")[0],
-        imu=ImuTable(imu_ns, gyro, accel, "rate", source=file),
-        mag=None if mag_ns is None or field is None else MagTable(mag_ns, field, source=file),
-        gnss=gnss,
-        time_unit_known=(file,),
-    )
+    samples, field = ImuTable(imu_ns, gyro, accel, "rate", source=file), None
+    if mag is not None and mag_ns is not None:
+        field = MagTable(mag_ns, to_si(triad(file, mag, "Mag{}", "XYZ"), "mG"), source=file)
+    return recording(file, samples, gnss, mag=field)
 
 
-def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[str, UlogTopic]:
+def _topics(file: str, data: Bytes, findings: Findings) -> dict[str, UlogTopic]:
     """The wanted messages; bytes that belong to none are counted.
 
     Raises:
@@ -164,7 +160,7 @@ def _definition(file: str, data: Bytes, at: int) -> tuple[int, int, str, np.dtyp
 
 
 def _instance(
-    file: str, topics: dict[str, UlogTopic], name: str, findings: list[Finding] | None
+    file: str, topics: dict[str, UlogTopic], name: str, findings: Findings
 ) -> UlogTopic | None:
     """The rows of the lowest instance; of GPS the lowest that had fixes, of GPA the same one."""
     topic, gps = topics.get(name), topics.get("GPS")
@@ -186,7 +182,7 @@ def _instance(
 
 
 def _fixes(
-    file: str, gps: UlogTopic, gpa: UlogTopic | None, findings: list[Finding] | None
+    file: str, gps: UlogTopic, gpa: UlogTopic | None, findings: Findings
 ) -> tuple[GnssTable, np.ndarray]:
     """Fixes that have a GPS time, and when each was logged."""
     week, ms = column(file, gps, "GWk"), column(file, gps, "GMS")
@@ -210,16 +206,12 @@ def _fixes(
     if np.isnan(separation).any():
         report_geoid_heights(findings, file, "A newer version of ArduPilot logs the geoid.")
         separation = np.zeros_like(separation)
-    down = np.where(beside("VV") == 0.0, np.nan, column(file, gps, "VZ"))
-    table = fixes(
-        file,
-        GPS_EPOCH_NS + time_ns,
-        (column(file, gps, "Lat"), column(file, gps, "Lng"), column(file, gps, "Alt") - separation),
-        (beside("HAcc"), beside("HAcc"), beside("VAcc")),
-        over_ground(column(file, gps, "Spd"), column(file, gps, "GCrs"), down),
-        beside("SAcc"),
-        np.array([MAVLINK.get(int(k), 0) for k in status]),
-        status == 2,
-        findings,
+    lat, lon, alt, speed, course, down = (
+        column(file, gps, name) for name in ("Lat", "Lng", "Alt", "Spd", "GCrs", "VZ")
     )
+    v_n = over_ground(speed, course, np.where(beside("VV") == 0.0, np.nan, down))
+    place, sigma_m = (lat, lon, alt - separation), (beside("HAcc"), beside("HAcc"), beside("VAcc"))
+    kind = np.array([MAVLINK.get(int(k), 0) for k in status])
+    time_ns, flat = GPS_EPOCH_NS + time_ns, status == 2
+    table = fixes(file, time_ns, place, sigma_m, v_n, beside("SAcc"), kind, flat, findings)
     return table, arrived

@@ -30,9 +30,10 @@ from typing import Any
 
 from robins.foreign import decoding
 from robins.logs.archives import head_of
-from robins.logs.findings import LogError, refused
+from robins.logs.findings import AnyPath, LogError, os_errors, refused
 from robins.logs.quantities import QUANTITIES
 from robins.logs.registry import format_named, matching_formats
+from robins.logs.tables import stem_of
 from robins.logs.text import Head
 from robins.logs.text_format import Column, TextFormat, columns_of, header_of, one_of
 from robins.units import KINDS, UnitError, parse
@@ -40,7 +41,7 @@ from robins.units import KINDS, UnitError, parse
 NAMED = "format:"
 """What the name of a format begins with where files with declarations are given."""
 
-Paths = Iterable[str | os.PathLike[str]]
+Paths = Iterable[AnyPath]
 Types = dict[str, tuple[type, ...]]
 _KEYS: Types = {"columns": (dict,), "separator": (str,), "skip": (int,)}
 _KEYS |= {"body": (str,), "nav": (str,), "rate": (str,), "decimal": (str,)}
@@ -51,7 +52,7 @@ _MANY = re.compile(r"([-+]?\d+\.?\d*(?:[eE][-+]?\d+)?) (.+)")
 _WORDS = {dict: "a table", str: "text", int: "a whole number", float: "a number"}
 
 
-def columns_from(path: str | os.PathLike[str]) -> TextFormat:
+def columns_from(path: AnyPath) -> TextFormat:
     """Read a format from a TOML file.
 
     Raises:
@@ -60,10 +61,8 @@ def columns_from(path: str | os.PathLike[str]) -> TextFormat:
     """
     file = os.fspath(path)
     try:
-        text = Path(path).read_text("utf-8")
-    except OSError as error:
-        why = error.strerror or str(error)
-        raise LogError(file, f"cannot be read: {why}", "check path and permissions") from error
+        with os_errors(file):
+            text = Path(path).read_text("utf-8")
     except UnicodeDecodeError as error:
         raise LogError(file, f"is no TOML: {error}", "repair it") from error
     return format_of(text, file)
@@ -87,7 +86,7 @@ def format_of(text: str, file: str) -> TextFormat:
         except UnitError as error:
             raise refused(file, field="rate")(str(error), "give it like 100 Hz") from error
         del content["rate"]
-    name = Path(file).name.split(".")[0]
+    name = stem_of(file)
     row = TextFormat(name, f"declared in {file}", columns, others=True, source=file, **content)
     # a file of several sensors has gaps where one is slower
     return replace(row, sparse=len(row.kinds) > 1 or any(c.where[0] for c in columns))
@@ -180,7 +179,7 @@ def formats_of(files: Paths, columns: Paths) -> dict[str, str | TextFormat]:
     return out
 
 
-def _head(path: str | os.PathLike[str]) -> Head | None:
+def _head(path: AnyPath) -> Head | None:
     """Beginning of a text file; one of another kind cannot be in a declared format."""
     try:
         return head_of(path)

@@ -70,46 +70,42 @@ class Check:
 
 def _check(topic: str, find: Callable[..., Iterable[Finding]], needs: str, **when: str):
     """A row: what it is asked about and when, and then what it can say."""
-    return lambda *codes: Check(topic, find, needs, codes, **when)
+    return lambda *codes: Check(topic, find, needs, _codes(*codes), **when)
+
+
+def _codes(*rows: tuple[str, str, str]) -> tuple[FindingCode, ...]:
+    return tuple(FindingCode(*row) for row in rows)
 
 
 # What readers leave out or doubt while they read.
-OF_READERS = (
-    FindingCode("ends_early", "warning", "the recording or the copy was interrupted"),
-    FindingCode("begins_midway", "warning", "the recording began in the middle of a line"),
-    FindingCode(
-        "no_place", "note", "the path is in local metres; it was put at latitude 0, longitude 0"
-    ),
-    FindingCode("no_velocity", "note", "RTKLIB did not solve for velocities"),
-    FindingCode("height_above_geoid", "warning", "heights are above the geoid, not the ellipsoid"),
-    FindingCode("dt_disagrees", "warning", "the column dt is not the time that has passed"),
-    FindingCode("several_instances", "note", "a recording holds several sensors of one kind"),
-    FindingCode(
-        "angle_range", "warning", "single angles that cannot be; they are taken as missing"
-    ),
-    FindingCode("quaternion_length", "warning", "single quaternions of another length; likewise"),
-    FindingCode("other_kinds", "note", "a file holds lines of kinds that are not read"),
-    FindingCode("damaged_frames", "warning", "messages without a right checksum, or bytes of none"),
-    FindingCode("undated", "note", "fixes from before the receiver knew the date"),
-    FindingCode(
-        "sigma_assumed", "note", "a receiver states no sigmas; those of its kind of fix are used"
-    ),
-    FindingCode("height_assumed", "warning", "a receiver states no heights, as with RMC alone"),
-    FindingCode("sensors_merged", "note", "gyros and accelerometers were recorded apart"),
-    FindingCode("table_replaced", "note", "a file of its own replaces what a recording holds"),
-    FindingCode("clock_aligned", "note", "samples are put on GPS time by the arrival of the fixes"),
-    FindingCode("velocity_taken", "note", "velocities of fixes come from a topic of their own"),
-    FindingCode(
-        "lines_left_out", "warning", "lines that fail their checksum, or of an idle receiver"
-    ),
-    FindingCode("fixes_of_truth", "note", "fixes and path are one solution, of the same receiver"),
+OF_READERS = _codes(
+    ("ends_early", "warning", "the recording or the copy was interrupted"),
+    ("begins_midway", "warning", "the recording began in the middle of a line"),
+    ("no_place", "note", "the path is in local metres; it was put at latitude 0, longitude 0"),
+    ("no_velocity", "note", "RTKLIB did not solve for velocities"),
+    ("height_above_geoid", "warning", "heights are above the geoid, not the ellipsoid"),
+    ("dt_disagrees", "warning", "the column dt is not the time that has passed"),
+    ("several_instances", "note", "a recording holds several sensors of one kind"),
+    ("angle_range", "warning", "single angles that cannot be; they are taken as missing"),
+    ("quaternion_length", "warning", "single quaternions of another length; likewise"),
+    ("other_kinds", "note", "a file holds lines of kinds that are not read"),
+    ("damaged_frames", "warning", "messages without a right checksum, or bytes of none"),
+    ("undated", "note", "fixes from before the receiver knew the date"),
+    ("sigma_assumed", "note", "a receiver states no sigmas; those of its kind of fix are used"),
+    ("height_assumed", "warning", "a receiver states no heights, as with RMC alone"),
+    ("sensors_merged", "note", "gyros and accelerometers were recorded apart"),
+    ("table_replaced", "note", "a file of its own replaces what a recording holds"),
+    ("clock_aligned", "note", "samples are put on GPS time by the arrival of the fixes"),
+    ("velocity_taken", "note", "velocities of fixes come from a topic of their own"),
+    ("lines_left_out", "warning", "lines that fail their checksum, or of an idle receiver"),
+    ("fixes_of_truth", "note", "fixes and path are one solution, of the same receiver"),
 )
 
 _OF_VELOCITY = (
-    FindingCode("velocity_unit", "error", "velocities that fit the positions in another unit"),
-    FindingCode("velocity_axes", "error", "velocities that fit with axes exchanged or reversed"),
-    FindingCode("velocity_disagrees", "warning", "velocities that fit the positions in no way"),
-    FindingCode("velocity_late", "warning", "velocities that fit only with a delay"),
+    ("velocity_unit", "error", "velocities that fit the positions in another unit"),
+    ("velocity_axes", "error", "velocities that fit with axes exchanged or reversed"),
+    ("velocity_disagrees", "warning", "velocities that fit the positions in no way"),
+    ("velocity_late", "warning", "velocities that fit only with a delay"),
 )
 
 _NO_PLACE = "position_unit no_fix_as_zero"
@@ -117,92 +113,72 @@ _NO_PLACE = "position_unit no_fix_as_zero"
 # Asked about each table by itself; only findings on that table silence.
 ALONE = (
     _check("In time", check_time, "stamps unit_known")(
-        FindingCode("too_short", "error", "fewer than two samples; nothing can be run on that"),
-        FindingCode("time_stands", "error", "a time column that is constant, or another one"),
-        FindingCode("time_unit", "error", "the rate tells that time is in ms, us or ns"),
-        FindingCode("time_slow", "warning", "inertial samples too far apart to navigate by"),
-        FindingCode(
-            "stamps_shared", "error or warning", "stamps of batches; `clean` spreads the samples"
-        ),
-        FindingCode(
-            "time_duplicate", "warning", "samples that repeat a time; `clean` refuses them"
-        ),
-        FindingCode("clock_set_back", "error", "a counter ran over, a time zone, a restart"),
-        FindingCode("time_backward", "warning", "samples that step back; `clean` refuses them"),
-        FindingCode("time_jump", "warning", "a gap, or a clock set by a leap second, a time zone"),
-        FindingCode("gap_short", "warning or note", "samples are missing, for less than a second"),
-        FindingCode("gap_long", "warning or note", "samples are missing, for a second or more"),
-        FindingCode("stamps_rounded", "note", "digits of stamps were lost"),
-        FindingCode("time_jitter", "warning or note", "stamps taken on arrival, not by the sensor"),
+        ("too_short", "error", "fewer than two samples; nothing can be run on that"),
+        ("time_stands", "error", "a time column that is constant, or another one"),
+        ("time_unit", "error", "the rate tells that time is in ms, us or ns"),
+        ("time_slow", "warning", "inertial samples too far apart to navigate by"),
+        ("stamps_shared", "error or warning", "stamps of batches; `clean` spreads the samples"),
+        ("time_duplicate", "warning", "samples that repeat a time; `clean` refuses them"),
+        ("clock_set_back", "error", "a counter ran over, a time zone, a restart"),
+        ("time_backward", "warning", "samples that step back; `clean` refuses them"),
+        ("time_jump", "warning", "a gap, or a clock set by a leap second, a time zone"),
+        ("gap_short", "warning or note", "samples are missing, for less than a second"),
+        ("gap_long", "warning or note", "samples are missing, for a second or more"),
+        ("stamps_rounded", "note", "digits of stamps were lost"),
+        ("time_jitter", "warning or note", "stamps taken on arrival, not by the sensor"),
     ),
     _check("In the numbers of any table", check_limits, "table")(
-        FindingCode(
-            "absurd", "warning", "single numbers no vehicle has: a bit or a digit was lost"
-        ),
+        ("absurd", "warning", "single numbers no vehicle has: a bit or a digit was lost"),
     ),
     _check("In the inertial samples", check_columns, "imu")(
-        FindingCode("column_missing", "error", "a column without a number"),
-        FindingCode("not_finite", "warning", "single samples without a number"),
-        FindingCode("axis_stuck", "error", "a value that never changes"),
-        FindingCode("axis_stuck_for_a_while", "warning", "a value that hung for a while"),
-        FindingCode("saturated", "warning", "the range was too small"),
-        FindingCode("coarse", "warning", "the bits or the decimals were too few"),
+        ("column_missing", "error", "a column without a number"),
+        ("not_finite", "warning", "single samples without a number"),
+        ("axis_stuck", "error", "a value that never changes"),
+        ("axis_stuck_for_a_while", "warning", "a value that hung for a while"),
+        ("saturated", "warning", "the range was too small"),
+        ("coarse", "warning", "the bits or the decimals were too few"),
     ),
     _check("In the inertial samples", check_imu, "imu in_vehicle")(
-        FindingCode("no_samples", "error", "fewer than ten samples have all six numbers"),
-        FindingCode(
-            "gravity_bias", "note", "the unit is right, the accelerometers are a little off"
-        ),
-        FindingCode(
-            "rates_as_increments", "error", "gravity tells that rates are read as increments"
-        ),
-        FindingCode(
-            "increments_as_rates", "error", "gravity tells that increments are read as rates"
-        ),
-        FindingCode(
-            "gravity_unit", "error", "gravity tells that the unit is g, mg, cm/s^2, ft/s^2"
-        ),
-        FindingCode("gravity_missing", "error", "gravity was taken off"),
-        FindingCode("gravity_unknown", "error", "gravity is not there, and no usual unit makes it"),
-        FindingCode("gravity_not_seen", "warning", "the same, in a log without a second at rest"),
-        FindingCode("sensor_axes", "note", "gravity is not along z: attitude will be the sensor's"),
-        FindingCode("z_axis_reversed", "error", "gravity points the wrong way"),
-        FindingCode("not_level", "warning", "gravity points along another axis"),
-        FindingCode(
-            "gyro_unit", "error or warning", "too fast, or the Earth's rate in deg/h, deg/s"
-        ),
+        ("no_samples", "error", "fewer than ten samples have all six numbers"),
+        ("gravity_bias", "note", "the unit is right, the accelerometers are a little off"),
+        ("rates_as_increments", "error", "gravity tells that rates are read as increments"),
+        ("increments_as_rates", "error", "gravity tells that increments are read as rates"),
+        ("gravity_unit", "error", "gravity tells that the unit is g, mg, cm/s^2, ft/s^2"),
+        ("gravity_missing", "error", "gravity was taken off"),
+        ("gravity_unknown", "error", "gravity is not there, and no usual unit makes it"),
+        ("gravity_not_seen", "warning", "the same, in a log without a second at rest"),
+        ("sensor_axes", "note", "gravity is not along z: attitude will be the sensor's"),
+        ("z_axis_reversed", "error", "gravity points the wrong way"),
+        ("not_level", "warning", "gravity points along another axis"),
+        ("gyro_unit", "error or warning", "too fast, or the Earth's rate in deg/h, deg/s"),
     ),
     _check("In the GNSS fixes", check_gnss, "gnss")(
-        FindingCode("gnss_missing", "error, warning or note", "components; the others are used"),
-        FindingCode("position_unit", "error", "degrees for radians, longitude for latitude"),
-        FindingCode("no_fix_as_zero", "error", '"no fix" was written as latitude 0, longitude 0'),
-        FindingCode("position_in_radians", "warning", "radians were read as degrees"),
-        FindingCode("height", "error or warning", "nobody drives, sails or flies by air there"),
-        FindingCode("sigma_not_positive", "warning", "zero, which means unknown, not exact"),
-        FindingCode(
-            "sigma_missing", "note", "there is none in any fix; a replay assumes the usual ones"
-        ),
-        FindingCode("sigma_absurd", "warning", "they are in another unit, or variances"),
-        FindingCode("float_sigma", "warning", "float solutions claim to be as good as fixed ones"),
-        FindingCode("position_resolution", "note", "too few decimals for so good a fix"),
+        ("gnss_missing", "error, warning or note", "components; the others are used"),
+        ("position_unit", "error", "degrees for radians, longitude for latitude"),
+        ("no_fix_as_zero", "error", '"no fix" was written as latitude 0, longitude 0'),
+        ("position_in_radians", "warning", "radians were read as degrees"),
+        ("height", "error or warning", "nobody drives, sails or flies by air there"),
+        ("sigma_not_positive", "warning", "zero, which means unknown, not exact"),
+        ("sigma_missing", "note", "there is none in any fix; a replay assumes the usual ones"),
+        ("sigma_absurd", "warning", "they are in another unit, or variances"),
+        ("float_sigma", "warning", "float solutions claim to be as good as fixed ones"),
+        ("position_resolution", "note", "too few decimals for so good a fix"),
     ),
     _check("In the GNSS fixes", check_velocity, "gnss", silenced_by=_NO_PLACE)(
         *_OF_VELOCITY,
-        FindingCode("velocity_sign", "error", "a vertical velocity of the other sign"),
+        ("velocity_sign", "error", "a vertical velocity of the other sign"),
     ),
     _check("In the magnetic field", check_mag, "mag")(
-        FindingCode("field_missing", "warning", "samples without a number"),
-        FindingCode("field_zero", "error or warning", "0 0 0 where there was no measurement"),
-        FindingCode("field_stuck", "error", "an axis that never changes"),
-        FindingCode("field_unit", "error or warning", "the Earth's field of 20 to 70 uT tells it"),
-        FindingCode("field_stuck_for_a_while", "warning", "the sensor hung"),
-        FindingCode("field_repeated", "note", "more rows than the sensor took measurements"),
-        FindingCode("field_saturated", "warning", "a magnet drove it to its stop"),
-        FindingCode("field_offset", "warning", "hard iron: run `robins calibrate`"),
-        FindingCode("field_varies", "warning", "hard or soft iron, or steel and magnets around"),
-        FindingCode(
-            "field_disturbed", "note", "single stretches of another field than the Earth's"
-        ),
+        ("field_missing", "warning", "samples without a number"),
+        ("field_zero", "error or warning", "0 0 0 where there was no measurement"),
+        ("field_stuck", "error", "an axis that never changes"),
+        ("field_unit", "error or warning", "the Earth's field of 20 to 70 uT tells it"),
+        ("field_stuck_for_a_while", "warning", "the sensor hung"),
+        ("field_repeated", "note", "more rows than the sensor took measurements"),
+        ("field_saturated", "warning", "a magnet drove it to its stop"),
+        ("field_offset", "warning", "hard iron: run `robins calibrate`"),
+        ("field_varies", "warning", "hard or soft iron, or steel and magnets around"),
+        ("field_disturbed", "note", "single stretches of another field than the Earth's"),
     ),
 )
 
@@ -217,11 +193,9 @@ _GYROS_WRONG = "gyro_unit gyro_scale gyro_axes gyro_reversed left_handed"
 # Asked about all tables of a log together.
 TOGETHER = (
     _check("In time", check_span, "imu others")(
-        FindingCode(
-            "no_overlap", "error", "the files share no time; names the offset that would fit"
-        ),
-        FindingCode("leap_seconds", "note", "one file may be in UTC, one in GPS time"),
-        FindingCode("little_overlap", "warning", "the files share little of their time"),
+        ("no_overlap", "error", "the files share no time; names the offset that would fit"),
+        ("leap_seconds", "note", "one file may be in UTC, one in GPS time"),
+        ("little_overlap", "warning", "the files share little of their time"),
     ),
     # An IMU alone is judged at rest or nearly so; a master tells more, in any motion.
     _check(
@@ -232,22 +206,22 @@ TOGETHER = (
         "z_axis_reversed not_level rates_as_increments increments_as_rates",
         undecided="force_not_checked",
     )(
-        FindingCode("master_missing", "error or warning", "position, velocity or attitude"),
+        ("master_missing", "error or warning", "position, velocity or attitude"),
         *_OF_VELOCITY,
-        FindingCode("velocity_sign", "error", "it changes against positions or specific forces"),
-        FindingCode("turning_not_checked", "note", "the vehicle hardly turns"),
-        FindingCode("attitude_sign", "error", "heading, pitch or roll reversed, or all inverted"),
-        FindingCode("gyro_axes", "error", "the gyros turn as the attitudes with other axes"),
-        FindingCode("gyro_unit", "error", "the gyros turn as the attitudes in another unit"),
-        FindingCode("turning_disagrees", "error", "gyros and attitudes show two turnings"),
-        FindingCode("master_late", "error or warning", "attitudes older or younger than stated"),
-        FindingCode("force_not_checked", "note", "too few seconds of both"),
-        FindingCode("gravity_unit", "error", "accelerometers fit the velocities in another unit"),
-        FindingCode("rates_as_increments", "error", "likewise"),
-        FindingCode("increments_as_rates", "error", "likewise"),
-        FindingCode("accel_reversed", "error", "they fit with the opposite sign"),
-        FindingCode("accel_axes", "error", "they fit with axes exchanged or reversed"),
-        FindingCode("force_disagrees", "error", "they feel something else than the velocities ask"),
+        ("velocity_sign", "error", "it changes against positions or specific forces"),
+        ("turning_not_checked", "note", "the vehicle hardly turns"),
+        ("attitude_sign", "error", "heading, pitch or roll reversed, or all inverted"),
+        ("gyro_axes", "error", "the gyros turn as the attitudes with other axes"),
+        ("gyro_unit", "error", "the gyros turn as the attitudes in another unit"),
+        ("turning_disagrees", "error", "gyros and attitudes show two turnings"),
+        ("master_late", "error or warning", "attitudes older or younger than stated"),
+        ("force_not_checked", "note", "too few seconds of both"),
+        ("gravity_unit", "error", "accelerometers fit the velocities in another unit"),
+        ("rates_as_increments", "error", "likewise"),
+        ("increments_as_rates", "error", "likewise"),
+        ("accel_reversed", "error", "they fit with the opposite sign"),
+        ("accel_axes", "error", "they fit with axes exchanged or reversed"),
+        ("force_disagrees", "error", "they feel something else than the velocities ask"),
     ),
     _check(
         "In IMU and GNSS together",
@@ -259,26 +233,22 @@ TOGETHER = (
         overrules="leap_seconds",
         undecided="motion_not_checked",
     )(
-        FindingCode("motion_not_checked", "note", "too little motion to compare them"),
-        FindingCode("motion_disagrees", "warning", "they do not describe one motion in any way"),
-        FindingCode("time_offset", "error or warning", "they fit only if one file is shifted"),
-        FindingCode("leap_seconds", "error", "likewise, by the 18 s between UTC and GPS time"),
-        FindingCode("time_jump", "error", "they fit only if one file is shifted from there on"),
-        FindingCode("clock_rate", "error", "the clocks of the two drift apart"),
-        FindingCode(
-            "gyro_unit", "error", "turns fit those of the velocities in another unit or scale"
-        ),
-        FindingCode("gyro_scale", "error", "they fit with another scale about one axis"),
-        FindingCode("force_scale", "warning", "likewise specific forces along an axis"),
-        FindingCode("left_handed", "error", "axes or signs of both triads"),
-        FindingCode("accel_reversed", "error", "the accelerometers have the opposite sign"),
-        FindingCode("accel_axes", "error", "axes or signs of the accelerometers"),
-        FindingCode("gyro_reversed", "error", "the gyros have the opposite sense"),
-        FindingCode("gyro_axes", "error", "axes or signs of the gyros"),
-        FindingCode("lever_arm", "note", "the antenna is away from the IMU"),
-        FindingCode(
-            "forward_axis", "warning", "the vehicle does not travel along its forward axis"
-        ),
+        ("motion_not_checked", "note", "too little motion to compare them"),
+        ("motion_disagrees", "warning", "they do not describe one motion in any way"),
+        ("time_offset", "error or warning", "they fit only if one file is shifted"),
+        ("leap_seconds", "error", "likewise, by the 18 s between UTC and GPS time"),
+        ("time_jump", "error", "they fit only if one file is shifted from there on"),
+        ("clock_rate", "error", "the clocks of the two drift apart"),
+        ("gyro_unit", "error", "turns fit those of the velocities in another unit or scale"),
+        ("gyro_scale", "error", "they fit with another scale about one axis"),
+        ("force_scale", "warning", "likewise specific forces along an axis"),
+        ("left_handed", "error", "axes or signs of both triads"),
+        ("accel_reversed", "error", "the accelerometers have the opposite sign"),
+        ("accel_axes", "error", "axes or signs of the accelerometers"),
+        ("gyro_reversed", "error", "the gyros have the opposite sense"),
+        ("gyro_axes", "error", "axes or signs of the gyros"),
+        ("lever_arm", "note", "the antenna is away from the IMU"),
+        ("forward_axis", "warning", "the vehicle does not travel along its forward axis"),
     ),
     _check(
         "In an IMU that was turned about",
@@ -289,11 +259,9 @@ TOGETHER = (
         but_after="motion_not_checked",
         proves="gyro_unit",
     )(
-        FindingCode(
-            "gyro_unit", "error", "the gyros turn gravity as it was seen in another unit or scale"
-        ),
-        FindingCode("left_handed", "error", "they do with the opposite sense, or triads reflected"),
-        FindingCode("gyro_axes", "error", "they do with axes exchanged or reversed"),
+        ("gyro_unit", "error", "the gyros turn gravity as it was seen in another unit or scale"),
+        ("left_handed", "error", "they do with the opposite sense, or triads reflected"),
+        ("gyro_axes", "error", "they do with axes exchanged or reversed"),
     ),
     _check(
         "In the magnetic field",
@@ -302,7 +270,7 @@ TOGETHER = (
         silenced_by=f"{_SPOILT} {_GYROS_WRONG} field_unit field_stuck",
         unless="master",
     )(
-        FindingCode("field_axes", "error", "it turns as the gyros say only with other columns"),
+        ("field_axes", "error", "it turns as the gyros say only with other columns"),
     ),
     _check(
         "In the attitudes",
@@ -311,11 +279,11 @@ TOGETHER = (
         silenced_by=f"{_SPOILT} {_GYROS_WRONG}",
         unless="master",
     )(
-        FindingCode("attitude_missing", "warning", "there is none"),
-        FindingCode("attitude_order", "error", "they are scalar last, or navigation to body"),
-        FindingCode("attitude_axes", "error", "they are of a body with other axes"),
-        FindingCode("attitude_disagrees", "warning", "they are of another body or another time"),
-        FindingCode("attitude_frame", "error", "they are to NED where ENU is said, or not upright"),
+        ("attitude_missing", "warning", "there is none"),
+        ("attitude_order", "error", "they are scalar last, or navigation to body"),
+        ("attitude_axes", "error", "they are of a body with other axes"),
+        ("attitude_disagrees", "warning", "they are of another body or another time"),
+        ("attitude_frame", "error", "they are to NED where ENU is said, or not upright"),
     ),
 )
 
@@ -361,7 +329,9 @@ def examine(subject: Subject, use: Use = "any") -> list[Finding]:
     unit_known = {file for dataset in datasets for file in dataset.time_unit_known}
     with np.errstate(all="ignore"):  # nonsense is looked at on purpose here
         tables = [checked(table) for part in parts for table in _tables(part)]
-        in_vehicle = use != "attitude" and _in_vehicle(tables)
+        # a vehicle has a top; a sensor by itself may lie any way
+        moved = any(isinstance(table, GnssTable | Trajectory) for table in tables)
+        in_vehicle = moved and use != "attitude"
         evens: list[Table] = []
         imu: ImuTable | None = None
         all_of_them: dict[str, Any] = {"others": evens}
@@ -397,11 +367,6 @@ def _asked(
 def _tables(part: Table | Dataset) -> list[Table]:
     master = part.master if isinstance(part, Dataset) else None
     return tables_of(part) + ([] if master is None else [master])
-
-
-def _in_vehicle(tables: list[Table]) -> bool:
-    """True where there is a vehicle, which has a top; a sensor by itself may lie any way."""
-    return any(isinstance(table, GnssTable | Trajectory) for table in tables)
 
 
 def _stamped_as(table: Table, imu: ImuTable | None) -> bool:

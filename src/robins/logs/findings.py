@@ -5,15 +5,22 @@ Both name the file, the line or time, the value, the likely cause and the mend, 
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeAlias
 
 from robins.dataset import Finding as Finding  # where datasets hold them; read from here too
 from robins.dataset import Severity as Severity
 from robins.errors import RobinsError
 
+AnyPath: TypeAlias = str | os.PathLike[str]
+Findings: TypeAlias = list[Finding] | None
+"""Takes what a reader leaves out or doubts; None: that is issued as `LogWarning`."""
 Value = float | int | str
+FETCH_AGAIN = "fetch it again; nothing of it was used, for no number in it can be trusted"
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 
@@ -48,6 +55,25 @@ def refused(
     return lambda what, fix: LogError(file, what, fix, where=where, field=field, value=value)
 
 
+@contextmanager
+def os_errors(file: str, done: str = "read", fix: str = "check path and permissions"):
+    """Turn an error of the operating system into a `LogError`."""
+    try:
+        yield
+    except OSError as error:
+        raise LogError(file, f"cannot be {done}: {error.strerror or error}", fix) from error
+
+
+@contextmanager
+def extra_package(file: str, what: str, package: str = "the package that reads it"):
+    """Turn the failed import of a package of the extra `logs` into a `LogError`."""
+    try:
+        yield
+    except ImportError as error:
+        cause = f"is {what}, and {package} is not installed"
+        raise LogError(file, cause, "install it with: pip install 'robins[logs]'") from error
+
+
 class LogWarning(UserWarning):
     """A finding of a reader that was given no list to put it in."""
 
@@ -60,7 +86,7 @@ def make_finding(
     return lambda sentence: Finding(severity, code, file, where, value, f"{begin}: {sentence}")
 
 
-def report(findings: list[Finding] | None, finding: Finding) -> None:
+def report(findings: Findings, finding: Finding) -> None:
     """Append to the list; without one, issue a `LogWarning`: nothing is refused silently."""
     if findings is None:
         warnings.warn(str(finding), LogWarning, stacklevel=3)
@@ -69,12 +95,7 @@ def report(findings: list[Finding] | None, finding: Finding) -> None:
 
 
 def finding_reporter(
-    findings: list[Finding] | None,
-    severity: Severity,
-    code: str,
-    file: str,
-    where: str = "",
-    value: Value = "",
+    findings: Findings, severity: Severity, code: str, file: str, where: str = "", value: Value = ""
 ) -> Callable[[str], None]:
     """Reports the finding that `make_finding` makes of its sentence."""
     make = make_finding(severity, code, file, where, value)
@@ -83,25 +104,24 @@ def finding_reporter(
 
 def damaged(file: str) -> Callable[[str], LogError]:
     """Makes the error about a damaged file of the reason."""
-    fix = "fetch it again; nothing of it was used, for no number in it can be trusted"
-    return lambda why: LogError(file, f"is damaged ({why})", fix)
+    return lambda why: LogError(file, f"is damaged ({why})", FETCH_AGAIN)
 
 
-def report_left_out(findings: list[Finding] | None, file: str, count: int, what: str) -> None:
+def report_left_out(findings: Findings, file: str, count: int, what: str) -> None:
     """Report what was not read because it is damaged, if there is any."""
     if count:
         make = finding_reporter(findings, "warning", "damaged_frames", file, value=count)
         make(f"{count} {what}; they are left out.")
 
 
-def report_undated(findings: list[Finding] | None, file: str, count: int, what: str) -> None:
+def report_undated(findings: Findings, file: str, count: int, what: str) -> None:
     """Report fixes from before a receiver knew the date, if there are any."""
     if count:
         make = finding_reporter(findings, "note", "undated", file, value=count)
         make(f"{count} {what} have no date yet; they are left out.")
 
 
-def report_cut_end(findings: list[Finding] | None, file: str, at: int) -> None:
+def report_cut_end(findings: Findings, file: str, at: int) -> None:
     """Report a last message that is not whole."""
     finding_reporter(findings, "warning", "ends_early", file, f"byte {at}", at)(
         "the last message is not whole: the recording or the copy was interrupted. All before it "
@@ -109,9 +129,11 @@ def report_cut_end(findings: list[Finding] | None, file: str, at: int) -> None:
     )
 
 
-def report_geoid_heights(findings: list[Finding] | None, file: str, fix: str) -> None:
+def report_geoid_heights(
+    findings: Findings, file: str, fix: str, where: str = "", value: Value = "geoid"
+) -> None:
     """Report heights that are not above the ellipsoid."""
-    finding_reporter(findings, "warning", "height_above_geoid", file, value="geoid")(
+    finding_reporter(findings, "warning", "height_above_geoid", file, where, value)(
         "heights are above the geoid, and robins takes them as above the WGS-84 ellipsoid. "
         f"Differences of height stay right; gravity errs by 3e-6 m/s^2 per metre. {fix}"
     )

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from robins.dataset import GnssTable
-from robins.logs.findings import Finding, report
+from robins.logs.findings import Finding, Findings, report
 
 PX4 = {6: 1, 5: 2, 4: 4, 3: 5, 2: 5}
 """Type of a fix in PX4 -> kind; less is no fix, 2 has no height, and 8 is extrapolated: none."""
@@ -37,7 +37,7 @@ def fixes(
     sigma_v: np.ndarray,
     kind: np.ndarray,
     flat: np.ndarray,
-    findings: list[Finding] | None,
+    findings: Findings,
 ) -> GnssTable:
     """Fixes of a receiver: NaN where it had none, and the usual sigmas where it stated none.
 
@@ -54,19 +54,12 @@ def fixes(
     """
     there, solid = kind > 0, (kind > 0) & ~flat
     lat, lon = (np.deg2rad(np.where(there, value, np.nan)) for value in place[:2])
-    sigma = np.stack(sigma_m, axis=-1)
-    table = GnssTable(
-        time_ns=time_ns,
-        lat_rad=lat,
-        lon_rad=lon,
-        alt_m=np.where(solid, place[2], np.nan),
-        sigma_m=np.where(sigma > 0.0, sigma, np.nan),
-        v_n=np.where(solid[:, None], v_n, np.nan),
-        sigma_v=np.repeat(np.where(sigma_v > 0.0, sigma_v, np.nan)[:, None], 3, axis=1),
-        quality=kind.astype(np.int64),
-        source=file,
-    )
-    return with_usual_sigmas(table, findings)
+    height, v_n = np.where(solid, place[2], np.nan), np.where(solid[:, None], v_n, np.nan)
+    stated = np.stack([*sigma_m, sigma_v, sigma_v, sigma_v], axis=-1)
+    sigma = np.where(stated > 0.0, stated, np.nan)
+    quality = kind.astype(np.int64)
+    table = GnssTable(time_ns, lat, lon, height, sigma[:, :3], v_n, sigma[:, 3:], quality)
+    return with_usual_sigmas(dataclasses.replace(table, source=file), findings)
 
 
 def over_ground(
@@ -79,9 +72,7 @@ def over_ground(
     return np.stack([north, east, np.broadcast_to(down, north.shape)], axis=-1)
 
 
-def with_usual_sigmas(
-    table: GnssTable, findings: list[Finding] | None, places: bool = True
-) -> GnssTable:
+def with_usual_sigmas(table: GnssTable, findings: Findings, places: bool = True) -> GnssTable:
     """The same fixes, with the usual sigmas of their kind where none is stated, and a note.
 
     The table marks which these are (``assumed_m``, ``assumed_v``), beside those marked before.

@@ -14,7 +14,6 @@ Axes of phones are those of Android: right, forward, up of one that lies flat.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -25,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.gps_time import gps_of
-from robins.logs.findings import Finding, LogError, finding_reporter, refused
+from robins.logs.findings import AnyPath, Findings, LogError, finding_reporter, os_errors, refused
 from robins.logs.fix_kinds import with_usual_sigmas
 from robins.logs.merging import interpolated
 from robins.logs.mounting import Origin
@@ -39,7 +38,6 @@ from robins.logs.text_formats import TEXT_FORMATS
 from robins.logs.timebase import dates_to_ns, stamps_to_ns
 from robins.units import to_si
 
-Findings = list[Finding] | None
 _XYZ = ("x", "y", "z")
 _TRUTH = "state_groundtruth_estimate0/data.csv"
 _ROWS = {row.name: row for row in TEXT_FORMATS}
@@ -50,7 +48,7 @@ _SEPARATORS = (",", ";", "\t")
 
 
 def read_folder(
-    path: str | os.PathLike[str], findings: Findings = None, origin: Origin | None = None
+    path: AnyPath, findings: Findings = None, origin: Origin | None = None
 ) -> Table | Dataset:
     """Read a folder that is a recording.
 
@@ -65,7 +63,7 @@ def read_folder(
             origin, and nothing in local metres.
     """
     folder = Path(path)
-    try:
+    with os_errors(str(path), fix="check its permissions"):
         for mark, read in _FOLDERS.items():
             for place in (folder, folder / "mav0", folder / "oxts"):
                 if (place / mark).exists():
@@ -75,9 +73,6 @@ def read_folder(
         names = sorted(p.name for p in folder.iterdir())
         if "metadata.yaml" in names or any(map(RECORDING.fullmatch, names)):
             return _without(origin, folder, read_rosbag(folder, findings))
-    except OSError as error:
-        why = error.strerror or str(error)
-        raise LogError(str(path), f"cannot be read: {why}", "check its permissions") from error
     held = ", ".join(names[:5]) or "nothing"
     remedy = "give files, or the folder of a recording (ROS, EuRoC, KITTI, phones)"
     raise LogError(str(path), f"is a folder with {held}", remedy)
@@ -111,9 +106,8 @@ def _table(
     places = [place(name) for name in names]
     wanted = [*names[:needed], *([clock] if clock else ())]
     if lacking := [name for name in wanted if place(name) < 0]:
-        raise refused(str(path), f"line {line}")(
-            f"no column fits {lacking[0]}; there are {', '.join(held)}", "export it again"
-        )
+        cause = f"no column fits {lacking[0]}; there are {', '.join(held)}"
+        raise refused(str(path), f"line {line}")(cause, "export it again")
     numbers = tuple(sorted({at for at in places if at >= 0}))
     texts = (place(clock),) if clock else ()
     comma = separator != "," and re.search(r"\d,\d", "".join(t for _, t in peek(path).data(3)[1:]))
@@ -222,9 +216,8 @@ def _phone(folder: Path, findings: Findings) -> Dataset:
         fix_ns, v, fix_rows = samples("Location", _LOCATION, 2)
         for k in range(3, 9):
             v[v[:, k] < 0.0, k] = np.nan  # what is not known
-        gnss = with_usual_sigmas(
-            fixes_of(str(path), fix_ns, v[:, :5], v[:, 5:], fix_rows), findings
-        )
+        fixes = fixes_of(str(path), fix_ns, v[:, :5], v[:, 5:], fix_rows)
+        gnss = with_usual_sigmas(fixes, findings)
         if gnss.v_n is None or np.isnan(gnss.v_n).all():
             gnss = replace(gnss, v_n=None, sigma_v=None)
     name = folder.resolve().name

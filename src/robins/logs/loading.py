@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from robins.dataset import Dataset, ImuTable, Trajectory
-from robins.logs.findings import Finding, LogError, finding_reporter
+from robins.logs.findings import AnyPath, Finding, LogError, finding_reporter
 from robins.logs.merging import are_halves, merged
 from robins.logs.mounting import Mounting, turned
 from robins.logs.registry import matching_formats, open_log
-from robins.logs.tables import Table, kind_of, tables_of
+from robins.logs.tables import Table, kind_of, stem_of, tables_of
 from robins.logs.text_format import TextFormat
 
 Formats = Mapping[str, str | TextFormat]
@@ -28,7 +28,7 @@ _OF_FIXES = ("sigma_assumed", "height_above_geoid", "height_assumed", "undated")
 
 
 def load_dataset(
-    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    paths: AnyPath | Iterable[AnyPath],
     *,
     name: str | None = None,
     mounting: Mounting | None = None,
@@ -64,7 +64,7 @@ def load_dataset(
         given = ", ".join(paths) or "(no file)"
         raise LogError(given, "no IMU log among the files", "give one IMU log")
     dataset = Dataset(
-        name=name or Path(held["imu"].source).name.split(".")[0],
+        name=name or stem_of(held["imu"].source),
         **held,
         findings=findings,
         time_unit_known=tuple(known),
@@ -100,9 +100,7 @@ def without_replaced(
 
 
 def by_kind(
-    paths: Iterable[str | os.PathLike[str]],
-    opened: Iterable[Table | Dataset],
-    findings: list[Finding],
+    paths: Iterable[AnyPath], opened: Iterable[Table | Dataset], findings: list[Finding]
 ) -> dict[str, Table]:
     """One table of each kind; gyros and accelerometers that were recorded apart become one.
 
@@ -128,8 +126,8 @@ def by_kind(
 
 
 def load_pair(
-    master: str | os.PathLike[str],
-    slave: str | os.PathLike[str],
+    master: AnyPath,
+    slave: AnyPath,
     *,
     name: str | None = None,
     delay_s: float = 0.0,
@@ -158,17 +156,12 @@ def load_pair(
         raise _exchanged(master, "no path of a master INS", "--master")
     if not isinstance(imu, ImuTable):
         raise _exchanged(slave, "no inertial samples", "--slave")
-    return Dataset(
-        name=name or Path(imu.source).name.split(".")[0],
-        imu=imu,
-        master=path,
-        findings=findings,
-        master_delay_s=delay_s,
-    )
+    name = name or stem_of(imu.source)
+    return Dataset(name, imu, master=path, findings=findings, master_delay_s=delay_s)
 
 
 def _open_as(
-    path: str | os.PathLike[str], kind: str, findings: list[Finding], formats: Formats | None
+    path: AnyPath, kind: str, findings: list[Finding], formats: Formats | None
 ) -> Table | Dataset | None:
     """A file that holds several kinds of columns is read for the kind that is wanted."""
     format = (formats or {}).get(os.fspath(path))
@@ -181,6 +174,6 @@ def _open_as(
     return opened
 
 
-def _exchanged(path: str | os.PathLike[str], what: str, option: str) -> LogError:
+def _exchanged(path: AnyPath, what: str, option: str) -> LogError:
     remedy = f"give {option} the right file; were master and slave exchanged?"
     return LogError(os.fspath(path), f"holds {what}", remedy)

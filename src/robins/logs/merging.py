@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from robins.dataset import ImuTable
-from robins.logs.findings import Finding, LogError, finding_reporter
+from robins.logs.findings import Findings, LogError, finding_reporter
 
 _LONG = 5.0  # typical intervals; across a longer one no specific force is interpolated
 _DRIFT, _STRAY_S = 2e-4, 1.0  # of a clock; a stamp that is further from the others is not used
@@ -21,7 +21,7 @@ def are_halves(one: ImuTable, other: ImuTable) -> bool:
     return sorted(has) == [[False, True], [True, False]]
 
 
-def merged(gyro: ImuTable, accel: ImuTable, findings: list[Finding] | None) -> ImuTable:
+def merged(gyro: ImuTable, accel: ImuTable, findings: Findings) -> ImuTable:
     """Rates of one table with the specific forces of another, on the clock of the rates.
 
     They may be given in either order. Specific forces are interpolated linearly. Samples outside of
@@ -74,7 +74,7 @@ def interpolated(now_ns: np.ndarray, at_ns: np.ndarray, values: np.ndarray) -> n
 
 
 def gps_clock(
-    file: str, local_ns: np.ndarray, gps_ns: np.ndarray, findings: list[Finding] | None
+    file: str, local_ns: np.ndarray, gps_ns: np.ndarray, findings: Findings
 ) -> Callable[[np.ndarray], np.ndarray]:
     """GPS time of a local clock that stamps fixes when they arrive.
 

@@ -220,14 +220,8 @@ def _line(
     for rate in _RATES:
         moved = np.round((lags[:, None] + rate * since - lags[0]) / _FINE_S).astype(int)
         outside = (moved < 0) | (moved >= len(lags))
-        total = np.sum(
-            np.where(
-                outside,
-                cost.max(axis=1),
-                cost[np.arange(len(since)), np.clip(moved, 0, len(lags) - 1)],
-            ),
-            axis=1,
-        )
+        inside = cost[np.arange(len(since)), np.clip(moved, 0, len(lags) - 1)]
+        total = np.sum(np.where(outside, cost.max(axis=1), inside), axis=1)
         k = int(np.argmin(total))
         if total[k] < best[0] - 1e-9:
             best = float(total[k]), float(lags[k]), float(rate)

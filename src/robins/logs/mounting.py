@@ -86,16 +86,8 @@ def from_local(path: LocalPath, origin: Origin, source: str = "") -> Trajectory:
     C_nl = np.swapaxes(_axes_at(lat, lon, "ENU"), -1, -2) @ C_el
     with np.errstate(invalid="ignore"):
         v_n = np.einsum("nij,nj->ni", C_nl, path.v_l)
-    return Trajectory(
-        time_ns=path.time_ns,
-        lat_rad=lat,
-        lon_rad=lon,
-        alt_m=alt,
-        v_n=v_n,
-        q_nb=_compose(C_nl, path.q_lb),
-        nav="ENU",
-        source=source,
-    )
+    q_nb = _compose(C_nl, path.q_lb)
+    return Trajectory(path.time_ns, lat, lon, alt, v_n, q_nb, "ENU", source=source)
 
 
 def _axes_at(lat_rad: np.ndarray, lon_rad: np.ndarray, nav: str) -> np.ndarray:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import datetime
 import math
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -27,7 +26,8 @@ import numpy as np
 from robins.dataset import GnssTable
 from robins.gps_time import gps_of
 from robins.logs.findings import (
-    Finding,
+    AnyPath,
+    Findings,
     LogError,
     finding_reporter,
     report_cut_end,
@@ -58,7 +58,7 @@ def is_nmea(head: Head) -> bool:
     return _BEGINS.search(head.start) is not None
 
 
-def read_nmea(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> GnssTable:
+def read_nmea(path: AnyPath, findings: Findings = None) -> GnssTable:
     """Read fixes.
 
     Args:
@@ -71,9 +71,7 @@ def read_nmea(path: str | os.PathLike[str], findings: list[Finding] | None = Non
     return fixes_of(str(path), map_file(path, findings), findings)[0]
 
 
-def fixes_of(
-    file: str, data: Bytes, findings: list[Finding] | None
-) -> tuple[GnssTable, np.ndarray]:
+def fixes_of(file: str, data: Bytes, findings: Findings) -> tuple[GnssTable, np.ndarray]:
     """Fixes, and where in the bytes the first sentence of each lies; errors as `read_nmea`."""
     epochs = _epochs(file, data, findings)
     days = _days(file, epochs, findings)
@@ -110,26 +108,19 @@ def fixes_of(
             f"no fix states a height; 0 m is assumed, with a sigma of {_ANY_HEIGHT_M:g} m. Switch "
             "on GGA for heights."
         )
-    table = fixes(
-        file,
-        gps_of(utc_ns) if days[0] >= 0 else utc_ns + _DAY_NS,
-        (of_place("lat"), of_place("lon"), height),
-        (column("north"), column("east"), up),
-        over_ground(speed, course),
-        nothing,
-        np.array([_KIND.get(int(one), 0) for one in quality]),
-        np.zeros(len(kept), bool),
-        findings,
-    )
+    time_ns = gps_of(utc_ns) if days[0] >= 0 else utc_ns + _DAY_NS
+    place = of_place("lat"), of_place("lon"), height
+    sigma_m = column("north"), column("east"), up
+    v_n, kind = over_ground(speed, course), np.array([_KIND.get(int(one), 0) for one in quality])
+    flat = np.zeros(len(kept), bool)
+    table = fixes(file, time_ns, place, sigma_m, v_n, nothing, kind, flat, findings)
     if unknown:
         marks = np.zeros((len(kept), 3), bool) if table.assumed_m is None else table.assumed_m
         table = replace(table, assumed_m=marks | [False, False, True])
     return table, column("at")
 
 
-def _report_kinds(
-    file: str, quality: np.ndarray, without: int, findings: list[Finding] | None
-) -> None:
+def _report_kinds(file: str, quality: np.ndarray, without: int, findings: Findings) -> None:
     """Report places that RMC alone states beside others, and qualities that count as no fix."""
     reporter = partial(finding_reporter, findings, "note", "other_kinds", file)
     if 0 < without < len(quality):
@@ -144,7 +135,7 @@ def _report_kinds(
             )
 
 
-def _epochs(file: str, data: Bytes, findings: list[Finding] | None) -> list[dict[str, float]]:
+def _epochs(file: str, data: Bytes, findings: Findings) -> list[dict[str, float]]:
     """Numbers of the sentences of each time of day; see `_in_order` for those without one."""
     epochs: list[dict[str, float]] = []
     talkers = {one[1] for one in _SENTENCE.finditer(data) if one[4]}
@@ -250,7 +241,7 @@ def _numbers(kind: str, fields: list[str]) -> dict[str, float]:
     return found
 
 
-def _days(file: str, epochs: list[dict[str, float]], findings: list[Finding] | None) -> list[int]:
+def _days(file: str, epochs: list[dict[str, float]], findings: Findings) -> list[int]:
     """Day of each epoch: that it states, else that of its neighbour, with midnights between.
 
     Days count from 1970, or from -1 where no sentence states the date.

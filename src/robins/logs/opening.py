@@ -13,7 +13,7 @@ import lzma
 import mmap
 import os
 import re
-import tempfile
+import secrets
 import zlib
 from collections.abc import Iterable, Iterator
 from functools import partial
@@ -21,7 +21,14 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from robins.foreign import FREE, decoding, within
-from robins.logs.findings import Finding, LogError, finding_reporter
+from robins.logs.findings import (
+    FETCH_AGAIN,
+    AnyPath,
+    Findings,
+    LogError,
+    finding_reporter,
+    os_errors,
+)
 
 Bytes: TypeAlias = bytes | mmap.mmap
 _BLOCK, _ABOUT, _LARGEST = 1 << 20, 1 << 22, 1 << 30
@@ -106,7 +113,7 @@ class _Gunzip:
         return self._inner.unused_data
 
 
-def parts_of(path: str | os.PathLike[str]) -> list[Path]:
+def parts_of(path: AnyPath) -> list[Path]:
     """Files of a recording in their order: the file itself, or those of a folder of ROS.
 
     A folder names them in its ``metadata.yaml``, or holds one file, or files numbered _0, _1, ...
@@ -145,35 +152,21 @@ class Source:
             that holds no text.
     """
 
-    def __init__(self, path: str | os.PathLike[str], binary: bool = False):
+    def __init__(self, path: AnyPath, binary: bool = False):
         self.path = parts_of(path)[0]
         self.binary = binary
         self.cut = False
 
     def __iter__(self) -> Iterator[bytes]:
-        try:
-            with self.path.open("rb") as file:
-                head = file.read(8)
-                file.seek(0)
-                packed = head.startswith((_XZ, _GZIP))
-                blocks = self._expand(file, head.startswith(_XZ)) if packed else self._plain(file)
-                for count, block in enumerate(blocks):
-                    if not (count or self.binary):
-                        self._refuse_foreign(block)
-                    yield block
-        except OSError as error:
-            why = error.strerror or str(error)
-            raise LogError(
-                str(self.path), f"cannot be read: {why}", "check path and permissions"
-            ) from error
-
-    def _plain(self, file) -> Iterator[bytes]:
-        while block := file.read(_BLOCK):
-            yield block
-
-    def _refuse_foreign(self, start: bytes) -> None:
-        if found := foreign(start):
-            raise LogError(str(self.path), f"is {found[0]}, not a text log", found[1])
+        with os_errors(str(self.path)), self.path.open("rb") as file:
+            head = file.read(8)
+            file.seek(0)
+            packed, plain = head.startswith((_XZ, _GZIP)), iter(partial(file.read, _BLOCK), b"")
+            blocks = self._expand(file, head.startswith(_XZ)) if packed else plain
+            for count, block in enumerate(blocks):
+                if not (count or self.binary) and (found := foreign(block)):
+                    raise LogError(str(self.path), f"is {found[0]}, not a text log", found[1])
+                yield block
 
     def _expand(self, file, xz: bool) -> Iterator[bytes]:
         new = partial(lzma.LZMADecompressor, memlimit=2 * FREE) if xz else _Gunzip
@@ -206,14 +199,11 @@ class Source:
         self.cut = not between
 
     def _damaged(self, why: str) -> LogError:
-        return LogError(
-            str(self.path),
-            f"is damaged: the compressed stream does not decode ({why})",
-            "fetch it again; nothing of it was used, for no number in it can be trusted",
-        )
+        cause = f"is damaged: the compressed stream does not decode ({why})"
+        return LogError(str(self.path), cause, FETCH_AGAIN)
 
 
-def read_beginning(path: str | os.PathLike[str], size: int = 256) -> bytes:
+def read_beginning(path: AnyPath, size: int = 256) -> bytes:
     """The first bytes of a file, decompressed.
 
     Raises:
@@ -227,7 +217,7 @@ def read_beginning(path: str | os.PathLike[str], size: int = 256) -> bytes:
     return start[:size]
 
 
-def map_file(path: str | os.PathLike[str], findings: list[Finding] | None) -> Bytes:
+def map_file(path: AnyPath, findings: Findings) -> Bytes:
     """All bytes of a file; a compressed stream that ended early is reported.
 
     A plain file is mapped, so that it may be larger than memory; a compressed one is unpacked.
@@ -248,7 +238,7 @@ def map_file(path: str | os.PathLike[str], findings: list[Finding] | None) -> By
         return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if file.tell() else b""
 
 
-def read_whole(path: str | os.PathLike[str], limit: int) -> tuple[bytes, bool]:
+def read_whole(path: AnyPath, limit: int) -> tuple[bytes, bool]:
     """All bytes of a file, decompressed, and whether a compressed stream ended early.
 
     Raises:
@@ -267,7 +257,7 @@ def read_whole(path: str | os.PathLike[str], limit: int) -> tuple[bytes, bool]:
 _OPENERS: dict[str, Any] = {".xz": lzma.open, ".gz": gzip.open}
 
 
-def write_lines(path: str | os.PathLike[str], blocks: Iterable[str | bytes]) -> None:
+def write_lines(path: AnyPath, blocks: Iterable[str | bytes]) -> None:
     """Write text or bytes, compressed if the name ends in .xz or .gz.
 
     An earlier file stays until the end.
@@ -276,39 +266,27 @@ def write_lines(path: str | os.PathLike[str], blocks: Iterable[str | bytes]) -> 
         LogError: the file cannot be written; no part of it is left behind.
     """
     path = Path(path)
-    try:
+    with os_errors(str(path), "written", "check the folder, its permissions and the disk"):
         if path.exists() and not path.is_file():  # a device must not be replaced by a file
             _write(path, path.suffix, blocks)
         else:
             _write_and_rename(path, blocks)
-    except OSError as error:
-        why = error.strerror or str(error)
-        raise LogError(
-            str(path), f"cannot be written: {why}", "check the folder, its permissions and the disk"
-        ) from error
 
 
-def _write(path: str | Path, suffix: str, blocks: Iterable[str | bytes]) -> None:
+def _write(path: Path, suffix: str, blocks: Iterable[str | bytes]) -> None:
     with _OPENERS.get(suffix, open)(path, "wb") as file:
         for block in blocks:
             file.write(block.encode() if isinstance(block, str) else block)
 
 
 def _write_and_rename(path: Path, blocks: Iterable[str | bytes]) -> None:
-    handle, temporary = tempfile.mkstemp(prefix=".", dir=path.parent)
-    os.close(handle)
+    temporary = path.with_name(f".{secrets.token_hex(8)}")  # with the permissions of any new file
+    temporary.touch(exist_ok=False)
     try:
         _write(temporary, path.suffix, blocks)
-        with open(temporary, "rb+") as file:
+        with temporary.open("rb+") as file:
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
+        temporary.replace(path)
     except BaseException:
-        os.unlink(temporary)
+        temporary.unlink()
         raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

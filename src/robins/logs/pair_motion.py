@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from robins.dataset import ImuTable, Trajectory
-from robins.logs.motion import at
+from robins.logs.motion import at, integral
 from robins.logs.ordering import increasing
-from robins.logs.quiet import ImuSignal, signal_of
+from robins.logs.quiet import signal_of
 from robins.rotation import skew
 
 GRAVITY = 9.80665  # m/s^2
@@ -58,17 +58,8 @@ def shared_motion(imu: ImuTable, master: Trajectory) -> SharedMotion | None:
     if np.count_nonzero(inside) < 10:
         return None
     q = Rotation.from_quat(master.q_nb[known], scalar_first=True)
-    angle, pushed = (_integral(imu, signal, a) for a in (signal.gyro, signal.accel))
+    angle, pushed = (integral(signal.time_s, a, imu.kind) for a in (signal.gyro, signal.accel))
     return SharedMotion(time_s, inside, q, master.v_n[known], signal.time_s, angle, pushed)
-
-
-def _integral(imu: ImuTable, signal: ImuSignal, values: np.ndarray) -> np.ndarray:
-    """(n, 3) integral of rates up to each sample, from the first; those of increments are means."""
-    steps = np.diff(signal.time_s, prepend=signal.time_s[0])[:, None]
-    before = np.concatenate([values[:1], values[:-1]])
-    return np.cumsum(
-        steps * (values if imu.kind == "increment" else 0.5 * (before + values)), axis=0
-    )
 
 
 def turned_by_gyros(shared: SharedMotion, lag_s: float = 0.0) -> np.ndarray:

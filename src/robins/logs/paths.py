@@ -13,7 +13,6 @@
 
 from __future__ import annotations
 
-import os
 import zlib
 from pathlib import Path
 
@@ -22,14 +21,13 @@ import numpy as np
 
 from robins import rotation
 from robins.dataset import Trajectory
-from robins.logs.findings import Finding, LogError, finding_reporter, refused
+from robins.logs.findings import AnyPath, Findings, LogError, finding_reporter, refused
 from robins.logs.mounting import LocalPath, from_local
 from robins.logs.opening import read_whole
 from robins.logs.read_text import NOWHERE
 from robins.logs.text import Head, TextLayout, read_columns
 from robins.logs.timebase import WEEK_NS, stamps_to_ns, unrolled, week_to_ns
 
-Findings = list[Finding] | None
 _LARGEST = 1 << 30  # bytes of a file
 _KITTI = TextLayout(tuple(f"{row}{k}" for row in "123" for k in range(1, 5)), None, texts=())
 _TO_ENU = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # x right, y down, z ahead
@@ -52,7 +50,7 @@ def is_kitti(head: Head) -> bool:
     return len(rows) > 0 and len(rows[0]) == 12 and bool(np.all(off < 1e-3))
 
 
-def read_kitti(path: str | os.PathLike[str], findings: Findings = None) -> Trajectory:
+def read_kitti(path: AnyPath, findings: Findings = None) -> Trajectory:
     """Read poses of KITTI odometry.
 
     Raises:
@@ -94,7 +92,7 @@ def is_sbet(head: Head) -> bool:
     return all(limits) and bool(near)
 
 
-def read_sbet(path: str | os.PathLike[str], findings: Findings = None) -> Trajectory:
+def read_sbet(path: AnyPath, findings: Findings = None) -> Trajectory:
     """Read a smoothed best estimate of trajectory.
 
     Raises:
@@ -125,7 +123,7 @@ def is_inspva(head: Head) -> bool:
     return any(line.startswith(_INSPVA) for line in head.lines)
 
 
-def read_inspva(path: str | os.PathLike[str], findings: Findings = None) -> Trajectory:
+def read_inspva(path: AnyPath, findings: Findings = None) -> Trajectory:
     """Read the INSPVA logs among the lines of a file, each against its checksum.
 
     Raises:

@@ -16,14 +16,12 @@ make give it above the sea.
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
-from robins.logs.findings import Finding, LogError, refused
+from robins.logs.findings import AnyPath, Findings, LogError, refused
 from robins.logs.fix_kinds import over_ground
+from robins.logs.tables import recording
 from robins.logs.text import Head, TextLayout, peek, read_columns
 from robins.logs.timebase import dates_to_ns
 from robins.units import to_si
@@ -47,7 +45,7 @@ def is_phone(head: Head) -> bool:
     return names[0] == "time" and {"acc_x", "gyro_x", "horizontalAccuracy"} <= set(names)
 
 
-def read_phone(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
+def read_phone(path: AnyPath, findings: Findings = None) -> Dataset:
     """Read inertial samples, magnetic field and fixes.
 
     Args:
@@ -60,16 +58,13 @@ def read_phone(path: str | os.PathLike[str], findings: list[Finding] | None = No
     """
     file, head = str(path), peek(path)
     line, names = _header(head)
+    at = refused(file, f"line {line}")
     if lacking := [name for name in _NEEDED if name not in names]:
-        raise refused(file, f"line {line}")(
-            f"the header lacks {', '.join(lacking)}", "is it of another format?"
-        )
+        raise at(f"the header lacks {', '.join(lacking)}", "is it of another format?")
     if twice := sorted({name for name in _NEEDED if names.count(name) > 1}):
-        raise refused(file, f"line {line}")(
-            f"the header names {', '.join(twice)} twice", "keep one"
-        )
+        raise at(f"the header names {', '.join(twice)} twice", "keep one")
     if names[0] != "time":
-        raise refused(file, f"line {line}")("the first column is not the time", "put it first")
+        raise at("the first column is not the time", "put it first")
     columns = read_columns(path, TextLayout(tuple(names), ",", skip=line, all_named=True), findings)
     place = {name: k - 1 for k, name in enumerate(names)}
 
@@ -86,16 +81,12 @@ def read_phone(path: str | os.PathLike[str], findings: list[Finding] | None = No
         if not lines.any():
             raise LogError(file, f"no line has {what}", "record that sensor as well")
     (imu, mag, gnss), rows = have.values(), columns.rows
-    return Dataset(
-        name=Path(file).name.split(".")[0],
-        imu=ImuTable(
-            time_ns[imu], stack(*_GYRO)[imu], stack(*_ACCEL)[imu], "rate", "RFU", file, rows[imu]
-        ),
-        mag=MagTable(time_ns[mag], to_si(stack(*_MAG)[mag], "uT"), "RFU", file, rows[mag]),
-        gnss=fixes_of(
-            file, time_ns[gnss], stack(*_PLACE)[gnss], stack(*_VELOCITY)[gnss], rows[gnss]
-        ),
-        time_unit_known=(file,),
+    gyro, accel, field = stack(*_GYRO)[imu], stack(*_ACCEL)[imu], to_si(stack(*_MAG)[mag], "uT")
+    fixed, moved = stack(*_PLACE)[gnss], stack(*_VELOCITY)[gnss]
+    samples = ImuTable(time_ns[imu], gyro, accel, "rate", "RFU", file, rows[imu])
+    fixes = fixes_of(file, time_ns[gnss], fixed, moved, rows[gnss])
+    return recording(
+        file, samples, fixes, mag=MagTable(time_ns[mag], field, "RFU", file, rows[mag])
     )
 
 
@@ -111,22 +102,16 @@ def fixes_of(
         velocity: (n, 4) speed [m/s], bearing [deg] and their sigmas.
         rows: (n,) line numbers.
     """
-    lat_deg, lon_deg, alt_m, radius_m, sigma_alt_m = place.T
+    lat, lon = np.deg2rad(place[:, :2]).T.copy()
+    alt_m, radius_m, sigma_alt_m = place[:, 2:].T
     speed, bearing_deg, sigma_speed, sigma_bearing_deg = velocity.T
     # A bearing that is 180 deg unsure says nothing: the error is at most twice the speed.
     across = speed * np.minimum(np.deg2rad(sigma_bearing_deg), 2.0)
     sigma = np.hypot(sigma_speed, across)
-    missing = np.full(len(speed), np.nan)
-    sigma_m = radius_m / _RADIUS_68
+    sigma_v = np.stack([sigma, sigma, np.full(len(speed), np.nan)], axis=-1)
+    sigma_m = np.stack([radius_m / _RADIUS_68, radius_m / _RADIUS_68, sigma_alt_m], axis=-1)
+    alt_m, v_n = alt_m.copy(), over_ground(speed, bearing_deg)
+    quality = np.full(len(speed), _SINGLE, np.int64)
     return GnssTable(
-        time_ns=time_ns,
-        lat_rad=np.deg2rad(lat_deg),
-        lon_rad=np.deg2rad(lon_deg),
-        alt_m=alt_m.copy(),
-        sigma_m=np.stack([sigma_m, sigma_m, sigma_alt_m], axis=-1),
-        v_n=over_ground(speed, bearing_deg),
-        sigma_v=np.stack([sigma, sigma, missing], axis=-1),
-        quality=np.full(len(speed), _SINGLE, np.int64),
-        source=file,
-        rows=rows,
+        time_ns, lat, lon, alt_m, sigma_m, v_n, sigma_v, quality, source=file, rows=rows
     )

@@ -24,46 +24,33 @@ class TableRecipe(NamedTuple):
     more: tuple[str, ...] = ()
 
 
-def _parts(stem: str, ends: str, kind: str) -> dict[str, str]:
-    return {f"{stem}_{end}": kind for end in ends.split()}
+def _alike(kind: str, names: str, text: str) -> QuantityGroup:
+    """A group whose quantities are of one kind."""
+    return QuantityGroup(dict.fromkeys(names.split(), kind), text)
 
-
-_XYZ, _NED = "x y z", "north east down"
 
 GROUPS: dict[str, QuantityGroup] = {
-    "time": QuantityGroup({"time": "time"}, "time of the row"),
-    "time_of_week": QuantityGroup(
-        {"time_of_week": "time"}, "second of the GPS week, goes on at its end"
-    ),
-    "week": QuantityGroup(
-        {"week": "ratio"}, "GPS week; time counts from the beginning of the first"
-    ),
-    "gyro": QuantityGroup(_parts("gyro", _XYZ, "angle rate"), "turn rate"),
-    "accel": QuantityGroup(_parts("accel", _XYZ, "specific force"), "specific force"),
-    "dtheta": QuantityGroup(_parts("dtheta", _XYZ, "angle"), "turn since the row before"),
-    "dv": QuantityGroup(
-        _parts("dv", _XYZ, "speed"), "specific force summed up since the row before"
-    ),
-    "dt": QuantityGroup(
-        {"dt": "time"}, "time over which dtheta and dv are, compared with that of the rows"
-    ),
-    "mag": QuantityGroup(_parts("mag", _XYZ, "magnetic field"), "magnetic field"),
+    "time": _alike("time", "time", "time of the row"),
+    "time_of_week": _alike("time", "time_of_week", "second of the GPS week, goes on at its end"),
+    "week": _alike("ratio", "week", "GPS week; time counts from the beginning of the first"),
+    "gyro": _alike("angle rate", "gyro_x gyro_y gyro_z", "turn rate"),
+    "accel": _alike("specific force", "accel_x accel_y accel_z", "specific force"),
+    "dtheta": _alike("angle", "dtheta_x dtheta_y dtheta_z", "turn since the row before"),
+    "dv": _alike("speed", "dv_x dv_y dv_z", "specific force summed up since the row before"),
+    "dt": _alike("time", "dt", "time over which dtheta and dv are, compared with that of the rows"),
+    "mag": _alike("magnetic field", "mag_x mag_y mag_z", "magnetic field"),
     "place": QuantityGroup(
         {"lat": "angle", "lon": "angle", "height": "length"}, "place, above the WGS-84 ellipsoid"
     ),
-    "local": QuantityGroup(
-        dict.fromkeys(("east", "north", "up"), "length"), "place, from an origin"
-    ),
-    "velocity": QuantityGroup(_parts("v", _NED, "speed"), "velocity"),
-    "sigma": QuantityGroup(_parts("sigma", _NED, "length"), "sigma of the place"),
-    "sigma_v": QuantityGroup(_parts("sigma_v", _NED, "speed"), "sigma of the velocity"),
-    "quality": QuantityGroup({"quality": "ratio"}, "1 fixed, 2 float, 5 single, as RTKLIB counts"),
-    "euler": QuantityGroup(dict.fromkeys(("roll", "pitch", "heading"), "angle"), "of the vehicle"),
-    "quaternion": QuantityGroup(_parts("q", "w x y z", "ratio"), "turns body into navigation axes"),
-    "wheels": QuantityGroup(
-        dict.fromkeys(("wheel_speed", "sigma_wheel_speed"), "speed"), "forward speed by the wheels"
-    ),
-    "omega": QuantityGroup(_parts("omega", _XYZ, "angle rate"), "turn rate against inertial space"),
+    "local": _alike("length", "east north up", "place, from an origin"),
+    "velocity": _alike("speed", "v_north v_east v_down", "velocity"),
+    "sigma": _alike("length", "sigma_north sigma_east sigma_down", "sigma of the place"),
+    "sigma_v": _alike("speed", "sigma_v_north sigma_v_east sigma_v_down", "sigma of the velocity"),
+    "quality": _alike("ratio", "quality", "1 fixed, 2 float, 5 single, as RTKLIB counts"),
+    "euler": _alike("angle", "roll pitch heading", "of the vehicle"),
+    "quaternion": _alike("ratio", "q_w q_x q_y q_z", "turns body into navigation axes"),
+    "wheels": _alike("speed", "wheel_speed sigma_wheel_speed", "forward speed by the wheels"),
+    "omega": _alike("angle rate", "omega_x omega_y omega_z", "turn rate against inertial space"),
 }
 """Every group by its name."""
 

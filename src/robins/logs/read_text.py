@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import replace
 from decimal import Decimal
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -25,11 +23,11 @@ from robins.dataset import (
 )
 from robins.ins.frames import swap, swap_q
 from robins.logs.archives import head_of, rows_of
-from robins.logs.findings import Finding, LogError, finding_reporter, refused
+from robins.logs.findings import AnyPath, Findings, LogError, finding_reporter, refused
 from robins.logs.merging import interpolated
 from robins.logs.mounting import LocalPath, Origin, from_local
 from robins.logs.quantities import CLOCKS, DATES, QUANTITIES, TABLES, parts, words_of
-from robins.logs.tables import Table, kind_of, unit_quaternions
+from robins.logs.tables import Table, kind_of, stem_of, unit_quaternions
 from robins.logs.text import COMMENTS, Columns, Head, TextLayout, read_columns
 from robins.logs.text_format import (
     PAIRS,
@@ -70,7 +68,7 @@ class TextContents(NamedTuple):
     rows: np.ndarray
     nav: NavFrame
     body: BodyFrame
-    findings: list[Finding] | None
+    findings: Findings
 
     def has(self, group: str) -> bool:
         """True if there is such a group of columns."""
@@ -93,10 +91,7 @@ class TextContents(NamedTuple):
 
 
 def read_text(
-    format: TextFormat,
-    path: str | os.PathLike[str],
-    findings: list[Finding] | None = None,
-    origin: Origin | None = None,
+    format: TextFormat, path: AnyPath, findings: Findings = None, origin: Origin | None = None
 ) -> Table | Dataset:
     """Read a log of this format.
 
@@ -160,9 +155,8 @@ def _marks(file: str, header: ColumnHeader, columns: dict[str, FoundColumn]) -> 
     """
     names = {f.column.where[0] for f in columns.values()} - {""}
     if lacking := sorted(names - set(header.names)):
-        raise refused(file, f"line {header.line}")(
-            f"the header lacks {lacking[0]}; it has {', '.join(header.names)}", "name it as it is"
-        )
+        cause = f"the header lacks {lacking[0]}; it has {', '.join(header.names)}"
+        raise refused(file, f"line {header.line}")(cause, "name it as it is")
     return {name: header.names.index(name) for name in names}
 
 
@@ -230,10 +224,9 @@ def _frames(format: TextFormat, head: Head) -> tuple[NavFrame, BodyFrame]:
         words = set(re.findall(r"[A-Z]{3}", matched[1]))
         fitting = [pair for pair in PAIRS if words and words <= set(pair)]
         if len(fitting) != 1:
-            raise refused(head.file, f"line {number}", "frames", matched[1].strip())(
-                "is neither NED FRD nor ENU RFU",
-                "convert the columns to one of the two and say which",
-            )
+            remedy = "convert the columns to one of the two and say which"
+            at = refused(head.file, f"line {number}", "frames", matched[1].strip())
+            raise at("is neither NED FRD nor ENU RFU", remedy)
         return fitting[0]
     return nav, body
 
@@ -267,11 +260,8 @@ def _tables(
         made.append(_path(part, origin) if kind == "trajectory" else _MAKERS[kind](part))
     if len(format.kinds) == 1 or len(made) == 1:
         return made[0]
-    return Dataset(
-        name=Path(read.file).name.split(".")[0],
-        **{kind_of(table): table for table in made},
-        time_unit_known=(read.file,) if known else (),
-    )
+    tables = {kind_of(table): table for table in made}
+    return Dataset(stem_of(read.file), **tables, time_unit_known=(read.file,) if known else ())
 
 
 def _imu(read: TextContents) -> ImuTable:
@@ -283,14 +273,8 @@ def _imu(read: TextContents) -> ImuTable:
     if rate and turns.any() and forces.any() and not (turns & forces).any():
         force = interpolated(read.time_ns[turns], read.time_ns[forces], force[forces])
         read, turn = read.of(turns), turn[turns]
-    return ImuTable(
-        read.time_ns,
-        turn,
-        force,
-        kind="rate" if rate else "increment",
-        body=read.body,
-        **read.origin,
-    )
+    kind: Literal["rate", "increment"] = "rate" if rate else "increment"
+    return ImuTable(read.time_ns, turn, force, kind, read.body, **read.origin)
 
 
 def _mag(read: TextContents) -> MagTable:
@@ -301,16 +285,12 @@ def _gnss(read: TextContents) -> GnssTable:
     quality = read.values.get("quality")
     if quality is not None:
         quality = np.where(np.abs(quality) < 100.0, quality, 0.0).astype(np.int64)
-    moves = read.has("velocity")
-    return GnssTable(
-        read.time_ns,
-        *(read.values[q] for q in parts("place")),
-        sigma_m=read.stack("sigma"),
-        v_n=read.stack("velocity") if moves else None,
-        sigma_v=read.stack("sigma_v") if moves else None,
-        quality=quality,
-        **read.origin,
-    )
+    v_n = sigma_v = None
+    if read.has("velocity"):
+        v_n, sigma_v = read.stack("velocity"), read.stack("sigma_v")
+    (lat, lon, height), sigma_m = (read.values[q] for q in parts("place")), read.stack("sigma")
+    now = read.time_ns
+    return GnssTable(now, lat, lon, height, sigma_m, v_n, sigma_v, quality, **read.origin)
 
 
 def _attitude(read: TextContents) -> AttitudeTable:
@@ -333,16 +313,10 @@ def _path(read: TextContents, origin: Origin | None) -> Trajectory:
         local = LocalPath(read.time_ns, read.stack("local"), swap(v_n), q_nb)
         path = from_local(local, origin or NOWHERE, source=read.file)
         return replace(path, body=read.body, omega_ib_b=omega, rows=read.rows)
-    return Trajectory(
-        read.time_ns,
-        *(read.values[q] for q in parts("place")),
-        v_n=swap(v_n) if read.nav == "ENU" else v_n,
-        q_nb=q_nb,
-        nav=read.nav,
-        body=read.body,
-        omega_ib_b=omega,
-        **read.origin,
-    )
+    v_n = swap(v_n) if read.nav == "ENU" else v_n
+    lat, lon, height = (read.values[q] for q in parts("place"))
+    origin_of = {"omega_ib_b": omega, "nav": read.nav, "body": read.body} | read.origin
+    return Trajectory(read.time_ns, lat, lon, height, v_n, q_nb, **origin_of)
 
 
 def _odometry(read: TextContents) -> OdometryTable:
@@ -351,23 +325,15 @@ def _odometry(read: TextContents) -> OdometryTable:
     return OdometryTable(read.time_ns, speed, unknown, sigma, unknown, **read.origin)
 
 
-_MAKERS = {
-    "imu": _imu,
-    "mag": _mag,
-    "gnss": _gnss,
-    "attitude": _attitude,
-    "odometry": _odometry,
-}
+_MAKERS = {"imu": _imu, "mag": _mag, "gnss": _gnss, "attitude": _attitude, "odometry": _odometry}
 
 
 def _quaternions(read: TextContents) -> np.ndarray:
     """As recorded, or from roll, pitch and heading, the same in both pairs of frames."""
     if read.has("quaternion"):
-        names = [read.columns[q].name for q in parts("quaternion")]
-        q = read.stack("quaternion")
-        return unit_quaternions(
-            read.file, f"{names[0]} .. {names[-1]}", q, read.rows, read.findings
-        )
+        first, *_, last = (read.columns[q].name for q in parts("quaternion"))
+        name, q = f"{first} .. {last}", read.stack("quaternion")
+        return unit_quaternions(read.file, name, q, read.rows, read.findings)
     q = np.asarray(rotation.from_euler(*read.stack("euler").T))
     return np.asarray(swap_q(q)) if read.nav == "ENU" else q
 
@@ -391,10 +357,9 @@ def _within_limits(read: TextContents, quantity: str) -> None:
     if 2 * beyond.sum() > np.isfinite(values).sum():
         radians = found.unit == "rad"
         other = "degrees under a name that says radians" if radians else "another unit"
-        raise refused(read.file, f"line {read.rows[k]}", found.name, shown)(
-            f"beyond {allowed}, as in {count}: probably {other}, or another column",
-            "name the column with the unit it is in",
-        )
+        cause = f"beyond {allowed}, as in {count}: probably {other}, or another column"
+        remedy = "name the column with the unit it is in"
+        raise refused(read.file, f"line {read.rows[k]}", found.name, shown)(cause, remedy)
     values[beyond] = np.nan
     finding_reporter(
         read.findings, "warning", "angle_range", read.file, f"line {read.rows[k]}", shown

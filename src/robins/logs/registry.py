@@ -28,7 +28,7 @@ from robins.logs import (
     ulog,
 )
 from robins.logs.archives import head_of, kind_of_archive
-from robins.logs.findings import Finding, LogError, refused
+from robins.logs.findings import AnyPath, Findings, LogError, refused
 from robins.logs.folders import read_folder
 from robins.logs.mounting import Origin
 from robins.logs.opening import read_beginning
@@ -52,11 +52,21 @@ class Format(NamedTuple):
     read: Callable[..., Table | Dataset]
     binary: bool = False
     text: TextFormat | None = None  # its row, by which it is also written
-    write: Callable[[str | os.PathLike[str], Table | Dataset], None] | None = None  # no text
+    write: Callable[[AnyPath, Table | Dataset], None] | None = None  # no text
 
 
 def _of_text(row: TextFormat) -> Format:
     return Format(row.name, row.kinds, row.about, row.recognise, partial(read_text, row), text=row)
+
+
+def _own(name: str, holds: str, *functions: Callable, binary: bool = True):
+    """A row of a format that text rows do not describe, and then a line for people.
+
+    Its functions recognise it, read it and, if there are three, write it.
+    """
+    recognise, read, *write = functions
+    kinds, write = tuple(holds.split()), write[0] if write else None
+    return lambda about: Format(name, kinds, about, recognise, read, binary, write=write)
 
 
 def _begins(magic: bytes) -> Callable[[Head], bool]:
@@ -65,128 +75,59 @@ def _begins(magic: bytes) -> Callable[[Head], bool]:
 
 FORMATS: tuple[Format, ...] = (
     *map(_of_text, TEXT_FORMATS),
-    Format(
-        "rtklib-pos",
-        ("gnss",),
-        "RTKLIB: .pos with latitude, longitude, height in degrees; GPST or UTC",
-        rtklib.is_rtklib,
-        rtklib.read_rtklib,
+    _own("rtklib-pos", "gnss", rtklib.is_rtklib, rtklib.read_rtklib, binary=False)(
+        "RTKLIB: .pos with latitude, longitude, height in degrees; GPST or UTC"
     ),
-    Format(
-        "kitti-odometry",
-        ("trajectory",),
-        "KITTI odometry: 12 numbers a line, times.txt beside it",
-        paths.is_kitti,
-        paths.read_kitti,
+    _own("kitti-odometry", "trajectory", paths.is_kitti, paths.read_kitti, binary=False)(
+        "KITTI odometry: 12 numbers a line, times.txt beside it"
     ),
-    Format(
-        "novatel-inspva",
-        ("trajectory",),
-        "NovAtel: INSPVAA and INSPVASA in ASCII, each line against its checksum",
-        paths.is_inspva,
-        paths.read_inspva,
+    _own("novatel-inspva", "trajectory", paths.is_inspva, paths.read_inspva, binary=False)(
+        "NovAtel: INSPVAA and INSPVASA in ASCII, each line against its checksum"
     ),
-    Format(
-        "phone-csv",
-        ("imu", "mag", "gnss"),
-        "phones, as strapdown-rs keeps their drives: CSV, UTC dates, Android's axes",
-        phone.is_phone,
-        phone.read_phone,
+    _own("phone-csv", "imu mag gnss", phone.is_phone, phone.read_phone, binary=False)(
+        "phones, as strapdown-rs keeps their drives: CSV, UTC dates, Android's axes"
     ),
-    Format(
-        "broad-npz",
-        ("imu", "mag", "attitude"),
-        "BROAD, the orientation benchmark of Laidig et al. (2021): .mat, .hdf5, .npz",
-        broad.is_broad,
-        broad.read_broad,
-        binary=True,
+    _own("broad-npz", "imu mag attitude", broad.is_broad, broad.read_broad)(
+        "BROAD, the orientation benchmark of Laidig et al. (2021): .mat, .hdf5, .npz"
     ),
-    Format(
-        "sbet",
-        ("trajectory",),
-        "Applanix POSPac: SBET, 17 doubles a record",
-        paths.is_sbet,
-        paths.read_sbet,
-        binary=True,
+    _own("sbet", "trajectory", paths.is_sbet, paths.read_sbet)(
+        "Applanix POSPac: SBET, 17 doubles a record"
     ),
-    Format(
+    _own(
         "arrays",
-        ("imu",),
-        "npy, npz, MATLAB, HDF5, Parquet ('robins[parquet]'): arrays named as columns of text",
+        "imu",
         lambda head: bool(kind_of_archive(head.start)) and not broad.is_broad(head),
         lambda path, findings=None: _of_names(path)(path, findings),
-        binary=True,
+    )("npy, npz, MATLAB, HDF5, Parquet ('robins[parquet]'): arrays named as columns of text"),
+    _own("px4-ulog", "imu mag gnss", _begins(ulog.MAGIC), ulog.read_ulog)(
+        "PX4: .ulg; needs the extra, pip install 'robins[logs]'"
     ),
-    Format(
-        "px4-ulog",
-        ("imu", "mag", "gnss"),
-        "PX4: .ulg; needs the extra, pip install 'robins[logs]'",
-        _begins(ulog.MAGIC),
-        ulog.read_ulog,
-        binary=True,
+    _own("ros-mcap", "imu mag gnss", _begins(ros_files.MCAP), rosbag.read_rosbag, write_rosbag)(
+        "ROS 2: .mcap with Imu, MagneticField, NavSatFix; needs the extra 'robins[logs]'"
     ),
-    Format(
-        "ros-mcap",
-        ("imu", "mag", "gnss"),
-        "ROS 2: .mcap with Imu, MagneticField, NavSatFix; needs the extra 'robins[logs]'",
-        _begins(ros_files.MCAP),
-        rosbag.read_rosbag,
-        binary=True,
-        write=write_rosbag,
+    _own("ros-db3", "imu mag gnss", _begins(ros_files.SQLITE), rosbag.read_rosbag)(
+        "ROS 2: .db3 with Imu, MagneticField, NavSatFix, or the folder of a recording"
     ),
-    Format(
-        "ros-db3",
-        ("imu", "mag", "gnss"),
-        "ROS 2: .db3 with Imu, MagneticField, NavSatFix, or the folder of a recording",
-        _begins(ros_files.SQLITE),
-        rosbag.read_rosbag,
-        binary=True,
+    _own("ros-bag", "imu mag gnss", _begins(ros_files.BAG), rosbag.read_rosbag)(
+        "ROS 1: .bag with Imu, MagneticField, NavSatFix; needs the extra 'robins[logs]'"
     ),
-    Format(
-        "ros-bag",
-        ("imu", "mag", "gnss"),
-        "ROS 1: .bag with Imu, MagneticField, NavSatFix; needs the extra 'robins[logs]'",
-        _begins(ros_files.BAG),
-        rosbag.read_rosbag,
-        binary=True,
+    _own("ubx", "imu gnss", ubx.is_ubx, ubx.read_ubx)(
+        "u-blox: .ubx with NAV-PVT, and ESF-MEAS of receivers with inertial sensors"
     ),
-    Format(
-        "ubx",
-        ("imu", "gnss"),
-        "u-blox: .ubx with NAV-PVT, and ESF-MEAS of receivers with inertial sensors",
-        ubx.is_ubx,
-        ubx.read_ubx,
-        binary=True,
+    _own("nmea", "gnss", lambda head: nmea.is_nmea(head) and not ubx.is_ubx(head), nmea.read_nmea)(
+        "NMEA 0183: sentences GGA, GNS, RMC, VTG, GST, ZDA of any receiver"
     ),
-    Format(
-        "nmea",
-        ("gnss",),
-        "NMEA 0183: sentences GGA, GNS, RMC, VTG, GST, ZDA of any receiver",
-        lambda head: nmea.is_nmea(head) and not ubx.is_ubx(head),
-        nmea.read_nmea,
-        binary=True,
+    _own("ardupilot-bin", "imu mag gnss", _begins(dataflash.MAGIC), dataflash.read_dataflash)(
+        "ArduPilot: dataflash .BIN with IMU, MAG, GPS, GPA"
     ),
-    Format(
-        "ardupilot-bin",
-        ("imu", "mag", "gnss"),
-        "ArduPilot: dataflash .BIN with IMU, MAG, GPS, GPA",
-        _begins(dataflash.MAGIC),
-        dataflash.read_dataflash,
-        binary=True,
-    ),
-    Format(
-        "mavlink-tlog",
-        ("imu", "mag", "gnss"),
-        "MAVLink: .tlog of a ground station; needs the extra 'robins[logs]'",
-        tlog.is_tlog,
-        tlog.read_tlog,
-        binary=True,
+    _own("mavlink-tlog", "imu mag gnss", tlog.is_tlog, tlog.read_tlog)(
+        "MAVLink: .tlog of a ground station; needs the extra 'robins[logs]'"
     ),
 )
 """All of them."""
 
 
-def _of_names(path: str | os.PathLike[str]) -> Callable[..., Table | Dataset]:
+def _of_names(path: AnyPath) -> Callable[..., Table | Dataset]:
     """Reader of the one text format whose names the arrays of an archive have.
 
     Raises:
@@ -203,7 +144,7 @@ def _of_names(path: str | os.PathLike[str]) -> Callable[..., Table | Dataset]:
     return partial(read_text, rows[0])
 
 
-def matching_formats(path: str | os.PathLike[str]) -> tuple[Head, list[Format]]:
+def matching_formats(path: AnyPath) -> tuple[Head, list[Format]]:
     """Beginning of a file, and the formats that it fits.
 
     Raises:
@@ -216,7 +157,7 @@ def matching_formats(path: str | os.PathLike[str]) -> tuple[Head, list[Format]]:
     return head, [f for f in FORMATS if not f.binary and f.recognise(head)]
 
 
-def recognise(path: str | os.PathLike[str]) -> Format:
+def recognise(path: AnyPath) -> Format:
     """The format of a file, by its content.
 
     Raises:
@@ -242,9 +183,9 @@ def recognise(path: str | os.PathLike[str]) -> Format:
 
 
 def open_log(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     format: str | TextFormat | None = None,
-    findings: list[Finding] | None = None,
+    findings: Findings = None,
     *,
     origin: Origin | None = None,
 ) -> Table | Dataset:
@@ -277,14 +218,13 @@ def open_log(
     if origin is None:
         return known.read(path, findings)
     if known.text is None or not known.text.local:
-        raise LogError(
-            str(path), f"{known.name} has no local metres to put at an origin", "give no origin"
-        )
+        cause = f"{known.name} has no local metres to put at an origin"
+        raise LogError(str(path), cause, "give no origin")
     return known.read(path, findings, origin)
 
 
 def write_log(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     table: Table | Dataset,
     format: str | TextFormat | None = None,
     *,
@@ -326,23 +266,18 @@ def write_log(
     write_text(row, path, table, week=week, origin=origin)
 
 
-def _usual(path: str | os.PathLike[str], table: Table | Dataset) -> str:
+def _usual(path: AnyPath, table: Table | Dataset) -> str:
     if str(path).endswith(".mcap"):
         return "ros-mcap"
     kinds = tuple(map(kind_in_text, tables_of(table)))
     for name in ("named-imu", "named-path"):
         if kinds == format_named(name, path).holds:
             return name
-    raise LogError(
-        str(path),
-        f"no named format holds {' and '.join(map(words_of, kinds))}",
-        f"choose a format: {', '.join(f.name for f in FORMATS if f.text or f.write)}",
-    )
+    remedy = f"choose a format: {', '.join(f.name for f in FORMATS if f.text or f.write)}"
+    raise LogError(str(path), f"no named format holds {' and '.join(map(words_of, kinds))}", remedy)
 
 
-def format_named(
-    name: str, path: str | os.PathLike[str], among: Sequence[Format] = FORMATS
-) -> Format:
+def format_named(name: str, path: AnyPath, among: Sequence[Format] = FORMATS) -> Format:
     """Format of this name; the path is for the message.
 
     Raises:
@@ -350,7 +285,6 @@ def format_named(
     """
     named = {f.name: f for f in among}
     if name not in named:
-        raise LogError(
-            str(path), f"no format is called {name!r}", f"choose one of {', '.join(named)}"
-        )
+        cause = f"no format is called {name!r}"
+        raise LogError(str(path), cause, f"choose one of {', '.join(named)}")
     return named[name]

@@ -14,12 +14,20 @@ import sqlite3
 import struct
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, cast
 
 from robins.foreign import decoding, largest, unpacked, within
-from robins.logs.findings import Finding, LogError, damaged, finding_reporter, report_cut_end
+from robins.logs.findings import (
+    Findings,
+    LogError,
+    damaged,
+    extra_package,
+    finding_reporter,
+    report_cut_end,
+)
 from robins.logs.opening import UNZSTD, Bytes, map_file
 
 if TYPE_CHECKING:
@@ -29,17 +37,15 @@ if TYPE_CHECKING:
 MCAP, SQLITE, BAG = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"#ROSBAG V2.0\n"
 _RECORD, _FOOTER = struct.Struct("<BQ"), 2  # opcode and length of a record; the last one's opcode
 _ZSTD = b"\x28\xb5\x2f\xfd"
-NO_PACKAGE = "is an MCAP file, and the package for these is not installed"
-INSTALL = "install it with: pip install 'robins[logs]'"
+_FOR_THESE = "the package for these"
+mcap_package = partial(extra_package, what="an MCAP file", package=_FOR_THESE)
 
 
 Raw: TypeAlias = tuple[str, str, bytes, bool]
 """Type of a message as ROS 2 spells it, topic, bytes, and whether ROS 1 serialised it."""
 
 
-def raw_messages(
-    path: Path, wanted: Collection[str], findings: list[Finding] | None
-) -> Iterator[Raw]:
+def raw_messages(path: Path, wanted: Collection[str], findings: Findings) -> Iterator[Raw]:
     """Messages of the wanted types, and one without bytes for each topic of any type.
 
     Args:
@@ -79,7 +85,7 @@ def _plain(data: bytes, refuse: Callable[[str], LogError]) -> bytes:
 
 
 def _from_mcap(
-    path: Path, data: Bytes, wanted: Collection[str], findings: list[Finding] | None
+    path: Path, data: Bytes, wanted: Collection[str], findings: Findings
 ) -> Iterator[Raw]:
     file, refuse = str(path), damaged(str(path))
     sound, closed = _sound(data)
@@ -128,12 +134,10 @@ def _records(
     Raises:
         LogError: the package is not installed, or a record is damaged.
     """
-    try:
+    with mcap_package(file):
         from mcap.exceptions import EndOfFile
         from mcap.records import Chunk
         from mcap.stream_reader import StreamReader, breakup_chunk
-    except ImportError as error:
-        raise LogError(file, NO_PACKAGE, INSTALL) from error
     plain = at = 0
 
     def read(size: int) -> bytes:  # no byte behind the last whole record
@@ -169,7 +173,7 @@ def _records(
 
 
 def _from_db3(
-    path: Path, data: Bytes, wanted: Collection[str], findings: list[Finding] | None
+    path: Path, data: Bytes, wanted: Collection[str], findings: Findings
 ) -> Iterator[Raw]:
     file, refuse = str(path), damaged(str(path))
     waiting = path.with_name(path.name + "-wal")
@@ -225,14 +229,11 @@ def _database(path: Path, data: Bytes, refuse: Callable[[str], LogError]) -> sql
 
 
 def _from_bag(
-    path: Path, data: Bytes, wanted: Collection[str], findings: list[Finding] | None
+    path: Path, data: Bytes, wanted: Collection[str], findings: Findings
 ) -> Iterator[Raw]:
     file = str(path)
-    try:
+    with extra_package(file, "a bag of ROS 1", _FOR_THESE):
         from rosbags.rosbag1 import Reader
-    except ImportError as error:
-        cause = "is a bag of ROS 1, and the package for these is not installed"
-        raise LogError(file, cause, INSTALL) from error
 
     def refuse(why: str) -> LogError:
         fix = "fetch it again, or restore its index: rosbag reindex FILE"

@@ -16,10 +16,8 @@ header: UTC since 1970, which becomes GPS time, or else a count from a start of 
 
 from __future__ import annotations
 
-import os
 from array import array
 from collections import defaultdict
-from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -27,12 +25,12 @@ import numpy as np
 from robins import ros
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.gps_time import GPS_EPOCH_S, gps_of
-from robins.logs.findings import Finding, LogError, damaged, finding_reporter
+from robins.logs.findings import AnyPath, Findings, LogError, damaged, finding_reporter
 from robins.logs.fix_kinds import with_usual_sigmas
 from robins.logs.merging import are_halves, merged
 from robins.logs.opening import parts_of
 from robins.logs.ros_files import raw_messages
-from robins.logs.tables import Table
+from robins.logs.tables import Table, recording
 
 _FLU = np.array([1.0, -1.0, -1.0])  # forward-left-up <-> forward-right-down
 _NED = [1, 0, 2]  # of east, north, up: variances have no sign
@@ -59,9 +57,7 @@ Topics: TypeAlias = dict[tuple[str, str], _TopicMessages]
 """Messages by type and topic."""
 
 
-def read_rosbag(
-    path: str | os.PathLike[str], findings: list[Finding] | None = None
-) -> Table | Dataset:
+def read_rosbag(path: AnyPath, findings: Findings = None) -> Table | Dataset:
     """Read inertial samples, magnetic field and fixes.
 
     Args:
@@ -82,20 +78,16 @@ def read_rosbag(
     field = mag and MagTable(mag.time_ns, mag.values[:, :3] * _FLU, source=file)
     gnss = fixes and _fixes(file, fixes, topics, findings)
     if imu is not None:
-        name = Path(file).name.split(".")[0]
-        return Dataset(name=name, imu=imu, mag=field, gnss=gnss, time_unit_known=(file,))
+        return recording(file, imu, gnss, mag=field)
     alone = field if gnss is None else gnss
     if alone is None or (field is not None and gnss is not None):
         held = ", ".join(sorted(kinds)) or "no messages"
-        raise LogError(
-            file, f"has no messages {_IMU}; it holds {held}", "record that topic as well"
-        )
+        cause = f"has no messages {_IMU}; it holds {held}"
+        raise LogError(file, cause, "record that topic as well")
     return alone
 
 
-def _topics(
-    path: str | os.PathLike[str], findings: list[Finding] | None
-) -> tuple[Topics, set[str]]:
+def _topics(path: AnyPath, findings: Findings) -> tuple[Topics, set[str]]:
     """All messages that are read, by type and topic, and the types of all that are there.
 
     Raises:
@@ -130,7 +122,7 @@ def _topics(
 
 
 def _first(
-    file: str, topics: Topics, name: str, findings: list[Finding] | None, beside: str = ""
+    file: str, topics: Topics, name: str, findings: Findings, beside: str = ""
 ) -> _TopicMessages | None:
     """The first topic of a type, and a note of the others but that `beside` it."""
     found = [one for (of, _), one in topics.items() if of == name]
@@ -143,7 +135,7 @@ def _first(
     return found[0] if found else None
 
 
-def _inertial(file: str, topics: Topics, findings: list[Finding] | None) -> ImuTable | None:
+def _inertial(file: str, topics: Topics, findings: Findings) -> ImuTable | None:
     """Samples of the first topic, with those of another where it has one half of them only."""
 
     def known(one: _TopicMessages, place: slice, at: int) -> np.ndarray:
@@ -164,33 +156,23 @@ def _inertial(file: str, topics: Topics, findings: list[Finding] | None) -> ImuT
     return merged(first, other[1], findings) if other else first
 
 
-def _fixes(
-    file: str, gnss: _TopicMessages, topics: Topics, findings: list[Finding] | None
-) -> GnssTable:
+def _fixes(file: str, gnss: _TopicMessages, topics: Topics, findings: Findings) -> GnssTable:
     status = gnss.values[:, _STATUS]
     lost = status < 0
     variance = gnss.values[:, _VARIANCE][:, _NED]
     unknown = gnss.values[:, _KIND] == 0
     with np.errstate(invalid="ignore"):  # a negative variance is none
         sigma_m = np.where(unknown[:, None], np.nan, np.sqrt(variance))
-    lat_deg, lon_deg, alt_m = np.where(lost[:, None], np.nan, gnss.values[:, _PLACE]).T.copy()
+    place = np.where(lost[:, None], np.nan, gnss.values[:, _PLACE]).T.copy()
+    lat, lon, alt = np.deg2rad(place[0]), np.deg2rad(place[1]), place[2]
     v_n, sigma_v = _velocities(file, gnss, topics, findings)
-    table = GnssTable(
-        time_ns=gnss.time_ns,
-        lat_rad=np.deg2rad(lat_deg),
-        lon_rad=np.deg2rad(lon_deg),
-        alt_m=alt_m,
-        sigma_m=sigma_m,
-        v_n=v_n,
-        sigma_v=sigma_v,
-        quality=np.array([_QUALITY.get(int(k), 0) for k in status], np.int64),
-        source=file,
-    )
+    quality = np.array([_QUALITY.get(int(k), 0) for k in status], np.int64)
+    table = GnssTable(gnss.time_ns, lat, lon, alt, sigma_m, v_n, sigma_v, quality, source=file)
     return with_usual_sigmas(table, findings, places=False)
 
 
 def _velocities(
-    file: str, gnss: _TopicMessages, topics: Topics, findings: list[Finding] | None
+    file: str, gnss: _TopicMessages, topics: Topics, findings: Findings
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Velocities of the fixes and their sigmas, where the receiver's driver wrote them."""
     for (name, topic), one in topics.items():

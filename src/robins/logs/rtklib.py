@@ -7,13 +7,19 @@ not kept.
 
 from __future__ import annotations
 
-import os
 import re
 
 import numpy as np
 
 from robins.dataset import GnssTable
-from robins.logs.findings import Finding, LogError, finding_reporter, refused
+from robins.logs.findings import (
+    AnyPath,
+    Findings,
+    LogError,
+    finding_reporter,
+    refused,
+    report_geoid_heights,
+)
 from robins.logs.text import Head, TextLayout, peek, read_columns
 from robins.logs.timebase import calendar_to_ns, stamps_to_ns, week_to_ns, weeks_of
 
@@ -38,7 +44,7 @@ def is_rtklib(head: Head) -> bool:
     return header or any(stamp.match(text) for _, text in head.data(1))
 
 
-def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> GnssTable:
+def read_rtklib(path: AnyPath, findings: Findings = None) -> GnssTable:
     """Read a .pos file of RTKLIB, latitude/longitude/height in degrees, GPST or UTC.
 
     Calendar stamps and week/time of week both become nanoseconds since 1970 in GPS time.
@@ -65,10 +71,8 @@ def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = N
     layout = TextLayout((*time_names, *names), "," if comma else None, tuple(range(texts)))
     columns = read_columns(path, layout, findings)
     if missing := [n for n in _NEEDED if n not in names]:
-        raise refused(file, "header")(
-            f"has no column {', '.join(missing)}",
-            "write latitude, longitude, height, Q and the standard deviations",
-        )
+        remedy = "write latitude, longitude, height, Q and the standard deviations"
+        raise refused(file, "header")(f"has no column {', '.join(missing)}", remedy)
 
     def column(name: str) -> np.ndarray:
         return columns.values[:, names.index(name)]
@@ -86,13 +90,13 @@ def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = N
                 "they are left out. Heading will be found from the positions alone; set "
                 "out-outvel = on."
             )
-    _report_geoid(file, head, findings)
-    quality = column("Q")
+    if any("/geodetic" in line for line in head.lines if line.startswith("%")):
+        fix = "Set out-height = ellipsoidal in RTKLIB."
+        report_geoid_heights(findings, file, fix, "header", "geodetic")
+    time_ns = _times(file, columns.texts, columns.rows, calendar, utc)
+    lat, lon, quality = np.deg2rad(column("latitude")), np.deg2rad(column("longitude")), column("Q")
     return GnssTable(
-        time_ns=_times(file, columns.texts, columns.rows, calendar, utc),
-        lat_rad=np.deg2rad(column("latitude")),
-        lon_rad=np.deg2rad(column("longitude")),
-        alt_m=column("height").copy(),
+        *(time_ns, lat, lon, column("height").copy()),
         sigma_m=vectors("sdn", "sde", "sdu", 1.0),
         v_n=v_n,
         sigma_v=sigma_v,
@@ -102,15 +106,6 @@ def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = N
     )
 
 
-def _report_geoid(file: str, head: Head, findings: list[Finding] | None) -> None:
-    if any("/geodetic" in line for line in head.lines if line.startswith("%")):
-        finding_reporter(findings, "warning", "height_above_geoid", file, "header", "geodetic")(
-            "heights are above the geoid, and robins takes them as above the WGS-84 "
-            "ellipsoid. Differences of height stay right; gravity errs by 3e-6 m/s^2 per "
-            "metre. Set out-height = ellipsoidal in RTKLIB."
-        )
-
-
 def _header(head: Head) -> tuple[list[str], bool]:
     """Names of the number columns, if the header gives them, and whether times are UTC."""
     for number, line in enumerate(head.lines, start=1):
@@ -118,9 +113,8 @@ def _header(head: Head) -> tuple[list[str], bool]:
             fields = line[1:].replace(",", " ").split()
             for mark, (what, remedy) in _UNSUPPORTED.items():
                 if any(mark in field for field in fields) and "ns" in fields:
-                    raise refused(head.file, f"line {number}")(
-                        what, f"set {remedy} in RTKLIB and solve again"
-                    )
+                    remedy = f"set {remedy} in RTKLIB and solve again"
+                    raise refused(head.file, f"line {number}")(what, remedy)
             if fields[:1] in (["GPST"], ["UTC"]):
                 names = [field.split("(")[0] for field in fields[1:]]
                 return names, fields[0] == "UTC"
@@ -137,8 +131,7 @@ def _times(file: str, texts: np.ndarray, rows: np.ndarray, calendar: bool, utc: 
         try:
             out[i] = calendar_to_ns(*stamp.split(), utc=utc)
         except (ValueError, TypeError) as error:
-            raise refused(file, f"line {rows[i]}", "time", stamp)(
-                f"is not a time stamp year/month/day hour:minute:second ({error})",
-                "repair or delete the line",
-            ) from error
+            cause = f"is not a time stamp year/month/day hour:minute:second ({error})"
+            remedy = "repair or delete the line"
+            raise refused(file, f"line {rows[i]}", "time", stamp)(cause, remedy) from error
     return out

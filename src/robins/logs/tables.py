@@ -7,6 +7,7 @@ missing whole, or not believed.
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -20,7 +21,7 @@ from robins.dataset import (
     OdometryTable,
     Trajectory,
 )
-from robins.logs.findings import Finding, LogError, finding_reporter, refused
+from robins.logs.findings import Findings, LogError, finding_reporter, refused
 from robins.logs.timebase import LIMIT_NS
 
 Table = ImuTable | GnssTable | Trajectory | MagTable | AttitudeTable | OdometryTable
@@ -58,6 +59,18 @@ def tables_of(opened: Table | Dataset) -> list[Table]:
         return [opened]
     tables = [getattr(opened, kind) for kind in KINDS.values()]
     return [table for table in tables if table is not None]
+
+
+def recording(
+    file: str, imu: ImuTable, gnss: GnssTable | None = None, mag: MagTable | None = None
+) -> Dataset:
+    """Dataset of a file that states the unit of its stamps, called by the name of the file."""
+    return Dataset(stem_of(file), imu, gnss, mag=mag, time_unit_known=(file,))
+
+
+def stem_of(file: str) -> str:
+    """Name of a file without its folder and whatever follows the first dot."""
+    return Path(file).name.split(".")[0]
 
 
 AnyTable = TypeVar("AnyTable", bound=Table)
@@ -100,23 +113,21 @@ def checked(table: AnyTable) -> AnyTable:
             continue
         array = np.asarray(value)
         if array.dtype.kind not in "fiu":
-            raise refused(_name(table), field=field)(
-                f"holds {array.dtype}, not real numbers",
-                "give an array of floats, nan where a number is missing",
-            )
+            remedy = "give an array of floats, nan where a number is missing"
+            cause = f"holds {array.dtype}, not real numbers"
+            raise refused(_name(table), field=field)(cause, remedy)
         shape = (n, components) if components else (n,)
         out[field] = np.ascontiguousarray(_shaped(table, field, array, shape), np.float64)
     for field in ("quality", "rows"):
         if getattr(table, field, None) is not None:
             out[field] = _shaped(table, field, _integers(table, field, "give integers"), (n,))
-    for field, components in (("moving", 0), ("assumed_m", 3), ("assumed_v", 3)):
+    for field, shape in (("moving", (n,)), ("assumed_m", (n, 3)), ("assumed_v", (n, 3))):
         if (value := getattr(table, field, None)) is not None:
             marks = np.asarray(value)
             if marks.dtype.kind != "b":
-                raise refused(_name(table), field=field)(
-                    f"is {marks.dtype}, not bool", "give True and False"
-                )
-            out[field] = _shaped(table, field, marks, (n, components) if components else (n,))
+                cause = f"is {marks.dtype}, not bool"
+                raise refused(_name(table), field=field)(cause, "give True and False")
+            out[field] = _shaped(table, field, marks, shape)
     return dataclasses.replace(table, **out)
 
 
@@ -155,7 +166,7 @@ TOLERANCE = 1e-3  # how far from one a length may be by its decimals
 
 
 def unit_quaternions(
-    file: str, name: str, q: np.ndarray, rows: np.ndarray | None, findings: list[Finding] | None
+    file: str, name: str, q: np.ndarray, rows: np.ndarray | None, findings: Findings
 ) -> np.ndarray:
     """Unit quaternions; a row that is not one is taken as missing, whole, and reported.
 
@@ -172,9 +183,8 @@ def unit_quaternions(
     length = np.linalg.norm(q, axis=-1)
     known = ~np.isnan(length)
     wrong = known & ~(np.abs(length - 1.0) < TOLERANCE)
-    out = np.where(
-        (known & ~wrong)[:, None], q / np.where(wrong | ~known, 1.0, length)[:, None], np.nan
-    )
+    good = (known & ~wrong)[:, None]
+    out = np.where(good, q / np.where(good, length[:, None], 1.0), np.nan)
     if not wrong.any():
         return out
     k = int(np.argmax(wrong))

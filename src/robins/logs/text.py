@@ -13,7 +13,6 @@ and value. A number is never completed, shortened or guessed:
 from __future__ import annotations
 
 import io
-import os
 import re
 from collections.abc import Iterator
 from itertools import groupby
@@ -22,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robins.logs.findings import Finding, LogError, refused, report
+from robins.logs.findings import AnyPath, Finding, Findings, LogError, refused, report
 from robins.logs.opening import Source
 
 _PARSE_BYTES = 1 << 22
@@ -81,7 +80,7 @@ class Head(NamedTuple):
         return found[:count]
 
 
-def peek(path: str | os.PathLike[str]) -> Head:
+def peek(path: AnyPath) -> Head:
     """The first lines of a file, at most 64 KiB of it.
 
     Raises:
@@ -98,22 +97,18 @@ def peek(path: str | os.PathLike[str]) -> Head:
     _refuse_nul(file, start[:_LONGEST_LINE], 1)
     start = start[:_LONGEST_LINE].removeprefix(_BOM)
     if b"\r" in start and _LF not in start:
-        raise refused(file, "line 1")(
-            "its lines end in CR alone", "save it with line ends LF or CR LF"
-        )
+        remedy = "save it with line ends LF or CR LF"
+        raise refused(file, "line 1")("its lines end in CR alone", remedy)
     try:
         text = start[: start.rfind(_LF) + 1 or None].decode("utf-8")
     except UnicodeDecodeError as error:
         line = start[: error.start].count(_LF) + 1
-        raise refused(file, f"line {line}")(
-            "is not text in UTF-8", "is this the log itself?"
-        ) from error
+        at = refused(file, f"line {line}")
+        raise at("is not text in UTF-8", "is this the log itself?") from error
     return Head(file, [line.removesuffix("\r") for line in text.removesuffix("\n").split("\n")])
 
 
-def read_columns(
-    path: str | os.PathLike[str], layout: TextLayout, findings: list[Finding] | None = None
-) -> Columns:
+def read_columns(path: AnyPath, layout: TextLayout, findings: Findings = None) -> Columns:
     """Read all lines of a file.
 
     Args:
@@ -152,10 +147,9 @@ def _refuse_nul(file: str, data: bytes, line: int) -> None:
     """Raise if the bytes, whose first line has this number, cannot be text."""
     if b"\0" in data:
         utf16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
-        raise refused(file, f"line {line + data[: data.index(bytes(1))].count(_LF)}")(
-            "is UTF-16 text" if utf16 else "holds NUL bytes: a binary file, or one with a hole",
-            "save it as UTF-8" if utf16 else "copy it again, or cut it before this line",
-        )
+        cause = "is UTF-16 text" if utf16 else "holds NUL bytes: a binary file, or one with a hole"
+        remedy = "save it as UTF-8" if utf16 else "copy it again, or cut it before this line"
+        raise refused(file, f"line {line + data[: data.index(bytes(1))].count(_LF)}")(cause, remedy)
 
 
 def _blocks_of_lines(file: str, source: Source) -> Iterator[tuple[bytes, bool]]:
@@ -170,10 +164,8 @@ def _blocks_of_lines(file: str, source: Source) -> Iterator[tuple[bytes, bool]]:
         lines, rest = _split(b"".join(pending), line)
         line += lines.count(_LF)
         if len(rest) > _LONGEST_LINE:
-            raise refused(file, f"line {line}")(
-                f"is longer than {_LONGEST_LINE} bytes",
-                "is this a text log with one sample a line?",
-            )
+            cause = f"is longer than {_LONGEST_LINE} bytes"
+            raise refused(file, f"line {line}")(cause, "is this a text log with one sample a line?")
         yield lines, True
         pending = [rest]
     lines, rest = _split(b"".join(pending), line)
@@ -232,14 +224,10 @@ class _BlockReader:
         if self.layout.decimal != ".":
             block = block.replace(self.layout.decimal.encode(), b".")
         try:
-            table = np.loadtxt(
-                io.BytesIO(block),
-                dtype=self.dtype,
-                delimiter=self.layout.delimiter,
-                comments=None,
-                ndmin=1,
-                encoding="latin1",
-            ) if block.strip() else np.zeros(0, self.dtype)  # fmt: skip
+            table, separator = np.zeros(0, self.dtype), self.layout.delimiter
+            if block.strip():
+                lines = io.BytesIO(block)
+                table = np.loadtxt(lines, self.dtype, None, separator, ndmin=1, encoding="latin1")
         except Exception:  # of the decoder of NumPy: the lines say where
             table = None
         if table is None or len(table) != block.count(_LF):
@@ -266,7 +254,10 @@ class _BlockReader:
                 continue
             fields = _fields(text, self.layout.delimiter)
             if len(fields) != self.width:
-                raise self._wrong_width(number, fields)
+                raise refused(self.file, f"line {number}")(
+                    f"{len(fields)} fields where the first lines have {self.width}",
+                    "bytes are missing, or numbers have decimal commas; delete or repair the line",
+                )
             texts.append([self._text(number, k, fields[k]) for k in self._places(_TEXT)])
             values.append([self._number(number, k, fields[k]) for k in self._places(_NUMBER_TYPE)])
             rows.append(number)
@@ -290,25 +281,16 @@ class _BlockReader:
         if not field:
             return np.nan
         if not _NUMBER.fullmatch(field):
-            cause = "is not a number"
-            if b"," in field:
-                cause += " (a decimal comma?)"
-            raise self._no_number(line, k, field, cause)
+            comma = " (a decimal comma?)" if b"," in field else ""
+            raise self._no_number(line, k, field, f"is not a number{comma}")
         return float(field)
 
     def _no_number(self, line: int, k: int, field: bytes, cause: str) -> LogError:
-        names = self.layout.names
-        return refused(
-            self.file,
-            f"line {line}",
-            names[k] if k < len(names) else f"column {k + 1}",
-            field[:_TEXT_BYTES].decode("utf-8", "replace"),
-        )(cause, "write numbers with a decimal point, nan where one is missing; or delete the line")
-
-    def _wrong_width(self, line: int, fields: list[bytes]) -> LogError:
-        return refused(self.file, f"line {line}")(
-            f"{len(fields)} fields where the first lines have {self.width}",
-            "bytes are missing, or numbers have decimal commas; delete or repair the line",
+        names, shown = self.layout.names, field[:_TEXT_BYTES].decode("utf-8", "replace")
+        name = names[k] if k < len(names) else f"column {k + 1}"
+        return refused(self.file, f"line {line}", name, shown)(
+            cause,
+            "write numbers with a decimal point, nan where one is missing; or delete the line",
         )
 
 

@@ -17,31 +17,24 @@ _RATE, _FORCE, _TURN, _ANGLE = ("rad/s", "deg/s"), ("m/s^2", "g"), ("rad", "deg"
 
 
 def _columns(names: str, holds: str, *units: str) -> tuple[Column, ...]:
-    """Columns of these units; @ stands for x, y, z in a name and in what it holds."""
+    """Columns of these units; @ in them stands for x, y, z, and % in a name for X, Y, Z."""
     pairs = [
-        (name.replace("@", axis), quantity.replace("@", axis))
+        (name.replace("@", axis).replace("%", axis.upper()), quantity.replace("@", axis))
         for name, quantity in zip(names.split(", "), holds.split(), strict=True)
         for axis in ("xyz" if "@" in quantity else " ")
     ]
     return tuple(Column(quantity, name, units) for name, quantity in pairs)
 
 
-def _triad(names: str, holds: str, *units: str) -> tuple[Column, ...]:
-    """Three columns, with @ for X, Y, Z in the names."""
-    return tuple(
-        Column(holds.replace("@", axis), names.replace("@", axis.upper()), units) for axis in "xyz"
-    )
+def _format(name: str, looks: Looks | None = None, rows: Looks | None = None, **how: Any):
+    """A row: what `TextFormat` takes, then a line for people and groups of columns.
 
-
-def _format(
-    name: str, about: str, looks: Looks | None = None, rows: Looks | None = None, **how: Any
-):
-    """A row: what `TextFormat` takes, then groups of columns; with `looks` by their order.
+    With `looks`, columns are found by their order.
 
     `rows` tells by rows of numbers where a header, by whose names columns are found, is missing.
     """
 
-    def of(*groups: Iterable[Column]) -> TextFormat:
+    def of(about: str, *groups: Iterable[Column]) -> TextFormat:
         columns = itertools.chain.from_iterable(groups)
         if looks is not None:
             columns = (column._replace(place=k) for k, column in enumerate(columns, start=1))
@@ -116,50 +109,34 @@ _SECOND = _columns("time of week [s]", "time_of_week", "s")
 _NAMED = _columns("time_{unit_}", "time", *_CLOCKS)
 
 TEXT_FORMATS: tuple[TextFormat, ...] = (
-    _format(
-        "gnss-imu",
+    _format("gnss-imu", looks=_gnss_imu)(
         "GNSS_IMU: CSV without header; seconds since 1970 in GPS time, axes of the sensor",
-        looks=_gnss_imu,
-    )(
         _columns("time [s]", "time", "s"),
         _columns("acc_@ [g]", "accel_@", "g"),
         _columns("gyro_@ [rad/s]", "gyro_@", "rad/s"),
     ),
-    _format(
-        "kfgins-imu", "KF-GINS: increments, forward-right-down", separator=" ", looks=_kfgins_imu
-    )(
+    _format("kfgins-imu", separator=" ", looks=_kfgins_imu)(
+        "KF-GINS: increments, forward-right-down",
         _SECOND,
         _columns("dtheta_@ [rad]", "dtheta_@", "rad"),
         _columns("dv_@ [m/s]", "dv_@", "m/s"),
     ),
-    _format(
-        "kfgins-gnss",
+    _format("kfgins-gnss", separator=" ", whole=True, looks=_kfgins_gnss)(
         "KF-GINS: fixes, which lack no component",
-        separator=" ",
-        whole=True,
-        looks=_kfgins_gnss,
-    )(
         _SECOND,
         _PLACE,
         _columns("sigma_N [m], sigma_E [m], sigma_D [m]", "sigma_north sigma_east sigma_down", "m"),
     ),
-    _format(
-        "kfgins-nav",
+    _format("kfgins-nav", separator=" ", looks=_kfgins_nav)(
         "KF-GINS: navigation result; counted from the week of the first line",
-        separator=" ",
-        looks=_kfgins_nav,
-    )(
         _columns("week", "week"),
         _SECOND,
         _PLACE,
         _columns("vN [m/s], vE [m/s], vD [m/s]", "v_north v_east v_down", "m/s"),
         _columns("roll [deg], pitch [deg], yaw [deg]", _EULER, "deg"),
     ),
-    _format(
-        "pyins-imu",
+    _format("pyins-imu", choice=True)(
         "pyins: CSV of Imu or Increments, a DataFrame whose index is the time",
-        choice=True,
-    )(
         _columns(f"time | {ANY}", "time", "s"),
         _columns("gyro_@", "gyro_@", "rad/s"),
         _columns("accel_@", "accel_@", "m/s^2"),
@@ -167,25 +144,22 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
         _columns("theta_@", "dtheta_@", "rad"),
         _columns("dv_@", "dv_@", "m/s"),
     ),
-    _format("pyins-trajectory", "pyins: CSV of Trajectory, a DataFrame whose index is the time")(
+    _format("pyins-trajectory")(
+        "pyins: CSV of Trajectory, a DataFrame whose index is the time",
         _columns(f"time | {ANY}", "time", "s"),
         _columns("lat, lon", "lat lon", "deg"),
         _columns("alt", "height", "m"),
         _columns("VN, VE, VD", "v_north v_east v_down", "m/s"),
         _columns("roll, pitch, heading", _EULER, "deg"),
     ),
-    _format("euroc-imu", "EuRoC and ASL: imu0/data.csv, axes of the sensor", commented=True)(
+    _format("euroc-imu", commented=True)(
+        "EuRoC and ASL: imu0/data.csv, axes of the sensor",
         _columns("timestamp [ns] | timestamp", "time", "ns"),
         _columns("w_RS_S_@ [rad s^-1] | w_RS_S_@", "gyro_@", "rad/s"),
         _columns("a_RS_S_@ [m s^-2] | a_RS_S_@", "accel_@", "m/s^2"),
     ),
-    _format(
-        "euroc-truth",
+    _format("euroc-truth", nav="ENU", commented=True, choice=True)(
         "EuRoC and ASL: ground truth in local metres, taken as east, north, up",
-        nav="ENU",
-        commented=True,
-        choice=True,
-    )(
         _columns("timestamp [ns] | timestamp", "time", "ns"),
         _columns(
             "p_RS_R_x [m] | p_RS_R_x, p_RS_R_y [m] | p_RS_R_y, p_RS_R_z [m] | p_RS_R_z",
@@ -201,57 +175,37 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
         (Column("v_down", "v_RS_R_z [m s^-1] | v_RS_R_z", scale=-1.0),),
     ),
     _format(
-        "tum",
-        "TUM, evo, ORB-SLAM, ov_eval: metres east, north, up of an origin, the scalar last",
-        separator=" ",
-        nav="ENU",
-        commented=True,
-        rows=_poses(4, (-1e9, 1e11), range(8, 9)),
+        "tum", separator=" ", nav="ENU", commented=True, rows=_poses(4, (-1e9, 1e11), range(8, 9))
     )(
+        "TUM, evo, ORB-SLAM, ov_eval: metres east, north, up of an origin, the scalar last",
         _columns("timestamp | timestamp(s)", "time", "s"),
         *_POSE,
     ),
-    _format(
-        "orbslam-euroc",
+    _format("orbslam-euroc", separator=" ", nav="ENU", looks=_poses(4, (1e14, 1e19), range(8, 9)))(
         "ORB-SLAM3 SaveTrajectoryEuRoC, Basalt: as tum, in nanoseconds and without a header",
-        separator=" ",
-        nav="ENU",
-        looks=_poses(4, (1e14, 1e19), range(8, 9)),
-    )(
         _columns("timestamp [ns]", "time", "ns"),
         *_POSE,
     ),
     _format(
-        "openvins-state",
-        "OpenVINS save_total_state: time, rotation with the scalar last, place, velocity",
-        separator=" ",
-        nav="ENU",
-        looks=_poses(1, (-1e9, 1e11), range(11, 1000)),
+        "openvins-state", separator=" ", nav="ENU", looks=_poses(1, (-1e9, 1e11), range(11, 1000))
     )(
+        "OpenVINS save_total_state: time, rotation with the scalar last, place, velocity",
         _columns("timestamp(s)", "time", "s"),
         _columns("q_x, q_y, q_z, q_w", "q_x q_y q_z q_w"),
         _columns("p_x [m], p_y [m], p_z [m]", "east north up", "m"),
         _columns("v_x [m/s], v_y [m/s]", "v_east v_north", "m/s"),
         (Column("v_down", "v_z [m/s]", ("m/s",), scale=-1.0),),
     ),
-    _format(
-        "named-imu",
+    _format("named-imu", states_frames=True, choice=True)(
         "anyone: CSV with units in its header; rates, or increments since the line before",
-        states_frames=True,
-        choice=True,
-    )(
         _NAMED,
         _columns("gyro_@_{unit_}", "gyro_@", *_RATE),
         _columns("accel_@_{unit_}", "accel_@", *_FORCE),
         _columns("dtheta_@_{unit_}", "dtheta_@", *_TURN),
         _columns("dv_@_{unit_}", "dv_@", "m/s"),
     ),
-    _format(
-        "named-path",
+    _format("named-path", states_frames=True, choice=True)(
         "anyone: CSV with units in its header; with angles or quaternions, maybe turn rates",
-        states_frames=True,
-        choice=True,
-    )(
         _NAMED,
         _columns("lat_{unit_}, lon_{unit_}", "lat lon", *_ANGLE),
         _columns("height_{unit_}", "height", "m"),
@@ -260,53 +214,35 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
         _columns("q_w, q_x, q_y, q_z", "q_w q_x q_y q_z"),
         _columns("omega_@_{unit_}", "omega_@", *_RATE),
     ),
-    _format(
-        "xsens-mt",
+    _format("xsens-mt", separator="\t", others=True)(
         "Xsens MT Manager: tab-separated text, ticks of 0.1 ms, axes of the sensor",
-        separator="\t",
-        others=True,
-    )(
         (Column("time", "SampleTimeFine", ("ms",), scale=0.1),),
-        _triad("Acc_@", "accel_@", "m/s^2"),
-        _triad("Gyr_@", "gyro_@", "rad/s"),
+        _columns("Acc_%", "accel_@", "m/s^2"),
+        _columns("Gyr_%", "gyro_@", "rad/s"),
     ),
-    _format(
-        "xsens-dot",
+    _format("xsens-dot", others=True)(
         "Xsens DOT: CSV below lines about the device, microseconds, axes of the sensor",
-        others=True,
-    )(
         _columns("SampleTimeFine", "time", "us"),
-        _triad("Acc_@", "accel_@", "m/s^2"),
-        _triad("Gyr_@", "gyro_@", "deg/s"),
+        _columns("Acc_%", "accel_@", "m/s^2"),
+        _columns("Gyr_%", "gyro_@", "deg/s"),
     ),
-    _format(
-        "microstrain-csv",
+    _format("microstrain-csv", others=True, choice=True)(
         "MicroStrain MIP Monitor: CSV below DATA_START, week and second of GPS",
-        others=True,
-        choice=True,
-    )(
         _columns("GPS Week", "week"),
         _columns("GPS TOW", "time_of_week", "s"),
-        _triad("@ Accel [x8004]", "accel_@", "g"),
-        _triad("@ Gyro [x8005]", "gyro_@", "rad/s"),
-        _triad("@ Mag [x8006]", "mag_@", "G"),
+        _columns("% Accel [x8004]", "accel_@", "g"),
+        _columns("% Gyro [x8005]", "gyro_@", "rad/s"),
+        _columns("% Mag [x8006]", "mag_@", "G"),
     ),
-    _format(
-        "vectornav-csv",
+    _format("vectornav-csv", others=True, choice=True)(
         "VectorNav: CSV of its uncompensated sensors, as INSTINCT writes it too",
-        others=True,
-        choice=True,
-    )(
         _columns("TimeStartup | TimeStartup [ns]", "time", "ns"),
-        _triad("UncompAcc@ | UnCompAcc@ | UnCompAcc@ [m/s^2]", "accel_@", "m/s^2"),
-        _triad("UncompGyro@ | UnCompGyro@ | UnCompGyro@ [rad/s]", "gyro_@", "rad/s"),
-        _triad("UncompMag@ | UnCompMag@ | UnCompMag@ [Gauss]", "mag_@", "G"),
+        _columns("UncompAcc% | UnCompAcc% | UnCompAcc% [m/s^2]", "accel_@", "m/s^2"),
+        _columns("UncompGyro% | UnCompGyro% | UnCompGyro% [rad/s]", "gyro_@", "rad/s"),
+        _columns("UncompMag% | UnCompMag% | UnCompMag% [Gauss]", "mag_@", "G"),
     ),
-    _format(
-        "xio-csv",
+    _format("xio-csv", choice=True)(
         "x-io sensors and Fusion: CSV with any units in its header, axes of the sensor",
-        choice=True,
-    )(
         _columns("Time ({unit}) | Timestamp ({unit})", "time", *_CLOCKS),
         (
             Column(f"{stem}_{axis}", f"{sensor} {axis.upper()} ({{unit}})", (symbol, ANY))

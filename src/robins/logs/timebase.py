@@ -42,37 +42,20 @@ def decimals_to_ns(text: np.ndarray, exponent: int = 9) -> tuple[np.ndarray, np.
     Returns:
         (n,) int64, and (n,) bool: False where the text is no number or beyond int64.
     """
-    n, width = len(text), text.dtype.itemsize
-    value, plain = np.zeros(n, np.int64), np.zeros(n, bool)
-    if n and np.char.str_len(text).any():
-        columns = np.ascontiguousarray(text).view(np.uint8).reshape(n, width)
-        columns = np.ascontiguousarray(columns[:, columns.any(axis=0)].T)  # (characters, n)
-        length = np.count_nonzero(columns, axis=0)
-        is_point = columns == ord(".")
-        points = np.count_nonzero(is_point, axis=0)
-        at = np.where(points == 1, is_point.argmax(axis=0), length)
-        after = np.maximum(length - at - 1, 0)
-        plain = np.count_nonzero(columns - np.uint8(48) < 10, axis=0) == length - points
-        plain &= (points < 2) & (length > points) & (after <= exponent)
+    value, plain = np.zeros(len(text), np.int64), np.zeros(len(text), bool)
+    if len(text):
+        whole, _, part = np.strings.partition(text, b".")
+        digits = np.strings.add(whole, np.strings.ljust(part, exponent, b"0"))
+        length = np.strings.str_len(digits)
+        plain = np.strings.isdigit(digits) & (np.strings.str_len(part) <= exponent)
+        plain &= np.strings.str_len(whole) + np.strings.str_len(part) > 0
         # int64 holds all numbers of 18 digits, and those of 19 that begin with less than a 9.
-        plain &= at + exponent <= 18 + (columns[0] < ord("9"))
-        shape = np.where(plain, at * width + length, -1)
-        # Stamps of one length with the point at one place are read together, digit by digit.
-        for k in np.unique(shape[plain]):
-            same = np.flatnonzero(shape == k)
-            value[same] = _digits(columns[:, same], int(k) // width, int(k) % width, exponent)
+        plain &= (length < 19) | ((length == 19) & (digits < b"9"))
+        value[plain] = digits[plain].astype(np.int64)
     for i in np.flatnonzero(~plain):  # signs, exponents, blanks, more digits than ns, nonsense
         exact = _exactly(text[i], exponent)
         value[i], plain[i] = exact or 0, exact is not None
     return value, plain
-
-
-def _digits(columns: np.ndarray, at: int, length: int, exponent: int) -> np.ndarray:
-    """Value of (characters, n) digits with the point, if any, in row `at`."""
-    value = np.zeros(columns.shape[1], np.int64)
-    for row in (r for r in range(length) if r != at):
-        value = value * 10 + (columns[row] - np.uint8(48))
-    return value * 10 ** (exponent - max(length - at - 1, 0))
 
 
 def _exactly(text: bytes, exponent: int, count: int = 1) -> int | None:
@@ -107,10 +90,9 @@ def stamps_to_ns(
         bad = int(np.argmin(good))
         shown = text[bad].decode("utf-8", "replace").strip()
         large = _exactly(text[bad], 0) is not None
-        raise refused(file, f"line {rows[bad]}", field, shown)(
-            "does not fit: the time may be in ns, us or ms" if large else "is not a time stamp",
-            "convert the time column to seconds" if large else "repair or delete the line",
-        )
+        cause = "does not fit: the time may be in ns, us or ms" if large else "is not a time stamp"
+        remedy = "convert the time column to seconds" if large else "repair or delete the line"
+        raise refused(file, f"line {rows[bad]}", field, shown)(cause, remedy)
     return time_ns
 
 
@@ -182,10 +164,9 @@ def dates_to_ns(
             out[k] = calendar_to_ns(date, clock, utc=zone != "GPS", ahead_s=ahead_s)
         except ValueError as error:
             form = "a date and time" if zone else "a date and time with its offset from UTC"
-            raise refused(file, f"line {rows[k]}", field, shown)(
-                f"is not {form} ({error})",
-                f"write it like 2025-06-11 20:34:27{'' if zone else '+00:00'}",
-            ) from error
+            cause = f"is not {form} ({error})"
+            remedy = f"write it like 2025-06-11 20:34:27{'' if zone else '+00:00'}"
+            raise refused(file, f"line {rows[k]}", field, shown)(cause, remedy) from error
     return out
 
 

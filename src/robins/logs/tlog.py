@@ -12,11 +12,9 @@ not, these are put on it by the order of arrival. Source: mavlink.io, common.xml
 
 from __future__ import annotations
 
-import os
 import re
 import struct
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,8 +22,10 @@ import numpy as np
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.gps_time import dated, gps_of
 from robins.logs.findings import (
-    Finding,
+    AnyPath,
+    Findings,
     LogError,
+    extra_package,
     finding_reporter,
     report_cut_end,
     report_geoid_heights,
@@ -34,6 +34,7 @@ from robins.logs.findings import (
 from robins.logs.fix_kinds import MAVLINK, fixes, over_ground
 from robins.logs.merging import gps_clock
 from robins.logs.opening import Bytes, map_file
+from robins.logs.tables import recording
 from robins.logs.text import Head
 from robins.logs.ulog import UlogTopic, column, stamps, triad
 from robins.units import to_si
@@ -55,7 +56,7 @@ def is_tlog(head: Head) -> bool:
     return _EARLIEST < _STAMP.unpack_from(head.start)[0] < _LATEST
 
 
-def read_tlog(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
+def read_tlog(path: AnyPath, findings: Findings = None) -> Dataset:
     """Read inertial samples, and field and fixes where they were sent.
 
     Args:
@@ -88,12 +89,10 @@ def read_tlog(path: str | os.PathLike[str], findings: list[Finding] | None = Non
     there = field.any(axis=1)  # zeros: there is no magnetometer
     mag = MagTable(time_ns[there], field[there], source=file) if there.any() else None
     samples = ImuTable(time_ns, gyro, accel, "rate", source=file)
-    return Dataset(Path(file).name.split(".")[0], samples, gnss, mag=mag, time_unit_known=(file,))
+    return recording(file, samples, gnss, mag=mag)
 
 
-def _frames(
-    file: str, data: Bytes, findings: list[Finding] | None
-) -> Iterator[tuple[int, int, bytes]]:
+def _frames(file: str, data: Bytes, findings: Findings) -> Iterator[tuple[int, int, bytes]]:
     """Place, number and bytes of the frames that are read."""
     at, end, stray = 0, len(data), 0
     while at < end:
@@ -115,17 +114,14 @@ def _frames(
     report_left_out(findings, file, stray, "bytes belong to no message")
 
 
-def _topics(file: str, data: Bytes, findings: list[Finding] | None) -> dict[int, UlogTopic]:
+def _topics(file: str, data: Bytes, findings: Findings) -> dict[int, UlogTopic]:
     """Messages of the first vehicle with inertial samples, by their number.
 
     Raises:
         LogError: pymavlink is not installed.
     """
-    try:
+    with extra_package(file, "telemetry of MAVLink"):
         from pymavlink.dialects.v20 import common
-    except ImportError as error:
-        cause = "is telemetry of MAVLink, and the package that reads it is not installed"
-        raise LogError(file, cause, "install it with: pip install 'robins[logs]'") from error
     decoder, wrong = common.MAVLink(None), 0
     senders: dict[tuple[int, int, int], dict[int, list[list[float]]]] = {}
     for at, number, frame in _frames(file, data, findings):
@@ -164,7 +160,7 @@ def _stamps(file: str, topic: UlogTopic) -> np.ndarray:
     return gps_of(time_ns) if _dated(time_ns) else time_ns
 
 
-def _fixes(file: str, gps: UlogTopic, findings: list[Finding] | None) -> GnssTable:
+def _fixes(file: str, gps: UlogTopic, findings: Findings) -> GnssTable:
     fix, lat, lon, msl, ellipsoid, h_acc, v_acc, vel_acc, vel, cog = (
         column(file, gps, name) for name in _FIX
     )
@@ -172,14 +168,8 @@ def _fixes(file: str, gps: UlogTopic, findings: list[Finding] | None) -> GnssTab
         report_geoid_heights(findings, file, "Set the telemetry to MAVLink 2.")
         ellipsoid = msl
     speed, course = (np.where(x < 65535.0, x * 1e-2, np.nan) for x in (vel, cog))
-    return fixes(
-        file,
-        _stamps(file, gps),
-        (lat * 1e-7, lon * 1e-7, ellipsoid * 1e-3),
-        (h_acc * 1e-3, h_acc * 1e-3, v_acc * 1e-3),
-        over_ground(speed, course),
-        vel_acc * 1e-3,
-        np.array([MAVLINK.get(int(k), 0) for k in fix]),
-        fix == 2,
-        findings,
-    )
+    place = lat * 1e-7, lon * 1e-7, ellipsoid * 1e-3
+    sigma_m, sigma_v = (h_acc * 1e-3, h_acc * 1e-3, v_acc * 1e-3), vel_acc * 1e-3
+    v_n, kind = over_ground(speed, course), np.array([MAVLINK.get(int(k), 0) for k in fix])
+    time_ns = _stamps(file, gps)
+    return fixes(file, time_ns, place, sigma_m, v_n, sigma_v, kind, fix == 2, findings)

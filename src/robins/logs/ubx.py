@@ -11,11 +11,9 @@ east, as for PX4. Source: u-blox F9 HPG 1.32 interface description, UBX-22008968
 
 from __future__ import annotations
 
-import os
 import re
 import struct
 from dataclasses import replace
-from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
@@ -23,7 +21,8 @@ import numpy as np
 from robins.dataset import Dataset, GnssTable, ImuTable
 from robins.gps_time import gps_of
 from robins.logs.findings import (
-    Finding,
+    AnyPath,
+    Findings,
     LogError,
     finding_reporter,
     report_cut_end,
@@ -35,7 +34,7 @@ from robins.logs.merging import gps_clock, merged
 from robins.logs.nmea import fixes_of
 from robins.logs.opening import Bytes, foreign, map_file, read_beginning
 from robins.logs.rtcm import end_of_frame
-from robins.logs.tables import Table
+from robins.logs.tables import Table, recording
 from robins.logs.text import Head
 from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS
 from robins.units import to_si
@@ -75,9 +74,7 @@ def is_ubx(head: Head) -> bool:
     return any(start[at + 2 : at + 3] != b"\0" and _end(start, at) for at in places)
 
 
-def read_ubx(
-    path: str | os.PathLike[str], findings: list[Finding] | None = None
-) -> Table | Dataset:
+def read_ubx(path: AnyPath, findings: Findings = None) -> Table | Dataset:
     """Read fixes, and inertial samples where they were recorded.
 
     Args:
@@ -114,10 +111,10 @@ def read_ubx(
     if (known := before >= 0).any():
         clock = gps_clock(file, tags[before[known]], gnss.time_ns[known], findings)
         imu = replace(imu, time_ns=clock(imu.time_ns))
-    return Dataset(Path(file).name.split(".")[0], imu, gnss, time_unit_known=(file,))
+    return recording(file, imu, gnss)
 
 
-def _frames(file: str, data: Bytes, findings: list[Finding] | None) -> Frames:
+def _frames(file: str, data: Bytes, findings: Findings) -> Frames:
     """Place and length of the content of each message with a right checksum, by its kind."""
     found: Frames = {k: [] for k in (_PVT, _HIGH, _MEAS, _RAW)}
     at, wrong, open_at = data.find(_SYNC), 0, -1
@@ -167,7 +164,7 @@ def _rows(
 
 
 def _fixes(
-    file: str, data: Bytes, frames: Frames, findings: list[Finding] | None
+    file: str, data: Bytes, frames: Frames, findings: Findings
 ) -> tuple[GnssTable, np.ndarray]:
     """Fixes that have a date, and the place of each in the file."""
     pvt, at = _rows(data, frames[_PVT], _NAV_PVT)
@@ -196,22 +193,14 @@ def _fixes(
         lon[mine], lat[mine] = (place * 1e-7 + digits[:, :2] * 1e-9).T
         height_m[mine] = high["h_m"][more] * 1e-3 + digits[:, 2] * 1e-4
         horizontal[mine], vertical[mine] = high["acc"][more].T * 1e-4
-    table = fixes(
-        file,
-        GPS_EPOCH_NS + week * WEEK_NS + tow_ns,
-        (lat, lon, height_m),
-        (horizontal, horizontal, vertical),
-        pvt["v"] * 1e-3,
-        pvt["s_acc"] * 1e-3,
-        np.where(there, kind, 0),
-        pvt["fix"] == 2,
-        findings,
-    )
-    return table, at
+    time_ns, place = GPS_EPOCH_NS + week * WEEK_NS + tow_ns, (lat, lon, height_m)
+    sigma_m, sigma_v = (horizontal, horizontal, vertical), pvt["s_acc"] * 1e-3
+    kind, flat, v_n = np.where(there, kind, 0), pvt["fix"] == 2, pvt["v"] * 1e-3
+    return fixes(file, time_ns, place, sigma_m, v_n, sigma_v, kind, flat, findings), at
 
 
 def _inertial(
-    file: str, data: Bytes, frames: list[tuple[int, int]], findings: list[Finding] | None
+    file: str, data: Bytes, frames: list[tuple[int, int]], findings: Findings
 ) -> ImuTable | None:
     """Samples on the clock of the receiver."""
     halves: dict[tuple[int, ...], dict[int, list[int]]] = {_GYRO: {}, _ACCEL: {}}
@@ -231,8 +220,8 @@ def _inertial(
     if not (len(gyro[0]) and len(accel[0])):
         return None
     rates, forces = to_si(gyro[1] * _GYRO_DEG_S, "deg/s"), accel[1] * _ACCEL_M_S2
-    turns = ImuTable(gyro[0], rates, np.full_like(rates, np.nan), "rate", source=file)
     if np.array_equal(gyro[0], accel[0]):
         return ImuTable(gyro[0], rates, forces, "rate", source=file)
+    turns = ImuTable(gyro[0], rates, np.full_like(rates, np.nan), "rate", source=file)
     other = ImuTable(accel[0], np.full_like(forces, np.nan), forces, "rate", source=file)
     return merged(turns, other, findings)

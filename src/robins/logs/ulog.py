@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import os
 import struct
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,9 +24,20 @@ import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.foreign import decoding
-from robins.logs.findings import Finding, LogError, damaged, finding_reporter, refused, report
+from robins.logs.findings import (
+    AnyPath,
+    Finding,
+    Findings,
+    LogError,
+    damaged,
+    extra_package,
+    finding_reporter,
+    refused,
+    report,
+)
 from robins.logs.fix_kinds import PX4
 from robins.logs.opening import read_whole
+from robins.logs.tables import recording
 from robins.logs.timebase import LIMIT_NS
 from robins.units import to_si
 
@@ -43,12 +53,6 @@ _TO_CSV = "this version of the autopilot is not known; export the topic to CSV"
 _NO_FIX, _FLAT_FIX = 2, 3  # below these there is no fix, or none of the height
 
 
-_EARLY = (
-    "{name} breaks off at byte {sound} of {size}: what follows is half a message, or none. The "
-    "recording or the copy was interrupted, or a crash report is appended; all before it was read."
-)
-
-
 class UlogTopic(NamedTuple):
     """Fields logged of one topic."""
 
@@ -56,7 +60,7 @@ class UlogTopic(NamedTuple):
     fields: dict[str, np.ndarray]
 
 
-def read_ulog(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
+def read_ulog(path: AnyPath, findings: Findings = None) -> Dataset:
     """Read inertial samples, and field and fixes where they were logged.
 
     Args:
@@ -72,7 +76,11 @@ def read_ulog(path: str | os.PathLike[str], findings: list[Finding] | None = Non
         raise refused(file, "byte 0")("is no ULog", "leave the format to be recognised")
     sound = _sound(data)
     if sound < len(data) or cut:
-        sentence = _EARLY.format(name=Path(file).name, sound=sound, size=len(data))
+        sentence = (
+            f"{Path(file).name} breaks off at byte {sound} of {len(data)}: what follows is half a "
+            "message, or none. The recording or the copy was interrupted, or a crash report is "
+            "appended; all before it was read."
+        )
         report(findings, Finding("warning", "ends_early", file, f"byte {sound}", sound, sentence))
     _check_formats(file, data[:sound])
     log = _decode(file, data[:sound])
@@ -83,19 +91,10 @@ def read_ulog(path: str | os.PathLike[str], findings: list[Finding] | None = Non
         raise LogError(file, cause, "log that topic and fly again")
     time_ns = stamps(file, imu)
     mag, gnss = (_first(file, log, topics, findings) for topics in (_MAG, _GNSS))
-    return Dataset(
-        name=Path(file).name.split(".")[0],
-        imu=ImuTable(
-            time_ns,
-            triad(file, imu, "gyro_rad[{}]", "012"),
-            triad(file, imu, "accelerometer_m_s2[{}]", "012"),
-            "rate",
-            source=file,
-        ),
-        mag=None if mag is None else _field(file, mag),
-        gnss=None if gnss is None else _fixes(file, gnss),
-        time_unit_known=(file,),
-    )
+    gyro = triad(file, imu, "gyro_rad[{}]", "012")
+    accel = triad(file, imu, "accelerometer_m_s2[{}]", "012")
+    samples = ImuTable(time_ns, gyro, accel, "rate", source=file)
+    return recording(file, samples, gnss and _fixes(file, gnss), mag=mag and _field(file, mag))
 
 
 def _sound(data: bytes) -> int:
@@ -149,28 +148,19 @@ def _check_formats(file: str, data: bytes) -> None:
 
 
 def _decode(file: str, data: bytes) -> Any:
-    try:
+    with extra_package(file, "a PX4 ULog"):
         from pyulog import ULog
-    except ImportError as error:
-        raise LogError(
-            file,
-            "is a PX4 ULog, and the package that reads it is not installed",
-            "install it with: pip install 'robins[logs]'",
-        ) from error
     printed = io.StringIO()
     # it prints what it doubts
     with decoding(damaged(file)), contextlib.redirect_stdout(printed):
         log = ULog(io.BytesIO(data), [*_IMU, *_MAG, *_GNSS], disable_str_exceptions=False)
     if log.file_corruption:
-        raise damaged(file)(
-            " ".join(printed.getvalue().split()) or "messages contradict each other"
-        )
+        why = " ".join(printed.getvalue().split())
+        raise damaged(file)(why or "messages contradict each other")
     return log
 
 
-def _first(
-    file: str, log: Any, topics: tuple[str, ...], findings: list[Finding] | None
-) -> UlogTopic | None:
+def _first(file: str, log: Any, topics: tuple[str, ...], findings: Findings) -> UlogTopic | None:
     """The first instance of the first of these topics that was logged."""
     for name in topics:
         found = sorted((d for d in log.data_list if d.name == name), key=lambda d: d.multi_id)
@@ -196,10 +186,8 @@ def column(file: str, topic: UlogTopic, name: str) -> np.ndarray:
             raise refused(file, field=f"{topic.name}.{name}")("holds text, no numbers", _TO_CSV)
         with np.errstate(invalid="ignore"):  # a NaN that signals stays a NaN
             return values.astype(np.float64)
-    raise refused(file, field=topic.name)(
-        f"has no field {name}; it has {', '.join(sorted(topic.fields))}",
-        _TO_CSV,
-    )
+    cause = f"has no field {name}; it has {', '.join(sorted(topic.fields))}"
+    raise refused(file, field=topic.name)(cause, _TO_CSV)
 
 
 def triad(file: str, topic: UlogTopic, pattern: str, parts: str) -> np.ndarray:
@@ -212,9 +200,8 @@ def stamps(file: str, topic: UlogTopic) -> np.ndarray:
     sample = topic.fields.get("timestamp_sample")
     stamps = topic.fields.get("timestamp") if sample is None or not np.all(sample) else sample
     if stamps is None or stamps.dtype.kind != "u" or np.any(stamps >= LIMIT_NS // 1000):
-        raise refused(file, field=f"stamps of {topic.name}")(
-            "are no microseconds since power-up", "fetch it again"
-        )
+        cause = "are no microseconds since power-up"
+        raise refused(file, field=f"stamps of {topic.name}")(cause, "fetch it again")
     return stamps.astype(np.int64) * 1000
 
 
@@ -231,8 +218,7 @@ def _fixes(file: str, topic: UlogTopic) -> GnssTable:
         return column(file, topic, new) if new in topic.fields else column(file, topic, old) * scale
 
     fix = column(file, topic, "fix_type")
-    lat_deg = either("latitude_deg", "lat", 1e-7)
-    lon_deg = either("longitude_deg", "lon", 1e-7)
+    lat, lon = (either(f"{x}itude_deg", x[:3], 1e-7) for x in ("lat", "long"))
     alt_m = either("altitude_ellipsoid_m", "alt_ellipsoid", 1e-3)
     eph, epv, speed = (column(file, topic, name) for name in ("eph", "epv", "s_variance_m_s"))
     v_n = triad(file, topic, "vel_{}_m_s", "ned")
@@ -241,14 +227,8 @@ def _fixes(file: str, topic: UlogTopic) -> GnssTable:
     def known(values: np.ndarray, least: int) -> np.ndarray:
         return np.where(fix >= least, values, np.nan)
 
-    return GnssTable(
-        time_ns=stamps(file, topic),
-        lat_rad=np.deg2rad(known(lat_deg, _NO_FIX)),
-        lon_rad=np.deg2rad(known(lon_deg, _NO_FIX)),
-        alt_m=known(alt_m, _FLAT_FIX),
-        sigma_m=np.stack([eph, eph, epv], axis=-1),
-        v_n=v_n,
-        sigma_v=np.repeat(speed[:, None], 3, axis=1),
-        quality=np.array([PX4.get(int(k), 0) for k in fix], np.int64),
-        source=file,
-    )
+    lat, lon = (np.deg2rad(known(x, _NO_FIX)) for x in (lat, lon))
+    time_ns, alt = stamps(file, topic), known(alt_m, _FLAT_FIX)
+    sigma_m, sigma_v = (np.stack(x, axis=-1) for x in ([eph, eph, epv], [speed] * 3))
+    quality = np.array([PX4.get(int(k), 0) for k in fix], np.int64)
+    return GnssTable(time_ns, lat, lon, alt, sigma_m, v_n, sigma_v, quality, source=file)

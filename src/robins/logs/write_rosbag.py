@@ -7,7 +7,6 @@ east-north-up. Stamps that are GPS time become UTC, others stay.
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,10 +17,10 @@ import numpy as np
 from robins import ros
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.gps_time import GPS_EPOCH_S, utc_of
-from robins.logs.findings import LogError, LogWarning
+from robins.logs.findings import AnyPath, LogError, LogWarning
 from robins.logs.opening import write_lines
 from robins.logs.quantities import words_of
-from robins.logs.ros_files import INSTALL, NO_PACKAGE
+from robins.logs.ros_files import mcap_package
 from robins.logs.tables import Table, kind_in_text, tables_of
 
 _LATEST_NS = (1 << 31) * 1_000_000_000
@@ -38,6 +37,14 @@ class _Topic(NamedTuple):
     make: Callable[[Any, int], ros.Message]  # of a table, from its row
 
 
+def _imu(table: ImuTable, k: int) -> ros.Message:
+    return ros.imu(table.gyro[k], table.accel[k], body=table.body)
+
+
+def _field(table: MagTable, k: int) -> ros.Message:
+    return ros.magnetic_field(table.field_t[k], body=table.body)
+
+
 def _fix(table: GnssTable, k: int) -> ros.Message:
     place = float(table.lat_rad[k]), float(table.lon_rad[k]), float(table.alt_m[k])
     quality = 0 if table.quality is None else int(table.quality[k])
@@ -47,23 +54,13 @@ def _fix(table: GnssTable, k: int) -> ros.Message:
 
 
 _TOPICS: dict[type[Any], _Topic] = {
-    ImuTable: _Topic(
-        "/imu/data_raw",
-        "imu",
-        ros.Imu,
-        lambda t, k: ros.imu(t.gyro[k], t.accel[k], body=t.body),
-    ),
-    MagTable: _Topic(
-        "/imu/mag",
-        "imu",
-        ros.MagneticField,
-        lambda t, k: ros.magnetic_field(t.field_t[k], body=t.body),
-    ),
+    ImuTable: _Topic("/imu/data_raw", "imu", ros.Imu, _imu),
+    MagTable: _Topic("/imu/mag", "imu", ros.MagneticField, _field),
     GnssTable: _Topic("/gnss/fix", "gnss", ros.NavSatFix, _fix),
 }
 
 
-def write_rosbag(path: str | os.PathLike[str], table: Table | Dataset) -> None:
+def write_rosbag(path: AnyPath, table: Table | Dataset) -> None:
     """Write tables; `robins.logs.rosbag.read_rosbag` reads them back.
 
     Velocities of fixes have no place in a NavSatFix: they are left out, and a `LogWarning` says so.
@@ -120,11 +117,9 @@ class _Sink:
 
 def _blocks(file: str, tables: list[Table]) -> Iterator[bytes]:
     """The file, in pieces; messages in the order of their times."""
-    try:
+    with mcap_package(file):
         from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
         from mcap.writer import Writer
-    except ImportError as error:
-        raise LogError(file, NO_PACKAGE, INSTALL) from error
     sink: Any = _Sink()
     writer = Writer(sink)
     writer.start(Profile.ROS2, "robins")

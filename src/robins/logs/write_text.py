@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Iterator
 from decimal import Decimal
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +20,7 @@ from robins.dataset import (
     Trajectory,
 )
 from robins.ins.frames import swap
-from robins.logs.findings import LogError, refused
+from robins.logs.findings import AnyPath, LogError, refused
 from robins.logs.mounting import Origin, to_local
 from robins.logs.opening import write_lines
 from robins.logs.quantities import DATES, parts, words_of
@@ -35,12 +33,13 @@ _CLOCKS = ("time", "time_of_week")
 _ROWS = 50_000
 _STEEP = 1.5  # rad; nearer to the vertical roll and heading lose digits
 Values = dict[str, np.ndarray]  # by quantity, SI
+Groups = dict[str, np.ndarray | None]
 Cells = tuple[np.ndarray, Column]
 
 
 def write_text(
     format: TextFormat,
-    path: str | os.PathLike[str],
+    path: AnyPath,
     table: Table | Dataset,
     *,
     week: int | None = None,
@@ -63,9 +62,14 @@ def write_text(
     if format.local and origin is None:
         origin = next(Origin.of(one) for one in tables if isinstance(one, Trajectory))
     time_ns, values = _together(format, path, [(t, _values(format, t, origin)) for t in tables])
-    columns = [c for c in format.columns if not format.choice or _wanted(c, values)]
-    if format.whole:
-        _refuse_missing(format, path, time_ns, columns, values)
+    written = values.keys() | {"time", "time_of_week", "week"}
+    columns = [c for c in format.columns if not format.choice or c.holds in written]
+    held = [values[c.holds] for c in columns if c.holds in values]
+    good = np.all([np.isfinite(v) for v in held], axis=0)
+    if format.whole and not good.all():
+        at, cause = ns_to_decimal(int(time_ns[np.argmin(good)])), "cannot hold a missing component"
+        remedy = "leave out the rows that are not complete"
+        raise refused(str(path), f"time {at} s")(f"{format.name} {cause}", remedy)
     comments = []
     if format.states_frames:
         said = (getattr(tables[0], which, "") for which in ("nav", "body"))
@@ -75,7 +79,7 @@ def write_text(
     write_lines(path, _blocks(format, comments, columns, _cells(columns, time_ns, values, week)))
 
 
-def _check(format: TextFormat, path: str | os.PathLike[str], table: Table) -> None:
+def _check(format: TextFormat, path: AnyPath, table: Table) -> None:
     """Refuse what the format does not hold."""
     kind = kind_in_text(table)
     if kind not in format.kinds:
@@ -106,38 +110,31 @@ def _check(format: TextFormat, path: str | os.PathLike[str], table: Table) -> No
             raise LogError(str(path), cause, "convert the table first")
 
 
-def _values(format: TextFormat, table: Any, origin: Origin | None) -> Values:
-    groups: dict[str, np.ndarray | None]
-    if isinstance(table, ImuTable):
-        elapsed = np.diff(table.time_ns) * 1e-9
-        # The first row has no row before it; the usual interval stands in.
-        usual = [np.median(elapsed) if len(elapsed) else np.nan]
-        groups = (
-            {"gyro": table.gyro, "accel": table.accel}
-            if table.kind == "rate"
-            else {
-                "dtheta": table.gyro,
-                "dv": table.accel,
-                "dt": np.concatenate([usual, elapsed])[: len(table), None],
-            }
-        )
-    elif isinstance(table, MagTable):
-        groups = {"mag": table.field_t}
-    elif isinstance(table, GnssTable):
+def _groups(format: TextFormat, table: Table, origin: Origin | None) -> Groups:
+    """Groups of quantities of a table; None where there is none."""
+    if isinstance(table, MagTable):
+        return {"mag": table.field_t}
+    if isinstance(table, OdometryTable):
+        return {"wheels": np.stack([table.speed_mps, table.sigma_speed], axis=-1)}
+    if isinstance(table, AttitudeTable):
+        return _turned(format, table.q_nb, table.nav)
+    if isinstance(table, Trajectory):
+        return _path(format, table, origin)
+    if isinstance(table, GnssTable):
         quality = None if table.quality is None else np.asarray(table.quality, float)[:, None]
-        groups = {
-            "place": place_of(table),
-            "sigma": table.sigma_m,
-            "velocity": table.v_n,
-            "sigma_v": table.sigma_v,
-            "quality": quality,
-        }
-    elif isinstance(table, OdometryTable):
-        groups = {"wheels": np.stack([table.speed_mps, table.sigma_speed], axis=-1)}
-    elif isinstance(table, AttitudeTable):
-        groups = _turned(format, table.q_nb, table.nav)
-    else:
-        groups = _path(format, table, origin)
+        moving = {"velocity": table.v_n, "sigma_v": table.sigma_v}
+        return {"place": place_of(table), "sigma": table.sigma_m, **moving, "quality": quality}
+    if table.kind == "rate":
+        return {"gyro": table.gyro, "accel": table.accel}
+    elapsed = np.diff(table.time_ns) * 1e-9
+    # The first row has no row before it; the usual interval stands in.
+    usual = [np.median(elapsed) if len(elapsed) else np.nan]
+    dt = np.concatenate([usual, elapsed])[: len(table), None]
+    return {"dtheta": table.gyro, "dv": table.accel, "dt": dt}
+
+
+def _values(format: TextFormat, table: Table, origin: Origin | None) -> Values:
+    groups = _groups(format, table, origin)
     if format.body not in ("FRD", "RFU"):
         axes = Axes.of(format.body)
         for group in set(groups) & {"gyro", "accel", "dtheta", "dv", "mag", "omega"}:
@@ -151,25 +148,18 @@ def _values(format: TextFormat, table: Any, origin: Origin | None) -> Values:
     }
 
 
-def _path(format: TextFormat, table: Trajectory, origin: Origin | None) -> dict[str, Any]:
+def _path(format: TextFormat, table: Trajectory, origin: Origin | None) -> Groups:
     if format.local and origin is not None:
-        local = to_local(table, origin)
-        return {
-            "local": local.r_l,
-            "velocity": swap(local.v_l),
-            "quaternion": local.q_lb,
-            "omega": table.omega_ib_b,
-        }
+        local, omega = to_local(table, origin), {"omega": table.omega_ib_b}
+        moving = {"velocity": swap(local.v_l), "quaternion": local.q_lb}
+        return {"local": local.r_l} | moving | omega
     v_n = np.asarray(table.v_n)
-    return {
-        "place": place_of(table),
-        "velocity": swap(v_n) if table.nav == "ENU" else v_n,
-        "omega": table.omega_ib_b,
-        **_turned(format, table.q_nb, table.nav),
-    }
+    v_n = swap(v_n) if table.nav == "ENU" else v_n
+    moving = {"velocity": v_n, "omega": table.omega_ib_b}
+    return {"place": place_of(table)} | moving | _turned(format, table.q_nb, table.nav)
 
 
-def _turned(format: TextFormat, q_nb: np.ndarray, nav: str) -> dict[str, Any]:
+def _turned(format: TextFormat, q_nb: np.ndarray, nav: str) -> Groups:
     """As quaternions where the format has them and angles would lose digits, else as angles."""
     q = jnp.asarray(q_nb)
     if "roll" not in format.quantities:
@@ -184,7 +174,7 @@ def _turned(format: TextFormat, q_nb: np.ndarray, nav: str) -> dict[str, Any]:
 
 
 def _together(
-    format: TextFormat, path: str | os.PathLike[str], parts_: list[tuple[Table, Values]]
+    format: TextFormat, path: AnyPath, parts_: list[tuple[Table, Values]]
 ) -> tuple[np.ndarray, Values]:
     """Stamps and values of all tables, row by row."""
     times = [table.time_ns for table, _ in parts_]
@@ -203,27 +193,6 @@ def _together(
             column[ends[k] : ends[k + 1]] = v
             out[quantity] = column[order]
     return stamps[order], out
-
-
-def _wanted(column: Column, values: Values) -> bool:
-    return column.holds in values or column.holds in ("time", "time_of_week", "week")
-
-
-def _refuse_missing(
-    format: TextFormat,
-    path: str | os.PathLike[str],
-    time_ns: np.ndarray,
-    columns: list[Column],
-    values: Values,
-) -> None:
-    held = [values[c.holds] for c in columns if c.holds in values]
-    good = np.all([np.isfinite(v) for v in held], axis=0)
-    if not good.all():
-        at = ns_to_decimal(int(time_ns[np.argmin(good)]))
-        raise refused(str(path), f"time {at} s")(
-            f"{format.name} cannot hold a missing component",
-            "leave out the rows that are not complete",
-        )
 
 
 def _cells(
