@@ -19,6 +19,7 @@ from robins.filters.smooth import rts_smoother as rts_smoother
 from robins.logs.loading import load_dataset as load
 from robins.results.reader import read as load_result
 from robins.systems.from_model import study_from_model as study_from_model
+from robins.systems.gnss.live import LiveGnss as LiveGnss
 from robins.systems.ins_gnss.live import LiveInsGnss as LiveInsGnss
 from robins.systems.marg.live import LiveMarg as LiveMarg
 from robins.systems.study import Scenario as Scenario
@@ -31,6 +32,7 @@ from robins.workbench.run import run as run
 
 __all__ = [
     "Belief",
+    "LiveGnss",
     "LiveInsGnss",
     "LiveMarg",
     "Model",

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from robins.errors import moved
 from robins.systems.gnss.filters import NAMES
+from robins.systems.gnss.live import LiveGnss, RoadNavigation
 from robins.systems.gnss.log import recorded, replay
 from robins.systems.gnss.model import gnss_model
 from robins.systems.gnss.parameters import City, GnssReplay
@@ -23,6 +24,14 @@ SYSTEM = System(
     replay_finds=("track",),
 )
 
-__all__ = ["SYSTEM", "City", "GnssReplay", "gnss_model", "replay"]
+__all__ = [
+    "SYSTEM",
+    "City",
+    "GnssReplay",
+    "LiveGnss",
+    "RoadNavigation",
+    "gnss_model",
+    "replay",
+]
 
 __getattr__ = moved(__name__)

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
+import jax
 import numpy as np
 
-from robins.dataset import OdometryTable, PlaceTable, RangeLog, RangeTable
+from robins.dataset import PlaceTable, RangeLog, RangeTable
 from robins.results import Outcome, Progress, ignore_progress
 from robins.systems import replaying
 from robins.systems.gnss.filters import SMOOTHERS, GnssWorld, contender
@@ -18,20 +19,15 @@ from robins.systems.gnss.model import (
     RANGES,
     GnssState,
     LocalFrame,
-    MotionStep,
-    Sky,
-    delay_law,
-    first_fix,
     heading_rad,
     sensor_axes,
 )
 from robins.systems.gnss.parameters import GnssAssumptions, GnssReplay
-from robins.systems.gnss.world import length_once
+from robins.systems.gnss.path import LEAST, GnssPath
 from robins.systems.replaying import FilterEstimates, LogPiece, PreparedLog, ReportedItems
 from robins.systems.study import StateBlock
 from robins.systems.tables import block_array, place_arrays, track_arrays
 
-LEAST = 4  # satellites of the first fix
 HEADING = StateBlock("heading", slice(0, 1), "rad", "deg", "NED", ("heading",))
 LETTERS = {1: "G", 2: "S", 4: "R", 8: "E", 16: "J", 32: "C"}
 """Letters of the satellite systems of libRSF, as in RINEX."""
@@ -50,7 +46,7 @@ class PreparedRangeLog(LogPiece):
     place: LocalFrame
     member: np.ndarray  # (N, K)
     satellites: tuple[str, ...]
-    way_m: np.ndarray  # (E,)
+    way_m: float
 
 
 def arrange(log: RangeLog, believed: GnssAssumptions) -> PreparedRangeLog:
@@ -62,99 +58,56 @@ def arrange(log: RangeLog, believed: GnssAssumptions) -> PreparedRangeLog:
     Raises:
         ValueError: no epoch has four satellites while there is odometry.
     """
-    ranges = log.ranges
-    time_ns, epoch = np.unique(ranges.time_ns, return_inverse=True)
-    count = np.bincount(epoch, minlength=len(time_ns))
-    inside = (time_ns >= log.odometry.time_ns[0]) & (time_ns <= log.odometry.time_ns[-1])
-    usable = np.flatnonzero((count >= LEAST) & inside)
-    if not len(usable):
+    ranges, odometry = log.ranges, log.odometry
+    inside = ranges.time_ns >= odometry.time_ns[0]
+    inside &= ranges.time_ns <= odometry.time_ns[-1]
+    path = GnssPath(believed, channels_of(ranges, inside))
+    names = names_of(ranges)
+    rows = np.column_stack(
+        [ranges.range_m, ranges.sigma_m, ranges.satellite_e, ranges.elevation_rad, ranges.cn0_dbhz]
+    )
+    path.push_odometry(
+        odometry.time_ns,
+        np.column_stack(
+            [odometry.speed_mps, odometry.yaw_rate, odometry.sigma_speed, odometry.sigma_yaw]
+        ),
+    )
+    edges = np.flatnonzero(np.diff(ranges.time_ns)) + 1
+    for at in np.split(np.arange(len(names)), edges):
+        path.push_ranges(int(ranges.time_ns[at[0]]), [names[k] for k in at], rows[at])
+    if not (steps := path.steps()):
         raise ValueError(
             f"no epoch has pseudoranges of {LEAST} satellites while there is odometry; are both "
             "of the same drive?"
         )
-    epochs = slice(usable[0], int(np.flatnonzero(inside)[-1]) + 1)
-    numbers, column = np.unique(ranges.satellite, return_inverse=True)
-    y, sky, elevation, cn0 = _columns(ranges, epoch, column, (len(time_ns), len(numbers)))
-    system = np.zeros(len(numbers), dtype=int)
-    system[column] = ranges.system
-    kinds = np.unique(system)
-    member = (system[:, None] == kinds[1:]).astype(float)
-
-    time_ns = time_ns[epochs]
-    u, way = _travel(log.odometry, time_ns)
-    mean, spread = delay_law(believed.delays, *(_filled(x[epochs]) for x in (elevation, cn0)))
-    sky = Sky(sky.satellite_e[epochs], sky.sigma[epochs])
-    first = Sky(sky.satellite_e[0], sky.sigma[0])
-    fix = first_fix(y[epochs][0], first, member, believed.clock.system_bias)
+    every = jax.tree_util.tree_map(lambda *x: np.stack(x), *steps)
     return PreparedRangeLog(
         begin_s=0.0,
-        epoch_s=(time_ns - time_ns[0]) * 1e-9,
-        time_ns=time_ns,
-        place=LocalFrame.at(fix[:3]),
-        member=member,
-        satellites=tuple(
-            f"{LETTERS.get(s, 'X')}{n}" for s, n in zip(system, numbers.tolist(), strict=True)
-        ),
-        way_m=way,
-        world=GnssWorld(
-            fix=fix,
-            u=u._replace(delay_mean=np.asarray(mean), delay_sigma=np.asarray(spread)),
-            y={RANGES: y[epochs], LENGTH: length_once(believed, way)},
-            sky=sky,
-        ),
+        epoch_s=(every.time_ns - every.time_ns[0]) * 1e-9,
+        time_ns=every.time_ns,
+        place=LocalFrame.at(path.fix[:3]),
+        member=path.member,
+        satellites=tuple(path.satellites),
+        way_m=float(every.way_m[-1]),
+        world=GnssWorld(fix=path.fix, u=every.u, y=every.y, sky=every.sky),
     )
 
 
-def _columns(
-    ranges: RangeTable, epoch: np.ndarray, column: np.ndarray, shape: tuple[int, int]
-) -> tuple[np.ndarray, Sky, np.ndarray, np.ndarray]:
-    """Pseudoranges, satellites, elevations and C/N0 by epoch and satellite; NaN where none is.
-
-    Raises:
-        ValueError: a satellite has two pseudoranges at one time.
-    """
-    if len(np.unique(epoch * shape[1] + column)) < len(epoch):
-        raise ValueError("a satellite has two pseudoranges at one time; leave one signal of each")
-    y, elevation, cn0 = (np.full(shape, np.nan) for _ in range(3))
-    satellite, sigma = np.zeros((*shape, 3)), np.ones(shape)
-    satellite[:] = ranges.satellite_e[0]  # read, and not used, where there is none
-    y[epoch, column], sigma[epoch, column] = ranges.range_m, ranges.sigma_m
-    satellite[epoch, column] = ranges.satellite_e
-    elevation[epoch, column], cn0[epoch, column] = ranges.elevation_rad, ranges.cn0_dbhz
-    return y, Sky(satellite, sigma), elevation, cn0
+def names_of(ranges: RangeTable) -> list[str]:
+    """Name of the satellite of each row, such as "G5"."""
+    pairs = zip(ranges.system.tolist(), ranges.satellite.tolist(), strict=True)
+    return [f"{LETTERS.get(system, 'X')}{number}" for system, number in pairs]
 
 
-def _filled(x: np.ndarray) -> np.ndarray:
-    """The last value of each column; before its first that one, and 0 of a column without any."""
-    rows = np.arange(len(x))[:, None]
-    there = np.isfinite(x)
-    last = np.maximum.accumulate(np.where(there, rows, -1), axis=0)
-    at = np.where(last < 0, np.argmax(there, axis=0)[None, :], last)
-    return np.nan_to_num(np.take_along_axis(x, at, axis=0))
-
-
-def _travel(odometry: OdometryTable, time_ns: np.ndarray) -> tuple[MotionStep, np.ndarray]:
-    """The steps between epochs, without delays, and the way (E,) [m] from the first on.
-
-    Speed and yaw rate are straight lines between their samples; a step has their means.
-    """
-    t = (odometry.time_ns - time_ns[0]) * 1e-9
-    epoch_s = (time_ns - time_ns[0]) * 1e-9
-
-    def integral(rate: np.ndarray) -> np.ndarray:
-        """(E,) from the first sample to each epoch."""
-        whole = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t))])
-        k = np.clip(np.searchsorted(t, epoch_s, "right") - 1, 0, len(t) - 1)
-        here = np.interp(epoch_s, t, rate)
-        return whole[k] + 0.5 * (rate[k] + here) * (epoch_s - t[k])
-
-    dt = np.diff(epoch_s, prepend=0.0)
-    step = np.where(dt > 0.0, dt, 1.0)
-    way, turn = integral(odometry.speed_mps), integral(odometry.yaw_rate)
-    speed, rate = (np.diff(x, prepend=x[:1]) / step for x in (way, turn))
-    slip, sway = (np.interp(epoch_s, t, x) for x in (odometry.sigma_speed, odometry.sigma_yaw))
-    none = np.zeros((len(dt), 0))
-    return MotionStep(dt, np.abs(speed), rate, slip, sway, none, none), way - way[0]
+def channels_of(ranges: RangeTable, rows: np.ndarray) -> dict[str, int]:
+    """Number of satellites of each system in some rows, by its letter."""
+    seen = np.unique(np.stack([ranges.system[rows], ranges.satellite[rows]]), axis=1)
+    systems, counts = np.unique(seen[0], return_counts=True)
+    channels: dict[str, int] = {}
+    for system, count in zip(systems.tolist(), counts.tolist(), strict=True):
+        letter = LETTERS.get(system, "X")
+        channels[letter] = channels.get(letter, 0) + count
+    return channels
 
 
 # ---------------------------------------------------------------------------------------- replay
@@ -218,7 +171,7 @@ def replay(
         counts=dict(log.counts) | counts,
         notes=[
             f"{counts['pseudoranges']} pseudoranges of {counts['satellites']} satellites in "
-            f"{len(there)} epochs over {given.way_m[-1]:.0f} m; the start is a fix by least "
+            f"{len(there)} epochs over {given.way_m:.0f} m; the start is a fix by least "
             "squares, of unknown heading."
         ],
     )

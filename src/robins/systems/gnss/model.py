@@ -12,7 +12,9 @@ The state is in a north-east-down frame fixed at a place o, with C = C_en there:
 With speed v and yaw rate w (positive to the right) over a step h, and the turn a = (w - b) h::
 
     c' = T(a) c,   p' = p + v h T(a/2) (c, 0),   t' = t + f h
-    d' = m + k (d - m),   k = exp(-h/tau - v h/L),   Q_d = sigma_d^2 (1 - k^2)
+    d' = m + k (d - m),   k = exp(-h/tau - |v| h/L),   Q_d = sigma_d^2 (1 - k^2)
+
+k is zero for a satellite that is received for the first time.
 
 c is linear where heading and scale are not, so that the start needs no heading: c is zero with a
 spread of one over the root of two along each axis. After some way, |c| = 1 is measured with the
@@ -70,12 +72,13 @@ class MotionStep(NamedTuple):
     """A step of the motion."""
 
     dt: Any  # () s
-    speed: Any  # () m/s, mean over the step
+    speed: Any  # () m/s, mean over the step, negative in reverse
     yaw_rate: Any  # () rad/s, positive to the right
     speed_sigma: Any  # () m/s
     yaw_sigma: Any  # () rad/s
     delay_mean: Any  # (N,) m
     delay_sigma: Any  # (N,) m
+    fresh: Any = 0.0  # (N,) one where a satellite is received for the first time, else zero
 
 
 class Sky(NamedTuple):
@@ -88,8 +91,8 @@ class Sky(NamedTuple):
 class LocalFrame(NamedTuple):
     """Origin of the frame of the state."""
 
-    origin_e: Array  # (3,) m
-    C_en: Array  # (3, 3)
+    origin_e: Numbers  # (3,) m
+    C_en: Numbers  # (3, 3)
 
     @classmethod
     def at(cls, origin_e: ArrayLike) -> LocalFrame:
@@ -130,17 +133,17 @@ def clock_density(clock: ReceiverClock) -> tuple[float, float]:
     return LIGHT * math.sqrt(clock.h0 / 2.0), LIGHT * math.pi * math.sqrt(2.0 * clock.h2)
 
 
-def delay_law(delays: Delays, elevation_rad: Number, cn0_dbhz: Number) -> tuple[Array, Array]:
+def delay_law(delays: Delays, elevation_rad: Number, cn0_dbhz: Number) -> tuple[Number, Number]:
     """Mean and spread [m] of the delay of a signal, by its elevation and C/N0.
 
     With P the probability that it is blocked and u = 2 a cos(e), the mean is P u, and the mean
     square 2 P u^2, as of exponential distances.
     """
-    d = delays
-    blocked = jnp.clip((d.clear_dbhz - cn0_dbhz) / (d.clear_dbhz - d.blocked_dbhz), 0.02, 0.98)
-    reach = 2.0 * d.reflector * jnp.cos(elevation_rad)
+    d, xp = delays, jnp if isinstance(cn0_dbhz, jax.Array) else np
+    blocked = xp.clip((d.clear_dbhz - cn0_dbhz) / (d.clear_dbhz - d.blocked_dbhz), 0.02, 0.98)
+    reach = 2.0 * d.reflector * xp.cos(elevation_rad)
     mean = blocked * reach
-    return mean, jnp.sqrt(d.multipath**2 + 2.0 * blocked * reach**2 - mean**2)
+    return mean, xp.sqrt(d.multipath**2 + 2.0 * blocked * reach**2 - mean**2)
 
 
 def _turned(angle: Array, c: Array) -> Array:
@@ -149,7 +152,8 @@ def _turned(angle: Array, c: Array) -> Array:
 
 
 def _kept(scales: Array, u: MotionStep) -> Array:
-    return jnp.exp(-u.dt / scales[0] - u.speed * u.dt / scales[1])
+    kept = jnp.exp(-u.dt / scales[0] - jnp.abs(u.speed) * u.dt / scales[1])
+    return jnp.where(jnp.asarray(u.fresh) > 0.0, 0.0, kept)
 
 
 def _step(scales: Array, x: GnssState, u: MotionStep) -> GnssState:
@@ -170,7 +174,7 @@ def _noise(memory: bool, numbers: tuple[Array, Array], x: GnssState, u: MotionSt
     (rise, clock, drift), scales = numbers
     root = jnp.sqrt(u.dt)
     slip, sway = u.speed_sigma * u.dt, u.yaw_sigma * u.dt
-    climb = rise * jnp.sqrt(u.speed * u.dt)
+    climb = rise * jnp.sqrt(jnp.abs(u.speed) * u.dt)
     place, time = jnp.stack([slip, slip, climb]), clock * root
     if not memory:
         place, time = jnp.full(3, _FREE_M), jnp.asarray(_FREE_CLOCK_M)
@@ -266,7 +270,7 @@ def start_belief(
     return Belief(mean, jnp.diag(jnp.concatenate(sigma)))
 
 
-def first_fix(y: Numbers, sky: Sky, member: Numbers, system_bias_m: float) -> Array:
+def first_fix(y: Numbers, sky: Sky, member: Numbers, system_bias_m: Number) -> Array:
     """(4 + K,) position [m, ECEF], clock and systems by least squares, from the Earth's centre on.
 
     Gauss-Newton on the pseudoranges there are, weighed by their sigmas, as `pseudoranges` has

@@ -198,7 +198,8 @@ def simulate(city: City, course: GnssCourse, seed: int, index: Array) -> GnssWor
     y = jnp.where(present, exact + sigma * draw(white, (e, n)), jnp.nan)
     wanted: dict[str, Any] = {RANGES: y, LENGTH: length_once(city, course.way_m)}
     u = MotionStep(
-        dt, speed, rate, jnp.full(e, city.speed_noise), jnp.full(e, city.yaw_noise), mean, spread
+        *(dt, speed, rate, jnp.full(e, city.speed_noise), jnp.full(e, city.yaw_noise)),
+        *(mean, spread, jnp.zeros((e, n))),
     )
     here = Sky(sky.satellite_e[0], sky.sigma[0])
     fix = first_fix(y[0], here, course.member, b.clock.system_bias)

@@ -1,0 +1,333 @@
+"""Navigation by pseudoranges and odometry while the vehicle moves, by the filter of a replay.
+
+`LiveGnss` takes samples of the odometry and epochs of pseudoranges as they come, and answers with
+the state at the newest odometry. Its epochs are those of a replay. Differences:
+
+- An epoch that comes late is used at its own time, unless a later one was used before
+  (`ranges_too_old`); where that happens, `wait_s` lets each epoch wait for earlier ones. One that
+  is newer than the odometry waits for it.
+- A replay has a column for each satellite of the log. Here their number is given for each system;
+  a satellite that is new takes the column that has not been used for longest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from robins.earth import Geodetic
+from robins.errors import require
+from robins.filters import Belief, Code, Filter, FilterState, Model, OnlineFilter
+from robins.filters.machine import usual
+from robins.filters.run import Step
+from robins.ins.plausible import GYRO_LIMIT
+from robins.program.evaluated import evaluated
+from robins.systems.gnss.filters import SMOOTHERS, GnssWorld, contender
+from robins.systems.gnss.model import RANGES, LocalFrame, MotionStep
+from robins.systems.gnss.parameters import GnssReplay
+from robins.systems.gnss.path import LEAST, GnssPath, GnssStep
+from robins.systems.streaming import Flag, Live, LiveError, numbers, online, stamp
+from robins.systems.study import Contender
+
+_FASTEST = 150.0  # m/s, of wheels
+_MOST_WAITING = 600  # epochs without odometry
+CHANNELS = {"G": 12, "R": 8, "E": 12}
+"""Columns of each satellite system: GPS, GLONASS, Galileo."""
+
+
+class RoadNavigation(NamedTuple):
+    """Answer to a record: the state at the newest odometry; NaN while `STARTING`."""
+
+    time_ns: int
+    r_e: np.ndarray  # (3,) m, Earth-fixed
+    sigma_m: np.ndarray  # (3,) m, north, east, down
+    heading_rad: float  # from north to east; NaN while it is not known
+    sigma_heading_rad: float
+    flags: Flag
+    code: Code | None = None  # of the last epoch of pseudoranges
+    nis: float = math.nan  # its normalised innovation squared
+    dof: int = 0  # pseudoranges in it
+
+    @property
+    def place(self) -> Geodetic:
+        """Latitude and longitude [rad], and height [m] above the ellipsoid."""
+        return Geodetic.from_ecef(jnp.asarray(self.r_e))
+
+
+def predicted(filter_: Filter, model: Model, state: FilterState, u: MotionStep) -> jax.Array:
+    """State after a step, in one vector."""
+    return _vector(filter_.predict(state, model.motion, u)[1].belief)
+
+
+def kept(step: Step) -> jax.Array:
+    """The same after the pseudoranges of an epoch, and their code, NIS and number."""
+    info = step.info[RANGES]
+    outcome = [jnp.asarray(x, float) for x in (info.code, info.nis, info.dof)]
+    return jnp.concatenate([_vector(step.posterior), jnp.stack(outcome)])
+
+
+def _vector(belief: Belief) -> jax.Array:
+    """Position and its sigmas (3,) [m], direction (2,), covariance (2, 2) of it."""
+    S = belief.factor[3:5]
+    x = belief.mean
+    return jnp.concatenate([x.position, belief.sigma[:3], x.direction, (S @ S.T).ravel()])
+
+
+def answer_of(time_ns: int, place: LocalFrame, x: np.ndarray, flags: Flag) -> RoadNavigation:
+    """Answer of a vector of `predicted` or `kept`.
+
+    Args:
+        time_ns: its stamp.
+        place: origin of the state.
+        x: the vector.
+        flags: of the answer.
+    """
+    c, P = x[6:8], x[8:12].reshape(2, 2)
+    length = float(np.hypot(*c))
+    across = np.array([-c[1], c[0]]) / max(length, 1e-9)
+    sigma = float(np.sqrt(across @ P @ across)) / max(length, 1e-9)
+    known = sigma < np.pi / 2
+    heading = math.atan2(c[1], c[0]) if known else math.nan
+    r_e = np.asarray(place.origin_e) + np.asarray(place.C_en) @ x[:3]
+    found = RoadNavigation(time_ns, r_e, x[3:6], heading, sigma if known else math.nan, flags)
+    if len(x) > 12:
+        found = found._replace(code=Code(int(x[12])), nis=float(x[13]), dof=int(x[14]))
+    return found
+
+
+class LiveGnss(Live):
+    """State of a road vehicle at each record, at once (see the module for what differs).
+
+    Attributes:
+        counts: records refused by reason: `odometry_...`, `ranges_...` (epochs), `range_...`
+            (single pseudoranges).
+        epoch: answer of the filter at the last epoch; None before.
+        passed: answers at the epochs that the last record brought, in order.
+    """
+
+    _parameters: ClassVar[type[Any]] = GnssReplay
+    _kept: ClassVar[tuple[str, ...]] = ("_last_step", "_frame")
+    _parts: ClassVar[tuple[str, ...]] = ("_path",)
+
+    def __init__(
+        self,
+        parameters: GnssReplay,
+        channels: Mapping[str, int] = CHANNELS,
+        filter: str = "delays",
+        wait_s: float = 0.0,
+        machine: str | None = None,
+    ):
+        """Make the programs, before the first record.
+
+        Args:
+            parameters: as of a replay.
+            channels: columns of each system, by the first letter of its satellites; the clocks of
+                the others are estimated against the first.
+            filter: a causal one of the replays.
+            wait_s: time that an epoch waits for earlier ones; the answers carry on meanwhile.
+            machine: the machine that steps the filter, as for `OnlineFilter`; default: `usual()`.
+
+        Raises:
+            ValueError: fewer than four columns, a letter that is none, a negative wait, or no such
+                filter or machine.
+        """
+        for letter, count in channels.items():
+            require(
+                len(letter) == 1 and letter.isalpha(), "channels: no letter of a system", letter
+            )
+            require(count >= 1, f"channels of {letter} must be positive", count)
+        total = sum(channels.values())
+        require(total >= LEAST, f"channels must be {LEAST} or more in all", total)
+        require(filter not in SMOOTHERS, f"{filter} smooths: it needs the whole log")
+        require(wait_s >= 0.0, "wait_s must not be negative", wait_s)
+        made_with = {"channels": dict(channels), "filter": filter, "wait_s": wait_s}
+        made_with |= {"machine": machine or usual()}
+        super().__init__(parameters, **made_with)
+        self.start_over()
+        self._compile()
+
+    def start_over(self) -> None:
+        """Be as new: without records and counts."""
+        self.counts.clear()
+        self._path = GnssPath(
+            self.parameters, self._made_with["channels"], self._made_with["wait_s"]
+        )
+        self._last_step: Any = None  # stamp and vector of the last step
+        self._frame = np.zeros((4, 3))  # of the state: origin [m, ECEF], and C_en
+        self._online, self.epoch = None, None
+        self.passed: list[RoadNavigation] = []
+
+    def push_odometry(
+        self,
+        time_ns: Any,
+        speed_mps: float,
+        yaw_rate: float,
+        sigma_speed: float,
+        sigma_yaw: float,
+    ) -> RoadNavigation:
+        """Take a sample of wheels and yaw gyro; the state at its stamp.
+
+        Args:
+            time_ns: stamp, whole nanoseconds, of the clock that epochs have too.
+            speed_mps: forward.
+            yaw_rate: rad/s, positive to the right.
+            sigma_speed: m/s, noise of the sample.
+            sigma_yaw: rad/s.
+
+        Raises:
+            LiveError: a stamp or number of another kind; the object goes on.
+        """
+        self.passed, time = [], stamp(time_ns)
+        given = [speed_mps, yaw_rate, sigma_speed, sigma_yaw]
+        row = numbers("speed_mps, yaw_rate, sigma_speed, sigma_yaw", given, 4)
+        newest = self._path.newest_ns
+        why = ""
+        if not np.all(np.isfinite(row)):
+            why = "nan"
+        elif abs(row[0]) > _FASTEST or abs(row[1]) > GYRO_LIMIT or np.any(row[2:] <= 0.0):
+            why = "absurd"
+        elif newest is not None and time <= newest:
+            why = "duplicate" if time == newest else "backward"
+        if why:
+            self.counts[f"odometry_{why}"] += 1
+            return self._answer(Flag.REFUSED)
+        self._path.push_odometry(np.array([time]), row[None])
+        self._advance()
+        return self._answer(Flag(0))
+
+    def push_ranges(
+        self,
+        time_ns: Any,
+        satellites: Sequence[str],
+        range_m: Any,
+        sigma_m: Any,
+        satellite_e: Any,
+        elevation_rad: Any,
+        cn0_dbhz: Any,
+    ) -> RoadNavigation:
+        """Take the pseudoranges of an epoch, late or not; the state at the newest odometry.
+
+        Args:
+            time_ns: of the receiver, whole nanoseconds.
+            satellites: names such as "G05"; the first letter is one of the channels.
+            range_m: (n,) m, corrected for the atmosphere and the satellites' clocks.
+            sigma_m: (n,) m.
+            satellite_e: (n, 3) m, Earth-fixed at the time of transmission.
+            elevation_rad: (n,) rad, NaN where unknown.
+            cn0_dbhz: (n,) dBHz, NaN where unknown.
+
+        Raises:
+            LiveError: a stamp, name or number of another kind, or one satellite twice; the object
+                goes on.
+        """
+        self.passed, time, n = [], stamp(time_ns), len(satellites)
+        columns = {"range_m": range_m, "sigma_m": sigma_m}
+        columns |= {"elevation_rad": elevation_rad, "cn0_dbhz": cn0_dbhz}
+        given = [numbers(name, values, n) for name, values in columns.items()]
+        place = numbers("satellite_e", np.ravel(satellite_e), 3 * n).reshape(n, 3)
+        rows = np.column_stack([*given[:2], place, *given[2:]])
+        names = list(satellites)
+        if len(set(names)) < n or not all(isinstance(name, str) and name for name in names):
+            raise LiveError(f"are {names!r:.80}", "satellites", "give each by its name, once")
+        if why := self._refused(time):
+            self.counts[f"ranges_{why}"] += 1
+            return self._answer(Flag.REFUSED)
+        letters = self._made_with["channels"]
+        good = np.all(np.isfinite(rows[:, :5]), axis=1) & (rows[:, 1] > 0.0)
+        known = np.array([name[0] in letters for name in names], dtype=bool)
+        self.counts["range_bad"] += int(np.sum(~good))
+        self.counts["range_of_another_system"] += int(np.sum(good & ~known))
+        taken = np.flatnonzero(good & known)
+        if not len(taken):
+            return self._answer(Flag.REFUSED)
+        self._path.push_ranges(time, [names[k] for k in taken], rows[taken])
+        self._advance()
+        return self._answer(Flag(0))
+
+    def _refused(self, time_ns: int) -> str:
+        """Reason why an epoch is refused; "" for one that is taken."""
+        last_ns = self._path.time_ns
+        if last_ns is not None and time_ns <= last_ns:
+            return "too_old"
+        if time_ns in self._path.waiting_ns:
+            return "duplicate"
+        return "without_odometry" if len(self._path.waiting_ns) >= _MOST_WAITING else ""
+
+    def _advance(self) -> None:
+        """Take all steps that can be taken."""
+        for step in self._path.steps():
+            if self._online is None:
+                self._begin(step)
+            assert self._online is not None
+            found = np.asarray(self._online.step(step.y, step.u, {RANGES: step.sky}, keep=kept))
+            self._last_step = step.time_ns, found
+            self.epoch = self._epoch()
+            self.passed.append(self.epoch)
+            if self.epoch.flags:
+                self.counts["outliers_pseudorange"] += 1
+        self.counts["range_without_column"] = self._path.dropped
+        self.counts = +self.counts
+
+    def _begin(self, first: GnssStep) -> None:
+        """Begin the filter at the first epoch."""
+        place = evaluated(LocalFrame.at, self._path.fix[:3])
+        self._frame = np.vstack([place.origin_e, place.C_en])
+        u = jax.tree_util.tree_map(lambda a: np.asarray(a)[None], first.u)
+        case = self._contender.case(GnssWorld(self._path.fix, u, {}, None))
+        self._online = self._on(case.start)
+
+    @property
+    def _place(self) -> LocalFrame:
+        return LocalFrame(self._frame[0], self._frame[1:])
+
+    @property
+    def _contender(self) -> Contender:
+        member, name = self._path.member, self._made_with["filter"]
+        return contender(self.parameters, self._place, member, name)
+
+    def _on(self, start: Belief | FilterState) -> OnlineFilter:
+        made = self._contender
+        return online(made.filter, made.model, start, self._made_with["machine"])
+
+    def _epoch(self) -> RoadNavigation:
+        """Answer of the last step of the filter."""
+        time_ns, found = self._last_step
+        answer = answer_of(time_ns, self._place, found, Flag(0))
+        return answer._replace(flags=Flag.OUTLIER if answer.code == Code.REFUSED else Flag(0))
+
+    def _answer(self, mark: Flag) -> RoadNavigation:
+        newest = self._path.newest_ns or 0
+        if self._online is None or self.epoch is None:
+            none = np.full(3, np.nan)
+            return RoadNavigation(newest, none, none, math.nan, math.nan, mark | Flag.STARTING)
+        found = np.asarray(self._online.look(predicted, self._path.since()))
+        answer = answer_of(newest, self._place, found, mark | self.epoch.flags)
+        return answer._replace(code=self.epoch.code, nis=self.epoch.nis, dof=self.epoch.dof)
+
+    def _compile(self) -> None:
+        """Have all compiled by a standstill that is thrown away."""
+        letters = [name for name, n in self._made_with["channels"].items() for _ in range(n)]
+        up = (np.arange(len(letters)) + 0.5) / len(letters)
+        turns = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(len(letters))
+        flat = np.sqrt(1.0 - up**2)
+        line = np.column_stack([up, flat * np.cos(turns), flat * np.sin(turns)])
+        names = [f"{letter}{k}" for k, letter in enumerate(letters)]
+        known, size = np.full(len(letters), 40.0), np.full(len(letters), 2e7)
+        satellite_e = 2e7 * line + np.array([6.4e6, 0.0, 0.0])
+        step_ns = max(1_000_000_000, round(1e9 * self._made_with["wait_s"]))
+        for k in range(4):
+            time_ns = step_ns * k
+            self.push_ranges(time_ns, names, size, known, satellite_e, 0.01 * known, known)
+            self.push_odometry(time_ns, 0.0, 0.0, 0.1, 0.01)
+        self._compiled_state = None if self._online is None else self._online.state
+        self.start_over()
+
+    def _go_on_from(self, states: list[PyTree]) -> None:
+        super()._go_on_from(states)
+        self.epoch = None if self._last_step is None else self._epoch()

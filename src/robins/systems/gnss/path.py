@@ -1,0 +1,191 @@
+"""Path from odometry and pseudoranges to steps of the filter, chunk by chunk.
+
+A replay is one chunk, a live object chunks of one; any chunks of the same records give the same
+bits. Each time of the receiver is an epoch, and each satellite has a column, free again when
+another one needs it. Only the latency of the odometry is taken from the future: an epoch becomes a
+step when the odometry has reached it, or has passed it by a wait that is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from robins.systems.gnss.model import LENGTH, RANGES, MotionStep, Sky, delay_law, first_fix
+from robins.systems.gnss.parameters import GnssAssumptions
+
+LEAST = 4  # satellites of the first fix
+_fix = jax.jit(first_fix)
+
+
+class GnssStep(NamedTuple):
+    """Input of a step of the filter, to an epoch; in a replay with a leading axis E."""
+
+    time_ns: Any  # () int64, of the epoch
+    way_m: Any  # () along the road since the first epoch
+    u: MotionStep
+    y: Mapping[str, Any]  # measurements by sensor
+    sky: Sky
+
+
+class GnssPath:
+    """Odometry and pseudoranges to steps of the filter (see the module).
+
+    Attributes:
+        satellites: name in each column, "" where there was none yet.
+        member: (N, K) one where a column is of a system other than the first.
+        time_ns: of the last epoch; None before the first.
+        fix: (4 + K,) of `first_fix`, of the first epoch.
+        dropped: pseudoranges without a column, because all of their system were in use.
+    """
+
+    def __init__(self, believed: GnssAssumptions, channels: Mapping[str, int], wait_s: float = 0.0):
+        """Make a path without records.
+
+        Args:
+            believed: of wheels, delays and clocks.
+            channels: columns of each satellite system, by the first letter of its satellites.
+            wait_s: time by which the odometry must be past an epoch, for earlier epochs that come
+                later.
+        """
+        self._believed, self._wait_ns = believed, round(1e9 * wait_s)
+        self._letters = "".join(letter * count for letter, count in channels.items())
+        others = np.array(list(channels)[1:], dtype=str)
+        self.member = (np.array(list(self._letters))[:, None] == others[None, :]).astype(float)
+        self.satellites = [""] * len(self._letters)
+        self._used = np.full(len(self._letters), -1)  # number of the last epoch of each column
+        self._shown = np.zeros((len(self._letters), 2))  # its elevation [rad] and C/N0 [dBHz]
+        self._odometry_ns, self._odometry = np.zeros(0, np.int64), np.zeros((0, 4))
+        self._waiting: list[tuple[int, list[str], np.ndarray]] = []
+        self.time_ns: int | None = None
+        self.fix = np.zeros(4 + self.member.shape[1])
+        self._epochs, self._way_m, self._is_long, self.dropped = 0, 0.0, False, 0
+
+    def push_odometry(self, time_ns: np.ndarray, rows: np.ndarray) -> None:
+        """Take odometry.
+
+        Args:
+            time_ns: (M,) int64, rising.
+            rows: (M, 4) speed [m/s] forward, yaw rate [rad/s] to the right, their sigmas.
+        """
+        self._odometry_ns = np.concatenate([self._odometry_ns, time_ns])
+        self._odometry = np.concatenate([self._odometry, rows])
+
+    def push_ranges(self, time_ns: int, names: list[str], rows: np.ndarray) -> None:
+        """Take the pseudoranges of an epoch, later than that of the last step.
+
+        Args:
+            time_ns: of the receiver.
+            names: of the satellites, a letter of `channels` and more.
+            rows: (n, 7) range and sigma [m], satellite (3,) [m, ECEF], elevation [rad] and C/N0
+                [dBHz], NaN where unknown.
+
+        Raises:
+            ValueError: a satellite has two pseudoranges.
+        """
+        if len(set(names)) < len(names):
+            what = "a satellite has two pseudoranges at one time; leave one signal of each"
+            raise ValueError(what)
+        self._waiting.append((time_ns, names, rows))
+        self._waiting.sort(key=lambda epoch: epoch[0])
+
+    def steps(self) -> list[GnssStep]:
+        """Steps to the epochs that the odometry has reached since the last call.
+
+        The first is to the first epoch with four satellites while there is odometry; it has no
+        length.
+        """
+        out: list[GnssStep] = []
+        if (newest_ns := self.newest_ns) is None:
+            return out
+        while self._waiting and self._waiting[0][0] <= newest_ns - self._wait_ns:
+            time_ns, names, rows = self._waiting.pop(0)
+            starts = len(names) >= LEAST and self._odometry_ns[0] <= time_ns
+            if self.time_ns is not None or starts:
+                out.append(self._step(time_ns, names, rows))
+            self._forget(time_ns)
+        return out
+
+    def since(self) -> MotionStep:
+        """Step from the last epoch to the newest odometry."""
+        u, _ = self._travel(int(self._odometry_ns[-1]))
+        return self._with_delays(u, np.zeros(len(self._letters)))
+
+    @property
+    def waiting_ns(self) -> list[int]:
+        """Times of the epochs that wait for odometry."""
+        return [time_ns for time_ns, _, _ in self._waiting]
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Time of the newest odometry; None before the first."""
+        return int(self._odometry_ns[-1]) if len(self._odometry_ns) else None
+
+    def _step(self, time_ns: int, names: list[str], rows: np.ndarray) -> GnssStep:
+        is_first = self.time_ns is None
+        if is_first:
+            self.time_ns = time_ns
+        u, way_m = self._travel(time_ns)
+        self._way_m += way_m
+        y, sky, fresh = self._in_columns(names, rows)
+        if is_first:
+            self.fix = np.asarray(_fix(y, sky, self.member, self._believed.clock.system_bias))
+        is_long = self._way_m >= self._believed.wheels.aligned_after
+        length = np.array([1.0 if is_long and not self._is_long else np.nan])
+        self.time_ns, self._is_long = time_ns, self._is_long or is_long
+        measured = {RANGES: y, LENGTH: length}
+        return GnssStep(time_ns, self._way_m, self._with_delays(u, fresh), measured, sky)
+
+    def _travel(self, until_ns: int) -> tuple[MotionStep, float]:
+        """Step from the last epoch to a time, without delays, and the way [m].
+
+        Speed and yaw rate are straight lines between their samples; a step has their means.
+        """
+        assert self.time_ns is not None
+        t, dt = (self._odometry_ns - self.time_ns) * 1e-9, (until_ns - self.time_ns) * 1e-9
+        at = np.concatenate([[0.0], t[(t > 0.0) & (t < dt)], [dt]])
+        ways = [float(np.trapezoid(np.interp(at, t, x), at)) for x in self._odometry[:, :2].T]
+        speed, rate = (way / dt if dt > 0.0 else 0.0 for way in ways)
+        slip, sway = (float(np.interp(dt, t, x)) for x in self._odometry[:, 2:].T)
+        none = np.zeros(0)
+        return MotionStep(dt, speed, rate, slip, sway, none, none, none), ways[0]
+
+    def _with_delays(self, u: MotionStep, fresh: np.ndarray) -> MotionStep:
+        mean, spread = delay_law(self._believed.delays, *self._shown.T)
+        return u._replace(delay_mean=mean, delay_sigma=spread, fresh=fresh)
+
+    def _in_columns(self, names: list[str], rows: np.ndarray) -> tuple[np.ndarray, Sky, np.ndarray]:
+        """Pseudoranges (N,), NaN where there is none, satellites, and (N,) one where new."""
+        count = len(self._letters)
+        y, sigma, fresh = np.full(count, np.nan), np.ones(count), np.zeros(count)
+        satellite = np.tile(rows[0, 2:5], (count, 1))  # read, and not used, where there is none
+        self._epochs += 1
+        for name in set(names) & set(self.satellites):  # these keep their columns
+            self._used[self.satellites.index(name)] = self._epochs
+        for name, row in zip(names, rows, strict=True):
+            k = self._column(name)
+            if k is None:
+                self.dropped += 1
+                continue
+            if name != self.satellites[k]:
+                self.satellites[k], self._shown[k], fresh[k] = name, 0.0, 1.0
+            self._used[k] = self._epochs
+            y[k], sigma[k], satellite[k] = row[0], row[1], row[2:5]
+            self._shown[k] = np.where(np.isfinite(row[5:]), row[5:], self._shown[k])
+        return y, Sky(satellite, sigma), fresh
+
+    def _column(self, name: str) -> int | None:
+        """Column of a satellite; for a new one that which was not in use for longest."""
+        if name in self.satellites:
+            return self.satellites.index(name)
+        of = [k for k, letter in enumerate(self._letters) if name.startswith(letter)]
+        free = min(of, key=lambda k: self._used[k], default=None)
+        return None if free is None or self._used[free] == self._epochs else free
+
+    def _forget(self, time_ns: int) -> None:
+        """Drop odometry before the last sample up to an epoch."""
+        first = max(int(np.searchsorted(self._odometry_ns, time_ns, side="right")) - 1, 0)
+        self._odometry_ns, self._odometry = self._odometry_ns[first:], self._odometry[first:]
