@@ -137,7 +137,7 @@ def test_a_misalignment_passes_half_a_turn():
 @jax.jit
 def by_periods(flown):
     """The model over the same 20 s in steps of 1 s and of 0.4 s, by the midpoint rule."""
-    errors = em.SensorErrors(tm.GYRO_ERROR, tm.ACCEL_ERROR)
+    errors = tm.GYRO_ERROR, tm.ACCEL_ERROR
 
     def one(x, said, count):
         f_c = (said.C @ said.f_b[..., None])[..., 0]
@@ -217,8 +217,9 @@ def test_small_errors_move_as_those_of_the_strapdown_room():
     scale = np.repeat([1.0, 1.0, 1e6, 1e6, 1.0], [3, 3, 1, 1, 1])[:, None]
     assert_allclose(scale * (A @ J), scale * (J @ F + J_rate), rtol=1e-9, atol=1e-13)
     T = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # FRD <-> RFU
-    assert_allclose(B.gyro, J @ G[:, :3] @ T, atol=1e-14)
-    assert_allclose(B.accel, J @ G[:, 3:6] @ T, atol=1e-14)
+    by_gyro, by_accel = B
+    assert_allclose(by_gyro, J @ G[:, :3] @ T, atol=1e-14)
+    assert_allclose(by_accel, J @ G[:, 3:6] @ T, atol=1e-14)
 
 
 # ------------------------------------------------------------------------------------ attitude rows

@@ -97,7 +97,7 @@ def played(live, all_):
 
 @pytest.mark.parametrize("size", [1, 7, 1000])
 def test_chunks_of_any_size_give_the_bits_of_a_replay(log, channels, size):
-    wanted = arrange(log, PARAMETERS)
+    wanted, whole = arrange(log, PARAMETERS)
     path, steps = GnssPath(PARAMETERS, channels), []
     for k, (kind, given) in enumerate(records(log)):
         if kind == ODOMETRY:
@@ -107,10 +107,11 @@ def test_chunks_of_any_size_give_the_bits_of_a_replay(log, channels, size):
         if k % size == size - 1:
             steps += path.steps()
     steps += path.steps()
-    found = jax.tree_util.tree_map(lambda *x: np.stack(x), *steps)
-    assert tuple(path.satellites) == wanted.satellites
+    found = jax.tree_util.tree_map(lambda *x: np.stack(x), *[world for _, world in steps])
+    assert (path.satellites, path.way_m) == (whole.satellites, whole.way_m)
+    assert path.begin_ns == steps[0][0]
     for a, b in (
-        (found.time_ns, wanted.time_ns),
+        ((np.array([t for t, _ in steps]) - path.begin_ns) * 1e-9, wanted.epoch_s),
         (path.fix, wanted.world.fix),
         *zip(found.u, wanted.world.u, strict=True),
         *((found.y[name], wanted.world.y[name]) for name in (RANGES, LENGTH)),
@@ -122,13 +123,14 @@ def test_chunks_of_any_size_give_the_bits_of_a_replay(log, channels, size):
 @pytest.fixture(scope="module")
 def replayed(log):
     """Epochs, Earth-fixed places and their sigmas of the causal replay."""
-    of = arrange(log, PARAMETERS)
-    make = partial(contender, PARAMETERS, of.place, of.member)
+    of, path = arrange(log, PARAMETERS)
+    make = partial(contender, PARAMETERS, path.place, path.member)
     answers = replaying.run_filters([of], ("delays",), make, SMOOTHERS, ignore_progress)
     mean, sigma = answers["delays"].mean, np.asarray(answers["delays"].sigma)
-    o, C = np.asarray(of.place.origin_e), np.asarray(of.place.C_en)
+    o, C = np.asarray(path.place.origin_e), np.asarray(path.place.C_en)
     places = np.stack([o + C @ p for p in np.asarray(mean.position)])
-    return of.time_ns, places, sigma[:, :3], np.asarray(mean.direction)
+    time_ns = path.begin_ns + np.round(1e9 * of.epoch_s).astype(np.int64)
+    return time_ns, places, sigma[:, :3], np.asarray(mean.direction)
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.17], ids=["at once", "late"])
@@ -192,7 +194,7 @@ def test_a_satellite_takes_the_column_that_was_not_used_for_longest(log):
     for k, chosen in enumerate(([a, b, c], [a, c], [a, d], [a, b, c, d])):
         at = [*chosen, *others]
         path.push_ranges(k * 10**9, [names[i] for i in at], rows[at])
-    steps = path.steps()
+    steps = [world for _, world in path.steps()]
     # b was not seen for longest when d came, c has its column still
     assert path.satellites[:3] == [names[a], names[d], names[c]]
     assert steps[2].u.fresh.tolist() == [0.0, 1.0, 0.0, 0.0, 0.0, 0.0]
@@ -268,7 +270,7 @@ def test_bad_records_are_refused_and_counted(live, log):
     assert push(live, EPOCH, (live.epoch.time_ns, names, rows)).flags & Flag.REFUSED
     assert live.counts["ranges_too_old"] == 1
     with pytest.raises(LiveError, match="whole number"):
-        live.push_odometry(1.5, 1.0, 0.0, 0.1, 0.01)
+        live.push_odometry(True, 1.0, 0.0, 0.1, 0.01)
     with pytest.raises(LiveError, match="by its name, once"):
         push(live, EPOCH, (t + 2, [names[0]] * len(names), rows))
     with pytest.raises(LiveError, match="range_m"):

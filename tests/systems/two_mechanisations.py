@@ -227,7 +227,7 @@ def difference(s: State) -> np.ndarray:
 def slipped_rate(x, sins, errors, slips):
     """The right-hand side of the error model, with mistakes of `SLIPS`."""
     if "gyro-sign" in slips:
-        errors = errors._replace(gyro=-errors.gyro)
+        errors = -errors[0], errors[1]
     small = nullcontext()
     if "small-angle" in slips:
         matrices = {
@@ -250,7 +250,7 @@ def slipped_rate(x, sins, errors, slips):
 @jax.jit(static_argnames="slips")
 def model_end(flown: Flown, slips=(), dt=DT_S, gyro=GYRO_ERROR, accel=ACCEL_ERROR):
     """End of the error model, (B, 9), from where the mechanisations begin, by their steps."""
-    errors = error_model.SensorErrors(gyro, accel)
+    errors = gyro, accel
 
     def stage(carry, now):
         x, k, total = carry

@@ -26,6 +26,7 @@ it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -66,14 +67,7 @@ class Sins(NamedTuple):
     f_c: Any  # (3,) m/s^2, measured specific force in the computed frame, C_cb f_b
 
 
-class SensorErrors(NamedTuple):
-    """Measured minus true, in body axes RFU."""
-
-    gyro: Any  # (3,) rad/s
-    accel: Any  # (3,) m/s^2
-
-
-NO_ERRORS = SensorErrors(np.zeros(3), np.zeros(3))
+NO_ERRORS = np.zeros(3), np.zeros(3)
 
 
 def dcm_cn(phi: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
@@ -113,7 +107,7 @@ def rate_matrix_inverse(phi: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
 
 
 def error_rate(
-    x: Float[Array, "9"], sins: Sins, errors: SensorErrors = NO_ERRORS
+    x: Float[Array, "9"], sins: Sins, errors: Sequence[ArrayLike] = NO_ERRORS
 ) -> Float[Array, "9"]:
     """The right-hand side f of x' = f (eq. 40).
 
@@ -130,7 +124,8 @@ def error_rate(
     Args:
         x: error state, computed minus true.
         sins: output of the SINS.
-        errors: its sensor errors; zero in a filter, where they are process noise.
+        errors: of its gyros (3,) [rad/s] and accelerometers (3,) [m/s^2], measured minus true, RFU;
+            zero in a filter, where they are process noise.
     """
     phi, dv = x[PHI], x[VELOCITY]
     C_cn = dcm_cn(phi)
@@ -148,7 +143,7 @@ def error_rate(
 
 
 def step(
-    x: Float[Array, "9"], over: Sins, dt_s: ArrayLike, errors: SensorErrors = NO_ERRORS
+    x: Float[Array, "9"], over: Sins, dt_s: ArrayLike, errors: Sequence[ArrayLike] = NO_ERRORS
 ) -> Float[Array, "9"]:
     """Move errors x by the midpoint rule over a filter period T: x + f(x + f(x) T/2) T.
 

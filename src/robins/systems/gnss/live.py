@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import ArrayLike, PyTree
 
 from robins.earth import Geodetic
 from robins.errors import require
@@ -27,11 +27,10 @@ from robins.filters import Belief, Code, Filter, FilterState, Model, OnlineFilte
 from robins.filters.machine import usual
 from robins.filters.run import Step
 from robins.ins.plausible import GYRO_LIMIT
-from robins.program.evaluated import evaluated
 from robins.systems.gnss.filters import SMOOTHERS, GnssWorld, contender
 from robins.systems.gnss.model import RANGES, LocalFrame, MotionStep
 from robins.systems.gnss.parameters import GnssReplay
-from robins.systems.gnss.path import LEAST, GnssPath, GnssStep
+from robins.systems.gnss.path import LEAST, GnssPath
 from robins.systems.streaming import Flag, Live, LiveError, numbers, online, stamp
 from robins.systems.study import Contender
 
@@ -111,7 +110,7 @@ class LiveGnss(Live):
         passed: answers at the epochs that the last record brought, in order.
     """
 
-    _parameters: ClassVar[type[Any]] = GnssReplay
+    _parameters = GnssReplay
     _kept: ClassVar[tuple[str, ...]] = ("_last_step", "_frame")
     _parts: ClassVar[tuple[str, ...]] = ("_path",)
 
@@ -158,14 +157,14 @@ class LiveGnss(Live):
         self._path = GnssPath(
             self.parameters, self._made_with["channels"], self._made_with["wait_s"]
         )
-        self._last_step: Any = None  # stamp and vector of the last step
+        self._last_step: tuple[int, np.ndarray] | None = None  # stamp and vector of the last step
         self._frame = np.zeros((4, 3))  # of the state: origin [m, ECEF], and C_en
         self._online, self.epoch = None, None
         self.passed: list[RoadNavigation] = []
 
     def push_odometry(
         self,
-        time_ns: Any,
+        time_ns: int | np.integer,
         speed_mps: float,
         yaw_rate: float,
         sigma_speed: float,
@@ -203,13 +202,13 @@ class LiveGnss(Live):
 
     def push_ranges(
         self,
-        time_ns: Any,
+        time_ns: int | np.integer,
         satellites: Sequence[str],
-        range_m: Any,
-        sigma_m: Any,
-        satellite_e: Any,
-        elevation_rad: Any,
-        cn0_dbhz: Any,
+        range_m: ArrayLike,
+        sigma_m: ArrayLike,
+        satellite_e: ArrayLike,
+        elevation_rad: ArrayLike,
+        cn0_dbhz: ArrayLike,
     ) -> RoadNavigation:
         """Take the pseudoranges of an epoch, late or not; the state at the newest odometry.
 
@@ -261,12 +260,12 @@ class LiveGnss(Live):
 
     def _advance(self) -> None:
         """Take all steps that can be taken."""
-        for step in self._path.steps():
+        for time_ns, world in self._path.steps():
             if self._online is None:
-                self._begin(step)
+                self._begin(world)
             assert self._online is not None
-            found = np.asarray(self._online.step(step.y, step.u, {RANGES: step.sky}, keep=kept))
-            self._last_step = step.time_ns, found
+            found = self._online.step(world.y, world.u, {RANGES: world.sky}, keep=kept)
+            self._last_step = time_ns, np.asarray(found)
             self.epoch = self._epoch()
             self.passed.append(self.epoch)
             if self.epoch.flags:
@@ -274,13 +273,12 @@ class LiveGnss(Live):
         self.counts["range_without_column"] = self._path.dropped
         self.counts = +self.counts
 
-    def _begin(self, first: GnssStep) -> None:
+    def _begin(self, first: GnssWorld) -> None:
         """Begin the filter at the first epoch."""
-        place = evaluated(LocalFrame.at, self._path.fix[:3])
+        place = self._path.place
         self._frame = np.vstack([place.origin_e, place.C_en])
         u = jax.tree_util.tree_map(lambda a: np.asarray(a)[None], first.u)
-        case = self._contender.case(GnssWorld(self._path.fix, u, {}, None))
-        self._online = self._on(case.start)
+        self._online = self._on(self._contender.case(first._replace(u=u)).start)
 
     @property
     def _place(self) -> LocalFrame:
@@ -297,6 +295,7 @@ class LiveGnss(Live):
 
     def _epoch(self) -> RoadNavigation:
         """Answer of the last step of the filter."""
+        assert self._last_step is not None
         time_ns, found = self._last_step
         answer = answer_of(time_ns, self._place, found, Flag(0))
         return answer._replace(flags=Flag.OUTLIER if answer.code == Code.REFUSED else Flag(0))

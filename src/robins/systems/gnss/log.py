@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 
 import jax
@@ -12,7 +11,7 @@ import numpy as np
 from robins.dataset import PlaceTable, RangeLog, RangeTable
 from robins.results import Outcome, Progress, ignore_progress
 from robins.systems import replaying
-from robins.systems.gnss.filters import SMOOTHERS, GnssWorld, contender
+from robins.systems.gnss.filters import SMOOTHERS, contender
 from robins.systems.gnss.model import (
     LENGTH,
     POSITION,
@@ -38,18 +37,7 @@ CAUSES = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class PreparedRangeLog(LogPiece):
-    """A log by epoch, and where its state has its origin; the world is a `GnssWorld`."""
-
-    time_ns: np.ndarray  # (E,)
-    place: LocalFrame
-    member: np.ndarray  # (N, K)
-    satellites: tuple[str, ...]
-    way_m: float
-
-
-def arrange(log: RangeLog, believed: GnssAssumptions) -> PreparedRangeLog:
+def arrange(log: RangeLog, believed: GnssAssumptions) -> tuple[LogPiece, GnssPath]:
     """Every satellite in a column of its own, every time of the receiver an epoch.
 
     The first epoch is the first with pseudoranges of four satellites and odometry; the filter
@@ -80,17 +68,10 @@ def arrange(log: RangeLog, believed: GnssAssumptions) -> PreparedRangeLog:
             f"no epoch has pseudoranges of {LEAST} satellites while there is odometry; are both "
             "of the same drive?"
         )
-    every = jax.tree_util.tree_map(lambda *x: np.stack(x), *steps)
-    return PreparedRangeLog(
-        begin_s=0.0,
-        epoch_s=(every.time_ns - every.time_ns[0]) * 1e-9,
-        time_ns=every.time_ns,
-        place=LocalFrame.at(path.fix[:3]),
-        member=path.member,
-        satellites=tuple(path.satellites),
-        way_m=float(every.way_m[-1]),
-        world=GnssWorld(fix=path.fix, u=every.u, y=every.y, sky=every.sky),
-    )
+    time_ns, worlds = zip(*steps, strict=True)
+    world = jax.tree_util.tree_map(lambda *x: np.stack(x), *worlds)._replace(fix=path.fix)
+    epoch_s = (np.array(time_ns) - time_ns[0]) * 1e-9
+    return LogPiece(world=world, begin_s=0.0, epoch_s=epoch_s), path
 
 
 def names_of(ranges: RangeTable) -> list[str]:
@@ -119,8 +100,8 @@ def recorded(log: RangeLog, parameters: GnssReplay) -> PreparedLog:
     Raises:
         ValueError: the log cannot be navigated; the message gives the reason.
     """
-    given = arrange(log, parameters)
-    return PreparedLog([given], partial(contender, parameters, given.place, given.member))
+    given, path = arrange(log, parameters)
+    return PreparedLog([given], partial(contender, parameters, path.place, path.member))
 
 
 def replay(
@@ -140,47 +121,52 @@ def replay(
     Raises:
         ValueError: the log cannot be navigated; the message gives the reason.
     """
-    given = arrange(log, parameters)
-    make = partial(contender, parameters, given.place, given.member)
+    given, path = arrange(log, parameters)
+    place, begin_ns = path.place, int(path.begin_ns or 0)
+    make = partial(contender, parameters, place, path.member)
     wanted = filters or parameters.filters
     answers = replaying.run_filters([given], wanted, make, SMOOTHERS, progress)
-    places = {name: given.place.geodetic(a.mean.position) for name, a in answers.items()}
+    places = {name: place.geodetic(a.mean.position) for name, a in answers.items()}
     variables = track_arrays(places.values())
-    true = None if log.truth is None else truth_at(log.truth, given)
+    true = (
+        None
+        if log.truth is None
+        else truth_at(log.truth, place, begin_ns + np.round(1e9 * given.epoch_s).astype(np.int64))
+    )
     if true is not None:
-        p = given.place.geodetic(true)
+        p = place.geodetic(true)
         variables |= place_arrays("reference", (p.lat, p.lon, p.alt), "true {}")
         error = np.stack([true - np.asarray(a.mean.position) for a in answers.values()])
         variables |= block_array("error", POSITION, error, "true minus estimated position")
     there = np.isfinite(given.world.y[RANGES])
-    counts = {"pseudoranges": int(np.sum(there)), "satellites": len(given.satellites)}
+    counts = {"pseudoranges": int(np.sum(there)), "satellites": len(path.satellites)}
     return replaying.outcome(
         given.epoch_s,
         answers,
         ReportedItems(
             blocks=(POSITION,),
-            sensors=sensor_axes(given.satellites),
+            sensors=sensor_axes(tuple(path.satellites)),
             estimates=_estimates,
             causes=CAUSES,
             assumed=(LENGTH,),
             euler=HEADING,
         ),
-        origin_ns=int(given.time_ns[0]),
+        origin_ns=begin_ns,
         metrics=lambda answer: {} if true is None else accuracy(answer, true),
         variables=variables,
         counts=dict(log.counts) | counts,
         notes=[
             f"{counts['pseudoranges']} pseudoranges of {counts['satellites']} satellites in "
-            f"{len(there)} epochs over {given.way_m:.0f} m; the start is a fix by least "
+            f"{len(there)} epochs over {path.way_m:.0f} m; the start is a fix by least "
             "squares, of unknown heading."
         ],
     )
 
 
-def truth_at(truth: PlaceTable, given: PreparedRangeLog) -> np.ndarray:
+def truth_at(truth: PlaceTable, place: LocalFrame, time_ns: np.ndarray) -> np.ndarray:
     """(E, 3) true places [m, NED] at the epochs, by straight lines; NaN beyond the truth."""
-    local = np.asarray(given.place.local(truth.r_e))
-    t, epochs = (x - given.time_ns[0] for x in (truth.time_ns, given.time_ns))
+    local = np.asarray(place.local(truth.r_e))
+    t, epochs = (x - time_ns[0] for x in (truth.time_ns, time_ns))
     out = np.stack([np.interp(epochs, t, x) for x in local.T], axis=1)
     return np.where(((epochs < t[0]) | (epochs > t[-1]))[:, None], np.nan, out)
 

@@ -9,26 +9,25 @@ step when the odometry has reached it, or has passed it by a wait that is asked 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from robins.systems.gnss.model import LENGTH, RANGES, MotionStep, Sky, delay_law, first_fix
+from robins.program.evaluated import evaluated
+from robins.systems.gnss.filters import GnssWorld
+from robins.systems.gnss.model import (
+    LENGTH,
+    RANGES,
+    LocalFrame,
+    MotionStep,
+    Sky,
+    delay_law,
+    first_fix,
+)
 from robins.systems.gnss.parameters import GnssAssumptions
 
 LEAST = 4  # satellites of the first fix
 _fix = jax.jit(first_fix)
-
-
-class GnssStep(NamedTuple):
-    """Input of a step of the filter, to an epoch; in a replay with a leading axis E."""
-
-    time_ns: Any  # () int64, of the epoch
-    way_m: Any  # () along the road since the first epoch
-    u: MotionStep
-    y: Mapping[str, Any]  # measurements by sensor
-    sky: Sky
 
 
 class GnssPath:
@@ -37,7 +36,9 @@ class GnssPath:
     Attributes:
         satellites: name in each column, "" where there was none yet.
         member: (N, K) one where a column is of a system other than the first.
-        time_ns: of the last epoch; None before the first.
+        begin_ns: time of the first epoch; None before it.
+        time_ns: of the last epoch; likewise.
+        way_m: along the road since the first epoch.
         fix: (4 + K,) of `first_fix`, of the first epoch.
         dropped: pseudoranges without a column, because all of their system were in use.
     """
@@ -60,9 +61,10 @@ class GnssPath:
         self._shown = np.zeros((len(self._letters), 2))  # its elevation [rad] and C/N0 [dBHz]
         self._odometry_ns, self._odometry = np.zeros(0, np.int64), np.zeros((0, 4))
         self._waiting: list[tuple[int, list[str], np.ndarray]] = []
+        self.begin_ns: int | None = None
         self.time_ns: int | None = None
         self.fix = np.zeros(4 + self.member.shape[1])
-        self._epochs, self._way_m, self._is_long, self.dropped = 0, 0.0, False, 0
+        self._epochs, self.way_m, self._is_long, self.dropped = 0, 0.0, False, 0
 
     def push_odometry(self, time_ns: np.ndarray, rows: np.ndarray) -> None:
         """Take odometry.
@@ -92,20 +94,20 @@ class GnssPath:
         self._waiting.append((time_ns, names, rows))
         self._waiting.sort(key=lambda epoch: epoch[0])
 
-    def steps(self) -> list[GnssStep]:
-        """Steps to the epochs that the odometry has reached since the last call.
+    def steps(self) -> list[tuple[int, GnssWorld]]:
+        """Time [ns] and world, without a leading axis, of each epoch that can be a step now.
 
-        The first is to the first epoch with four satellites while there is odometry; it has no
-        length.
+        The first is the first epoch with four satellites while there is odometry; the step to it
+        has no length.
         """
-        out: list[GnssStep] = []
+        out: list[tuple[int, GnssWorld]] = []
         if (newest_ns := self.newest_ns) is None:
             return out
         while self._waiting and self._waiting[0][0] <= newest_ns - self._wait_ns:
             time_ns, names, rows = self._waiting.pop(0)
             starts = len(names) >= LEAST and self._odometry_ns[0] <= time_ns
             if self.time_ns is not None or starts:
-                out.append(self._step(time_ns, names, rows))
+                out.append((time_ns, self._step(time_ns, names, rows)))
             self._forget(time_ns)
         return out
 
@@ -113,6 +115,11 @@ class GnssPath:
         """Step from the last epoch to the newest odometry."""
         u, _ = self._travel(int(self._odometry_ns[-1]))
         return self._with_delays(u, np.zeros(len(self._letters)))
+
+    @property
+    def place(self) -> LocalFrame:
+        """Origin of the state: the first fix."""
+        return evaluated(LocalFrame.at, self.fix[:3])
 
     @property
     def waiting_ns(self) -> list[int]:
@@ -124,20 +131,19 @@ class GnssPath:
         """Time of the newest odometry; None before the first."""
         return int(self._odometry_ns[-1]) if len(self._odometry_ns) else None
 
-    def _step(self, time_ns: int, names: list[str], rows: np.ndarray) -> GnssStep:
+    def _step(self, time_ns: int, names: list[str], rows: np.ndarray) -> GnssWorld:
         is_first = self.time_ns is None
         if is_first:
-            self.time_ns = time_ns
+            self.begin_ns = self.time_ns = time_ns
         u, way_m = self._travel(time_ns)
-        self._way_m += way_m
+        self.way_m += way_m
         y, sky, fresh = self._in_columns(names, rows)
         if is_first:
             self.fix = np.asarray(_fix(y, sky, self.member, self._believed.clock.system_bias))
-        is_long = self._way_m >= self._believed.wheels.aligned_after
+        is_long = self.way_m >= self._believed.wheels.aligned_after
         length = np.array([1.0 if is_long and not self._is_long else np.nan])
         self.time_ns, self._is_long = time_ns, self._is_long or is_long
-        measured = {RANGES: y, LENGTH: length}
-        return GnssStep(time_ns, self._way_m, self._with_delays(u, fresh), measured, sky)
+        return GnssWorld(self.fix, self._with_delays(u, fresh), {RANGES: y, LENGTH: length}, sky)
 
     def _travel(self, until_ns: int) -> tuple[MotionStep, float]:
         """Step from the last epoch to a time, without delays, and the way [m].

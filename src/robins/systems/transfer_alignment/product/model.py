@@ -100,9 +100,7 @@ class RecordDelay(NamedTuple):
     omega_m: ArrayLike  # (3,) rad/s, omega_im of the master at the record's time of validity
 
 
-class _ProductNoise(NamedTuple):
-    noise: InsNoise
-    flexure: Flexure | None
+_ProductNoise = tuple[InsNoise, Flexure | None]  # of the slave and of its mounting
 
 
 def _swing(flexure: Flexure, block: ImuBlock) -> tuple[Array, Array]:
@@ -117,20 +115,22 @@ def _swing(flexure: Flexure, block: ImuBlock) -> tuple[Array, Array]:
 
 
 def _step(drive: _ProductNoise, x: ProductState, block: ImuBlock) -> ProductState:
-    new = x._replace(ins=propagate(x.ins, block.increments, drive.noise))
-    if drive.flexure is None:
+    noise, flexure = drive
+    new = x._replace(ins=propagate(x.ins, block.increments, noise))
+    if flexure is None:
         return new
-    Phi, _ = _swing(drive.flexure, block)
+    Phi, _ = _swing(flexure, block)
     return new._replace(flexure=Phi @ x.flexure)
 
 
 def _step_linear(drive: _ProductNoise, x: ProductState, block: ImuBlock):
     """(1): the state after a block of samples, Phi and a factor of Q."""
-    ins, Phi, L = propagate_linear(x.ins, block.increments, drive.noise, segments=1)
+    noise, flexure = drive
+    ins, Phi, L = propagate_linear(x.ins, block.increments, noise, segments=1)
     new = x._replace(ins=ins)
     Phis, Ls = [Phi, jnp.eye(3)], [L, jnp.zeros((3, 3))]
-    if drive.flexure is not None:
-        Phi, L = _swing(drive.flexure, block)
+    if flexure is not None:
+        Phi, L = _swing(flexure, block)
         new = new._replace(flexure=Phi @ x.flexure)
         Phis, Ls = [*Phis, Phi], [*Ls, L]
     return new, block_diag(*Phis), block_diag(*Ls) * block.noise_scale
@@ -283,7 +283,7 @@ def product_model(
         sensors have the names of `sigmas`; an attitude is a `Rotation`, a velocity (3,) NED, a
         position a `Geodetic`; the aux of each is a `RecordDelay`.
     """
-    motion = moved_by(_step, _step_linear, _ProductNoise(noise, flexure))
+    motion = moved_by(_step, _step_linear, (noise, flexure))
 
     def sensor(name: str, sigma: ArrayLike) -> Sensor:
         record, noisy = RECORDS[name], jnp.broadcast_to(jnp.asarray(sigma, float), 3)
