@@ -101,7 +101,7 @@ def replay(
 
 
 class OpenLog(NamedTuple):
-    """A log of which all is known that is not in its files, ready to be read."""
+    """A log with its configuration, ready to be read."""
 
     system: Any  # a `System` that replays logs
     files: Sequence[str | os.PathLike[str]]
@@ -138,7 +138,7 @@ def open_log(
     settings: Sequence[str] = (),
     columns: Sequence[str | os.PathLike[str]] = (),
 ) -> OpenLog:
-    """Part a log's files from their configuration and read this; as of `replay`.
+    """Separate a log's files from the configuration and read the latter; see `replay`.
 
     Raises:
         InputError: the system replays no logs.
@@ -189,7 +189,7 @@ def align(
     progress(0.0, "reading")
     formats = logs.formats_of((master, slave), columns)
     dataset = logs.load_pair(master, slave, delay_s=parameters.master.delay, formats=formats)
-    # the doctor looks along the master's axes, the filter along those of the slave
+    # the doctor examines along the master's axes, the filter uses those of the slave
     turn = logs.Mounting(*np.degrees(system.orientation(parameters)))
     _examine(replace(dataset, imu=turn.turn(to_ned_frd(dataset.imu))), findings)
     dataset = logs.clean(dataset)

@@ -86,7 +86,7 @@ def tune(
 
     Raises:
         InputError, robins.scenario.ScenarioError: the request cannot be fulfilled.
-        TooLittle: the data do not determine a parameter.
+        robins.campaign.tuning.UndeterminedError: the data do not determine a parameter.
     """
     _float64.require()
     if _is_log(names):
