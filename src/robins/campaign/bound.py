@@ -34,7 +34,7 @@ from robins.systems.study import Case, Contender, Problem, StateBlock
 from robins.systems.tables import block_array
 
 _AT_ONCE = 128  # runs: histories of the information of each are held
-FEW = 1.0  # eigenvalue of the Gramian below which the prior still knows more of a direction
+FEW = 1.0  # eigenvalue of the Gramian below which the prior holds more on a direction
 _FEWEST, _MOST = 3, 6  # directions that are reported
 
 
@@ -158,9 +158,10 @@ def _bounded(c: Contender, subsets: Array, world: Data) -> dict[str, Data]:
         world: the run, as the problem simulates it.
 
     Returns:
-        variance (V, E, r) by subset; prior (r,) variances; mean of the start; L (E, n, n) of the
-        Gramian with the first subset, and D (n,) its units; spoke (S,) true for sensors that ever
-        measured anything; rows (r, n) the reported combinations of the start, or None.
+        variance (V, E, r) by subset; prior (r,) variances; mean of the start; L (E, n, n) factors
+        of (I + W)^-1 with the Gramian W of the first subset, and D (n,) its units; spoke (S,) true
+        for sensors that ever measured anything; rows (r, n) the reported combinations of the start,
+        or None.
     """
     it = complete_case(c.filter, c.model, c.case(world))
     start = jax.tree_util.tree_map(jnp.asarray, _start(it))

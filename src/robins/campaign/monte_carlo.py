@@ -218,8 +218,8 @@ def record(problem: Problem, name: str, worlds: PyTree, count: int) -> dict[str,
     Returns:
         NumPy records with a leading axis of ``count`` runs. Of the reported components error and
         sigma (E, r) and block_nees by block; of the state mean, nees (E,) and dim (); by sensor
-        updates, each an `Update`, and readings; by name the outputs; by suspect the probability
-        that it is wrong (E,); the tally of its steps.
+        updates, each a `robins.systems.tables.SensorUpdates`, and readings; by name the outputs; by
+        suspect the probability that it is wrong (E,); the tally of its steps.
 
     Raises:
         ValueError: there is no such contender.

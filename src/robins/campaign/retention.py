@@ -47,7 +47,7 @@ def histories(
     Args:
         store: of the campaign.
         group: `NAMED` or `DIVERGED`.
-        shards: `by_stem`; histories of other shards are left out.
+        shards: of `by_stem`; histories of other shards are left out.
     """
     found: dict[str, list[RunHistories]] = {}
     for name in store.names(group):

@@ -259,7 +259,7 @@ class Statistics:
     def percentiles(self, block: StateBlock) -> np.ndarray:
         """(T, 4) lengths of the error of a block that `PERCENTS` of the runs do not exceed.
 
-        To the width of a bin, see `robins.campaign.histogram`; a diverged run is beyond all.
+        They are accurate to a bin of `robins.campaign.histogram`; a diverged run is beyond all.
         """
         return percentiles(self.bins[block.name], len(self.thinned), PERCENTS)
 
@@ -300,7 +300,7 @@ class Statistics:
 
     @property
     def run_rms(self) -> np.ndarray:
-        """(runs, r) root mean square error over the epochs counted."""
+        """(runs, r) root mean square error of each run over the epochs counted."""
         return self._all("rms")
 
     @property

@@ -78,7 +78,7 @@ class Tuned(NamedTuple):
         gradient: true if found by gradient, false if by search.
         evaluations: of the objective, those of the gradient among them.
         before: (parts, k) of the data held out, as written.
-        after: (parts, k) with what was found.
+        after: (parts, k) with the parameters found.
         gain: decrease of the objective on the data held out; negative: it is worse.
         gain_low: its one-sided lower bound of 95 % confidence.
         notes: parts that JAX computed, with the reason.
@@ -167,8 +167,8 @@ class ObjectiveGradient:
     """An objective and its gradient, on the data that x is chosen on.
 
     By central differences: all ends are computed at once, and the same noise makes the objective
-    smooth. The derivative of a run (forward mode through the factorisations of 2 700 steps of
-    INS/GNSS) was 20 times as long to compute and 5 times to compile as the run.
+    smooth. Differentiating a run (forward mode through the factorisations of 2 700 steps of
+    INS/GNSS) took 20 times as long to compute and 5 times as long to compile as the run.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ class ObjectiveGradient:
         return list(dict.fromkeys(note for one in self._measured.values() for note in one.notes))
 
     def total(self, parts: np.ndarray) -> float:
-        """The objective of some parts; infinite where the filter is lost."""
+        """The objective of some parts; infinite where the filter diverges."""
         mean = np.mean(parts, axis=0)
         if not np.all(np.isfinite(mean)):
             return np.inf
@@ -227,7 +227,7 @@ class ObjectiveGradient:
         steps = step * np.eye(self._p)
         here, *ends = self.parts([x, *(x + steps), *(x - steps)])
         above, below = ends[: self._p], ends[self._p :]
-        with np.errstate(invalid="ignore"):  # of a filter that is lost
+        with np.errstate(invalid="ignore"):  # of a filter that diverges
             slope = [(a - b) / (2.0 * step) for a, b in zip(above, below, strict=True)]
         return here, np.stack(slope, axis=-1)
 
@@ -333,7 +333,7 @@ def _gain(
     if not np.all(np.isfinite(after)):
         return -math.inf, -math.inf
     if not np.all(np.isfinite(before)):
-        return math.inf, math.inf  # as written it is lost
+        return math.inf, math.inf  # as written it diverges
     n = len(before)
 
     def fell(which: np.ndarray) -> float:

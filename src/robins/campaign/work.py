@@ -84,7 +84,7 @@ class Worker:
             self.store.drop(taken.claim)
 
     def compute(self, one: MissingShards) -> None:
-        """Compute shards of a chunk and put them, after the histories that are kept of its runs."""
+        """Compute and store shards of a chunk, after the histories to be kept of its runs."""
         names = [s.filter for s in one.shards]
         found = self.found(one.chunk, names)
         for shard in one.shards:
@@ -127,7 +127,7 @@ class Worker:
         return pack(about, statistics)
 
     def _keep(self, shard: Shard, chunk: Chunk, statistics: Statistics) -> None:
-        """Put the histories of those runs of a chunk that the scenario wants kept."""
+        """Store the histories of those runs of a chunk that the scenario wants kept."""
         every, most = range(chunk.begin, chunk.begin + chunk.runs), self.plan.keep_diverged
         group = {run: NAMED for run in self.plan.keep if run in every}
         lost = [every[k] for k in np.flatnonzero(statistics.lost)] if most != 0 else []

@@ -76,7 +76,7 @@ def with_adjustable(request: Request, numbers: Sequence[str]) -> Request:
 def files_of(
     request: Request, unroll: int | None, precision: Precision
 ) -> tuple[dict[str, str], Library, PrecisionCost | None]:
-    """Texts of an exported folder by name, their library, and what single precision costs.
+    """Texts of an exported folder by name, their library, and the cost of single precision.
 
     Args:
         request: the filter, and the problem by which it is tried.
@@ -102,7 +102,7 @@ def files_of(
 def _library(
     request: Request, unroll: int | None, precision: Precision
 ) -> tuple[Library, str, RecordedSteps, PrecisionCost | None]:
-    """The filter as a library, its C, some steps of it by JAX, and what single precision costs."""
+    """The filter as a library, its C, recorded steps by JAX, and the cost of single precision."""
     problem, name, label = request[:3]
     contender = problem.contenders[name]
     single = precision is SINGLE

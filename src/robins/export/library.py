@@ -61,7 +61,7 @@ class StructField(NamedTuple):
 
     name: str
     leaf: Leaf
-    at: int  # in the reals or in all else
+    at: int  # offset in the reals or in all else
 
     @property
     def size(self) -> int:

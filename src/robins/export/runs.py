@@ -121,9 +121,9 @@ def _update_result(info: StepInfo) -> UpdateResult:
 def reset_function(filter_: Filter, start: Any) -> Any:
     """The entry point `reset`, ``(state, belief) -> (state, result)``.
 
-    The filter is `reset` as it was at the start, so that nothing is left of what it learned since,
-    not even of a state that is no longer finite. The entries of the factor above the diagonal
-    are ignored. A belief that is not finite is refused.
+    `Filter.reset` begins from the initial state, so that nothing learned since is left, not even of
+    a state that is no longer finite. The entries of the factor above the diagonal are ignored. A
+    belief that is not finite is refused.
     """
 
     def begin_anew(state: Any, belief: Belief):

@@ -107,7 +107,7 @@ class _Writer:
         return [("x", "x" in used), ("k", "k" in used), ("y", reals > 0), ("m", others > 0)]
 
     def _scope(self, scope: int, depth: int, only: set[Node] | None = None) -> None:
-        """Write the nodes of a scope, or those of them that are named."""
+        """Write the nodes of a scope, or only some of them."""
         for node in self.inner[scope]:
             if node not in self.names and (only is None or node in only):
                 self._node(node, depth)

@@ -86,11 +86,11 @@ def results_of(
     """Results of a jaxpr on arrays of nodes, from a template where there is one.
 
     Args:
-        calls: so far.
+        calls: calls and templates so far.
         graph: into which it is written.
         jaxpr: of the call.
         args: arrays of nodes.
-        write: walks through the jaxpr.
+        write: walks through the jaxpr, where there is no template.
     """
     if len(jaxpr.eqns) < WORTH:
         return write()

@@ -55,8 +55,8 @@ def cached_program(
 
     Args:
         parts: all that the program depends on: jaxprs, arrays, numbers, texts.
-        write: makes it.
-        interpreter: that carries out the tape.
+        write: writes the program.
+        interpreter: executes the tape.
 
     Raises:
         ProgramError: it cannot be made.
@@ -130,8 +130,8 @@ def cached_by_name(
     Args:
         what: the kind of the program.
         key: all that the program depends on.
-        write: makes it.
-        interpreter: that carries out the tape.
+        write: writes the program.
+        interpreter: executes the tape.
 
     Raises:
         ProgramError: it cannot be made.

@@ -105,7 +105,7 @@ class CompiledRounds:
             named: indices of the results that are kept of the first run only.
 
         Raises:
-            MemoryError: there is none for the rows of some rounds.
+            MemoryError: there is too little memory for the rows of the rounds.
         """
         inputs, results = self.program.inputs, self.program.results
         arrays = [

@@ -63,8 +63,8 @@ def most_bytes(
 
     Args:
         stages: in an order of computation.
-        given: what is there before and stays.
-        kept: what is needed in the end.
+        given: variables that exist before and stay.
+        kept: variables needed in the end.
     """
     stay = set(variables(given))
     most = here = sum(map(bytes_of, stay))

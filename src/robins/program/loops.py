@@ -163,7 +163,7 @@ class LoopBody:
     def __init__(
         self, equations: Sequence[Equation], axis: Along, wanted: Callable[[Variable], bool]
     ):
-        """Find what goes in and out.
+        """Find inputs and outputs.
 
         Args:
             equations: in an order of computation.
@@ -208,8 +208,8 @@ class LoopBody:
         """One round as a program: (number, carry, staying, rows) -> (next number, carry, rows).
 
         Args:
-            known: numbers of some that stay, which become part of the program.
-            zeros: of what is carried, by its number, the entries that are zero.
+            known: numbers of some variables that stay, which become part of the program.
+            zeros: by index of an argument, mask of its carried entries that are zero.
             unroll: as in `robins.program.trace`.
             calls: of earlier attempts.
 

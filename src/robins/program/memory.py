@@ -130,7 +130,7 @@ class NativeState:
         unroll: int | None = LIVE_UNROLL,
         lasting: bool = False,
     ):
-        """Take a state.
+        """Lay a state out in memory.
 
         Args:
             state: a pytree of arrays.
@@ -164,7 +164,7 @@ class NativeState:
 
     @property
     def state(self) -> PyTree:
-        """The state now."""
+        """Current state."""
         if self._pytree is None:
             reals, others = self._x[: self._reals].copy(), self._k[: self._others]
             self._pytree = self._reader.read(reals, others)

@@ -272,7 +272,7 @@ def split_stages(
 ) -> tuple[
     ArraySteps, dict[int, ArraySteps], dict[tuple[int, Along], AxisLoop], dict[Variable, int]
 ]:
-    """Equations as stages.
+    """Cut equations into stages.
 
     Args:
         equations: in an order of computation.
@@ -396,7 +396,7 @@ class StagedFunction:
 
     @property
     def refused(self) -> list[ProgramError | BuildError]:
-        """Reasons why parts stay with JAX, once it was called."""
+        """Reasons why parts stay with JAX; all are known after the first call."""
         arrays = (one for one in self._stages if isinstance(one, ArraySteps))
         loops = [loop.refused for loop in self.loops if loop.refused]
         return [*self._known_refused, *(why for one in arrays for why in one.refused), *loops]
@@ -430,5 +430,5 @@ class StagedFunction:
 
 
 def first_of(value: np.ndarray) -> np.ndarray:
-    """The first run of an array of runs, without holding the others."""
+    """First run of an array of runs, copied so that the others can be freed."""
     return value if value.shape[0] == 1 else value[:1].copy()

@@ -34,7 +34,7 @@ class Instruction:
     """An operation before its registers are known.
 
     Attributes:
-        code: its name; empty if registers are only set aside.
+        code: its name; empty if registers are only reserved.
         result: the place of a value.
         args: places of values.
         listed: places of values in a list, behind `numbers`.
@@ -78,7 +78,7 @@ class Writer:
         self.written: list[Instruction] = []
         self.around: dict[int, int] = {0: -1}
         self.spans: dict[int, tuple[int, int]] = {}
-        self.scope_of: dict[Value, int] = {}  # of a value, where it is written
+        self.scope_of: dict[Value, int] = {}  # the loop in which a value is written
         self._places: dict[Value, Place] = {}
         live = program.live
         self.results = [n for nodes in program.outputs for n in nodes.ravel().tolist()]
@@ -314,7 +314,7 @@ class Tape:
     Attributes:
         arrays: instructions, lists, constants with their registers, registers of the results.
         sizes: counts of instructions, constants, registers, scratch, and of what goes in and out.
-        address: of these, as `interpreter.cc` has them.
+        address: of the pointers and sizes, as `interpreter.cc` reads them.
     """
 
     def __init__(self, program: Program, codes: Mapping[str, int], flag: int):

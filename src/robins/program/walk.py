@@ -50,7 +50,7 @@ def rule(*names: str) -> Callable[[Rule], Rule]:
 
 @dataclass(frozen=True)
 class Leaf:
-    """An array among the arguments or results: what it is made of, and where in them it lies."""
+    """An array among the arguments or results: shape, type, kind, and path there."""
 
     shape: tuple[int, ...]
     dtype: Any

@@ -136,13 +136,13 @@ class ReplayComparison(NamedTuple):
     """Comparison of what a part sent in the record and in its replay."""
 
     node: str
-    frames: int  # that it sent the second time
+    frames: int  # number that it sent the second time
     same: bool  # byte for byte
     differences: list[FieldDifference]
     whole: bool  # neither record was cut or damaged
     damages: list[str]  # why not, a sentence a record
-    until_s: float  # what was compared ends there
-    planned_s: float  # the run was to end there
+    until_s: float  # end of what was compared
+    planned_s: float  # planned end of the run
     first_difference: str  # the first difference, in words, where the part was run again
     compared: int  # frames
 
