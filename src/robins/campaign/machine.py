@@ -80,7 +80,7 @@ class JaxMachine:
     name = "jax"
 
     def __init__(self, problem: Problem, why: Sequence[str] = ()):
-        """Trace nothing yet; why: notes on the choice of this machine."""
+        """Prepare batches, not traced yet; why: notes on the choice of this machine."""
         self.problem = problem
         self.notes = self._why = list(why)
         self._batch = batch_of(problem)

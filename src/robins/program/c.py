@@ -1,4 +1,4 @@
-"""A program as C99: one function, locals only, no allocation, no library but `math.h`.
+"""A program as C99: one function, locals only, no allocation, no library but libm.
 
 The text names every scalar once, in the order of computation; a scalar that is used once is
 written where it is used. Selects, comparisons and functions are calls of `scalars.h` and

@@ -36,7 +36,7 @@ NO_COMPILER = (
 
 
 class Language(NamedTuple):
-    """Language of compiled texts: C for single numbers, C++ for lanes (its `?:` takes vectors)."""
+    """Language of compiled texts: C for single numbers, C++ (``?:`` on vectors) for lanes."""
 
     suffix: str
     variable: str  # of the environment, that names the compiler

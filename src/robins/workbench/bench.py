@@ -272,7 +272,7 @@ def bench_node(
         name: of the part.
         port: to the bench, "/dev/ttyUSB0,460800".
         scenario: as for `bench_up`, with the same seed.
-        filter_: of the attitude determination.
+        filter_: of the part that runs one; by default that of the scenario.
         seed: of all noise.
         opened: called when the port is open.
 

@@ -169,9 +169,9 @@ def align(
 ) -> Outcome:
     """Align a recorded slave to its recorded master: doctor, clean, filter, measure.
 
-    What is believed of the two units is a scenario by name, "system/name" or the path of a TOML
-    file. What the master reported and the slave's inertial samples, along the axes of the slave,
-    are paths in any format of `robins.logs`. All else, and what is raised, is as of `replay`.
+    The model of the two units is a scenario by name, "system/name" or the path of a TOML file. The
+    outputs of the master and the inertial samples of the slave, along the axes of the slave, are
+    paths in any format of `robins.logs`. All other arguments and errors are as of `replay`.
     """
     _float64.require()
     system, label, text = find_scenario(name, recorded=True)

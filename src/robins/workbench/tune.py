@@ -79,7 +79,7 @@ def tune(
             "innovations", the log density of the measurements. By default the error of simulated
             runs; a log has no truth.
         system: of a log.
-        settings: "path=value" texts that change scenario and filter before.
+        settings: "path=value" texts that change scenario and filter beforehand.
         columns: TOML files that declare formats of the log's files.
         progress: called with the share done and what is being done.
         findings: called with the doctor's findings on a log.
