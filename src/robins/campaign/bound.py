@@ -34,7 +34,7 @@ from robins.systems.study import Case, Contender, Problem, StateBlock
 from robins.systems.tables import block_array
 
 _AT_ONCE = 128  # runs: histories of the information of each are held
-FEW = 1.0  # eigenvalue of the Gramian below which the prior still knows more of a direction
+FEW = 1.0  # eigenvalue of the Gramian below which the prior holds more on a direction
 _FEWEST, _MOST = 3, 6  # directions that are reported
 
 
@@ -52,10 +52,10 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
         ``bound_BLOCK`` (time, axis_BLOCK), one standard deviation; ``bound_prior_BLOCK``
         (axis_BLOCK) before the first step; ``bound_unaided_BLOCK`` with no sensor and
         ``bound_without_BLOCK`` (sensor, time, axis_BLOCK) without one of them;
-        ``bound_left_BLOCK`` (axis_BLOCK), the share of the prior that the measurements leave of the
-        start, process noise aside. Of the first run ``information`` (state, time), the bits gained
-        about the start, see `robins.filters.observability`; ``gramian`` (direction), the least
-        eigenvalues, with a coordinate that describes in words what each direction is made of; and
+        ``bound_left_BLOCK`` (axis_BLOCK), sigma of the initial state after all measurements over
+        its prior, without process noise. Of the first run ``information`` (state, time), the bits
+        gained about the start, see `robins.filters.observability`; ``gramian`` (direction), the
+        least eigenvalues, with a coordinate that describes each direction in words; and
         ``gramian_rank``. The attribute ``filter`` is the name.
 
     Raises:
@@ -106,7 +106,7 @@ def _of_all(bounded: ManyRuns, runs: int) -> tuple[dict[str, Data], np.ndarray, 
 
 
 def bound_sigma(problem: Problem, name: str, world: PyTree, machine: str = "vm") -> np.ndarray:
-    """(E, r) standard deviations of the reported components, no lower than any filter gets.
+    """(E, r) standard deviations of the reported components, which no filter can go below.
 
     Args:
         problem: whose components they are.
@@ -131,7 +131,7 @@ def bound_sigma(problem: Problem, name: str, world: PyTree, machine: str = "vm")
 
 
 def _share_left(rows: np.ndarray, L: np.ndarray, D: np.ndarray) -> np.ndarray:
-    """(r,) share of the prior that is left of the reported start; NaN if known."""
+    """(r,) posterior over prior sigma of the reported initial state; NaN if known."""
     begun = np.linalg.norm(rows * D, axis=1)
     known = begun == 0.0
     share = np.linalg.norm(rows @ (D[:, None] * L), axis=1) / np.where(known, 1.0, begun)
@@ -158,9 +158,10 @@ def _bounded(c: Contender, subsets: Array, world: Data) -> dict[str, Data]:
         world: the run, as the problem simulates it.
 
     Returns:
-        variance (V, E, r) by subset; prior (r,) variances; mean of the start; L (E, n, n) of the
-        Gramian with the first subset, and D (n,) its units; spoke (S,) true for sensors that ever
-        measured anything; rows (r, n) the reported combinations of the start, or None.
+        variance (V, E, r) by subset; prior (r,) variances; mean of the start; L (E, n, n) factors
+        of (I + W)^-1 with the Gramian W of the first subset, and D (n,) its units; spoke (S,) true
+        for sensors that ever measured anything; rows (r, n) the reported combinations of the start,
+        or None.
     """
     it = complete_case(c.filter, c.model, c.case(world))
     start = jax.tree_util.tree_map(jnp.asarray, _start(it))
@@ -211,7 +212,7 @@ def _states(
 ) -> tuple[list[str], np.ndarray]:
     """Names of the tangent components, and the sign with which they are reported.
 
-    A component takes the name of what reports it alone, others that of their place in the state.
+    A component takes the name of the axis that reports it alone, others that of their field.
     """
     names, sign = _named(mean), np.ones(rows.shape[1])
     for b in blocks:
@@ -239,8 +240,8 @@ def _named(mean: State) -> list[str]:
 
 
 def _information(names: list[str], sign: np.ndarray, L: np.ndarray, D: np.ndarray):
-    """Bits by state and time, and the directions of which least is known, in words."""
-    (open_,) = np.nonzero(D > 0.0)  # what is known from the start has no information to gain
+    """Information in bits by state and time, and the least observable directions, in words."""
+    (open_,) = np.nonzero(D > 0.0)  # a state known from the start gains no information
     labels = [names[i] for i in open_]
     values, vectors = spectrum(L[-1][np.ix_(open_, open_)])
     rank = int(np.sum(values >= NOTHING))

@@ -1,7 +1,7 @@
-"""Change from the interpreter of a campaign to compiled lanes, which have the same bits.
+"""Switch of a campaign from the interpreter to compiled lanes, which have the same bits.
 Interpreting begins at once and takes about twice as long as compiled lanes. The compiler runs in a
-thread of its own, along with the campaign, as soon as the runs that are left would save more than
-it takes; each loop changes over when its lanes are there.
+thread of its own, along with the campaign, as soon as it would save more time on the remaining runs
+than it takes; each loop switches when its lanes are compiled.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from robins.errors import RobinsError
 from robins.program.stages import AxisLoop, StagedFunction
 
-LOOP_S = 0.6  # of the compiler, for any loop
+LOOP_S = 0.6  # compile time of any loop
 NODE_S = 3e-4  # and for a node of its program (`benchmarks/campaigns.py --compile`)
 SAVED = 0.5  # of the interpreter's time, by compiled lanes (`benchmarks/program.py`)
 
@@ -31,7 +31,7 @@ class CompilationTrigger:
         self.compiling: threading.Thread | None = None
 
     def took(self, runs: int, seconds: float, left: int) -> None:
-        """Note the time of some runs, and compile the loops if that pays for those that are left.
+        """Record the time of some runs, and compile the loops if that pays for the rest.
 
         The first call only starts the record, as it may have traced the loops.
 

@@ -1,4 +1,4 @@
-"""A campaign's shards joined: its progress, and the statistics of all its runs."""
+"""Join of a campaign's shards: its progress, and the statistics of all its runs."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class CampaignState(NamedTuple):
         found: statistics by filter of all shards that are there and whole, joined in the order of
             the runs: sums have the same bits on every worker, at any time.
         done: number of runs of each filter among these.
-        damaged: shards whose checksum does not fit.
-        lacking: number of shards that are not there or damaged.
+        damaged: shards whose checksum does not match.
+        lacking: number of shards that are missing or damaged.
     """
 
     found: dict[str, Statistics]
@@ -35,12 +35,12 @@ class CampaignState(NamedTuple):
 
     @property
     def digest(self) -> str | None:
-        """SHA-256 of the final table; None as long as it is not final."""
+        """SHA-256 of the final statistics; None while shards are missing."""
         return None if self.lacking else digest(self.found)
 
 
 def blank_statistics(problem: Problem | None) -> Statistics:
-    """Statistics of no runs; without a problem they can be joined, and give no figures."""
+    """Statistics of no runs; without a problem they can be merged but give no figures."""
     return Statistics(()) if problem is None else Statistics.of(problem)
 
 
@@ -75,7 +75,7 @@ def gather(store: Store, plan: CampaignPlan, problem: Problem | None = None) -> 
 
 
 def example_of(problem: Problem, name: str) -> PyTree:
-    """The tree of the record of a run, without its numbers."""
+    """Record of a run as shapes and types, without its numbers."""
     one, blocks = contender(problem, name), blocks_of(problem)
     number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
     return jax.eval_shape(lambda k: one_record(blocks, one, problem.simulate(k)), number)

@@ -1,10 +1,9 @@
-"""Percentiles of many numbers by counting: whole numbers, which join exactly in any order.
+"""Percentiles of many numbers by histograms, whose counts merge exactly in any order.
 
-Bins have equal ratios, 32 of them a decade, from 1e-18 to 1e18; what is below or above has a bin of
-its own. A percentile is reported as the geometric middle of its bin, and so to 3.7 % at worst. Only
-bins that hold something are kept, as a table (2, M): a row of increasing numbers, each of a place
-and a bin, and a row of how many are there. A table grows with what differs, not with what is
-counted.
+Bins are logarithmic, 32 a decade from 1e-18 to 1e18, with one more bin below and one above. A
+percentile is reported as the geometric middle of its bin, with an error of 3.7 % at worst. Only
+occupied bins are kept, as a table (2, M): a row of increasing keys, each of a place and a bin, and
+a row of their counts. A table grows with the number of occupied bins, not of runs.
 """
 
 from __future__ import annotations
@@ -22,13 +21,13 @@ _TOLD = np.concatenate([[0.0], np.sqrt(EDGES[:-1] * EDGES[1:]), [np.inf]])
 
 
 def histogram_of(values: np.ndarray) -> np.ndarray:
-    """The table of (runs, places) numbers, none negative or NaN."""
+    """Table of numbers (runs, places), none negative or NaN."""
     keys = np.arange(values.shape[1]) * _BINS + np.searchsorted(EDGES, values, side="right")
     return np.stack(np.unique(keys, return_counts=True)).astype(np.int32)
 
 
 def merged_histograms(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The table of what two tables count."""
+    """Table of the counts of two tables together."""
     keys, places = np.unique(np.concatenate([a[0], b[0]]), return_inverse=True)
     counts = np.zeros(len(keys), np.int32)
     np.add.at(counts, places, np.concatenate([a[1], b[1]]))
@@ -36,7 +35,7 @@ def merged_histograms(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def percentiles(table: np.ndarray, places: int, percents: Sequence[int]) -> np.ndarray:
-    """(places, percents) the least numbers that so many percent of each place do not exceed.
+    """(places, percents) percentiles: least numbers that so many percent do not exceed.
 
     Args:
         table: of at least one number at each place.

@@ -58,19 +58,19 @@ from robins.program.stages import StagedFunction
 from robins.systems.study import Problem
 
 MACHINES = ("vm", "c", "jax")
-BETWEEN_S = 1.0  # between two times that memory is given back
+BETWEEN_S = 1.0  # between two releases of memory
 COMPILERS = 3  # at once, in addition to that of the worlds: some take a gigabyte
 NUMBER = jax.ShapeDtypeStruct((), int)  # shape of the number of a run
 STACK = 1 << 28  # bytes of a thread's stack, on which lanes hold all that a step computes
 
-Taken = Callable[[str, Any], Any]  # of a filter's name and its record of a chunk: what is kept
+Taken = Callable[[str, Any], Any]  # (filter's name, its record of a chunk) -> what is kept
 
-# The world of the first run, with the first chunk; how many runs count; what is kept of a filter.
+# World of the first run (with the first chunk), number of runs, what is kept by filter.
 Simulated = tuple[Any, int, Callable[[str], Any]]
 
 
 def whole_record(name: str, record: PyTree) -> PyTree:
-    """All of a record."""
+    """Keep all of a record."""
     return record
 
 
@@ -80,7 +80,7 @@ class JaxMachine:
     name = "jax"
 
     def __init__(self, problem: Problem, why: Sequence[str] = ()):
-        """Trace nothing yet; why: notes on the choice of this machine."""
+        """Prepare batches, not traced yet; why: notes on the choice of this machine."""
         self.problem = problem
         self.notes = self._why = list(why)
         self._batch = batch_of(problem)
@@ -136,7 +136,7 @@ class JaxMachine:
 
     def _of(self, held: list[PyTree], count: int, taken: Taken, name: str) -> PyTree:
         if name in self._programs:
-            self._programs[name].result()  # which serves the call
+            self._programs[name].result()  # wait for it: the call uses it
         return taken(name, record(self.problem, name, held[0], count))
 
     def compute(
@@ -169,7 +169,7 @@ class LaneMachine:
 
     Attributes:
         name: "c" where the programs are compiled, "vm" where they are interpreted first.
-        bytes_of_run: about the most memory that the histories of a run take at once.
+        bytes_of_run: approximate peak memory of the histories of a run.
     """
 
     def __init__(self, problem: Problem, name: str = "vm"):
@@ -183,7 +183,7 @@ class LaneMachine:
         self._hand_over = CompilationTrigger(stages) if name == "vm" else None
 
     def _staged(self, name: str, named: bool = False) -> StagedFunction:
-        """The record of a filter; named: in two parts, of which the second is that of one run."""
+        """Record of a filter; named: in two parts, of which the second is kept of one run."""
         problem = self.problem
         one = partial(one_record, blocks_of(problem), contender(problem, name), over=one_by_one)
         return StagedFunction(
@@ -213,8 +213,8 @@ class LaneMachine:
         Args:
             runs: number of runs.
             chunk: runs at a time; not given, by the memory that they need.
-            taken: what is kept of the record of a filter, found in the thread that computed it.
-                What figures show of one run has a leading axis of one there.
+            taken: what is kept of the record of a filter, called in the thread that computed it.
+                Arrays that figures show of one run have a leading axis of one there.
         """
         width = chunk or self.width(runs)
         workers = concurrent_chunks(self.bytes_of_run, width, available_cores())
@@ -278,13 +278,13 @@ class LaneMachine:
         return self._simulate(np.arange(begin, begin + width))
 
     def _of(self, name: str, world: PyTree, count: int, taken: Taken) -> PyTree:
-        """Run a filter, and keep what is `taken` of its record without the runs that fill up."""
+        """Run a filter, and keep what is `taken` of its record without the padding runs."""
         return taken(name, rejoined_record(*first_runs(self._filters[name](world), count)))
 
     def _chunk(
         self, begin: int, width: int, count: int, names: Iterable[str], taken: Taken, left: int
     ) -> dict[str, PyTree]:
-        """Compute the filters of some runs, and note how long that took; as of `compute`."""
+        """Compute the filters of some runs, and record the time that took; as `compute`."""
         begun, world = thread_time(), self._worlds(begin, width, count)
         found = {name: self._of(name, world, count, taken) for name in names}
         if self._hand_over is not None:
@@ -294,7 +294,7 @@ class LaneMachine:
 
 @contextmanager
 def threads(count: int) -> Iterator[ThreadPoolExecutor]:
-    """Threads with a stack large enough for lanes and compilers; what waits for one is dropped."""
+    """Threads with stacks large enough for lanes and compilers; pending work is cancelled."""
     before = threading.stack_size(STACK)
     pool = ThreadPoolExecutor(count)
     try:
@@ -315,14 +315,14 @@ def with_stack(function: Callable[[], PyTree]) -> PyTree:
 
 
 def first_worlds(problem: Problem, count: int) -> State:
-    """The first runs of a problem, with a leading axis, by the interpreter where it can be."""
+    """First runs of a problem, with a leading axis, by the interpreter where possible."""
     sys.audit("robins.simulate", count)  # counted by tests
     simulate = StagedFunction(problem.simulate, NUMBER, engine=interpreted_rounds)
     return jax.device_put(with_stack(lambda: simulate(np.arange(count))))
 
 
 def first_run(world: PyTree) -> PyTree:
-    """First of the worlds with a leading axis of runs, holding none of the others."""
+    """First world of a leading axis of runs, copied so that the others can be freed."""
 
     def first(x: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -333,7 +333,7 @@ def first_run(world: PyTree) -> PyTree:
 
 
 def one_by_one(function: Callable[..., PyTree], rows: PyTree) -> PyTree:
-    """All rows one after the other: a loop, which lanes can do."""
+    """Apply a function to one row after the other: a loop, which lanes support."""
     return jax.lax.map(function, rows)
 
 
@@ -345,7 +345,7 @@ def available_cores() -> int:
 
 
 def check_machine(name: str) -> None:
-    """Refuse a machine that is not there, before anything is computed.
+    """Refuse a machine that is not available, before anything is computed.
 
     Raises:
         RobinsError: there is no such machine, or no compiler for it.

@@ -34,7 +34,7 @@ class ManyRuns:
         self._first: list[Any] = []  # leaves of the first point
         self._differ: list[int] = []  # those that are arguments
         self._staged: StagedFunction | None = None
-        self._refused: list[str] = []  # reasons of programs that others replaced
+        self._refused: list[str] = []  # reasons of programs since replaced
 
     def __call__(
         self,
@@ -94,7 +94,7 @@ class ManyRuns:
     def _traced(
         self, point: Tree, numbers: Mapping[int, np.ndarray], arrays: Tree
     ) -> StagedFunction:
-        """The function as one of the numbers that differ, and of a run."""
+        """The function, staged, with the numbers that differ and a run as arguments."""
         tree, fixed = jax.tree_util.tree_structure(point), dict(enumerate(self._first))
 
         def function(numbers: Mapping[int, Any], of_run: Tree) -> Tree:

@@ -1,4 +1,4 @@
-"""Number of runs of a chunk and of chunks computed at once, so that memory has a bound.
+"""Runs of a chunk, and chunks computed at once, within a bound on memory.
 
 A chunk is as wide as the histories of its runs allow, by what the stages of a run hold at once. The
 width depends on the problem and not on the machine's cores: results that JAX sums in batches have
@@ -12,13 +12,13 @@ import sys
 
 LEAST = 8  # runs of a chunk: the lanes of a processor
 CHUNK = 64  # runs of a chunk at most: they fill a core's vectors, and more would not fit its cache
-SOME = 32  # with which the interpreter takes as long for a run as with 48
+SOME = 32  # runs of a chunk; a run takes the interpreter as long as with 48
 CHUNK_BYTES = 192 << 20  # of a chunk in lanes, of which several are computed at once
 MEMORY = 768 << 20  # bytes of all chunks at once
 
 
 def filled(runs: int, most: int = CHUNK) -> int:
-    """Runs of a chunk where memory does not matter: all of a few, `most` of more than half as many.
+    """Runs of a chunk regardless of memory: all, up to half of `most`; else `most`.
 
     The last chunk is filled up, so that 50 and 1000 runs need one program.
     """
@@ -41,7 +41,7 @@ def concurrent_chunks(bytes_of_run: int, width: int, cores: int) -> int:
 
 
 def memory_note(bytes_of_run: int, width: int) -> list[str]:
-    """A note, where a chunk alone is more than the bound."""
+    """A note where one chunk alone exceeds the bound."""
     needed = width * bytes_of_run
     if needed <= MEMORY:
         return []

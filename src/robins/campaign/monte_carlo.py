@@ -3,7 +3,7 @@
 A chunk is the unit of everything: of compilation (one shape, the last chunk padded), of memory, of
 progress and, for stores and clusters, of work. Run number k draws the same random numbers in any
 chunk of any campaign. A chunk of worlds is simulated once, and every filter sees it; filters that
-differ in numbers only share what was compiled for them.
+differ only in numbers share compiled code.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from robins.systems.study import Case, Contender, Problem
 from robins.systems.suspects import probabilities
 from robins.systems.tables import updates
 
-Blocks = tuple[tuple[str, int, int], ...]  # name, first and last of the reported components
+Blocks = tuple[tuple[str, int, int], ...]  # name, first and end of its reported components
 
 
 def _kept(step: Step) -> PyTree:
@@ -73,7 +73,7 @@ def run_case(
 ) -> tuple[PyTree, Case, Tally]:
     """Kept parts of the steps of a filter, its case with all its inputs, and the tally.
 
-    A case in closed loop knows its truth and its measurements only when the filter has run.
+    A case in closed loop has its truth and measurements only after the filter has run.
     """
     if case.loop is None:
         done = run(filter_, model, case.start, case.y, case.u, case.aux, keep=keep)
@@ -86,14 +86,14 @@ def run_case(
 
 
 def complete_case(filter_, model, case: Case) -> Case:
-    """A case with all its inputs; in closed loop it takes the filter to know them."""
+    """A case with all its inputs; in closed loop the filter is run to find them."""
     if case.loop is not None:
         return run_case(filter_, model, case, nothing)[1]
     checked(model, case.y, case.u, case.aux)
     return case
 
 
-Over = Callable[[Callable[..., Any], Any], Any]  # a function of a row, on all rows of some arrays
+Over = Callable[[Callable[..., Any], Any], Any]  # maps a function over the rows of arrays
 
 
 def at_once(function: Callable[..., PyTree], rows: PyTree) -> PyTree:
@@ -104,7 +104,7 @@ def at_once(function: Callable[..., PyTree], rows: PyTree) -> PyTree:
 def one_record(
     blocks: Blocks, contender: Contender, world: PyTree, over: Over = at_once
 ) -> dict[str, PyTree]:
-    """One run of one filter, to what statistics need."""
+    """Record of one run of one filter: what statistics need."""
     steps, case, tally = run_case(contender.filter, contender.model, contender.case(world), _kept)
     posterior, info, moved = steps
     rows, along = reported_rows(contender.reported, case)
@@ -133,10 +133,10 @@ def _records(filter_, blocks: Blocks, model, case, reported, worlds) -> dict[str
 
 
 def _each(one: Callable[[PyTree], PyTree], many: PyTree) -> PyTree:
-    """`one` of each run of a batch.
+    """Apply `one` to each run of a batch.
 
-    A run alone is not made a batch of one: its branches stay branches, and it has the very bits of
-    `run` or `run_closed`, which a batch has to rounding only.
+    A single run is not vectorised: its branches stay branches, and it has the bits of `run` or
+    `run_closed`, which a batch has to rounding only.
     """
     leaves, shape = jax.tree_util.tree_flatten(many)
     if leaves[0].shape[0] > 1:
@@ -173,7 +173,7 @@ def batch_of(problem: Problem) -> PyTree:
 def bytes_of_batch(problem: Problem, batch: PyTree, width: int) -> int:
     """Approximate peak memory of JAX for a chunk of so many runs.
 
-    What is traced for it serves again when a chunk of this width is computed.
+    The traces are used again when a chunk of this width is computed.
 
     Args:
         problem: to be simulated.
@@ -201,7 +201,7 @@ def _given(problem: Problem, name: str) -> tuple:
 
 
 def contender(problem: Problem, name: str) -> Contender:
-    """A contender of a problem, as data: what was compiled for another of its kind serves again.
+    """A contender of a problem, as data, so that contenders of one kind share compiled code.
 
     Raises:
         ValueError: there is none of this name.
@@ -218,8 +218,8 @@ def record(problem: Problem, name: str, worlds: PyTree, count: int) -> dict[str,
     Returns:
         NumPy records with a leading axis of ``count`` runs. Of the reported components error and
         sigma (E, r) and block_nees by block; of the state mean, nees (E,) and dim (); by sensor
-        updates, each an `Update`, and readings; by name the outputs; by suspect the probability
-        that it is wrong (E,); the tally of its steps.
+        updates, each a `robins.systems.tables.SensorUpdates`, and readings; by name the outputs; by
+        suspect the probability that it is wrong (E,); the tally of its steps.
 
     Raises:
         ValueError: there is no such contender.
@@ -232,7 +232,7 @@ def blocks_of(problem: Problem) -> Blocks:
     return tuple((b.name, b.where.start, b.where.stop) for b in problem.blocks)
 
 
-_NEEDED = ("innovation", "sigma", "nis", "dof")  # of each run's updates, by its statistics
+_NEEDED = ("innovation", "sigma", "nis", "dof")  # fields of updates that statistics use
 
 
 def split_record(record: dict[str, PyTree]) -> tuple[dict[str, PyTree], dict[str, PyTree]]:
@@ -246,7 +246,7 @@ def split_record(record: dict[str, PyTree]) -> tuple[dict[str, PyTree], dict[str
 
 
 def rejoined_record(needed: dict[str, PyTree], named: dict[str, PyTree]) -> dict[str, PyTree]:
-    """The record of `split_record`; the leading axis of what is shown of one run is one."""
+    """Inverse of `split_record`; arrays of the first run only have a leading axis of one."""
     updates = {name: u._replace(**needed["updates"][name]) for name, u in named["updates"].items()}
     return needed | {"mean": named["mean"], "updates": updates}
 

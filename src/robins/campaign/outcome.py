@@ -1,4 +1,4 @@
-"""A campaign's answer: every filter of a problem, on the same random numbers, as one outcome."""
+"""Outcome of a campaign: all filters of a problem on the same random numbers."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def simulate(
     Raises:
         RobinsError: the machine is not available.
 
-    An error while something is made of the statistics takes their arrays along, by filter, for
+    An error in the evaluation of the statistics carries their arrays, by filter, for
     `robins.results.rescued` to write.
     """
     names = list(problem.contenders)
@@ -112,7 +112,7 @@ def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray
 
 
 def _finds(problem: Problem, name: str, s: Statistics) -> list[str]:
-    """Sentences on the instruments that a filter finds wrong, with the time."""
+    """Sentences on the instruments that a filter finds faulty, with the time of the first alarm."""
     if s.runs == 1:
         return sentences(name, problem.epoch_s, s.first_run.get("wrong", {}))
     remarks, suspects = [], s.suspects
@@ -167,7 +167,7 @@ def _metrics(
 def _claims(
     problem: Problem, found: dict[str, Statistics], bound: np.ndarray | None, metrics: Metrics
 ) -> Verdicts:
-    """Verdicts, with intervals by draws of the runs, the same runs for all filters."""
+    """Verdicts with bootstrap intervals; the draws of runs are the same for all filters."""
     claims, runs = problem.claims(metrics), {s.runs for s in found.values()}
     if not claims or len(runs) > 1 or (count := runs.pop()) < 2:
         return claims
@@ -306,7 +306,7 @@ def _wrong(problem: Problem, found: dict[str, Statistics]) -> dict[str, xr.Varia
 def _notes(found: dict[str, Statistics]) -> dict[str, Any]:
     """Notes of rules in the first run, NaN for filters that have no such rule.
 
-    With several sensors the last one's are those of the step.
+    With several sensors, the notes of the last one stand for the step.
     """
     of: dict[str, dict[str, np.ndarray]] = {}
     for name, s in found.items():

@@ -52,7 +52,7 @@ class CampaignPlan:
     """A campaign, as written in `campaign.json`.
 
     Attributes:
-        asked: address of its system: a name of `robins list`, or a file.
+        asked: its scenario as requested: a name of `robins list`, or a file.
         scenario: its name.
         text: TOML, with what the command line changed.
         seed: of all noise.
@@ -107,7 +107,7 @@ class CampaignPlan:
         return Chunk(run // self.width, begin, min(self.width, self.runs - begin))
 
     def with_more(self, runs: int, filters: tuple[str, ...]) -> CampaignPlan:
-        """The plan of as many runs and of these filters too."""
+        """The plan extended to as many runs and to these filters."""
         both = tuple(dict.fromkeys((*self.filters, *filters)))
         return replace(self, runs=max(runs, self.runs), filters=both)
 
@@ -117,7 +117,7 @@ def _hash(data: Any) -> str:
 
 
 def write(store: Store, plan: CampaignPlan) -> None:
-    """Put a plan in the place of that which is there."""
+    """Write a plan, in place of an earlier one."""
     data = {"schema": SCHEMA} | asdict(plan)
     store.put(NAME, f"{json.dumps(data, indent=2)}\n".encode(), overwrite=True)
 
@@ -150,7 +150,7 @@ def _check(plan: CampaignPlan) -> None:
     """Refuse a plan that cannot be cut into chunks.
 
     Raises:
-        TypeError, ValueError: a field is of another type, or counts nothing.
+        TypeError, ValueError: a field is of another type, or a count is not positive.
     """
     for field in fields(plan):
         value = getattr(plan, field.name)
@@ -188,12 +188,12 @@ def code_of(asked: str, text: str) -> str:
     """Hash of all code that a shard depends on.
 
     Args:
-        asked: address of the system; a file of a user's own counts with the local modules that
+        asked: the scenario as requested; a file of a user's own counts with the local modules that
             it imports.
         text: of the scenario, which may name such a file.
     """
     sha = hashlib.sha256(_of_package().encode())
-    sha.update(os.environ.get("XLA_FLAGS", "").encode())  # by which JAX rounds
+    sha.update(os.environ.get("XLA_FLAGS", "").encode())  # they change the rounding of JAX
     named: Mapping[str, Any] = scenario.mapping_of(text)
     folder = Path(asked).parent if asked.endswith(".toml") else Path()
     for path in dict.fromkeys((Path(asked), folder / str(named.get("system", "")))):

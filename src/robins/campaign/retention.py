@@ -1,11 +1,11 @@
-"""Runs of which a campaign keeps the histories: those that are named, and the first that diverge.
+"""Retention of histories in a campaign: of named runs, and of the first that diverge.
 
-The histories of a run are a shard of that run alone, with its record, under the name of the shard
-that it belongs to. They are put before that shard: where a shard is, its histories are.
+The histories of a run are a shard of that run alone, with its record, named after the shard that it
+belongs to. They are stored before that shard: where a shard exists, so do its histories.
 
-Workers agree on nothing here either. Each puts those of its own chunk that may be among the first,
-and after that drops what is beyond the first of all that are there: what stays is the same in any
-order, and never much more is there.
+Workers do not coordinate. Each stores those of its own chunk that may be among the first, and then
+drops all beyond the first in the store: the rest does not depend on the order, and the surplus
+stays small.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def name_of(group: str, shard: Shard, run: int) -> str:
 
 
 def by_stem(shards: Mapping[Chunk, list[Shard]]) -> dict[str, Shard]:
-    """The shards of a campaign, as those to which histories belong."""
+    """Shards of a campaign by stem, to find the shard of a history."""
     return {shard.stem: shard for some in shards.values() for shard in some}
 
 
@@ -47,7 +47,7 @@ def histories(
     Args:
         store: of the campaign.
         group: `NAMED` or `DIVERGED`.
-        shards: `by_stem`; histories of others are of no run of this campaign.
+        shards: of `by_stem`; histories of other shards are left out.
     """
     found: dict[str, list[RunHistories]] = {}
     for name in store.names(group):
@@ -59,7 +59,7 @@ def histories(
 
 
 def trim(store: Store, shards: Mapping[str, Shard], name: str, most: int) -> None:
-    """Drop the histories of diverged runs of a filter that are beyond so many first ones."""
+    """Drop the histories of diverged runs of a filter beyond the first `most`."""
     for history in histories(store, DIVERGED, shards).get(name, [])[most:]:
         store.drop(history.name)
 
@@ -79,7 +79,7 @@ def content_of(store: Store, shard: Shard, run: int) -> bytes | None:
 
 
 def damaged(store: Store, shards: Mapping[str, Shard]) -> dict[str, Shard]:
-    """Histories whose checksum does not fit, each with the shard that it belongs to."""
+    """Histories whose checksum does not match, each with the shard that it belongs to."""
     found = {}
     for group in (NAMED, DIVERGED):
         for of in histories(store, group, shards).values():

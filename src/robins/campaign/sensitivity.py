@@ -1,17 +1,17 @@
 """Shares of the variance of an error that come from each uncertain parameter.
 
-Let Y = f(p_1 .. p_d) be an error and the parameters independent. With X ~ p_i all of them but one,
+Let Y = f(p_1 .. p_d) be an error and the parameters independent. With X ~ p_i all of them but p_i,
 
     first order  S_i  = Var(E(Y | p_i)) / Var(Y)        what would go if p_i were known
     total        ST_i = E(Var(Y | X ~ p_i)) / Var(Y)    what would stay if all others were known
 
 (Sobol 2001, Math. Comput. Simulation 55). S_i <= ST_i; the total has the interactions with other
-parameters too. Both are estimated by Saltelli et al. (2010, Comput. Phys. Commun. 181), as scipy
-has it, from two samples A and B of n points and for each parameter A with its column of B.
+parameters too. Both are estimated by Saltelli et al. (2010, Comput. Phys. Commun. 181), as in
+SciPy, from two samples A and B of n points and for each parameter A with its column of B.
 
-Here the world varies and the filter does not: it believes the scenario as written. The numbers that
-vary are data of one program, which is possible because parameters are records that take what JAX
-traces in the place of a number.
+Here the world varies and the filter does not: it assumes the scenario as written. The numbers that
+vary are data of one program, which is possible because records of parameters accept tracers of JAX
+in place of numbers.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ Path = tuple[str | int, ...]  # names of fields and numbers of items, from the p
 
 
 class ParameterRange(NamedTuple):
-    """The numbers of the parameters that one key stands for, such as three axes, and their ends."""
+    """Numbers that one key of the parameters stands for, such as three axes, and their ends."""
 
     paths: tuple[Path, ...]
     low: tuple[float, ...]  # SI
@@ -77,7 +77,7 @@ def one_at(share: Data, low: float, high: float, by_logarithm: bool) -> Data:
 
 
 def between(low: Any, high: Any) -> ParameterRange:
-    """Differences between two sets of parameters.
+    """Range between two sets of parameters.
 
     Raises:
         ValueError: nothing differs, or something that is not a number.
@@ -142,7 +142,7 @@ class SensitivityRuns(NamedTuple):
         Returns:
             (blocks,) mean over the epochs that count of the squared length of the error, infinite
             where the filter diverged, as `robins.campaign.Statistics` has it; and a number that
-            changes with what the filter believes at the start.
+            changes with the initial belief of the filter.
         """
         numbers: dict[Path, Any] = {}
         for k, one in enumerate(self.ranges):
@@ -161,7 +161,7 @@ class SensitivityRuns(NamedTuple):
 
 
 def _believed(start: Any) -> Array:
-    """A number of a belief to which each of its standard deviations adds, whatever its unit."""
+    """Sum of the log variances of a belief: any standard deviation changes it, in any unit."""
     if not isinstance(start, Belief):
         return jnp.zeros(())
     size = jnp.sum(jnp.asarray(start.factor, float) ** 2, axis=-1)
@@ -169,7 +169,7 @@ def _believed(start: Any) -> Array:
 
 
 def follows(believed: np.ndarray) -> list[bool]:
-    """True for each parameter that the belief at the start of a run follows.
+    """True for each parameter that changes the initial belief of the filter.
 
     Args:
         believed: (d + 2, n, runs), as of `simulate_points` at the points of `sobol_points`.
@@ -178,11 +178,11 @@ def follows(believed: np.ndarray) -> list[bool]:
 
 
 def course_differs(before: Any, course: Any, after: Any) -> bool:
-    """True if a course differs from another, by all that can be compared of it.
+    """True if two courses differ in anything that can be compared.
 
     Args:
         before: a course.
-        course: of the same parameters, laid out again: what differs here does not count.
+        course: of the same parameters, laid out again: differences from it do not count.
         after: of other parameters.
     """
     first, again, other = (list(_parts(x)) for x in (before, course, after))
@@ -227,12 +227,12 @@ def simulate_points(
     runs: int,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """All runs of all points.
+    """Simulate all runs at all points.
 
     Args:
         budget: what is run.
         shares: (points, d).
-        runs: the same ones, with the same random numbers, at all points.
+        runs: number of runs, with the same random numbers at all points.
         progress: called with the share done.
 
     Returns:
@@ -328,7 +328,7 @@ def labelled(
     blocks: Sequence[StateBlock],
     found: Indices,
 ) -> xr.Dataset:
-    """Arrays of a result: indices of each block, RMS errors and places of all points.
+    """Arrays of a result: indices of each block, RMS errors and shares of all points.
 
     Args:
         name: of the filter.

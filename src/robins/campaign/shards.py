@@ -31,8 +31,8 @@ def pack(about: Mapping[str, Any], statistics: Statistics) -> bytes:
     """A shard as bytes.
 
     Args:
-        about: what it is of, plain data.
-        statistics: of a chunk; the record of its first run goes along where it is there.
+        about: identification of the shard, plain data.
+        statistics: of a chunk; the record of its first run is included if it is there.
     """
     arrays: dict[str, Any] = dict(tables(statistics))
     arrays |= {
@@ -62,7 +62,7 @@ def unpack(content: bytes, into: Statistics, example: PyTree = None) -> dict[str
         example: the tree of the record of a run, to be filled with its leaves; None: leave them.
 
     Returns:
-        What it is of.
+        Its identification.
 
     Raises:
         DamagedShardError: the content is cut or changed.

@@ -33,7 +33,7 @@ class Statistics:
         runs: added so far.
         diverged: runs whose error or covariance stopped being finite; they stay in the count, and
             every statistic that they touch is infinite rather than flattered.
-        n: tangent dimension of the filter's state, which may have more than is reported.
+        n: tangent dimension of the filter's state, which may exceed the reported components.
         example: the record of the first run, for figures.
         sums: over the runs, arrays by name.
         each: of every run, by name arrays with a leading axis of runs, one a chunk.
@@ -58,11 +58,11 @@ class Statistics:
 
     @classmethod
     def of(cls, view: View | Statistics) -> Statistics:
-        """Statistics of no runs yet, of what a problem wants, or other statistics."""
+        """Statistics of no runs yet, with the settings of a problem or of other statistics."""
         return cls(**{name: getattr(view, name) for name in _WANTED})
 
     def add(self, record: dict[str, PyTree]) -> None:
-        """Take in a chunk as `robins.campaign.record` gives it."""
+        """Add a chunk of records of `robins.campaign.record`."""
         error, sigma = record["error"], record["sigma"]
         if self.example is None:
             self.example = jax.tree_util.tree_map(lambda x: np.array(x[0]), record)
@@ -121,7 +121,7 @@ class Statistics:
         return Statistics.of(self)
 
     def resampled(self, draws: np.ndarray) -> Iterator[Statistics]:
-        """The statistics of other choices of the runs, for a bootstrap.
+        """Statistics of resampled runs, for a bootstrap.
 
         Sums over the runs at each epoch cannot be formed again, and are NaN there: figures pooled
         over the epochs are those of the runs drawn.
@@ -181,9 +181,10 @@ class Statistics:
                 self._each(f"peaks of {norm.name}", np.stack(worst, axis=1))
 
     def _suspected(self, wrong: Mapping[str, np.ndarray]) -> None:
-        """Mean probability; by run the first alarm, false alarms, and delays of detection.
+        """Add probabilities of suspects; by run first alarm, false alarms, and detection delays.
 
-        A suspect alarms above `HELD`. A fault is a run of epochs, detected by an alarm within it.
+        An alarm is a probability above `HELD`. A fault is a span of epochs, detected by an alarm
+        within it.
         """
         for name, chance in wrong.items():
             held = chance > HELD
@@ -220,7 +221,7 @@ class Statistics:
 
     @property
     def lost(self) -> np.ndarray:
-        """(runs,) which of them diverged."""
+        """(runs,) flags of those that diverged."""
         return self._all("lost")
 
     @property
@@ -235,13 +236,14 @@ class Statistics:
 
     @property
     def thinned(self) -> np.ndarray:
-        """(T,) numbers of the epochs of `covariance` and `percentiles`."""
+        """(T,) indices of the epochs of `covariance` and `percentiles`."""
         return thinned(len(self.sums["error"]))
 
     def covariance(self, block: StateBlock) -> np.ndarray:
         """(T, k, k) covariance of the errors of a block; NaN of one run, infinite if one diverged.
 
-        From sums of products, so that it has lost digits where the mean is far beyond the scatter.
+        It is computed from sums of products, and loses digits where the mean far exceeds the
+        scatter.
         """
         k, at = len(block.axes), self.thinned
         if self.diverged or self.runs < 2:
@@ -257,7 +259,7 @@ class Statistics:
     def percentiles(self, block: StateBlock) -> np.ndarray:
         """(T, 4) lengths of the error of a block that `PERCENTS` of the runs do not exceed.
 
-        To the width of a bin, see `robins.campaign.histogram`; a diverged run is beyond all.
+        They are accurate to a bin of `robins.campaign.histogram`; a diverged run is beyond all.
         """
         return percentiles(self.bins[block.name], len(self.thinned), PERCENTS)
 
@@ -281,7 +283,7 @@ class Statistics:
         return self._all("peaks")
 
     def norm_peaks(self, name: str) -> np.ndarray:
-        """(runs, windows) the same of a norm."""
+        """(runs, windows) largest value of a norm of the error in each window."""
         return self._all(f"peaks of {name}")
 
     def output_rms(self, name: str) -> np.ndarray:
@@ -298,7 +300,7 @@ class Statistics:
 
     @property
     def run_rms(self) -> np.ndarray:
-        """(runs, r)."""
+        """(runs, r) root mean square error of each run over the epochs counted."""
         return self._all("rms")
 
     @property
@@ -326,7 +328,7 @@ class Statistics:
         return self.sums[f"within {limit}"] / self.runs
 
     def settled(self, limit: str) -> np.ndarray:
-        """(runs,) number of the epoch from which on a run is within a limit; E: never."""
+        """(runs,) index of the epoch from which on a run is within a limit; E: never."""
         return self._all(f"settled {limit}")
 
     @property
@@ -348,7 +350,7 @@ class Statistics:
         return self._all(f"false alarms of {suspect}")
 
     def delays(self, suspect: str) -> np.ndarray:
-        """(runs, faults) epochs from the begin of each fault to its detection; -1: none."""
+        """(runs, faults) epochs from the start of each fault to its detection; -1: none."""
         return self._all(f"delay {suspect}")
 
     @property
@@ -364,7 +366,7 @@ class Statistics:
         return Tally(found.pop("predictions")[""], **found)
 
     def overall_ratio(self) -> np.ndarray:
-        """(r,) RMS error over stated sigma, both pooled over the epochs counted; one is right."""
+        """(r,) RMS error over stated sigma, both pooled over the epochs counted; ideally 1."""
         return self.pooled_rms / self.pooled_sigma
 
     def ratio_bounds(self, level: float = 0.99) -> np.ndarray:
@@ -383,7 +385,7 @@ class Statistics:
         return self.sums["nees"] / (self.runs * self.n)
 
     def anees_band(self, level: float = 0.95) -> np.ndarray:
-        """(2,) band of `anees`."""
+        """(2,) chi-square band of `anees` at this level."""
         return chi2_band(self.n, self.runs, level) / self.n
 
     def anees_share_inside(self, level: float = 0.95) -> float:
@@ -413,7 +415,7 @@ THIN = 128  # epochs at which the scatter is kept: its memory does not grow with
 
 
 def thinned(epochs: int) -> np.ndarray:
-    """Numbers of at most `THIN` epochs from the first to the last, evenly."""
+    """Indices of at most `THIN` evenly spaced epochs from the first to the last."""
     return np.unique(np.rint(np.linspace(0, epochs - 1, min(THIN, epochs))).astype(int))
 
 

@@ -1,7 +1,7 @@
 """Store of a campaign's results: objects that are put once and read by any worker.
 
 An object appears whole or not at all, and the first one under a name stays. So workers need no
-agreement: what two of them compute is the same, and the second is thrown away.
+coordination: if two compute the same object, the second copy is dropped.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _OLD_S = 3600.0  # what is older was left by a writer that died
 class FolderStore:
     """Objects as files of a folder: written under another name, synced, linked into place.
 
-    A slash in the name of an object parts a group from what is in it.
+    A slash in the name of an object separates its group from the rest.
     """
 
     def __init__(self, path: str | os.PathLike[str]):
@@ -76,7 +76,7 @@ class FolderStore:
             raise self._cannot(f"read {name}", error) from error
 
     def names(self, group: str) -> set[str]:
-        """Names of what is in a group, without that of the group."""
+        """Names of the objects of a group, without the group."""
         try:
             return {entry.name for entry in os.scandir(self.path / group)}
         except FileNotFoundError:
@@ -119,7 +119,7 @@ def _link(partial: Path, target: Path) -> bool:
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise
-        return _replace(partial, target)  # by what has the same content, if it is there
+        return _replace(partial, target)  # an object that is there has the same content
     return True
 
 
@@ -137,7 +137,7 @@ def _sync(folder: Path) -> None:
 
 
 class ObjectStore:
-    """Objects of a store of the S3 kind, Azure's or Google's, by `obstore` (extra ``objects``)."""
+    """Objects in S3-compatible, Azure or Google storage, by `obstore` (extra ``objects``)."""
 
     def __init__(self, url: str):
         try:
@@ -182,7 +182,7 @@ class ObjectStore:
 
     @contextmanager
     def _naming(self, what: str) -> Iterator[None]:
-        """State what failed; that an object is there, or is not, is no failure."""
+        """State what failed; an object that exists, or is missing, is no failure."""
         errors = self._obstore.exceptions
         try:
             yield

@@ -1,9 +1,9 @@
-"""Parameters of a filter that make its runs best, with the confidence that the data allow.
+"""Tuning of filter parameters on runs or a log, with the confidence that the data allow.
 
 Parameters are tuned by a factor each: x is the natural logarithm of the factors, zero where they
-are as written. What is measured of a filter comes in independent *parts*, the runs of a campaign or
-the segments of a log; the objective is a function of their mean. Half of the work is to say how
-much of a difference is chance: by the spread of the parts.
+are as written. The measures of a filter come in independent *parts*, the runs of a campaign or
+the segments of a log; the objective is a function of their mean. The spread of the parts shows how
+much of a difference is chance.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from robins.campaign.many_runs import ManyRuns
 from robins.errors import RobinsError
 from robins.results import Progress, ignore_progress
 
-FARTHEST = math.log(1000.0)  # of a factor, either way
-TOO_WIDE = math.log(3.0)  # of a 95 % interval, either way: the data do not determine it
+FARTHEST = math.log(1000.0)  # limit of |x|: a factor of 1000 either way
+TOO_WIDE = math.log(3.0)  # half width of a 95 % interval: wider ones are undetermined
 FEWEST_PARTS = 6
 Tree = Any  # a pytree of arrays
 Measure = Callable[[Tree, Tree], Array]
 _STEP = 0.01  # of differences of runs
-_COARSE = 0.1  # where a run may leap, or is traced again
+_COARSE = 0.1  # where a run may be discontinuous, or is traced again
 _CURVED = 0.05  # of differences of gradients
-_LOST = 1e6  # objective where a filter is lost
+_LOST = 1e6  # objective where a filter diverges
 
 
 class Trial(NamedTuple):
     """A filter at some x.
 
     Attributes:
-        kind: where it differs, what is measured may leap, as by another threshold.
+        kind: where it differs, measures may be discontinuous, as by another threshold.
         numbers: pytree of arrays; of another structure it is traced again.
     """
 
@@ -75,12 +75,12 @@ class Tuned(NamedTuple):
     Attributes:
         x: (p,) log factors.
         sigma: (p,) their standard deviations, by the spread of the parts chosen on.
-        gradient: by gradient; else by search.
+        gradient: true if found by gradient, false if by search.
         evaluations: of the objective, those of the gradient among them.
         before: (parts, k) of the data held out, as written.
-        after: (parts, k) with what was found.
-        gain: by how much the objective of the data held out is less; negative: it is worse.
-        gain_low: its lower bound, of 95 % confidence one-sided.
+        after: (parts, k) with the parameters found.
+        gain: decrease of the objective on the data held out; negative: it is worse.
+        gain_low: its one-sided lower bound of 95 % confidence.
         notes: parts that JAX computed, with the reason.
     """
 
@@ -96,7 +96,7 @@ class Tuned(NamedTuple):
 
     @property
     def better(self) -> bool:
-        """True if it is better on data that it was not chosen on, beyond chance."""
+        """True if it is better on the data held out, beyond chance."""
         return self.gain_low > 0.0
 
 
@@ -116,10 +116,11 @@ def choose(
     """Find x on some data, and judge it on other data.
 
     By gradient (L-BFGS-B) where the parameters are numbers of the model, by search (Nelder & Mead
-    1965) where they are of the filter itself, whose decisions leap, or decide a structure.
+    1965) where they are of the filter itself, whose decisions are discontinuous, or determine a
+    structure.
 
     Args:
-        objective: what is to be small.
+        objective: to be minimised.
         names: (p,) of the parameters, for messages.
         chosen_on: at least `FEWEST_PARTS` parts.
         judged_on: other parts, of the same shapes.
@@ -166,8 +167,8 @@ class ObjectiveGradient:
     """An objective and its gradient, on the data that x is chosen on.
 
     By central differences: all ends are computed at once, and the same noise makes the objective
-    smooth. The derivative of a run (forward mode through the factorisations of 2 700 steps of
-    INS/GNSS) was 20 times as long to compute and 5 times to compile as the run.
+    smooth. Differentiating a run (forward mode through the factorisations of 2 700 steps of
+    INS/GNSS) took 20 times as long to compute and 5 times as long to compile as the run.
     """
 
     def __init__(
@@ -179,7 +180,7 @@ class ObjectiveGradient:
 
     @cached_property
     def gradient(self) -> bool:
-        """True if numbers alone depend on the parameters, and what is measured does not leap."""
+        """True if only numbers depend on the parameters, and measures are continuous."""
         try:
             near = [self._objective.trial(x) for x in (np.zeros(self._p), *_STEP * np.eye(self._p))]
         except ValueError:
@@ -212,7 +213,7 @@ class ObjectiveGradient:
         return list(dict.fromkeys(note for one in self._measured.values() for note in one.notes))
 
     def total(self, parts: np.ndarray) -> float:
-        """The objective of some parts; infinite where the filter is lost."""
+        """The objective of some parts; infinite where the filter diverges."""
         mean = np.mean(parts, axis=0)
         if not np.all(np.isfinite(mean)):
             return np.inf
@@ -221,17 +222,17 @@ class ObjectiveGradient:
         return found if np.isfinite(found) else np.inf
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(parts, k), and by x (parts, k, p)."""
+        """(parts, k) measures at x, and their derivatives by x (parts, k, p)."""
         step = _STEP if self.gradient else _COARSE
         steps = step * np.eye(self._p)
         here, *ends = self.parts([x, *(x + steps), *(x - steps)])
         above, below = ends[: self._p], ends[self._p :]
-        with np.errstate(invalid="ignore"):  # of a filter that is lost
+        with np.errstate(invalid="ignore"):  # of a filter that diverges
             slope = [(a - b) / (2.0 * step) for a, b in zip(above, below, strict=True)]
         return here, np.stack(slope, axis=-1)
 
     def gradients(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """The objective, and by x the contribution of each part (parts, p), whose mean it is."""
+        """The objective, and contributions of the parts (parts, p), whose mean is its gradient."""
         parts, by_x = self.at(x)
         total = self.total(parts)
         if not np.isfinite(total) or not np.all(np.isfinite(by_x)):
@@ -241,13 +242,13 @@ class ObjectiveGradient:
 
 
 def _form(trial: Trial) -> Hashable:
-    """Structure of the numbers of a trial, which those of one program have in common."""
+    """Structure, shapes and types of the numbers of a trial; equal ones share a program."""
     leaves, tree = jax.tree_util.tree_flatten(trial.numbers)
     return tree, tuple((np.shape(x), jnp.result_type(x)) for x in leaves)
 
 
 def _by_mean(total: Callable[[np.ndarray], float], mean: np.ndarray) -> np.ndarray:
-    """(k,) slope of the objective over the mean of the parts, by differences of its own scale."""
+    """(k,) derivative of the objective by the mean of the parts, by scaled differences."""
     steps = 1e-5 * np.maximum(np.abs(mean), 1e-300)
     ends = [(total(mean + e), total(mean - e)) for e in np.diag(steps)]
     return np.array([(a - b) / (2.0 * s) for (a, b), s in zip(ends, steps, strict=True)])
@@ -276,9 +277,10 @@ def _least(slopes: ObjectiveGradient, p: int) -> np.ndarray:
 
 
 def _sigma(slopes: ObjectiveGradient, x: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """(p,) standard deviations of x: the spread of the parts' gradients through the curvature.
+    """(p,) standard deviations of x by the sandwich estimator.
 
-    The estimate of Huber (1967), cov(x) = H^-1 cov(g) H^-1, which holds for a wrong model too.
+    cov(x) = H^-1 cov(g) H^-1, from the curvature H and the parts' gradients g, holds for a wrong
+    model too (Huber 1967).
 
     Raises:
         UndeterminedError: a parameter is not known within `TOO_WIDE`.
@@ -311,7 +313,7 @@ def _sigma(slopes: ObjectiveGradient, x: np.ndarray, names: Sequence[str]) -> np
 
 
 def _along(row: np.ndarray, spread: np.ndarray) -> float:
-    """Standard deviation of a component, where some axes have none that is finite."""
+    """Standard deviation of a component; infinite if an undetermined axis adds to it."""
     endless = np.isinf(np.diag(spread))
     if np.any(endless & (np.abs(row) > 1e-6)):
         return math.inf
@@ -327,11 +329,11 @@ def _times(factor: float) -> str:
 def _gain(
     total: Callable[[np.ndarray], float], before: np.ndarray, after: np.ndarray
 ) -> tuple[float, float]:
-    """Decrease of the objective, and its lower bound of 95 %: the parts left out in turn."""
+    """Decrease of the objective, and its 95 % lower bound by the jackknife over the parts."""
     if not np.all(np.isfinite(after)):
         return -math.inf, -math.inf
     if not np.all(np.isfinite(before)):
-        return math.inf, math.inf  # as written it is lost
+        return math.inf, math.inf  # as written it diverges
     n = len(before)
 
     def fell(which: np.ndarray) -> float:

@@ -1,8 +1,7 @@
-"""A worker of a campaign: it takes the next shards that are missing, computes them, puts them.
+"""Worker of a campaign, which computes the next missing shards and stores them.
 
-Workers agree on nothing. A claim only shows others what a worker computes; what is claimed for
-long, since its worker died, is computed by another, and if both end, one of two equal shards is
-kept.
+Workers do not coordinate. A claim only shows others what a worker computes; after a time, as when
+its worker died, another computes the same, and if both finish, one of two equal shards is kept.
 """
 
 from __future__ import annotations
@@ -29,8 +28,8 @@ from robins.campaign.statistics import Statistics
 from robins.campaign.store import Store
 from robins.systems.study import Problem
 
-PATIENCE = 3.0  # times what a chunk took: so long a claim of somebody else is believed
-LEAST_S = 5.0  # before this worker has computed one
+PATIENCE = 3.0  # times the duration of a chunk, for which claims of others are respected
+LEAST_S = 5.0  # at least, also before this worker has computed one
 POLL_S = 0.2
 
 
@@ -47,7 +46,7 @@ class MissingShards(NamedTuple):
 
 
 def missing(store: Store, shards: Mapping[Chunk, list[Shard]]) -> list[MissingShards]:
-    """All that is not there yet, in the order of the runs."""
+    """Chunks with missing shards, in the order of the runs."""
     there = store.names("shards")
     lack = (
         MissingShards(chunk, [s for s in some if PurePosixPath(s.name).name not in there])
@@ -57,7 +56,7 @@ def missing(store: Store, shards: Mapping[Chunk, list[Shard]]) -> list[MissingSh
 
 
 class Worker:
-    """Computes shards of one campaign."""
+    """Worker of one campaign."""
 
     def __init__(self, store: Store, plan: CampaignPlan, problem: Problem):
         self.store, self.plan, self.problem = store, plan, problem
@@ -70,7 +69,7 @@ class Worker:
         self._left = 0  # runs that are not computed yet
 
     def work(self) -> Iterator[int]:
-        """Compute until nothing is missing; yields how many shards are, before each chunk."""
+        """Compute until nothing is missing; yields the number missing before each chunk."""
         while lack := missing(self.store, self._shards):
             yield sum(len(one.shards) for one in lack)
             self._left = sum(one.chunk.runs for one in lack)
@@ -85,7 +84,7 @@ class Worker:
             self.store.drop(taken.claim)
 
     def compute(self, one: MissingShards) -> None:
-        """Compute shards of a chunk and put them, after the histories that are kept of its runs."""
+        """Compute and store shards of a chunk, after the histories to be kept of its runs."""
         names = [s.filter for s in one.shards]
         found = self.found(one.chunk, names)
         for shard in one.shards:
@@ -123,12 +122,12 @@ class Worker:
         return one
 
     def packed(self, shard: Shard, chunk: Chunk, statistics: Statistics) -> bytes:
-        """A shard as it is stored: equal ones are equal files, since none names its worker."""
+        """A shard as it is stored; it does not name its worker, so equal shards are equal files."""
         about = {"filter": shard.filter, "begin": chunk.begin, "code": self.plan.code}
         return pack(about, statistics)
 
     def _keep(self, shard: Shard, chunk: Chunk, statistics: Statistics) -> None:
-        """Put the histories of those runs of a chunk that the scenario wants kept."""
+        """Store the histories of those runs of a chunk that the scenario wants kept."""
         every, most = range(chunk.begin, chunk.begin + chunk.runs), self.plan.keep_diverged
         group = {run: NAMED for run in self.plan.keep if run in every}
         lost = [every[k] for k in np.flatnonzero(statistics.lost)] if most != 0 else []
@@ -145,7 +144,7 @@ class Worker:
             trim(self.store, self._stems, shard.filter, most)
 
     def _next(self, lack: list[MissingShards]) -> MissingShards | None:
-        """Chunk that is not claimed; else one claimed for long; else none for now."""
+        """Chunk that is not claimed; else one with an old claim; None if there is neither."""
         claimed = self.store.names("claims")
         who = {"host": socket.gethostname(), "process": os.getpid()}
         for one in lack:

@@ -4,7 +4,7 @@
 - `runs`: simulated runs of a filter by its entry points, as a board calls them;
 - `library`: programs on one state as C, with named fields; `field_notes`: their units and axes;
 - `harness`: the test that a user's own compiler runs; `page`: how the library is called;
-- `single_precision`: what reals of 32 bit cost a filter, against the simulated truth.
+- `single_precision`: the cost of 32-bit reals for a filter, against the simulated truth.
 
 The C of one program is `robins.program.c`, the header of the wire `robins.bench.wire.c_header`.
 """

@@ -21,9 +21,9 @@ Axis = tuple[str, str, str]  # block, "[unit], frame", axis
 
 
 def tangent_axes(problem: Problem, reported: Any, n: int) -> list[Axis | None]:
-    """Axes of those of n components of the error that are reported by themselves.
+    """Axes of the n components of the error; None for those not reported by themselves.
 
-    Where the reported axes turn with time, those are reported so at all epochs.
+    Where the reported axes turn with time, a component must be reported so at all epochs.
     """
     rows = np.eye(n) if reported is None else np.asarray(reported)
     if rows.ndim == 3:
@@ -39,7 +39,7 @@ def tangent_axes(problem: Problem, reported: Any, n: int) -> list[Axis | None]:
 
 
 def _pieces(axes: list[Axis | None]) -> Iterator[tuple[int, int, Axis, list[str]]]:
-    """First and last of components of one block that follow each other, and their axes."""
+    """Consecutive components of one block: first, last, axis of the first, names of the axes."""
     ends = [k for k in range(1, len(axes)) if (axes[k] or "")[:2] != (axes[k - 1] or "")[:2]]
     for first, end in pairwise([0, *ends, len(axes)]):
         some = [axis for axis in axes[first:end] if axis is not None]
@@ -48,7 +48,7 @@ def _pieces(axes: list[Axis | None]) -> Iterator[tuple[int, int, Axis, list[str]
 
 
 def components(axes: list[Axis | None]) -> list[str]:
-    """Lines on the factor of the covariance."""
+    """Comment on the factor of the covariance, in lines."""
     lines = [
         "factor is lower triangular, covariance P = factor factor' of the error, whose rows are"
     ]
@@ -102,7 +102,7 @@ def field_notes(
 
 
 def _roots(state: State) -> Iterator[str]:
-    """Paths of the means in a state that have the structure of its own."""
+    """Paths of the means in a state that have the structure of the state's own mean."""
     parts = jax.tree_util.tree_flatten_with_path(state, is_leaf=lambda x: isinstance(x, Belief))[0]
     own = jax.tree_util.tree_structure(state.belief.mean)
     for path, part in parts:
@@ -111,14 +111,14 @@ def _roots(state: State) -> Iterator[str]:
 
 
 def _read(sensor: SensorAxes, first: int, last: int) -> str:
-    """Some components of a reading; an axis in brackets has a unit of its own."""
+    """Note on some components of a reading; an axis may give its own unit in brackets."""
     axes = sensor.axes[first:last]
     units = dict.fromkeys(axis.partition("[")[2].rstrip("]") or sensor.units for axis in axes)
     return f"{', '.join(units)}, {sensor.frame}: {', '.join(axes)}"
 
 
 def _joined_note(own: str | None, unit_text: str) -> str:
-    """The note of a field: in its own words, or those of its error."""
+    """Note of a field: its own text, or that of its error."""
     if own is None:
         return unit_text
     text, _, error = own.partition("; error: ")
@@ -134,10 +134,10 @@ def mean_fields(mean: State) -> Iterator[Place]:
 
 
 def tangent_fields(tree: State, root: str) -> Iterator[Place]:
-    """Fields of a point, the first and the end of their components of the error, and their units.
+    """Fields of a point: name, first and end of their components of the error, and units.
 
-    The units are None where they are those of the error: of arrays, and of an element that has no
-    others, as `Angle`.
+    The units are None where they equal those of the error: for arrays, and for an element without
+    others, such as `Angle`.
     """
     at = 0
     flat = jax.tree_util.tree_flatten_with_path(tree, is_leaf=manifold.is_element)[0]
@@ -149,7 +149,7 @@ def tangent_fields(tree: State, root: str) -> Iterator[Place]:
 
 
 def _inner(leaf: State) -> Iterator[tuple[KeyPath, str | None]]:
-    """Paths of the arrays in a leaf, and what units these have by themselves."""
+    """Paths of the arrays in a leaf, and their own units."""
     if not manifold.is_element(leaf):
         yield (), None
         return
@@ -167,7 +167,7 @@ def _inner(leaf: State) -> Iterator[tuple[KeyPath, str | None]]:
 
 
 def _components_text(axes: list[Axis | None], at: int) -> str:
-    """The components of a field of the mean, counted from its own 0."""
+    """Note on the components of a field of the mean, counted from 0 within the field."""
     pieces = list(_pieces(axes))
     texts = []
     for first, last, (name, unit_text, _), names in pieces:

@@ -38,9 +38,9 @@ from robins.systems.study import Case, Problem
 
 STEPS = 60  # of a run, recorded for the test
 RUNS = 3  # by which the cost of single precision is measured
-NIS = 1e-7  # tolerance: it squares what is left of readings far larger than their sigma
-MARGIN, LEAST = 4.0, 1e-6  # of its differences in the test: other compilers round otherwise
-RESET = "reset"  # the entry point that starts again
+NIS = 1e-7  # tolerance: the square of a small difference of large readings
+MARGIN, LEAST = 4.0, 1e-6  # on differences of floats: other compilers round differently
+RESET = "reset"  # the entry point that restarts the filter
 
 
 class Request(NamedTuple):
@@ -50,11 +50,11 @@ class Request(NamedTuple):
     filter: str
     label: str  # of the problem
     library: str = "robins"
-    files: Mapping[str, str] = MappingProxyType({})  # of a loop around it
+    files: Mapping[str, str] = MappingProxyType({})  # additional, such as a loop around it
 
 
 def with_adjustable(request: Request, numbers: Sequence[str]) -> Request:
-    """The request with some numbers of its filter in the state.
+    """Request with some numbers of its filter as fields of the state.
 
     Raises:
         ValueError: the filter has no such number.
@@ -76,7 +76,7 @@ def with_adjustable(request: Request, numbers: Sequence[str]) -> Request:
 def files_of(
     request: Request, unroll: int | None, precision: Precision
 ) -> tuple[dict[str, str], Library, PrecisionCost | None]:
-    """Texts of an exported folder by name, their library, and what single precision costs.
+    """Texts of an exported folder by name, their library, and the cost of single precision.
 
     Args:
         request: the filter, and the problem by which it is tried.
@@ -102,7 +102,7 @@ def files_of(
 def _library(
     request: Request, unroll: int | None, precision: Precision
 ) -> tuple[Library, str, RecordedSteps, PrecisionCost | None]:
-    """The filter as a library, its C, some steps of it by JAX, and what single precision costs."""
+    """The filter as a library, its C, recorded steps by JAX, and the cost of single precision."""
     problem, name, label = request[:3]
     contender = problem.contenders[name]
     single = precision is SINGLE
@@ -140,7 +140,7 @@ def _library(
 
 
 def _entry(name: str, program: Program) -> EntryPoint:
-    """An entry point with its words."""
+    """Entry point with the sentence that describes it."""
     if name == "predict":
         return EntryPoint(name, program, ("input",), "Moves on by one step.")
     if name == RESET:
@@ -162,7 +162,7 @@ def _any_start(runs: Sequence[BoardRun]) -> Any:
 
 
 def _record(run: BoardRun, functions: Mapping[str, Any], anew: Any) -> RecordedSteps:
-    """The steps by JAX, and then a new start from what was believed after the first."""
+    """Record the steps by JAX, and then a reset to the belief after the first step."""
     made = by_jax(functions, run, dict)
     states = list(made.values())[-1][0]
     first, last = (jax.tree_util.tree_map(lambda a, k=k: a[k], states) for k in (0, -1))
@@ -174,9 +174,9 @@ def _record(run: BoardRun, functions: Mapping[str, Any], anew: Any) -> RecordedS
 
 
 def _sizes(made: Calls) -> dict[Key, float]:
-    """Sizes against which a billionth is no difference, by struct and field.
+    """Sizes by struct and field, relative to which a difference of 1e-9 is rounding.
 
-    They are the largest sigma of what is in the units of a sigma, and the degrees of freedom of a
+    They are the largest sigma for fields in the units of a sigma, and the degrees of freedom for a
     NIS.
     """
     sizes: dict[Key, float] = {}
@@ -199,7 +199,7 @@ def _largest(numbers: np.ndarray) -> float:
 
 
 def _compared(library: Library, record: RecordedSteps, singles: Calls) -> RecordedSteps:
-    """Record with the tolerances of floats: their differences times a margin."""
+    """Record with the tolerances of single precision: its differences times a margin."""
     parts: dict[Key, float] = {}
     off = 0
     for entry in library.entries:

@@ -33,8 +33,8 @@ from robins.program.wrap import wrapped
 
 TOLERANCE = 1e-9  # of the size of a field; of a library of doubles
 
-# The word that holds the bits of a real, that of any NaN, and how it is printed: newlib's small
-# printf knows nothing wider than a long.
+# Word that holds the bits of a real, the bits that stand for any NaN, and their printing: newlib's
+# small printf supports nothing wider than a long.
 BITS = {
     DOUBLE: {
         "word": "uint64_t",
@@ -56,22 +56,20 @@ Key = tuple[str, str]  # struct ("state", "predict_result") and field, as in the
 
 
 class RecordedSteps(NamedTuple):
-    """Steps of a filter.
+    """Recorded steps of a filter.
 
     Attributes:
         given: of each entry point, in the order in which a step calls them, its arguments after the
             state, with a leading axis of steps.
         made: of each entry point what its calls returned, the state and the result, with a leading
             axis of calls.
-        tolerances: of fields, in parts of their size, the largest number that each has; `TOLERANCE`
-            of the others.
+        tolerances: of fields, relative to the largest number in each; `TOLERANCE` for the others.
         codes_off: number of calls that may return another code, count or flag.
         sizes: of fields, the least size by which a difference is judged, where the numbers of the
             field may be nothing but rounding.
         ends: of each entry point that is called once after the last step, its arguments after the
             state.
-        ruined: why the library is not to be used, however well it was compiled; its test prints it
-            and fails.
+        ruined: reason not to use the library, however it is compiled; its test prints it and fails.
     """
 
     given: Mapping[str, Sequence[Any]]
@@ -161,7 +159,7 @@ def _table(name: str, f: StructField, leaf: np.ndarray, precision: Precision) ->
 
 
 def check_c(library: Library, record: RecordedSteps) -> str:
-    """The test."""
+    """C text of the test."""
     name = library.name
     lines = [f"static void call_init({name}_state *state, int t)", "{", "    int off = 0;"]
     lines += [f"    {name}_init(state);", *_compared("init", library.state, "state"), *COUNTED]
@@ -178,7 +176,7 @@ def check_c(library: Library, record: RecordedSteps) -> str:
 
 
 def _called(library: Library, entry: EntryPoint) -> list[str]:
-    """A function that calls an entry point on a row of what is given, and compares all it makes."""
+    """C function that calls an entry point with a row of the record and compares its outputs."""
     name, e, given = library.name, entry.symbol, []
     lines = [f"static void call_{e}({name}_state *state, int t)", "{"]
     for j, argument in enumerate(entry.takes, start=1):
@@ -199,7 +197,7 @@ def _called(library: Library, entry: EntryPoint) -> list[str]:
 
 
 def _compared(entry: str, fields: Sequence[StructField], struct: str) -> list[str]:
-    """The fields of a struct against a row of the record."""
+    """C lines that compare the fields of a struct with a row of the record."""
     lines = []
     for f in fields:
         table = f"{entry}_{struct}_{f.name}[t]"

@@ -2,7 +2,7 @@
 
 A program takes and gives bare arrays of numbers. Here each array has the name that it has in the
 model, in a struct: the state, which all entry points change, and the arguments and the result of
-each. What is left of Python are the comments.
+each.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def template(name: str) -> str:
 
 EXTERN_C = '#ifdef __cplusplus\nextern "C" {\n#endif', "#ifdef __cplusplus\n}\n#endif"
 
-# Words that name no field: those of C and C++, and what compilers and widespread headers define.
+# Names that no field may have: keywords of C and C++, macros of compilers and common headers.
 RESERVED = frozenset(template("reserved.txt").split())
 
 C_TYPES = {"flag": "int", "whole": "int64_t", "word": "uint32_t", "word64": "uint64_t"}
@@ -61,7 +61,7 @@ class StructField(NamedTuple):
 
     name: str
     leaf: Leaf
-    at: int  # in the reals or in all else
+    at: int  # offset in the reals or in all else
 
     @property
     def size(self) -> int:
@@ -100,7 +100,7 @@ def symbol(name: str) -> str:
 
 
 def identifier(path: str) -> str:
-    """A path in a pytree as a name in C: attributes and indices, the belief's own left out.
+    """A path in a pytree as a name in C: attributes and indices, less a leading ``belief``.
 
     A name that is reserved, or has capitals only as macros have (`I` of complex.h), ends with an
     underscore.
@@ -195,18 +195,18 @@ class Library(NamedTuple):
     # -------------------------------------------------------------------------------- the file
 
     def source(self) -> str:
-        """The file: the scalars, the start, and each entry point around its program."""
+        """C file: the text of the scalars, the initial state, each entry point with its program."""
         lines = [f'#include "{self.name}.h"', "", self.programs("static "), *self._init()]
         for entry in self.entries:
             lines += self._entry(entry)
         return self.headed(_text(lines) + "\n")
 
     def headed(self, text: str) -> str:
-        """A file below the lines of comment for its head."""
+        """A file with the comment for its head."""
         return f"{_text(self._head())}\n{text}" if self.about else text
 
     def programs(self, linkage: str = "") -> str:
-        """The scalars, and the program of each entry point on bare arrays: a file of C by itself.
+        """Self-contained C file: the scalars, and the program of each entry point on bare arrays.
 
         Its functions are ``of_ENTRY``, as `robins.program.function` writes them.
         """

@@ -24,7 +24,7 @@ def page(
         label: of the problem by which it was tried.
         found: cost of single precision; None in double precision.
         margin: of the tolerances of the test over the differences that were found.
-        least: tolerance.
+        least: smallest tolerance.
     """
     calls = "\n".join(f"    {library.signature(e)};" for e in library.entries)
     codes = "\n".join(f"| {int(code)} | {sentence} |" for code, sentence in SENTENCES.items())

@@ -39,7 +39,7 @@ class UpdateResult(NamedTuple):
 
 
 class BoardRun(NamedTuple):
-    """A simulated run.
+    """A simulated run, as a board is given it.
 
     Attributes:
         case: with the truth and all that the filter is given, also where it ran in closed loop.
@@ -68,7 +68,7 @@ class BoardRun(NamedTuple):
 
 
 def board_runs(problem: Problem, name: str, count: int) -> list[BoardRun]:
-    """The first runs of a problem as one of its filters is given them."""
+    """First runs of a problem, with the inputs of one of its filters."""
     contender = problem.contenders[name]
     model, found = contender.model, []
     batch = first_worlds(problem, count)
@@ -121,9 +121,9 @@ def _update_result(info: StepInfo) -> UpdateResult:
 def reset_function(filter_: Filter, start: Any) -> Any:
     """The entry point `reset`, ``(state, belief) -> (state, result)``.
 
-    The filter is `reset` as it was at the start, so that nothing is left of what it learned since,
-    not even of a state that is no longer finite. The entries of the factor above the diagonal
-    are ignored. A belief that is not finite is not taken.
+    `Filter.reset` begins from the initial state, so that nothing learned since is left, not even of
+    a state that is no longer finite. The entries of the factor above the diagonal are ignored. A
+    belief that is not finite is refused.
     """
 
     def begin_anew(state: Any, belief: Belief):

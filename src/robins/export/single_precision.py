@@ -28,22 +28,22 @@ from robins.program.walk import counts, slots
 from robins.systems.study import Contender, Problem
 
 NONE: Mapping[str, float] = {}
-LITTLE, MUCH = 1.01, 1.1  # growth of an error: below the one it does not show, above the other ...
-SEVERAL = 0.01  # ... or with this share of other codes, or of the NEES, the filter is another one
+LITTLE, MUCH = 1.01, 1.1  # growth of an RMS or NEES: negligible up to LITTLE, ruin above MUCH
+SEVERAL = 0.01  # share of changed codes above which the filter is ruined too
 
-# What is called some thousand times is not worth optimising; the bits are the same without.
+# Code that is called some thousand times is not worth optimising; its bits are the same.
 QUICK = tuple("-O0" if flag == "-O2" else flag for flag in FLAGS)
 
 
 class BlockCost(NamedTuple):
-    """A block of the error against the truth, over the steps that count.
+    """Error of a block against the truth, over the steps that count.
 
     Attributes:
         name: of the block.
         unit: of the RMS.
         rms: root mean square of the components, in double precision.
         rms_single: the same in single precision.
-        nees: normalised error squared over the number of components; one is right.
+        nees: normalised error squared over the number of components; 1 is consistent.
         nees_single: the same in single precision.
     """
 
@@ -87,7 +87,7 @@ class PrecisionCost(NamedTuple):
 
     @property
     def bearable(self) -> bool:
-        """True if the filter is still the one that was judged."""
+        """True if the state is finite, and errors and codes change little (`MUCH`, `SEVERAL`)."""
         grows = max((b.growth for b in self.blocks), default=1.0)
         return self.finite and grows <= MUCH and self.codes_off <= SEVERAL * self.codes
 
@@ -186,7 +186,7 @@ def _one(loaded: ctypes.CDLL, library: Library, run: BoardRun) -> Calls:
 
 
 def _flat(leaves: Sequence[Any], dtype: Any, steps: int) -> list[np.ndarray]:
-    """Reals, and all else, one after the other, behind an axis of steps."""
+    """Two arrays with a leading axis of steps: the reals of all leaves, and all else."""
     arrays = [np.asarray(x) for x in leaves]
     parts = []
     for real, kind in ((True, dtype), (False, np.int64)):
@@ -212,9 +212,9 @@ Made = tuple[Any, np.ndarray | Array]  # states and codes of a run
 def differences(
     fields: Sequence[StructField], doubles: Any, singles: Any, least: Mapping[str, float] = NONE
 ) -> dict[str, float]:
-    """Largest difference over its size, of each field of reals in the states or results of a run.
+    """Largest relative difference of each field of reals in the states or results of a run.
 
-    Its size is its largest number, or what is the ``least``.
+    It is relative to the largest number of the field, at least to its ``least``.
     """
     pairs = zip(*map(jax.tree_util.tree_leaves, (doubles, singles)), strict=True)
     some = [(a, b) for a, b in pairs if a[0].size]

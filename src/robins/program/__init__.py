@@ -1,20 +1,20 @@
-"""Functions of JAX as programs of scalars: the step of a filter as C, without a change to it.
+"""Compilation of pure JAX functions to programs of scalars: the step of a filter as C.
 
-A filter is traced to its jaxpr and taken apart into the scalars that it computes with. Moving data
-leaves no code, equal scalars are computed once, what is known is folded, and what no result needs
-is left out. What remains is emitted as C99, compiled, and called from Python; or flown.
+A filter, unchanged, is traced to its jaxpr and lowered to a graph of scalar operations. Moving data
+leaves no code, equal scalars are computed once, constants are folded, and dead code is left out.
+The rest is emitted as C99 and compiled, to be called from Python or flown.
 
     trace        function -> `Program`
-    trace_step   the same of a step from state to state, whose lasting zeros are structural
-    trace_steps  the same of several steps of one state
+    trace_step   the same for a step from state to state, whose lasting zeros are structural
+    trace_steps  the same for several steps of one state
     to_c         `Program` -> text
     native       function -> the same function, compiled
     NativeState  a state that stays in the memory of C, and programs that step it
 
-`stages` makes of a function of one run one of many, its loops in lanes. `robins.export`
+`stages` turns a function of one run into one of many runs, its loops in SIMD lanes. `robins.export`
 writes C for a board.
 
-This room knows JAX and no filter: no filter, rule or system is written for it.
+The package is generic: no filter, rule or system is written for it.
 """
 
 from robins.program.c import function, header, to_c

@@ -1,4 +1,4 @@
-"""Equations on arrays of all runs: NumPy moves large ones, programs compute numbers.
+"""Equations on arrays of all runs: NumPy moves large arrays, programs compute numbers.
 
 Between the loops of a function lie a few numbers of each run, which are a program of one round
 (`ArrayProgram`), and long histories that are cut, joined and gathered (`moving_step`) or computed
@@ -43,7 +43,7 @@ Values = dict[Variable, np.ndarray]
 
 LARGE = 200  # entries of an array beyond which it is moved as a whole
 FOLDED = 2_000  # indices or flags that become part of a program
-MOST = 200_000  # about as many nodes of one equation are written out
+MOST = 200_000  # about the most nodes of one equation that are written out
 DRAW = 150  # nodes of a random number
 UNROLL = 3_000  # operations up to which a loop is written out
 MOVES = {
@@ -51,10 +51,10 @@ MOVES = {
     *("concatenate", "stack", "tile", "split", "unstack", "iota"),
 }
 INDEXED = {"gather": gathered, "scatter": scattered}
-# Of these XLA must not run two batches at once (`docs/performance.md`).
+# XLA must not run two batches of these at once (`docs/performance.md`).
 FACTORISED = ("qr[", "lu[", "eigh[", "svd[", "cholesky[", "triangular_solve[")
 _one_at_a_time = threading.Lock()
-# Variables that are taken, those that are made, and how: of the number of runs and of values.
+# Variables taken, variables made, and their computation from number of runs and values.
 Compute = Callable[[int, Values], Sequence[np.ndarray]]
 Step = tuple[list[Variable], list[Variable], Compute]
 
@@ -91,13 +91,13 @@ class ArrayProgram:
         batched: Collection[Variable],
         entries: tuple[int, ...] = (),
     ):
-        """Write the program when it is called first.
+        """Store the equations; the first call writes the program.
 
         Args:
             equations: in an order of computation.
             makes: variables that are wanted.
             batched: variables that depend on the run.
-            entries: the shape of all large arrays; given, the equations are those of one entry.
+            entries: the shape of all large arrays; where given, the program is of one entry.
         """
         self.takes, self.makes, self._entries = taken_by(equations), makes, entries
         self.refused: ProgramError | BuildError | None = None
@@ -107,7 +107,7 @@ class ArrayProgram:
 
     def __call__(self, runs: int, values: Values) -> Sequence[np.ndarray]:
         """Compute the equations, for one run where they depend on none."""
-        with self._lock:  # of the threads that come first, one writes the program
+        with self._lock:  # one of the first threads writes the program
             if self._compute is None:
                 self._compute = self._made(values)
         return self._compute(runs, values)
@@ -149,7 +149,7 @@ class ArrayProgram:
         return [a[:, 0] for a in self._rounds(runs, given)]
 
     def _of_entries(self, runs: int, values: Values) -> Sequence[np.ndarray]:
-        """Compute all entries of all runs; of arrays that depend on no run once."""
+        """Compute all entries of all runs, or once where no array depends on the run."""
         lead = (runs,) if any(self._batched) else ()
         shape = *lead, *self._entries
         given: list[Given] = []
@@ -166,7 +166,7 @@ class ArrayProgram:
 def by_jax(
     equations: Sequence[Equation], makes: list[Variable], batched: Sequence[bool]
 ) -> Compute:
-    """Equations that JAX computes for all runs at once; batched: by variable that they take."""
+    """Computation by JAX for all runs at once; batched: flags by variable taken."""
     takes = taken_by(equations)
     jaxpr = jaxpr_of(equations, takes, makes)
     function = jex.jaxpr_as_fun(jex.ClosedJaxpr(jaxpr, []))
@@ -183,11 +183,11 @@ def by_jax(
 
 
 def moving_step(e: Equation, batched: Collection[Variable]) -> Compute:
-    """An equation that moves or counts the entries of arrays, at places that all runs share."""
+    """Computation of an equation that moves or counts entries at places common to all runs."""
     name = e.primitive.name
     index = e.invars[1] if name in INDEXED else None
     data = [v for v in e.invars if v is not index]
-    found: list[np.ndarray] = []  # for each entry of the results its place among those of all data
+    found: list[np.ndarray] = []  # by result: index of each entry in the joined data
     of_runs = [v in batched for v in variables(e.invars)]
 
     def flat(v: Variable, runs: int, values: Values) -> np.ndarray:
@@ -197,7 +197,7 @@ def moving_step(e: Equation, batched: Collection[Variable]) -> Compute:
     def compute(runs: int, values: Values) -> Sequence[np.ndarray]:
         if not found:
             known = [] if index is None else [_value(index, values)]
-            found[:] = _places(e, known, data)  # the same, if two threads come first
+            found[:] = _places(e, known, data)  # equal, if two threads come first
         parts = [flat(v, runs, values) for v in data]
         if name == "gather":
             parts.append(np.full((1, 1), filling(e)))
@@ -253,7 +253,7 @@ class ArraySteps:
 
     @property
     def refused(self) -> list[ProgramError | BuildError]:
-        """Reasons why parts stay with JAX, once it was called."""
+        """Reasons why parts stay with JAX; known after the first call."""
         every = (step for _, _, step in self._steps if isinstance(step, ArrayProgram))
         return [step.refused for step in every if step.refused is not None]
 
@@ -266,7 +266,7 @@ class ArraySteps:
         self._dropped = last_uses(touched, {*self.takes, *self.makes})
 
     def __call__(self, runs: int, values: Values) -> Values:
-        """Compute the variables in `makes` from those that are there."""
+        """Compute the variables in `makes` from the values so far."""
         here = {v: values[v] for v in self.takes}
         for (_, makes, step), dropped in zip(self._steps, self._dropped, strict=True):
             here.update(zip(makes, step(runs, here), strict=True))
@@ -278,7 +278,7 @@ class ArraySteps:
 def steps_of(
     equations: Sequence[Equation], makes: list[Variable], batched: Collection[Variable]
 ) -> list[Step]:
-    """Equations as steps: what is small at each level together, then what is large."""
+    """Steps of equations: at each level the small ones together, then the large ones."""
     level: dict[Variable, tuple[int, bool]] = {}  # of a result, and whether it is made last there
     small: dict[int, list[Equation]] = {}
     large: dict[int, list[Equation]] = {}
@@ -298,7 +298,7 @@ def steps_of(
 
 
 def grouped(equations: Sequence[Equation]) -> list[list[Equation]]:
-    """Large equations: those that follow each other and go entry by entry are one group."""
+    """Group large equations: consecutive entrywise ones of one shape are a group."""
     groups: list[list[Equation]] = []
     kinds: list[tuple[int, ...] | None] = []
     for e in equations:
@@ -320,7 +320,7 @@ def moves_entries(e: Equation, batched: Collection[Variable]) -> bool:
 
 
 def is_large(e: Equation, batched: Collection[Variable]) -> bool:
-    """True for an equation that is a step of its own: of large arrays, or none for a program."""
+    """True for an equation that is a step of its own: on large arrays, or unfit for a program."""
     name = e.primitive.name
     if moves_entries(e, batched) or name in ENTRYWISE:
         return max(map(size_of, [*e.invars, *e.outvars])) > LARGE
@@ -368,7 +368,7 @@ def _value(v: Variable, values: Values) -> np.ndarray:
 
 
 def _at(entries: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Entries (runs, n) at places, without copying where these are in a row."""
+    """Entries (runs, n) at places; a view where the places are contiguous."""
     flat = places.ravel()
     if flat.size and flat[0] >= 0 and np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size)):
         found = entries[:, flat[0] : flat[0] + flat.size]

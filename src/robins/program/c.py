@@ -1,4 +1,4 @@
-"""A program as C99: one function, locals only, no allocation, no library but the mathematics.
+"""A program as C99: one function, locals only, no allocation, no library but libm.
 
 The text names every scalar once, in the order of computation; a scalar that is used once is
 written where it is used. Selects, comparisons and functions are calls of `scalars.h` and
@@ -22,11 +22,11 @@ from robins.program.wrap import wrapped
 
 PREFIX = {"real": "r", "flag": "f", "whole": "i", "word": "u", "word64": "v"}
 POOL = {"real": "x", "flag": "k", "whole": "k", "word": "k", "word64": "k"}
-WIDEST = 60  # characters of a scalar that is written where it is used
+WIDEST = 60  # most characters of a scalar that is inlined
 
 
 def header(name: str = "scalars.h", precision: Precision = DOUBLE) -> str:
-    """The text that a program stands on, for one number at a time or, in doubles, for lanes."""
+    """C text that a program builds on, for single numbers or, in doubles, for lanes."""
     parts = "finite.h", name, precision.sine, "routines.h"
     return precision.text("\n".join(map(part, parts)))
 
@@ -42,14 +42,14 @@ def function(
     """The function of a program: ``void name(const real *x, const whole *k, real *y, whole *m)``.
 
     x and y hold the reals of arguments and results, k and m all else, in the order of the leaves.
-    The results may lie where the arguments do: they are written last.
+    The results may overlap the arguments: they are written last.
     """
     lines = _Writer(program, precision).function(name, linkage)
     return "\n".join(part for line in lines for part in wrapped(line)) + "\n"
 
 
 def to_c(program: Program, name: str = "robins_step") -> str:
-    """A file of C by itself: what the program stands on, and its function."""
+    """Self-contained C file: the text of `header`, and the function of the program."""
     return header() + "\n" + function(program, name)
 
 
@@ -59,7 +59,7 @@ class _Writer:
     def __init__(self, program: Program, precision: Precision):
         self.program, self.graph, self.precision = program, program.graph, precision
         self.lines: list[str] = []
-        self.names: dict[Node, str] = {}  # how a node is read
+        self.names: dict[Node, str] = {}  # C text of each node
         self.inlined: set[Node] = set()
         self.strides: dict[Node, tuple[Array, int, int]] = {}  # arrays that lie in another one
         live = program.live
@@ -107,7 +107,7 @@ class _Writer:
         return [("x", "x" in used), ("k", "k" in used), ("y", reals > 0), ("m", others > 0)]
 
     def _scope(self, scope: int, depth: int, only: set[Node] | None = None) -> None:
-        """Write the nodes of a scope, or those of them that are named."""
+        """Write the nodes of a scope, or only some of them."""
         for node in self.inner[scope]:
             if node not in self.names and (only is None or node in only):
                 self._node(node, depth)
@@ -162,7 +162,7 @@ class _Writer:
         return read if kind in ("real", "whole") else f"{kind}_of_whole({read})"
 
     def _read(self, node: Node, bare: bool = False) -> str:
-        """A node as an argument; bare where a number needs no macro, next to an operator."""
+        """C text of a node; bare: next to an operator, where a number needs no macro."""
         graph = self.graph
         match graph.op[node]:
             case "constant":
@@ -225,7 +225,7 @@ class _Writer:
         self.names[node] = f"a{node}"
 
     def _listed(self, head: str, entries: list[str], depth: int) -> None:
-        """An array with its entries, some to a line."""
+        """Declare an array with its entries, several to a line."""
         pad = "    " * depth
         self.lines.append(f"{pad}{head} = {{")
         line = ""
@@ -237,7 +237,7 @@ class _Writer:
         self.lines += [f"{pad}    {line.rstrip(' ,')}", f"{pad}}};"]
 
     def _block(self, node: Node, depth: int) -> None:
-        """A call of a routine; copies for it are in braces, so that their memory serves again."""
+        """Call a routine; copied operands are in braces, so that their memory is reused."""
         routine, sizes, count = self.graph.value[node]
         pad, kind = "    " * depth, "real" if routine in IN_PLACE else "const real"
         self.lines += [f"{pad}real b{node}[{count}];", f"{pad}{{"]
@@ -294,21 +294,21 @@ class _Writer:
         self.lines.append(f"{pad}}}")
 
     def _at(self, found: tuple[Array, int, int], kind: str, index: str) -> str:
-        """Text by which an entry of some nodes in an array is read."""
+        """C text that reads an entry of an array."""
         (what, name, rounds), first, step = found
         steps = [(f"n{scope}", by) for scope, by in rounds] + [(index, step)]
         at = place_of(first, steps)
         return self._input_at(kind, at) if what == "input" else f"{what}{name}[{at}]"
 
     def _address(self, array: Array, first: int) -> str:
-        """Text of a pointer to a real in an array."""
+        """C text of a pointer to a real in an array."""
         what, name, rounds = array
         at = place_of(first, [(f"n{scope}", by) for scope, by in rounds])
         return ("x" if what == "input" else f"{what}{name}") + (f" + {at}" if at != "0" else "")
 
 
 def place_of(first: int, steps: Sequence[tuple[str, int]]) -> str:
-    """Text of a place in an array: the first one, and steps."""
+    """C text of an index into an array: the first index and strides."""
     parts = [index if by == 1 else f"{by} * {index}" for index, by in steps if by]
     return " + ".join([str(first)] * (first != 0 or not parts) + parts).replace("+ -", "- ")
 

@@ -1,4 +1,4 @@
-"""Jaxprs that were walked before: calls of one form are written from a template.
+"""Templates of jaxprs that were walked before, for further calls of the same form.
 
 A jaxpr is walked once for each row of a batch, each sigma point, each hypothesis of a bank, and in
 each attempt of `robins.program.trace.lasting`. What a walk writes depends on the form of its
@@ -21,8 +21,8 @@ from robins.program.nodes import ALIKE, Graph, Node
 Nodes = np.ndarray
 
 SEEN_THROUGH = {"neg", "not", "is_finite"}  # rules and folding look at the arguments of these
-OWN = {"input", "leaf", "loop", "after"}  # of one graph: such a call is not copied
-WORTH = 4  # equations of a jaxpr that is looked up
+OWN = {"input", "leaf", "loop", "after"}  # of one graph: a call with these is not copied
+WORTH = 4  # fewest equations of a jaxpr that is looked up
 
 # A call as it was written: the graph, its arguments and its results.
 Call = tuple[Graph, list[Node], list[Nodes]]
@@ -34,7 +34,7 @@ Calls = dict[Hashable, Call | Template | None]
 
 
 def template_of(call: Call) -> Template | None:
-    """The template that a call leaves; None if it contains a loop."""
+    """Template of a call; None if it contains a loop or nodes of its own graph."""
     graph, given, outputs = call
     place = {n: k for k, n in enumerate(given)}
     ahead = [n for a in outputs for n in a.ravel().tolist()]
@@ -86,11 +86,11 @@ def results_of(
     """Results of a jaxpr on arrays of nodes, from a template where there is one.
 
     Args:
-        calls: so far.
+        calls: calls and templates so far.
         graph: into which it is written.
         jaxpr: of the call.
         args: arrays of nodes.
-        write: walks through the jaxpr.
+        write: walks through the jaxpr, where there is no template.
     """
     if len(jaxpr.eqns) < WORTH:
         return write()

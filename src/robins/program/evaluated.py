@@ -1,7 +1,7 @@
-"""A function computed once, without a compiler.
+"""Evaluation of a function that is called once, without a compiler.
 
-JAX compiles each operation on arrays of a new shape for some 20 ms, and the start of a filter is
-dozens of them.
+JAX takes some 20 ms to compile each operation on arrays of a new shape, and the initialisation of a
+filter has dozens of them.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ MOST = 20_000  # operations, folded in 0.2 s
 def evaluated(function: Callable[..., T], *args: Data) -> T:
     """Return ``function(*args)``, computed by folding the constants of its program.
 
-    JAX computes it where it traces the arguments, and functions that cannot be traced or folded: of
-    many operations, with routines such as eigenvalues, or with what has no place in a program.
+    JAX computes it where the arguments are traced, and functions that cannot be traced or folded:
+    with too many operations, with routines such as eigenvalues, or with primitives that have no
+    place in a program.
 
     Args:
-        function: pure. It is called with traced arguments, so it does not see bad numbers: those
-            are to be refused before. A real converted to a whole number is in its range.
+        function: pure. It is traced, so it cannot check values: refuse bad numbers before. A real
+            that it converts to a whole number must be in the range of that type.
         args: arguments of the function.
     """
     given = jax.tree_util.tree_leaves(args)

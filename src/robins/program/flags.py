@@ -10,12 +10,12 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-# Passes that look for repeated computations: there is nothing left to find, and they take half of
-# the time of the compiler. Compilers that do not know them ignore the flags.
+# No passes that look for repeated computations: there are none left, and the passes take half of
+# the compile time. Compilers that do not know these flags ignore them.
 FASTER = ("-fno-gcse", "-fno-tree-pre")
-# In addition for gcc, which others may refuse: no search for double or adjacent stores, and a limit
-# to how many writes it looks at behind a read. Half of the time that is left; the code
-# is as fast.
+# In addition for gcc, as other compilers may reject them: no search for redundant or adjacent
+# stores, and a limit on the stores examined for each load. They save half of the remaining compile
+# time; the code is as fast.
 FASTER_IN_GCC = (
     *("-fno-code-hoisting", "-fno-tree-slp-vectorize", "-fno-tree-dse", "-fno-dse"),
     "--param=sccvn-max-alias-queries-per-access=30",
@@ -23,7 +23,7 @@ FASTER_IN_GCC = (
 )
 # Contraction would join a product and a sum into one rounding: other bits on other machines.
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", *FASTER)
-# Lanes are as wide as the processor that compiles them.
+# Lanes use the full vector width of the processor that compiles them.
 LANE_FLAGS = ("-std=gnu++17", "-march=native", "-Wno-psabi", *FLAGS[1:])
 # In the interpreter `and`, `or` and `not` are parts of names, and a register holds all kinds.
 INTERPRETER_FLAGS = (
@@ -32,7 +32,7 @@ INTERPRETER_FLAGS = (
 )
 SHARED = ("-shared", "-fPIC")
 ONE = "one"  # for one run at a time
-# Of many runs for processors, by `robins_generation`: of x86-64 1, 3 or 4, of others 0.
+# Flags for many runs by `robins_generation`: level 1, 3 or 4 of x86-64, 0 for other processors.
 GENERATIONS = {
     "0": (),
     "1": ("-march=x86-64",),
@@ -47,7 +47,7 @@ def compile_interpreters(compiler: Sequence[str], into: Path) -> list[Path]:
 
     Raises:
         OSError: there is no such compiler.
-        subprocess.CalledProcessError: it refuses the interpreter; `stderr` has its words.
+        subprocess.CalledProcessError: it rejects the interpreter; `stderr` has its message.
     """
     x86 = platform.machine().lower() in ("x86_64", "amd64")
     kinds = [kind for kind in OF_KIND if kind == ONE or (kind == "0") is not x86]

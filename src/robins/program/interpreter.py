@@ -26,13 +26,13 @@ from robins.program.walk import Program
 
 
 class Interpreter:
-    """An interpreter.
+    """A loaded interpreter of tapes.
 
     Attributes:
         library: its functions.
         width: runs at a time.
         codes: numbers of instructions, by name.
-        flag: a flag that is set, which for many runs is a mask.
+        flag: value of a flag that is set: 1, or -1 (a mask) for many runs.
     """
 
     def __init__(self, path: Path):
@@ -104,16 +104,16 @@ def interpreter_of_many() -> Interpreter:
 @lru_cache
 def _loaded(kind: str) -> Interpreter:
     path = Path(str(files("robins.program"))) / "built" / f"{kind}.so"
-    if not path.is_file():  # which a wheel has
+    if not path.is_file():  # only a wheel has it
         path = build_once(text("interpreter.cc"), (*INTERPRETER_FLAGS, *OF_KIND[kind]), CPP)
     try:
         return Interpreter(path)
-    except OSError as error:  # a folder of which nothing may be run, another C library
+    except OSError as error:  # a folder mounted without execution, another C library
         raise BuildError(f"the interpreter cannot be loaded: {error}", str(path)) from None
 
 
 def text(name: str) -> str:
-    """Text of a file of C of this room, with those that it includes."""
+    """Text of a C file of this package, its includes expanded."""
     return re.sub(r'^#include "(.*)"$', lambda found: text(found[1]), part(name), flags=re.M)
 
 

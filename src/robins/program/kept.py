@@ -1,9 +1,9 @@
-"""Tapes kept in the user's cache, or in a wheel, by what they were made of.
+"""Tapes in the user's cache or in a wheel, by a digest of all that they depend on.
 
-That is the structure of equations (primitives, parameters, shapes and numbers, not names or where
-code stands); or, before anything is traced, the names of functions of robins and the numbers that
-they are given (`names.by_name`). A digest is of that and of robins' own code. Names in the cache
-also contain the versions of JAX, NumPy and SciPy, which trace and fold; those in a wheel serve all.
+That is robins' own code and the structure of the equations (primitives, parameters, shapes and
+numbers, but neither names nor source lines); or, before anything is traced, the names of functions
+of robins and their arguments (`names.by_name`). File names in the cache also contain the versions
+of JAX, NumPy and SciPy, which trace and fold; those in a wheel serve all versions.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from robins.program.primitives.control import called
 from robins.program.tape import Tape
 from robins.program.walk import Leaf, Program
 
-WORTH = 1_000  # nodes of a program that is kept
+WORTH = 1_000  # fewest nodes of a program that is kept
 IN_WHEEL = Path(str(files("robins.program"))) / "tapes"  # those of the live filters, by a release
 _BEGAN_S = time.time()  # about when the code of this process was read
 DAMAGED = OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error
@@ -48,15 +48,15 @@ DAMAGED = OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.erro
 def cached_program(
     parts: Iterable[Any], write: Callable[[], Program], interpreter: Interpreter
 ) -> tuple[Program, Tape, int]:
-    """A program, its tape, and how many nodes it has; from the cache or made.
+    """A program, its tape and its number of nodes; from the cache, else written.
 
-    A program from the cache has its arguments, results and zeros, but neither nodes nor outputs,
-    and of the structure of its results the texts of `names.as_json`.
+    A program from the cache has its arguments, results and zeros, but neither nodes nor outputs;
+    the structure of its results is data of `names.as_json`.
 
     Args:
-        parts: all that the program is made of: jaxprs, arrays, numbers, texts.
-        write: makes it.
-        interpreter: that carries out the tape.
+        parts: all that the program depends on: jaxprs, arrays, numbers, texts.
+        write: writes the program.
+        interpreter: executes the tape.
 
     Raises:
         ProgramError: it cannot be made.
@@ -78,7 +78,7 @@ def cached_program(
 def cached_rounds(
     parts: Iterable[Any], write: Callable[[], Program]
 ) -> tuple[Program, RoundsEngine, int]:
-    """Program as of `cached_program`, its rounds by the interpreter of many runs, node count.
+    """Program as of `cached_program`, engine of the interpreter of many runs, node count.
 
     Raises:
         ProgramError: it cannot be made.
@@ -130,8 +130,8 @@ def cached_by_name(
     Args:
         what: the kind of the program.
         key: all that the program depends on.
-        write: makes it.
-        interpreter: that carries out the tape.
+        write: writes the program.
+        interpreter: executes the tape.
 
     Raises:
         ProgramError: it cannot be made.
@@ -172,8 +172,8 @@ def _packages() -> str:
 def _code() -> str | None:
     """A digest of robins, and of what its programs depend on.
 
-    None where it is not known what code this process runs: its files are not there, or were changed
-    since it began.
+    None where the code of this process is unknown: its files are missing, or changed since it
+    began.
     """
     found, newest = hashlib.sha256(), 0.0
     kinds = (".py", ".h", ".cc", ".COF")
@@ -235,8 +235,8 @@ def _feed(
             for one in value:
                 _feed(to, one, names, jaxprs)
         case _:
-            # Functions among the parameters, of JAX's generators and rules of batching, make no
-            # node; they are distinguished by name alone.
+            # Functions among the parameters (JAX's generators and batching rules) make no node;
+            # their names alone distinguish them.
             text = re.sub(r" at 0x[0-9a-f]+", "", repr(value))
             to.append(f"{type(value).__name__} {text};")
 

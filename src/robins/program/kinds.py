@@ -32,7 +32,7 @@ def kind_of(dtype: Any, where: str = "") -> str:
     """The kind of scalar that holds numbers of a type.
 
     Raises:
-        ProgramError: none does: single precision, complex numbers, keys of another generator.
+        ProgramError: no kind does: single precision, complex numbers, keys of another generator.
     """
     if is_key(dtype):
         if str(dtype) == KEY:
@@ -49,7 +49,7 @@ def kind_of(dtype: Any, where: str = "") -> str:
 
 
 def numbers_of(value: Any) -> np.ndarray:
-    """An array as one of NumPy; of a key one number, its first word above its second."""
+    """NumPy array of an array; a key as one number, its first word in the upper half."""
     if not is_key(getattr(value, "dtype", np.float64)):
         return np.asarray(value)
     words = np.asarray(jax.random.key_data(value)).astype(np.uint64)
@@ -57,7 +57,7 @@ def numbers_of(value: Any) -> np.ndarray:
 
 
 def array_of(numbers: np.ndarray, dtype: Any) -> np.ndarray | jax.Array:
-    """Numbers as an array of a type: what `numbers_of` made of it."""
+    """Array of a type from its numbers: the inverse of `numbers_of`."""
     if not is_key(dtype):
         return numbers.astype(dtype)
     words = numbers.astype(np.uint64)[..., None] >> np.array([32, 0], np.uint64)

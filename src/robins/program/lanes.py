@@ -1,14 +1,14 @@
-"""Rounds in lanes: a program called again and again, for several runs at a time, rows in C.
+"""Loops in SIMD lanes: a program called once a round, for several runs at a time.
 
-A round takes what is carried, what stays, and a row of each array that goes along; it gives what is
-carried on, and a row of each array that is made. The body of a `scan` is one.
+A round takes the carry, arguments that stay, and a row of each input array; it gives the next carry
+and a row of each output array. The body of a `scan` is one.
 
 Compilers call this vectorisation of the outer loop, or one program on many lanes of SIMD (Pharr &
 Mark 2012). An example: ``x = a x + u[k]`` for four runs. Its loop over k stays a loop, and each
 scalar of a round becomes a vector of one entry a run:
 
     x  = [x0 x1 x2 x3]                    carried
-    uk = [u0[k] u1[k] u2[k] u3[k]]        a row of an array that goes along
+    uk = [u0[k] u1[k] u2[k] u3[k]]        a row of an input array
     x  = [a a a a] * x + uk               two instructions for four runs
 
 Operations of a lane are those of the run alone, so a run has the same bits in any lane and batch.
@@ -31,7 +31,7 @@ from robins.program.native import CPP, build
 from robins.program.trace import positive_zeros
 from robins.program.walk import Leaf, Program, lengths
 
-KINDS = {"f8": 0, "b1": 1, "i4": 2, "i8": 3, "u4": 4, "u8": 5}  # of arrays, as `scan.h` counts them
+KINDS = {"f8": 0, "b1": 1, "i4": 2, "i8": 3, "u4": 4, "u8": 5}  # of arrays, as numbered in `scan.h`
 
 
 Given = tuple[np.ndarray | jax.Array, bool]  # an array, and whether it has a leading axis of runs
@@ -50,11 +50,11 @@ def compiled_rounds(program: Program) -> tuple[Scan, int]:
 
 
 class CompiledRounds:
-    """A program with rounds around it, called with arrays of all runs.
+    """A loop of rounds around a program, called with arrays of all runs.
 
     Attributes:
-        program: of one round: carried, staying, a row; to carried and a row.
-        lanes: how many runs at a time, as this machine's processor can.
+        program: of one round: (carry, staying, row) -> (carry, row).
+        lanes: runs at a time, by the vector width of this machine's processor.
     """
 
     def __init__(
@@ -66,13 +66,13 @@ class CompiledRounds:
         backwards: bool = False,
         engine: RoundsEngine = compiled_rounds,
     ):
-        """Make them ready.
+        """Prepare the rounds.
 
         Args:
             program: of one round.
-            length: how many rounds.
-            carried: so many of its first arguments, and of its first results, are carried.
-            stays: so many after these are the same in all rounds.
+            length: number of rounds.
+            carried: number of its first arguments, and of its first results, that are carried.
+            stays: number of arguments after these that are the same in all rounds.
             backwards: from the last row to the first.
             engine: `compiled_rounds`, or `interpreted_rounds`.
 
@@ -84,11 +84,11 @@ class CompiledRounds:
         self._scan, self.lanes = engine(program)
 
     def hand_over(self, engine: RoundsEngine) -> None:
-        """Change the engine of the program; calls under way end as they began."""
+        """Change the engine of the program; calls under way finish with the old one."""
         self._scan, self.lanes = engine(self.program)
 
     def holds_for(self, begin: Sequence[Given]) -> bool:
-        """True if runs begin with the zeros that the program takes for granted."""
+        """True if runs begin with the zeros that the program assumes."""
         zeros = self.program.zeros
         return all(bool(np.all(zero_in_all(begin[k])[mask])) for k, mask in zeros.items())
 
@@ -102,10 +102,10 @@ class CompiledRounds:
         Args:
             runs: number of runs.
             given: carry, constants, rows.
-            named: numbers of the results that are kept of the first run only.
+            named: indices of the results that are kept of the first run only.
 
         Raises:
-            MemoryError: there is none for the rows of some rounds.
+            MemoryError: there is too little memory for the rows of the rounds.
         """
         inputs, results = self.program.inputs, self.program.results
         arrays = [
@@ -157,7 +157,7 @@ def _rows(a: np.ndarray, batched: bool, by_round: bool, leaf: Leaf) -> tuple[int
 
 
 def _text(program: Program) -> str:
-    """The program for lanes, and the rounds around it."""
+    """C++ text of a program in lanes, and of the rounds around it."""
     sizes = *lengths(program.inputs), *lengths(program.results)
     names = ("NX", "NK", "NY", "NM")
     defined = "\n".join(f"#define {n} {size}" for n, size in zip(names, sizes, strict=True))

@@ -1,7 +1,7 @@
-"""Places of the numbers of a program in the arrays of its C, so that they are read in place.
+"""Memory layout of a program in C: arrays whose numbers are read in place.
 
-A routine takes a pointer, and a loop an offset and a step, where the numbers that it needs already
-lie in one array; else they are copied into an array of their own.
+Where the operands already lie in one array, a routine takes a pointer, and a loop an offset and a
+stride; else they are copied into an array of their own.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from itertools import accumulate, pairwise
 
 from robins.program.nodes import Graph, GraphLoop, Node
 
-# The prefix of its name and the rest ("b" and a block; "" and a name), or "input" and a kind; then
-# the scopes of loops whose rounds move the place of a number, each with the step of one round.
+# An array: prefix and rest of its name ("b" and a block; "" and a name), or "input" and a kind;
+# then the scopes of loops whose rounds shift the place of a number, each with its stride.
 Array = tuple[str, Node | str, tuple[tuple[int, int], ...]]
-Entry = tuple[int, int]  # a loop by its scope, and the number of a node that it keeps
-# An array of what a loop keeps, a row for each round: its name, and which nodes are in a row.
+Entry = tuple[int, int]  # scope of a loop, and index of a node in its `kept`
+# Array of the kept nodes of a loop, one row a round: its name, and the indices of the nodes.
 Rows = tuple[str, list[int]]
 
 OPERANDS = {
     "product": lambda m, depth, n: (m * depth, n * depth),
     "solve_lower": lambda n, width: (n * n, n * width),
 }
-IN_PLACE = {"triangle", "householder", "eigh"}  # change what they are given
+IN_PLACE = {"triangle", "householder", "eigh"}  # routines that overwrite their operands
 
 
 def operands(graph: Graph, block: Node) -> list[tuple[Node, ...]]:
@@ -48,7 +48,7 @@ class MemoryLayout:
         kept: dict[int, set[int]] = defaultdict(set)
         for scope, k in graph.kept(live):
             kept[scope].add(k)
-        whole: dict[tuple[Node, int], Entry] = {}  # operands that are all of an array
+        whole: dict[tuple[Node, int], Entry] = {}  # operands that are a whole array
         for block in live:
             if graph.op[block] == "block":
                 for index, nodes in enumerate(operands(graph, block)):
@@ -74,7 +74,7 @@ class MemoryLayout:
         return self._graph.op[node] == "after" and self._graph.value[node][1] is not None
 
     def _entries(self, nodes: Sequence[Node]) -> list[Entry]:
-        """Entries of one array of a loop, if these nodes are all of it, known ones included."""
+        """Entries of an array of a loop if the nodes are all of it, with constants; else none."""
         graph = self._graph
         first = next((n for n in nodes if self._is_kept(n)), None)
         if first is None:
@@ -97,7 +97,7 @@ class MemoryLayout:
         return [(loop.scope, k) for k in columns]
 
     def source(self, node: Node) -> tuple[Array | None, int]:
-        """The array in which a node lies, and where in it; None for what is in none."""
+        """Array that holds a node, and its index there; None where no array does."""
         graph = self._graph
         match graph.op[node]:
             case "input":
@@ -116,7 +116,7 @@ class MemoryLayout:
         return None, 0
 
     def stride(self, nodes: Sequence[Node]) -> tuple[Array, int, int] | None:
-        """The array in which nodes lie one step from each other: array, first place, step."""
+        """Array that holds nodes at a constant stride, first index and stride; or None."""
         array, first = self.source(nodes[0])
         if array is None:
             return None
@@ -126,9 +126,9 @@ class MemoryLayout:
         return array, first, step
 
     def operand(self, block: Node, index: int) -> tuple[Array, int] | None:
-        """The array in which an operand lies, and from where on; None if it is to be copied.
+        """Array that holds an operand, and its first index; None if it must be copied.
 
-        A routine that works in place is given no number that something else reads.
+        A routine that works in place never gets a number that something else reads.
         """
         graph, nodes = self._graph, operands(self._graph, block)[index]
         if rows := self._whole.get((block, index)):

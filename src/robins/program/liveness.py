@@ -28,8 +28,6 @@ from jax.extend import core as jex
 from robins.program.kinds import Equation, Variable, is_key
 from robins.program.primitives.control import called
 
-# Of JAX's jaxprs, whose abstract values have neither shape nor type for a checker.
-
 KEY_BYTES = 8
 
 
@@ -65,8 +63,8 @@ def most_bytes(
 
     Args:
         stages: in an order of computation.
-        given: what is there before and stays.
-        kept: what is needed in the end.
+        given: variables that exist before and stay.
+        kept: variables needed in the end.
     """
     stay = set(variables(given))
     most = here = sum(map(bytes_of, stay))
@@ -80,7 +78,7 @@ def most_bytes(
 def bytes_of_jaxpr(jaxpr: jex.Jaxpr) -> int:
     """The most bytes that the values of a jaxpr take at once, one equation after the other.
 
-    Rather too much: XLA makes one of several equations, and what they hand on is never in memory.
+    An upper estimate: XLA fuses equations, whose intermediate values are then never in memory.
     """
 
     def touched(e: Equation) -> StageMemory:

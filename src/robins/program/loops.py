@@ -1,9 +1,9 @@
-"""Equations of a jaxpr that go along one axis, as rounds of one loop.
+"""Fusion of the equations of a jaxpr along one axis into the rounds of one loop.
 
-A scan goes along its axis; so does an operation on arrays whose first axis is as long, if it does
-to each row the same by itself; and so do random numbers, as the generator can be given the number
-of an entry. What goes along the same axis is one loop: a row that the next equation needs is never
-written to memory. What a round leaves for the next is carried.
+A scan goes along its axis; so does an operation on arrays whose first axis is as long, if it treats
+all rows alike and independently; and so do random numbers, as the generator takes the index of an
+entry. Equations along the same axis become one loop, in which a row that only the next equation
+needs is never written to memory. Values that a round leaves for the next are carried.
 
 Compilers call this loop fusion, and the array that shrinks to one row array contraction; a scan is
 the loop of a recurrence. An example: ``sin a`` and the sums of ``a``, added. Three equations go
@@ -38,9 +38,9 @@ from robins.program.primitives.control import size_of
 from robins.program.primitives.random import bits_of, numbered
 from robins.program.walk import JaxprWriter, Leaf, Nodes, Program
 
-ROUNDS = 200  # of a loop of rows that is worth it; a scan is from SHORTEST on
+ROUNDS = 200  # least length of a loop over rows; that of a scan is SHORTEST
 SHORTEST = 30
-WIDEST = 64  # entries of a row
+WIDEST = 64  # most entries of a row
 DRAW = 150  # operations of a scan that cost JAX as much as one random number
 
 ENTRYWISE = {
@@ -51,7 +51,7 @@ ENTRYWISE = {
     *("asin", "acos", "atan", "atan2", "tanh", "erf_inv", "convert_element_type", "copy"),
     *("bitcast_convert_type", "random_fold_in", "random_wrap", "random_unwrap", "stop_gradient"),
 }
-# What a primitive calls the axes that it works on; it goes along the first if that is not one.
+# Parameters that name the axes a primitive acts on; it goes along axis 0 if that is none of them.
 AXES = {
     **dict.fromkeys(("squeeze", "expand_dims", "rev"), "dimensions"),
     **dict.fromkeys(("reduce_sum", "reduce_max", "reduce_min", "reduce_and", "reduce_or"), "axes"),
@@ -67,7 +67,7 @@ Along = tuple[int, bool]  # length of an axis, and whether equations go along it
 
 
 def axis_of(e: Equation) -> Along | None:
-    """The axis along which an equation goes, if it does and can be part of a loop."""
+    """Axis along which an equation can be part of a loop; None if there is none."""
     name, p = e.primitive.name, e.params
     if name == "scan":
         return (p["length"], p["reverse"]) if p["length"] >= SHORTEST else None
@@ -131,7 +131,7 @@ def operations(e: Equation) -> int:
 
 
 def uses(e: Equation, length: int) -> tuple[list[Variable], list[Variable]]:
-    """Variables that an equation of a loop needs as a whole before it, and those row by row."""
+    """Variables that an equation needs whole before the loop, and those it needs row by row."""
     if e.primitive.name == "scan":
         before = e.params["num_consts"] + e.params["num_carry"]
         whole, rows = e.invars[:before], e.invars[before:]
@@ -152,17 +152,18 @@ class LoopBody:
     """The body of a loop over some equations, ready to be made a program.
 
     Attributes:
-        begin: what scans begin with, variables or literals; carried behind the number of the round.
-        stays: variables that are needed as they are.
+        begin: initial carries of the scans, variables or literals; in the carry of the loop they
+            follow the number of the round.
+        stays: variables needed whole, the same in all rounds.
         rows: variables of which each round takes a row.
-        after: variables of what scans leave.
+        after: variables of the final carries of the scans.
         made: variables of which each round gives a row.
     """
 
     def __init__(
         self, equations: Sequence[Equation], axis: Along, wanted: Callable[[Variable], bool]
     ):
-        """Find what goes in and out.
+        """Find inputs and outputs.
 
         Args:
             equations: in an order of computation.
@@ -204,11 +205,11 @@ class LoopBody:
         unroll: int | None,
         calls: Calls | None = None,
     ) -> Program:
-        """One round as a program: number of the round, carried, staying, rows; to carried and rows.
+        """One round as a program: (number, carry, staying, rows) -> (next number, carry, rows).
 
         Args:
-            known: numbers of some that stay, which become part of the program.
-            zeros: of what is carried, by its number, the entries that are zero.
+            known: numbers of some variables that stay, which become part of the program.
+            zeros: by index of an argument, mask of its carried entries that are zero.
             unroll: as in `robins.program.trace`.
             calls: of earlier attempts.
 

@@ -40,7 +40,7 @@ _PYTHON = {float: _FLOAT, int: np.dtype(np.int64), bool: np.dtype(bool)}
 
 
 class Reader:
-    """Puts arrays together from where they lie in memory."""
+    """Reader of a pytree from its slots in memory."""
 
     def __init__(self, result_slots: list[MemorySlot], tree: Tree):
         """Take slots, and the structure whose leaves they are."""
@@ -130,7 +130,7 @@ class NativeState:
         unroll: int | None = LIVE_UNROLL,
         lasting: bool = False,
     ):
-        """Take a state.
+        """Lay a state out in memory.
 
         Args:
             state: a pytree of arrays.
@@ -164,7 +164,7 @@ class NativeState:
 
     @property
     def state(self) -> PyTree:
-        """The state now."""
+        """Current state."""
         if self._pytree is None:
             reals, others = self._x[: self._reals].copy(), self._k[: self._others]
             self._pytree = self._reader.read(reals, others)
@@ -192,9 +192,9 @@ class NativeState:
 
         Args:
             name: of the function; with equal content and name it is the same function.
-            function: a pure function of JAX; looked at when there is no program of its name yet
-                for arguments of these shapes.
-            args: numbers and arrays of NumPy are the quickest.
+            function: a pure function of JAX; traced when there is no program of its name yet for
+                arguments of these shapes.
+            args: numbers and NumPy arrays are the fastest.
 
         Raises:
             ProgramError: the function does what has no place in a program, or the state that it
@@ -221,7 +221,7 @@ class NativeState:
         leaves: list[ArrayLike],
         tree: Tree,
     ) -> _Call:
-        """A function in this memory, which grows where that is wanted."""
+        """Bind a function to this memory, enlarging it if needed."""
         forms = [form(x) for x in leaves]
         key = (self._content, name, self._tree, tuple(self._forms), tree, tuple(forms), self._how)
         made = _known.get(key)
@@ -236,7 +236,7 @@ class NativeState:
         result_slots, *end = slots(program.results[count:])
         wanted = [max(a, b + e) for a, b, e in zip(after, begin, end, strict=True)]
         if wanted[0] > len(self._x) or wanted[1] > len(self._k):
-            self._calls.clear()  # they point to the memory that was
+            self._calls.clear()  # they point to the old memory
             self._x = np.append(self._x, np.zeros(max(0, wanted[0] - len(self._x))))
             more = np.zeros(max(0, wanted[1] - len(self._k)), np.int64)
             self._k = np.append(self._k, more)

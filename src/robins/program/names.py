@@ -1,4 +1,4 @@
-"""Texts for values, by which another process knows that it has the same ones."""
+"""Texts of values, equal in every process for equal values only."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ def by_name(value: Any) -> str:
 
     Raises:
         LookupError: a function or class that is not of a module of robins, JAX or Python, such as
-            one of a user's file, which may change, or one made in a function; or another value.
+            one of a user's file, which may change, or one made in a function; or a value of another
+            type.
     """
     if type(value) in PLAIN:
         return repr(value)
@@ -55,7 +56,7 @@ def _named(name: str) -> Any:
         LookupError: there is none, or it is of another package than those of `NAMED`.
     """
     module, _, path = name.partition(":")
-    if name == NONE:  # which its module does not have
+    if name == NONE:  # no attribute of its module
         return type(None)
     found: Any = sys.modules.get(module) if module.split(".")[0] in NAMED else None
     for part in path.split("."):
@@ -66,7 +67,7 @@ def _named(name: str) -> Any:
 
 
 def as_json(tree: Tree) -> Json | None:
-    """A structure of a pytree for a file; None where `of_json` would not give the same one."""
+    """JSON data of a pytree structure; None where `of_json` would not restore it."""
     try:
         text = json.loads(json.dumps(_nodes(tree)))
     except (LookupError, TypeError):
@@ -75,13 +76,13 @@ def as_json(tree: Tree) -> Json | None:
 
 
 def _nodes(tree: Tree) -> Json:
-    """Class, data of the node, and structures inside; of an array nothing."""
+    """Class, node data and children of a structure; an empty list for a leaf."""
     node = tree.node_data()
     return [] if node is None else [by_name(node[0]), node[1], list(map(_nodes, tree.children()))]
 
 
 def of_json(text: Json) -> Tree | None:
-    """The structure of such a text; None where a class of it is not loaded."""
+    """Pytree structure from data of `as_json`; None where a class of it is not loaded."""
     if not text:
         return jax.tree_util.tree_structure(0)
     kind, about, inner = text
@@ -90,7 +91,7 @@ def of_json(text: Json) -> Tree | None:
         made = jax.tree_util.PyTreeDef.from_node_data_and_children
         about = about if kind == by_name(dict) else _tuples(about)
         return made(jax.tree_util.default_registry, (_named(kind), about), inside)
-    except (AttributeError, LookupError, TypeError, ValueError):  # or an older version of JAX
+    except (AttributeError, LookupError, TypeError, ValueError):  # also an older version of JAX
         return None
 
 

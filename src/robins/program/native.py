@@ -1,4 +1,4 @@
-"""Programs as functions of Python, and C compiled on this computer, kept by content."""
+"""Programs as functions of Python, and C compiled on this machine, cached by content."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ NO_COMPILER = (
 
 
 class Language(NamedTuple):
-    """Language of compiled texts: one number by C, lanes by C++, which chooses between vectors."""
+    """Language of compiled texts: C for single numbers, C++ (``?:`` on vectors) for lanes."""
 
     suffix: str
     variable: str  # of the environment, that names the compiler
@@ -101,7 +101,7 @@ def _own_folder() -> Path:
 
 
 def build(text: str, flags: tuple[str, ...] = FLAGS, language: Language = C) -> Path:
-    """A shared library of a text: the one there is if text, compiler, flags are equal.
+    """Shared library of a text, cached by text, compiler and flags.
 
     Where the flags hold `FASTER`, gcc is given `FASTER_IN_GCC` too.
 
@@ -118,7 +118,7 @@ def build(text: str, flags: tuple[str, ...] = FLAGS, language: Language = C) -> 
 
 
 def build_once(text: str, flags: tuple[str, ...], language: Language) -> Path:
-    """A shared library of a text: the one there is, whatever compiled it.
+    """Shared library of a text, cached by text and flags, whatever compiled it.
 
     Raises:
         BuildError: it is not there, and there is no compiler, or it refuses the text.
@@ -168,8 +168,8 @@ def compiled_step(program: Program, flags: tuple[str, ...] = FLAGS) -> Callable[
 class Native:
     """A program as a function of Python: takes and gives what the traced function did.
 
-    Its results are arrays of NumPy. One call takes some microseconds a leaf; a loop that steps a
-    filter millions of times calls `address` from C.
+    Its results are arrays of NumPy. One call takes some microseconds a leaf; a loop of millions of
+    steps belongs in C, see `robins.program.to_c`.
     """
 
     def __init__(self, program: Program, engine: Engine = compiled_step):
@@ -233,7 +233,7 @@ def native(
     unroll: int | None = UNROLL,
     engine: Engine = compiled_step,
 ) -> Native:
-    """Trace a function with arguments, and give its program back as a function.
+    """Trace a function with arguments, and return its program as a function.
 
     Args:
         function: a pure function of JAX.

@@ -7,8 +7,8 @@ operations there are
 - *blocks*: a routine on arrays, such as a QR; its arguments are gathered, its results are leaves;
 - *loops*: `GraphLoop`; what depends on the leaves of a loop is computed inside it, all else before.
 
-Zeros are structural: a product with a known zero is zero, whatever the other factor is. A step
-looks at its inputs before it trusts a product, so an infinity is not lost by that.
+Zeros are structural: a product with a known zero is zero, whatever the other factor is. Filters
+test their inputs for finiteness, so that no infinity is lost by this.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from robins.program.operations import KINDS, OPERATIONS
 
 Node = int
 
-ALIKE = {"neg", "not", "and", "or", "max", "min"}  # simpler by the nodes that their arguments are
+ALIKE = {"neg", "not", "and", "or", "max", "min"}  # may simplify by the nodes of their arguments
 COMMUTING = {op for op, row in OPERATIONS.items() if row.commutes}
 _DOUBLE = struct.Struct("<d")
 
 
 @dataclass
 class GraphLoop:
-    """A loop: leaves that each round begins with, and what it leaves for the next.
+    """A loop: its leaves, the carried values at the start of a round, and their next values.
 
     Attributes:
         scope: its number.
-        begin: what the leaves are in the first round.
+        begin: values of the leaves in the first round.
         leaves: one for each of `begin`.
         index: the number of the round, from 0.
-        count: how many rounds; None: as long as `condition` holds at the beginning of a round.
+        count: number of rounds; None: as long as `condition` holds at the beginning of a round.
         condition: a node inside the loop, of its leaves.
-        next: what the leaves are in the next round.
+        next: values of the leaves in the next round.
         kept: nodes whose values in all rounds are kept; only where `count` is known.
-        sizes: of the arrays, one after the other, that the nodes of `kept` are the entries of.
+        sizes: numbers of entries of the arrays that `kept` lists one after the other.
     """
 
     scope: int
@@ -77,7 +77,7 @@ class Graph:
         literal: of a constant the bytes of a real, or a text of its kind and number; else None.
         scope: the loop in which a node is computed, 0 outside of all.
         within: of each scope the one around it.
-        met: nodes that were there when they were to be added, in order.
+        met: existing nodes that were to be added again, in order.
     """
 
     def __init__(self) -> None:
@@ -104,7 +104,7 @@ class Graph:
         scope: int | None = None,
         order: Sequence[Node] | None = None,
     ) -> Node:
-        """The node of these fields; the one there is, if there is one."""
+        """Add a node, or return the existing one with the same fields."""
         args = tuple(args)
         same = args if order is None else tuple(order)
         known = (op, same, kind, value if key is None else key)
@@ -124,9 +124,9 @@ class Graph:
         return node
 
     def ordered(self, op: str, args: tuple[Node, ...], kind: str, value: Any = None) -> Node:
-        """The node of an operation that is not folded.
+        """Node of an operation, without folding.
 
-        The order of arguments is kept as it was written, so that equal trees look equal.
+        Commuted arguments give the same node, which keeps the order that was written first.
         """
         commutes = op in COMMUTING and args[0] > args[1]
         return self.add(op, args, kind, value, order=args[::-1] if commutes else None)
@@ -134,13 +134,13 @@ class Graph:
     # ------------------------------------------------------------------------------- leaves
 
     def constant(self, value: float | int | np.generic | np.ndarray, kind: str) -> Node:
-        """A number that is known."""
+        """Node of a known number."""
         number = KINDS[kind](value)
         key = _DOUBLE.pack(number) if kind == "real" else f"{kind} {int(number)}"
         return self.add("constant", (), kind, number, key)
 
     def input(self, index: int, kind: str) -> Node:
-        """One of the arguments of the program, counted by kind."""
+        """Node of a scalar argument, counted among the reals or among all else."""
         return self.add("input", (), kind, index)
 
     def known(self, node: Node) -> np.generic | None:
@@ -181,7 +181,7 @@ class Graph:
         return self.add("select", (condition, new, old), self.kind[new])
 
     def convert(self, node: Node, kind: str) -> Node:
-        """The same number in another kind; a flag is 0 or 1, a real is cut towards zero."""
+        """The same number in another kind; a flag is 0 or 1, a real is truncated towards zero."""
         given = self.kind[node]
         if given == kind:
             return node
@@ -199,7 +199,7 @@ class Graph:
         return self.add("bits", (node,), kind)
 
     def pick(self, among: Sequence[Node], index: Node) -> Node:
-        """One of some nodes, by an index that lies among them."""
+        """One of several nodes, by an index that is in range."""
         if (value := self.known(index)) is not None:
             return among[int(value)]
         if len(set(among)) == 1:
@@ -220,14 +220,14 @@ class Graph:
     def block(
         self, routine: str, sizes: Sequence[int], args: Sequence[Node], count: int
     ) -> list[Node]:
-        """The reals that a routine of `scalars.h` makes of an array of reals."""
+        """Results (reals) of a routine of `routines.h` on an array of reals."""
         block = self.add("block", args, "real", (routine, tuple(sizes), count))
         return [self.add("item", (block,), "real", k) for k in range(count)]
 
     # -------------------------------------------------------------------------------- loops
 
     def open(self, begin: Sequence[Node], count: int | None) -> GraphLoop:
-        """A loop; what is made of its leaves from here on is computed inside it."""
+        """Open a loop; nodes that depend on its leaves are computed inside it."""
         scope = len(self.within)
         self.within.append(max((self.scope[n] for n in begin), default=0))
         leaves = [
@@ -237,7 +237,7 @@ class Graph:
         return GraphLoop(scope, list(begin), leaves, index, count)
 
     def close(self, loop: GraphLoop) -> tuple[list[Node], list[list[Node]]]:
-        """The leaves after the last round, and of each kept node its values in all rounds."""
+        """Close a loop: its leaves after the last round, and each kept node in all rounds."""
         outside = [n for n in self._needed_by(loop) if self.scope[n] < loop.scope]
         args = list(dict.fromkeys([*loop.begin, *outside]))
         node = self.add("loop", args, "", loop, key=loop.scope)
@@ -270,7 +270,7 @@ class Graph:
         return sorted(seen)
 
     def live(self, roots: Sequence[Node]) -> list[Node]:
-        """All nodes that some need, in the order of computation."""
+        """All nodes that the roots need, in the order of computation."""
         op, args = self.op, self.args
         seen: set[Node] = set()
         ahead = list(roots)
@@ -287,7 +287,7 @@ class Graph:
         return sorted(seen)
 
     def kept(self, nodes: Sequence[Node]) -> dict[tuple[int, int], Node]:
-        """Nodes that loops keep of all rounds and some nodes read, by scope and number."""
+        """Kept nodes of loops that the given nodes read, by scope and index."""
         read: dict[tuple[int, int], Node] = {}
         for node in nodes:
             if self.op[node] == "after" and self.value[node][1] is not None:
@@ -298,7 +298,7 @@ class Graph:
     # ------------------------------------------------------------------------------ folding
 
     def _simpler(self, op: str, args: tuple[Node, ...]) -> Node | None:
-        """A node that is the same, for less; None where there is none."""
+        """Simpler node of the same value; None if there is none."""
         match op:
             case "add" | "or" | "xor":
                 for one, other in (args, args[::-1]):

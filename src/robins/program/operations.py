@@ -1,7 +1,7 @@
-"""The operations of scalars: one row each, with its value on known numbers and its C.
+"""Scalar operations: one row each, with its value on known numbers and its form in C.
 
-A program computes with five kinds of scalars. What C calls them stands in `scalars.h`: typedefs, so
-that one text serves a single number and a vector of lanes.
+A program computes with five kinds of scalars. In C they are typedefs, of `scalars.h` or `lanes.h`,
+so that one text serves a single number and a vector of lanes.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ KINDS: dict[str, type[np.generic]] = {
 
 
 class Operation(NamedTuple):
-    """One operation: ``fold`` is its value on NumPy scalars, all of one kind.
+    """A scalar operation on arguments of one kind.
 
     Attributes:
-        fold: its value where all arguments are known.
+        fold: its value on NumPy scalars, where all arguments are known.
         infix: the operator in C; where there is none, a function of `scalars.h` or of C's
             mathematics is called, ``real_sin(x)``: kind of the first argument, name of the row.
         gives: the kind of the result; None is the kind of the arguments.
@@ -61,7 +61,7 @@ def _away(a: np.number) -> np.number:
 
 
 def _wrap(a: np.number, half: np.number) -> np.number:
-    """A whole number between -half and half that is the same but for whole rounds of both."""
+    """Wrap a whole number into [-half, half), as two's complement does on overflow."""
     number, most = int(a), int(half)
     return np.int64((number + most) % (2 * most) - most)
 
@@ -76,7 +76,7 @@ _OF_NUMPY = (
     *("abs", "sign", "sqrt", "cbrt", "floor", "ceil", "sin", "cos", "tan", "sinh", "cosh", "tanh"),
     *("exp", "exp2", "expm1", "log", "log1p", "nextafter"),
 )
-_INVERSE = ("sin", "cos", "tan", "tan2", "sinh", "cosh", "tanh")  # with an "a", in NumPy an "arc"
+_INVERSE = ("sin", "cos", "tan", "tan2", "sinh", "cosh", "tanh")  # after "a", in NumPy "arc"
 
 OPERATIONS: dict[str, Operation] = {
     "add": Operation(lambda a, b: a + b, "+", commutes=True),

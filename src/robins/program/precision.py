@@ -19,7 +19,7 @@ class Precision(NamedTuple):
 
     Attributes:
         kind: their type in C.
-        suffix: of a number, and of a function of ``math.h``.
+        suffix: of a literal, and of a function of ``math.h``.
         dtype: their type in NumPy.
         sine: the file with the polynomials of sine and cosine.
     """
@@ -30,7 +30,7 @@ class Precision(NamedTuple):
     sine: str
 
     def number(self, value: SupportsFloat | str) -> str:
-        """A real in C, to the bit once it is rounded."""
+        """C literal of a real, exact after rounding to this precision."""
         number = float(value)
         if np.isnan(number):
             return "NAN"
@@ -39,7 +39,7 @@ class Precision(NamedTuple):
         return f"{self.rounded(number)!s}{self.suffix}"
 
     def rounded(self, number: float) -> float | np.floating:
-        """The finite number nearest to one; not zero unless it is."""
+        """Nearest finite number of this precision; zero for zero only."""
         if self.dtype is np.float64:
             return number
         info = np.finfo(self.dtype)
@@ -47,7 +47,7 @@ class Precision(NamedTuple):
         return self.dtype(np.copysign(np.clip(abs(number), least, float(info.max)), number))
 
     def text(self, double: str) -> str:
-        """A text of C that was written for doubles; comments stay."""
+        """C text, written for doubles, in this precision; comments stay as they are."""
         if self.dtype is np.float64:
             return double
         return _WRITTEN.sub(self._in_single, double)

@@ -1,4 +1,4 @@
-"""Errors of this room when it cannot make a program, or cannot build one."""
+"""Errors for functions that cannot become programs, and for programs that cannot be built."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from robins.errors import RobinsError
 
 
 class ProgramError(RobinsError, ValueError):
-    """A function cannot be made a program: it names the operation and the line that uses it."""
+    """A function that cannot become a program; names the operation and the line that uses it."""
 
 
 class BuildError(RobinsError):

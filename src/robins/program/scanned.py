@@ -1,4 +1,4 @@
-"""A scan of one run by the interpreter: nothing is compiled, and rows are taken in C."""
+"""Scan of one run by the interpreter: nothing is compiled, and the loop over rows is in C."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ _known: OrderedDict[Hashable, Made] = OrderedDict()
 
 
 def scan(body: Body, content: Hashable, carry: Data, rows: Data) -> tuple[Data, Data]:
-    """Return ``jax.lax.scan(body, carry, rows)`` with numbers of NumPy for results.
+    """Return ``jax.lax.scan(body, carry, rows)`` with NumPy results.
 
     Args:
-        body: pure; looked at when its program is neither remembered nor in the user's cache. Bodies
-            of one function (that of a `partial`) and equal content are the same one.
-        content: all that the body holds. In other processes too they are the same if the function
-            and the content have names there (`robins.program.names.by_name`).
+        body: pure; traced when its program is neither in memory nor in the user's cache. Bodies of
+            one function (that of a `partial`) with equal content share a program.
+        content: all values that the body holds. Other processes share the program too if function
+            and content have texts (`robins.program.names.by_name`).
         carry: pytree of arrays; a round leaves the same shapes and types.
         rows: pytree of arrays, one at least, with an equal leading axis of rounds.
 
     Raises:
         ValueError: there are no rows, or arrays of them differ in length.
-        ProgramError: the body does what has no place in a program, or leaves another form; or an
-            array is of a type that a program does not take.
+        ProgramError: the body does what has no place in a program, or changes the form of the
+            carry; or an array is of a type that a program does not take.
         BuildError: there is no interpreter.
     """
     taken, tree = jax.tree_util.tree_flatten((carry, rows))
@@ -74,9 +74,9 @@ def scan(body: Body, content: Hashable, carry: Data, rows: Data) -> tuple[Data, 
 
 
 def named_scan(body: Body, carry: Data, rows: Data) -> tuple[Data, Data]:
-    """`scan` of a function of a module, known by its name; else by JAX.
+    """`scan` with a body that its name identifies; by JAX where that is impossible.
 
-    JAX computes where there is no interpreter, and what has no place in a program.
+    JAX computes it where there is no interpreter, or where it has no place in a program.
 
     Args:
         body: as of `scan`; a function, or a `partial` that binds functions as first arguments.
@@ -96,7 +96,7 @@ def named_scan(body: Body, carry: Data, rows: Data) -> tuple[Data, Data]:
 
 @lru_cache
 def _can_interpret() -> bool:
-    """True if there is an interpreter; without one no other is sought at each call."""
+    """True if there is an interpreter; cached, so that a missing one is sought once only."""
     try:
         interpreter_of_one()
     except BuildError:
@@ -110,7 +110,7 @@ def _by_jax(function: Body, bound: tuple, carry: Data, rows: Data) -> tuple[Data
 
 
 def mapped_rows(function: Callable[[Data], Data], rows: Data) -> Data:
-    """Return ``jax.vmap(function)(rows)`` with numbers of NumPy, by `named_scan`."""
+    """Return ``jax.vmap(function)(rows)`` with NumPy results, by `named_scan`."""
     return named_scan(partial(_alone, function), (), rows)[1]
 
 
@@ -119,7 +119,7 @@ def _alone(function: Callable[[Data], Data], carry: Data, row: Data) -> tuple[Da
 
 
 def _array(x: Data) -> np.ndarray:
-    """An array that rounds can take."""
+    """Array of a type that rounds can take."""
     if is_key(getattr(x, "dtype", None)):
         raise ProgramError(
             "a key of JAX has no place in a scan", fix="pass jax.random.key_data(key)"
@@ -132,7 +132,7 @@ def _array(x: Data) -> np.ndarray:
 
 
 def _written(body: Body, one: Data, count: int) -> Program:
-    """Program of a body, for what is carried (so many arrays) and a row."""
+    """Program of a body; one: a carry (of count arrays) and a row."""
     program = trace(body, *one, unroll=LIVE_UNROLL)
     forms = [(x.shape, x.dtype) for x in jax.tree_util.tree_leaves(one)[:count]]
     left = [(leaf.shape, leaf.dtype) for leaf in program.results[:count]]

@@ -1,4 +1,4 @@
-"""A function of one run, for many: its loops as programs, and arrays between them.
+"""A function of one run, applied to many: its loops as programs, and arrays between them.
 
 The jaxpr of the function is cut into *stages*: what goes along one axis is a loop
 (`robins.program.loops`), what lies between loops are arrays (`robins.program.arrays`). What depends
@@ -82,7 +82,7 @@ from robins.program.refusal import BuildError, ProgramError
 from robins.program.trace import lasting
 
 WORTH = 5_000  # operations of a loop that is worth a compiler; others are interpreted
-FEWEST = 8  # equations without a scan or random numbers that are
+FEWEST = 8  # number of equations from which on any loop is worth one
 FOLDED = 2_000  # numbers of a known array that becomes part of a program
 CUMULATED = {
     "cumsum": (lax.add, lambda dtype: 0),
@@ -202,7 +202,7 @@ class AxisLoop:
         named: Collection[Variable],
         unroll: int | None,
     ) -> None:
-        """Find what goes in and out; of some variables that are made the first run is enough."""
+        """Find inputs and outputs; named: variables of which the first run is enough."""
         self._batched, self._wanted, self._unroll = batched, wanted, unroll
         self.body = body = LoopBody(self.equations, self.axis, wanted)
         made = [*body.after, *body.made]
@@ -210,7 +210,7 @@ class AxisLoop:
         self.touched = StageMemory([*body.begin, *body.stays, *body.rows], made)
 
     def __call__(self, runs: int, values: Values) -> Values:
-        """Compute the variables that it makes from those that are there."""
+        """Compute the variables that it makes from the values so far."""
         body = self.body
 
         def given(v: Variable) -> Given:
@@ -224,7 +224,7 @@ class AxisLoop:
             if v not in self._batched and size_of(v) <= FOLDED and not is_key(v.aval.dtype)
         }
         begin = [(np.zeros((), np.int64), False), *map(given, body.begin)]
-        with self._lock:  # of the threads that come first, one compiles
+        with self._lock:  # one of the first threads compiles
             self._compile(known, begin)
             rounds = self.rounds
         if rounds is None:
@@ -234,7 +234,7 @@ class AxisLoop:
         return dict(zip([*body.after, *body.made], found[1:], strict=True))
 
     def hand_over(self) -> None:
-        """Compile the rounds of a loop that was called; they have the same bits.
+        """Replace the interpreter by compiled rounds, after the first call; the bits stay the same.
 
         Raises:
             BuildError: there is no compiler, or it refuses the program.
@@ -272,7 +272,7 @@ def split_stages(
 ) -> tuple[
     ArraySteps, dict[int, ArraySteps], dict[tuple[int, Along], AxisLoop], dict[Variable, int]
 ]:
-    """Equations as stages.
+    """Cut equations into stages.
 
     Args:
         equations: in an order of computation.
@@ -326,10 +326,10 @@ def split_stages(
 class StagedFunction:
     """A function of one run as a function of a batch of them.
 
-    What is made of a run has the same bits in any batch, but to rounding what stays with JAX.
+    Results of a run have the same bits in any batch; parts that stay with JAX agree to rounding.
 
     Attributes:
-        bytes_of_run: about the most that the values of a run take at once, its arguments included.
+        bytes_of_run: approximate peak memory of the values of a run, its arguments included.
     """
 
     def __init__(
@@ -379,7 +379,7 @@ class StagedFunction:
         self.bytes_of_run = most_bytes(touched, self._takes, kept)
 
     def _of_runs(self, one: StageMemory, between: set[Variable]) -> StageMemory:
-        """Variables of a stage by run: none that is known or kept of the first run alone."""
+        """Stage with its per-run variables: none that is known or kept of one run alone."""
         here = self._batched - (self._named - between)
         takes, makes = ([v for v in variables(some) if v in here] for some in one[:2])
         return StageMemory(takes, makes, one.within)
@@ -396,7 +396,7 @@ class StagedFunction:
 
     @property
     def refused(self) -> list[ProgramError | BuildError]:
-        """Reasons why parts stay with JAX, once it was called."""
+        """Reasons why parts stay with JAX; all are known after the first call."""
         arrays = (one for one in self._stages if isinstance(one, ArraySteps))
         loops = [loop.refused for loop in self.loops if loop.refused]
         return [*self._known_refused, *(why for one in arrays for why in one.refused), *loops]
@@ -410,7 +410,7 @@ class StagedFunction:
         for stage, dropped in zip(self._stages, self._dropped, strict=True):
             values.update(stage(runs, values))
             for v in dropped:
-                value = values.pop(v, None)  # JAX makes less than a loop
+                value = values.pop(v, None)  # a loop left to JAX makes fewer
                 if value is not None and v in self._named:
                     values[v] = first_of(value)
                 del value
@@ -430,5 +430,5 @@ class StagedFunction:
 
 
 def first_of(value: np.ndarray) -> np.ndarray:
-    """The first run of an array of runs, without holding the others."""
+    """First run of an array of runs, copied so that the others can be freed."""
     return value if value.shape[0] == 1 else value[:1].copy()

@@ -1,9 +1,9 @@
 """A program as a tape: the instructions of the interpreter (`interpreter.cc`).
 
 An instruction is one operation, its result a register, and up to three arguments. Nodes become
-instructions in the order of computation, scope by scope; registers are given out by linear scan
-(Poletto & Sarkar 1999) and serve again when the last reader is done. A product that one sum alone
-reads is part of that instruction; both are rounded.
+instructions in the order of computation, scope by scope; registers are allocated by linear scan
+(Poletto & Sarkar 1999) and reused after the last read. A product that only one sum reads is part of
+that instruction; both are rounded.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from robins.program.operations import KINDS
 from robins.program.refusal import ProgramError
 from robins.program.walk import Program, counts
 
-DEEPEST = 16  # loops in each other: the interpreter has so many counters of rounds
+DEEPEST = 16  # nested loops: the interpreter has so many counters of rounds
 CHANGES = ("keep", "move")  # instructions that change what is there
 
 # A value that an instruction makes or reads: a node; or by name an argument, a constant, or what a
 # loop carries from round to round.
 Value = int | tuple
-Place = tuple[Value, int]  # the value that holds another, and how many registers behind its first
+Place = tuple[Value, int]  # the value that holds another, and the offset from its first register
 
 
 @dataclass(slots=True)
@@ -34,12 +34,12 @@ class Instruction:
     """An operation before its registers are known.
 
     Attributes:
-        code: its name; empty if registers are only set aside.
+        code: its name; empty if registers are only reserved.
         result: the place of a value.
         args: places of values.
         listed: places of values in a list, behind `numbers`.
-        numbers: as they are.
-        count: of results, in registers one after the other.
+        numbers: immediate operands.
+        count: number of results, in consecutive registers.
     """
 
     code: str
@@ -56,7 +56,7 @@ class Instruction:
 
     @property
     def read(self) -> list[Value]:
-        """Values that have to be there when it is carried out."""
+        """Values that it reads."""
         read = [value for value, _ in self.args + self.listed]
         if self.result is not None and self.code in CHANGES:
             read.append(self.result[0])
@@ -78,7 +78,7 @@ class Writer:
         self.written: list[Instruction] = []
         self.around: dict[int, int] = {0: -1}
         self.spans: dict[int, tuple[int, int]] = {}
-        self.scope_of: dict[Value, int] = {}  # of a value, where it is written
+        self.scope_of: dict[Value, int] = {}  # the loop in which a value is written
         self._places: dict[Value, Place] = {}
         live = program.live
         self.results = [n for nodes in program.outputs for n in nodes.ravel().tolist()]
@@ -98,7 +98,7 @@ class Writer:
         self.given = [self.place(self._as_whole(n)) for n in self.results]
 
     def _products(self, live: list[Node]) -> list[tuple[Node, Node]]:
-        """Sums with the product that is part of them."""
+        """Sums, each with the product that becomes part of it."""
         graph, taken, found = self.graph, set(), []
         for node in live:
             if graph.op[node] not in ("add", "sub") or graph.kind[node] != "real":
@@ -178,7 +178,7 @@ class Writer:
         self._write(code, node, *self.graph.args[product], other)
 
     def _from_whole(self, node: Node) -> None:
-        """An argument that is handed over as a whole number."""
+        """Convert an argument that is passed as a whole number."""
         kind, raw = self.graph.kind[node], ("raw", self.graph.value[node])
         if kind == "flag":
             self._write("whole_ne", node, raw, ("constant", "whole", 0))
@@ -197,7 +197,7 @@ class Writer:
     # -------------------------------------------------------------------------------------- loops
 
     def _loop(self, node: Node) -> None:
-        """Rounds: leaves begin, change at the end of a round, and stay after the last one."""
+        """Write a loop: leaves are set before it and changed at the end of each round."""
         graph, loop = self.graph, self.graph.value[node]
         s, around = loop.scope, self.graph.scope[node]
         self.around[s] = around
@@ -227,7 +227,7 @@ class Writer:
         self.spans[s] = begin, len(self.written)
 
     def _next(self, loop: GraphLoop) -> None:
-        """The leaves of the next round, none written before it is read."""
+        """Write the leaves of the next round, none before its last read."""
         s, graph = loop.scope, self.graph
         changed = [k for k, n in enumerate(loop.next) if n != loop.leaves[k]]
         new: dict[int, Value] = dict(enumerate(loop.next))
@@ -279,7 +279,7 @@ class Writer:
         return value, 0
 
     def last_uses(self) -> dict[Value, int]:
-        """Instruction that reads a value last; in a loop that of all rounds."""
+        """Last instruction that reads each value; the end of a loop for values from outside it."""
         last: dict[Value, int] = {}
         scope = self._scopes()
         for at, one in enumerate(self.written):
@@ -294,7 +294,7 @@ class Writer:
         return last
 
     def depth(self, scope: int) -> int:
-        """Number of loops around one, and so of its counter of rounds."""
+        """Number of loops around one, which is the index of its counter of rounds."""
         found = 0
         while (scope := self.around[scope]) > 0:
             found += 1
@@ -314,11 +314,11 @@ class Tape:
     Attributes:
         arrays: instructions, lists, constants with their registers, registers of the results.
         sizes: counts of instructions, constants, registers, scratch, and of what goes in and out.
-        address: of these, as `interpreter.cc` has them.
+        address: of the pointers and sizes, as `interpreter.cc` reads them.
     """
 
     def __init__(self, program: Program, codes: Mapping[str, int], flag: int):
-        """Choose registers.
+        """Write the instructions and allocate their registers.
 
         Args:
             program: of scalars.
@@ -337,8 +337,8 @@ class Tape:
                 self._constants.setdefault(bits, nx + nk + len(self._constants))
         self._count = nx + nk + len(self._constants)  # registers
         self._of: dict[Value, int] = {}
-        self._lasting: dict[Value, int] = {}  # registers that are not taken back
-        self._free: dict[int, list[int]] = defaultdict(list)  # by how many lie together
+        self._lasting: dict[Value, int] = {}  # registers that are never freed
+        self._free: dict[int, list[int]] = defaultdict(list)  # by number of consecutive registers
         self._ends: dict[int, list[tuple[Value, int]]] = defaultdict(list)
         self._rows: list[tuple[int, ...]] = []
         self._lists: list[int] = []
@@ -361,7 +361,7 @@ class Tape:
 
     @classmethod
     def of(cls, arrays: Sequence[np.ndarray], sizes: np.ndarray) -> Tape:
-        """Tape of what another one holds."""
+        """Tape from the arrays and sizes of another one."""
         made = object.__new__(cls)
         made._hold(arrays, sizes)
         return made
@@ -402,10 +402,10 @@ class Tape:
         raise KeyError(value)
 
     def _assemble(self) -> None:
-        """Write all instructions; where jumps go is known in the end."""
+        """Write all instructions, and the targets of jumps in the end."""
         writer = self._writer
         last, at_row = writer.last_uses(), [0] * (len(writer.written) + 1)
-        jumps: list[tuple[int, int, int]] = []  # a row, a number of it, and an instruction
+        jumps: list[tuple[int, int, int]] = []  # row, operand in it, target instruction
         for at, one in enumerate(writer.written):
             at_row[at] = len(self._rows)
             args = list(map(self._register, one.args))
@@ -434,7 +434,7 @@ class Tape:
             self._rows[row] = (*numbers[:k], at_row[to], *numbers[k + 1 :])
 
     def _take(self, value: Value, count: int, until: int) -> None:
-        """Give registers to a value, until an instruction is carried out."""
+        """Allocate registers to a value up to an instruction."""
         if self._free[count]:
             self._of[value] = self._free[count].pop()
         else:
@@ -443,14 +443,14 @@ class Tape:
         self._ends[until].append((value, count))
 
     def _free_after(self, at: int) -> None:
-        """Take back the registers that an instruction is the last to need."""
+        """Free the registers that an instruction is the last to need."""
         for value, count in self._ends.pop(at, ()):
             self._free[count].append(self._of.pop(value))
 
     def _row(
         self, one: Instruction, result: int, args: Sequence[int], listed: Sequence[int]
     ) -> tuple[int, ...]:
-        """The numbers of an instruction behind its code."""
+        """Operands of an instruction, which follow its code."""
         match one.code:
             case "begin":
                 return (self._writer.depth(one.numbers[0]),)

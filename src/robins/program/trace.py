@@ -36,9 +36,9 @@ def trace(function: Callable[..., PyTree], *args: PyTree, unroll: int | None = U
     """A pure function of JAX as a program of scalars.
 
     Args:
-        function: of pytrees of arrays; nothing else of it is looked at than its jaxpr.
+        function: of pytrees of arrays; only its jaxpr is used.
         args: arguments of the shapes and types that the program will be given; their values do not
-            matter. What the function holds otherwise is known, and folded.
+            matter. Values that the function holds are constants, and folded.
         unroll: the number of scalar operations up to which a loop or a factorisation is written
             out; above, it is a loop or a call. Written out it is faster, and longer. None writes
             out everything that is known to end. Arrays in no loop (`jax.lax.scan`,
@@ -60,7 +60,7 @@ def trace_step(
 
     Args:
         function: the step; the first of its results has the structure of the state.
-        state: one to begin with: its zeros matter.
+        state: the initial one, whose zeros matter.
         args: as in `trace`.
         unroll: as in `trace`.
 
@@ -78,10 +78,10 @@ def trace_steps(
     """Steps that change one state, each ``(state, *args) -> (state, ...)``, as programs.
 
     Zeros of the state that all steps leave zero are structural, such as those above the diagonal
-    of a factor. Which they are follows by induction: those are tried that are zero in the state
-    given; those are dropped for which any step leaves anything but a known zero; and so on until
-    none is dropped. The programs are for states that have them, as the one given and all that
-    follow from it; `Native` refuses others.
+    of a factor. They are found by induction: all zeros of the given state are tried; those that any
+    step does not leave a known zero are dropped, until none is dropped any more. The programs are
+    for states with these zeros, as the given one and all that follow from it; `Native` refuses
+    others.
 
     Args:
         steps: functions, and their arguments after the state.
@@ -115,15 +115,15 @@ def positive_zeros(a: np.ndarray) -> np.ndarray:
     return np.asarray((a == 0.0) & ~np.signbit(a))
 
 
-Zeros = dict[int, np.ndarray]  # of an argument, by its number, entries that are zero
+Zeros = dict[int, np.ndarray]  # by index of an argument, mask of its zero entries
 
 
 def lasting(made: Callable[[Zeros, Calls], list[Program]], zeros: Zeros) -> list[Program]:
-    """The programs of steps that change one state, with those of some zeros of it that last.
+    """Programs of steps of one state, with those of the given zeros that all steps preserve.
 
     Args:
-        made: the programs that take some entries of their first arguments for zero, whose next
-            values their first results are; and the calls of earlier attempts.
+        made: (zeros, calls of earlier attempts) -> programs that take these entries of their first
+            arguments, the state, for zero; their first results are its next value.
         zeros: the entries to try.
     """
     calls: Calls = {}
@@ -160,7 +160,7 @@ def _program(
     zeros: Zeros,
     calls: Calls | None = None,
 ) -> Program:
-    """The program of a jaxpr, some entries of its arguments known to be zero."""
+    """Program of a jaxpr with some entries of its arguments known to be zero."""
     walk = JaxprWriter(Graph(), unroll, calls)
     nodes = [
         walk.taken(leaf.shape, leaf.dtype, leaf.path, zeros.get(index))

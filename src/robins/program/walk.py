@@ -26,7 +26,7 @@ from robins.program.refused import REFUSED
 
 UNKNOWN = "this version of robins does not know it"
 
-# What may leave the range of its type, with whole numbers of fewer than 64 bits.
+# Primitives whose results may overflow a type of whole numbers of fewer than 64 bits.
 OVERFLOWING = {
     *("add", "sub", "mul", "neg", "abs", "shift_left", "integer_pow", "square", "dot_general"),
     *("reduce_sum", "reduce_prod", "cumsum", "cumprod"),
@@ -50,7 +50,7 @@ def rule(*names: str) -> Callable[[Rule], Rule]:
 
 @dataclass(frozen=True)
 class Leaf:
-    """An array among the arguments or results: what it is made of, and where in them it lies."""
+    """An array among the arguments or results: shape, type, kind, and path there."""
 
     shape: tuple[int, ...]
     dtype: Any
@@ -68,7 +68,7 @@ class MemorySlot(NamedTuple):
     dtype: Any
 
     def view(self, reals: np.ndarray, others: np.ndarray) -> np.ndarray:
-        """The array in memory, to be written to."""
+        """View of the array in memory, writable."""
         pool = reals if self.is_real else others
         return pool[self.first : self.last].reshape(self.shape)
 
@@ -105,16 +105,16 @@ def lengths(leaves: Sequence[Leaf]) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Program:
-    """A function as scalars.
+    """Program of scalars of a function.
 
     Attributes:
         graph: its nodes.
         inputs: arrays in the order of the function's leaves; ``input`` nodes count their entries,
             reals by themselves and all other kinds by themselves.
-        outputs: arrays of nodes, and
-        results: what they are.
+        outputs: arrays of nodes of the results.
+        results: their shapes and types.
         structure: pytrees of the arguments and of the results.
-        zeros: of an argument, by its number, which entries it takes to be zero.
+        zeros: by index of an argument, mask of the entries that are assumed zero.
     """
 
     graph: Graph
@@ -151,7 +151,7 @@ class JaxprWriter:
     def __init__(self, graph: Graph, unroll: int | None = None, calls: Calls | None = None):
         self.graph, self.unroll = graph, unroll
         self._calls: Calls = {} if calls is None else calls
-        self._constants: dict[int, tuple[Any, Nodes]] = {}  # by id, which the value keeps its own
+        self._constants: dict[int, tuple[Any, Nodes]] = {}  # by id; holds the value too
         self.inputs: list[Leaf] = []
 
     def taken(
@@ -179,7 +179,7 @@ class JaxprWriter:
         return found[1]
 
     def each(self, function: Callable[..., Node], *arrays: np.ndarray) -> Nodes:
-        """A function of nodes on all entries of arrays of one shape."""
+        """Apply a function of nodes to all entries of arrays, broadcast to one shape."""
         shape = arrays[0].shape
         if any(a.shape != shape for a in arrays):
             arrays = tuple(np.broadcast_arrays(*arrays))
@@ -194,7 +194,7 @@ class JaxprWriter:
         return self.each(partial(self.graph.apply, op), *arrays)
 
     def wrapped(self, nodes: Nodes, dtype: Any) -> Nodes:
-        """Whole numbers as a type of fewer than 64 bits holds them; all others as they are."""
+        """Wrap whole numbers into a type of fewer than 64 bits; leave all others as they are."""
         bits = 8 * np.dtype(dtype).itemsize
         if np.dtype(dtype).kind != "i" or bits == 64:
             return nodes

@@ -6,11 +6,11 @@ COLUMNS = 100
 
 
 def wrapped(line: str) -> list[str]:
-    """A line as several of at most 100 columns, broken at spaces, after commas if there are any."""
+    """Break a line of C at spaces, in code after commas, into lines of at most 100 columns."""
     begin = line[: len(line) - len(line.lstrip())]
     lines = []
     while len(line) > COLUMNS and not line.startswith("#"):
-        least = len(begin) + 24  # a piece shorter than that is no line
+        least = len(begin) + 24  # break no earlier than this
         comma, space = line.rfind(", ", least, COLUMNS), line.rfind(" ", least, COLUMNS)
         is_code = "/*" not in line and "*/" not in line
         at = comma + 1 if comma > 0 and is_code else space

@@ -8,11 +8,11 @@
 The first line writes nothing; `publish` makes a result folder of any outcome, with its report.
 Where computing takes long, `publishing` refuses a folder that cannot be written before it begins.
 
-A file bears the name of its command in `robins --help`; `demo` is in `run`, `verify` in `compare`.
-What several of them use bears a noun: `scenarios`, `publication`, `formats`, `workers`.
+A module is named after its command in `robins --help`; `demo` is in `run`, `verify` in `compare`.
+Modules that several of them use are nouns: `scenarios`, `publication`, `formats`, `workers`.
 
-A function is imported when it is used: the doctor of logs does not wait for the systems, nor a
-list of scenarios for JAX. A new command is a function in a module here, and its row below.
+A function is imported when it is used, so that the doctor of logs imports no system, and a list of
+scenarios no JAX. A new command is a function in a module here, and its row below.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ _TURNING = np.deg2rad(2.0)  # rad/s of mean rate over a second; sensors at rest 
 
 
 class RestingImu(NamedTuple):
-    """Rates of a resting IMU."""
+    """Samples of a resting IMU."""
 
     rates: dict[str, np.ndarray]  # "gyro" [rad/s], "accel" [m/s^2]: (N, 3)
     time_ns: np.ndarray  # (N,)
@@ -76,7 +76,7 @@ def resting_imu(path: Path, columns: Sequence[str | os.PathLike[str]] = ()) -> R
     if cleaned.kind == "increment":
         dt_s = np.diff(time_ns) * 1e-9
         own = np.full((len(cleaned), 1), np.median(dt_s))
-        # The first increment after a gap may be that of the whole gap.
+        # The first increment after a gap may span the whole gap.
         rows = bounds[1:-1]
         own[rows, 0] = own_intervals(dt_s, cleaned.gyro, cleaned.accel)[rows]
         rates = {sensor: values / own for sensor, values in rates.items()}
@@ -86,7 +86,7 @@ def resting_imu(path: Path, columns: Sequence[str | os.PathLike[str]] = ()) -> R
 
 
 def _moved(gyro: np.ndarray, time_ns: np.ndarray) -> bool:
-    """True if the mean rate of any second is off by more than a resting sensor's could be."""
+    """True if the mean rate of any second is off the median by more than `_TURNING`."""
     second = (time_ns - time_ns[0]) // 1_000_000_000
     starts = np.flatnonzero(np.diff(second, prepend=-1))
     count = np.diff(np.append(starts, len(second)))[:, None]
@@ -163,7 +163,8 @@ def allan(
         progress: called with the share done and what is being done.
 
     Raises:
-        InputError: the terms are not letters of these, or the log is too short, not even, constant.
+        InputError: the terms are not among these letters, or the log is too short, uneven or
+            constant.
         robins.logs.LogError: the file cannot be read.
     """
     if len(set(terms)) != len(terms) or not terms or not set(terms) <= set(_NAMES):

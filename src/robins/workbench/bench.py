@@ -136,13 +136,13 @@ class ReplayComparison(NamedTuple):
     """Comparison of what a part sent in the record and in its replay."""
 
     node: str
-    frames: int  # that it sent the second time
+    frames: int  # number that it sent the second time
     same: bool  # byte for byte
     differences: list[FieldDifference]
     whole: bool  # neither record was cut or damaged
     damages: list[str]  # why not, a sentence a record
-    until_s: float  # what was compared ends there
-    planned_s: float  # the run was to end there
+    until_s: float  # end of what was compared
+    planned_s: float  # planned end of the run
     first_difference: str  # the first difference, in words, where the part was run again
     compared: int  # frames
 
@@ -272,7 +272,7 @@ def bench_node(
         name: of the part.
         port: to the bench, "/dev/ttyUSB0,460800".
         scenario: as for `bench_up`, with the same seed.
-        filter_: of the attitude determination.
+        filter_: of the part that runs one; by default that of the scenario.
         seed: of all noise.
         opened: called when the port is open.
 

@@ -32,9 +32,9 @@ from robins.workbench.options import Logs, Option
 
 FILE = "calibration.toml"
 _AXES = ("x", "y", "z")
-_UT = 1e6  # of a tesla
-_WIDE = np.deg2rad(60.0)  # a gap of directions that is worth a word
-_MANY = 0.02  # outliers, likewise
+_UT = 1e6  # microtesla in a tesla
+_WIDE = np.deg2rad(60.0)  # a gap of directions that is reported
+_MANY = 0.02  # share of outliers that is reported
 _WAYS = {
     False: "the sensor so that each of its axes points up and down once",
     True: "the vehicle by a whole circle",

@@ -121,7 +121,7 @@ def plan_campaign(
 
 
 def _of_runs(text: str) -> str:
-    """Scenario text that any run depends on, and its title: what is kept may change at any time."""
+    """Scenario text without the keys that decide what is kept, which may change at any time."""
     tables = scenario.mapping_of(text)
     return scenario.text_of({k: v for k, v in tables.items() if k not in KEPT})
 
@@ -138,7 +138,7 @@ def problem_of(plan: CampaignPlan, filters: Sequence[str] = ()) -> Problem:
 
 
 def ready(where: Where) -> tuple[Store, CampaignPlan]:
-    """A campaign that this code may go on with.
+    """A campaign that this code may continue.
 
     Raises:
         robins.errors.RobinsError: there is none, or other code began it.
@@ -150,7 +150,7 @@ def ready(where: Where) -> tuple[Store, CampaignPlan]:
 
 
 def opened(where: Where) -> tuple[Store, CampaignPlan]:
-    """A campaign that is there, whatever code began it.
+    """An existing campaign, whatever code began it.
 
     Raises:
         robins.errors.RobinsError: there is none, or there are several.
@@ -163,7 +163,7 @@ def opened(where: Where) -> tuple[Store, CampaignPlan]:
 
 
 def campaign_work(where: Where) -> Iterator[tuple[int, int]]:
-    """Compute until nothing is missing; yields how many shards are done, and of how many."""
+    """Compute until nothing is missing; yields the numbers of shards done and in total."""
     every = [ready(one) for one in campaigns_of(where)]
     total, done = sum(len(some) for _, plan in every for some in plan.shards.values()), 0
     for store, plan in every:
@@ -176,7 +176,7 @@ def campaign_work(where: Where) -> Iterator[tuple[int, int]]:
 
 
 def campaigns_of(where: Where) -> list[str]:
-    """The campaigns of a sweep, or the one that is there."""
+    """The campaigns of a sweep, or a single one."""
     sweep = sweep_of(where)
     return [str(where)] if sweep is None else [f"{where}/{point}" for point in sweep[1]]
 
@@ -243,7 +243,7 @@ def diverged_of(found: CampaignState, name: str) -> list[int]:
 
 
 def campaign_report(where: Where) -> Outcome:
-    """Outcome of all runs that are there; fewer than wanted are reported.
+    """Outcome of all finished runs; a warning states if there are fewer than planned.
 
     Args:
         where: folder or address.
@@ -286,7 +286,7 @@ def _bound(problem: Problem, machine: str) -> np.ndarray | None:
 
 
 def campaign_show(where: Where, run: int, *, progress: Progress = ignore_progress) -> Outcome:
-    """One run alone with its histories, as they were kept or computed again, with the same bits.
+    """Outcome of one run with its histories, kept or computed again with the same bits.
 
     Raises:
         InputError: there is no such run.
@@ -334,7 +334,7 @@ class CampaignVerification(NamedTuple):
 def campaign_verify(
     where: Where, share: float = 0.01, *, progress: Progress = ignore_progress
 ) -> CampaignVerification:
-    """Check all shards and histories, compute a share again by chance, and compare the bits.
+    """Check all shards and histories; compute a random share again and compare the bits.
 
     Raises:
         InputError: there is nothing to compare.
@@ -365,7 +365,7 @@ def campaign_verify(
 
 
 def remove_damaged(where: Where) -> int:
-    """Remove damaged shards, and those of damaged histories, to be computed again; how many."""
+    """Remove damaged shards and those of damaged histories; return the number of shards."""
     store, plan = ready(where)
     spoilt = retention.damaged(store, by_stem(plan.shards))
     shards = {shard.name for shard in (*gather(store, plan).damaged, *spoilt.values())}

@@ -56,7 +56,7 @@ def compare(
     A metric that differs is shown with the ratio of the second to the first, by component.
 
     Raises:
-        robins.results.ResultError: one of them is none, or damaged.
+        robins.results.ResultError: one of them is no result folder, or is damaged.
     """
     a, b = results.read(first), results.read(second)
     told = [
@@ -151,7 +151,8 @@ def verify(where: Annotated[Where, Option(metavar="FOLDER")]) -> dict[str, Any]:
         ``scenario``, ``files`` (how many), ``whole``.
 
     Raises:
-        robins.results.ResultError: it is none, incomplete or damaged; the message names the file.
+        robins.results.ResultError: it is no result folder, incomplete or damaged; the message names
+            the file.
     """
     found = results.read(where)
     return {

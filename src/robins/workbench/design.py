@@ -25,7 +25,7 @@ from robins.workbench.options import Option
 
 GAINS, TABLE = "gains.json", "trade_off.csv"
 _NUMBERS = ("h2", "hinf", "hinf_sweep", "bound", "radius", "lambda_", "seconds")
-_MISSING = "robins[design]"  # in the sentence of a method whose packages are not there
+_MISSING = "robins[design]"  # in the message of a method whose packages are not installed
 
 
 def as_text(gammas: Sequence[float]) -> list[str]:

@@ -49,7 +49,7 @@ class LogExamination(NamedTuple):
     @property
     def data(self) -> dict[str, Any]:
         """All of it in the types of JSON."""
-        from robins.results.summary import plain  # people do not wait for what writes results
+        from robins.results.summary import plain  # imported late: people need no writer of results
 
         return {
             "files": self.files,
@@ -105,7 +105,7 @@ def unit_file(
         InputError: there is a configuration among them, or nothing was found.
         robins.logs.LogError: a file cannot be read.
     """
-    from robins.systems.ins_gnss import InsGnssReplay  # JAX, which the findings do not wait for
+    from robins.systems.ins_gnss import InsGnssReplay  # imported late: it needs JAX
 
     files, configuration = parted(paths)
     if configuration is not None:
@@ -125,7 +125,7 @@ def unit_file(
 
 
 def _lasting_share(dataset: Dataset) -> float | None:
-    """Share of the variance of positions that a replay takes to last; None where it finds none."""
+    """Share of the position variance that a replay takes as correlated; None if it finds none."""
     from robins.systems.ins_gnss import InsGnssReplay
     from robins.systems.ins_gnss.correlated_errors import with_correlated_share
     from robins.systems.ins_gnss.recording import on_one_clock
@@ -151,7 +151,7 @@ def _described(table: Any) -> dict[str, Any]:
 def typed(
     paths: Sequence[str | os.PathLike[str]], columns: Sequence[str | os.PathLike[str]] = ()
 ) -> str:
-    """Words of a command line that give these files, declarations and names again."""
+    """Command-line words that pass these files and their formats to another command."""
     words = [str(path) for path in paths]
     for one in map(str, columns):
         named = one.startswith("format:")

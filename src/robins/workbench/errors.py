@@ -14,10 +14,10 @@ class InputError(RobinsError, ValueError):
 
 @contextlib.contextmanager
 def refusing(what: object) -> Iterator[None]:
-    """Add to a ValueError what it is about.
+    """Raise a ValueError as an InputError that names what it is about.
 
     Raises:
-        InputError: in its place.
+        InputError: in place of the ValueError.
     """
     try:
         yield

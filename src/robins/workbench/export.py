@@ -119,7 +119,7 @@ def _rig_for(name: str) -> Rig:
 
 
 def _built(folder: Path, part: str) -> Path:
-    """The part as a program.
+    """Build the part as a program.
 
     Raises:
         InputError: it cannot be built; the files are there.
@@ -139,7 +139,7 @@ def _built(folder: Path, part: str) -> Path:
 def _requested(
     rig: Rig | None, float32: bool, name: str, filter_name: str, seed: int, settings: Sequence[str]
 ) -> Request:
-    """The filter as a part of a rig has it, in a run of this scenario; else as it is tried."""
+    """Request for the filter as a part of a rig in this scenario; else as in a simulation."""
     if rig is None or rig.aboard is None:
         return _export_request(name, filter_name, seed, settings)
     if float32:
@@ -152,7 +152,7 @@ def _requested(
 
 
 def _exportable(asked: Request, adjust: Sequence[str]) -> Request:
-    """The request with its adjustable numbers, refused where no program in C does it."""
+    """Request with its adjustable numbers; refused where the filter cannot run in C."""
     if why := asked.problem.contenders[asked.filter].on_host:
         what = f"filter '{asked.filter}' cannot be exported: {why}, which no program in C does"
         raise InputError(what, asked.label, "choose another by --filter")
@@ -163,7 +163,7 @@ def _exportable(asked: Request, adjust: Sequence[str]) -> Request:
 
 
 def _export_request(name: str, filter_name: str, seed: int, settings: Sequence[str]) -> Request:
-    """The problem by which a filter is tried."""
+    """Request for a filter, with the problem by which it is tested."""
     system, label, text = find_scenario(name, recorded=True)
     if system.aboard is not None and system.replay_parameters is not None:
         given = scenario.parse(system.replay_parameters, text, settings, source=name)

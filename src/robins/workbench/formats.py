@@ -28,7 +28,7 @@ _HEIGHTS = "Heights are above the WGS-84 ellipsoid, not above the sea."
 
 
 class ExportTrack(NamedTuple):
-    """A way over the Earth; E places, NaN between the pieces of a log."""
+    """A track over the Earth; E positions, NaN between the pieces of a log."""
 
     name: str
     text: str  # whose places they are
@@ -75,7 +75,7 @@ _NEEDED = {"attitude": "attitudes", "track": "places on the Earth"}
 
 
 def tracks(solution: xr.Dataset) -> list[ExportTrack]:
-    """The ways of the filters, the reference and the fixes."""
+    """Tracks of the filters, the reference and the fixes."""
     found = []
     for role, name in (("track", ""), ("reference", "reference"), ("gnss", "GNSS fixes")):
         places = find(solution, role)
@@ -113,12 +113,12 @@ def export(solution: xr.Dataset, formats: Sequence[str], name: str = "robins") -
 
 
 def require_formats(formats: Sequence[str], there: Collection[str], where: str) -> None:
-    """Refuse formats that are not known, or that need what there is not.
+    """Refuse unknown formats, and those that need arrays which are missing.
 
     Args:
         formats: names.
-        there: roles of arrays that there are, of "attitude" and "track".
-        where: they are.
+        there: roles of existing arrays, of "attitude" and "track".
+        where: name of what is exported, for the message.
 
     Raises:
         InputError: one of them; the message names those that are possible.
@@ -136,7 +136,7 @@ def require_formats(formats: Sequence[str], there: Collection[str], where: str) 
 def with_exports(outcome: Outcome, formats: Sequence[str], name: str) -> Outcome:
     """The outcome with its solution in other formats among its files, and lines that name them.
 
-    What cannot be exported after all is a warning: the run is not lost by it.
+    A failed export is a warning, so that the run is not lost.
     """
     if not formats or outcome.solution is None:
         return outcome
@@ -225,7 +225,7 @@ def _about(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places (E, 3) [m] east, north, up of an origin, and q_nb (E, 4) with the axes of NED there.
 
-    Both are exact at any distance: north at the other end of a track is not parallel to it.
+    Both are exact at any distance, where north and down differ from those at the origin.
     """
     r_e = np.asarray(ecef_from_geodetic(track.lat_rad, track.lon_rad, track.alt_m))
     C_eo, C_en = dcm_en(*origin[:2]), dcm_en(track.lat_rad, track.lon_rad)

@@ -2,7 +2,7 @@
 
 Names and units are those that loggers use. A unit that no heading states is proved where it can be:
 specific force by the size of gravity, a magnetic field by that of the Earth, stamps by the year,
-gyros by the doctor, who compares them with gravity and, where there are fixes, with the course.
+gyros by the doctor, which compares them with gravity and, where there are fixes, with the course.
 What is only likely is marked in a comment, and what is not known is left out.
 
 Examples::
@@ -48,9 +48,9 @@ _SENSORS = {sensor: set(line.split()) for sensor, line in _WORDS["sensors"].item
 _NOT_RAW, _NO_HEIGHT, _NO_UNIT = (set(line.split()) for line in _WORDS["others"].values())
 _MILLI = {"mdeg/s": ("deg/s", 1e-3)}  # spelt by loggers, unknown to `robins.units`
 _ISO = re.compile(r'"?\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d[.,\d]*(Z|[-+]\d\d:?\d\d)?"?')
-_EPOCHS = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18}  # seconds of today since 1970, roughly
+_EPOCHS = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18}  # today since 1970, roughly
 _FIELD_T = (2.0e-5, 7.0e-5)
-_FEWEST = 20  # fifths of a second in which gravity must have turned
+_FEWEST = 20  # least number of 0.2 s windows for a comparison with gravity
 _FASTEST = 35.0  # rad/s, 2000 deg/s: the range of most gyros
 
 Columns = dict[str, tuple[str, str, str]]  # quantity -> name, unit or "", why
@@ -117,7 +117,7 @@ def _whole(found: set[str]) -> set[str]:
 
 
 def _sheet(head: Head) -> tuple[list[str], str, str, list[list[str]]]:
-    """Names, separator, sign of decimals and cells of the first rows.
+    """Names, separator, decimal mark and cells of the first rows.
 
     Raises:
         InputError: no line of names stands above rows of numbers.
@@ -229,7 +229,7 @@ def _number(text: str, decimal: str) -> float:
 
 
 def _fill(columns: Columns, numbers: dict[str, np.ndarray], stamps: Sequence[str]) -> None:
-    """State the units that numbers tell."""
+    """Fill in units that follow from the numbers."""
     if "time" in columns and not columns["time"][1]:
         name, _, doubt = columns["time"]
         unit, why = _clock(numbers["time"], stamps, "lat" in columns and "accel_x" not in columns)
@@ -295,7 +295,7 @@ def _prove_gyros(
     columns: Columns,
     numbers: dict[str, np.ndarray],
 ) -> None:
-    """State the unit of gyros to which the doctor does not object, where he does to the other."""
+    """Fill in the gyro unit that gravity proves, or to which alone the doctor does not object."""
     if "gyro_x" not in columns or columns["gyro_x"][1]:
         return
 
@@ -333,16 +333,16 @@ def _prove_gyros(
 
 
 def _si(unit: str) -> float:
-    """One of an angle rate in rad/s."""
+    """Value of a unit of angular rate, in rad/s."""
     symbol, scale = _MILLI.get(unit, (unit, 1.0))
     return to_si(scale, symbol)
 
 
 def _turned_by_gravity(imu: ImuTable) -> tuple[float, bool]:
-    """Factor of the rates by which specific force turns as gravity does, and if it can be trusted.
+    """Scale factor of gyro rates from the turning of gravity, and True if it can be trusted.
 
-    At rest in translation f' = f x omega. Both sides are summed up over a fifth of a second; the
-    factor is that of least squares, trusted where they correlate by 0.9.
+    Without acceleration, specific force has f' = f x omega. Both sides are integrated over 0.2 s;
+    the factor is the least-squares one, trusted where they correlate by more than 0.9.
     """
     if len(imu) < _FEWEST:
         return 0.0, False
@@ -354,7 +354,7 @@ def _turned_by_gravity(imu: ImuTable) -> tuple[float, bool]:
     change = np.cross(f[:-1], imu.gyro[:-1]) * dt[:, None]
     summed = np.add.reduceat(change, np.arange(0, len(change), size))[: n - 1]
     smooth = np.add.reduceat(f, np.arange(0, len(f), size))[:n] / size
-    # means of two neighbouring windows lie one window apart, as the middle of what turned between
+    # means of adjacent windows lie one window apart: compare with the mean turn of both windows
     turned = np.diff(smooth, axis=0)[: len(summed) - 1]
     between = 0.5 * (summed[:-1] + summed[1:])[: len(turned)]
     good = np.isfinite(turned).all(axis=1) & np.isfinite(between).all(axis=1)
@@ -367,7 +367,7 @@ def _turned_by_gravity(imu: ImuTable) -> tuple[float, bool]:
 
 
 def _objects(imu: ImuTable, others: list[Table], scale: float) -> bool:
-    """True if the doctor objects to the unit of the rates, times this."""
+    """True if the doctor objects to the unit of the rates, multiplied by this scale."""
     found = logs.examine([replace(imu, gyro=imu.gyro * scale), *others])
     return any(finding.code == "gyro_unit" for finding in found)
 
@@ -378,7 +378,7 @@ def _objects(imu: ImuTable, others: list[Table], scale: float) -> bool:
 def _settings(
     separator: str, decimal: str, numbers: dict[str, np.ndarray], columns: Columns
 ) -> tuple[list[str], list[str]]:
-    """Lines above the columns, and comments."""
+    """Settings above the columns, and comments."""
     lines = [f"separator = {json.dumps(separator)}"] if separator not in ("", ",") else []
     lines += ['decimal = ","'] if decimal == "," else []
     notes = []

@@ -38,7 +38,8 @@ def publishing(
 
     Raises:
         robins.results.ResultError: the folder cannot be written.
-        robins.results.NotWritten: neither could what was computed, which is kept elsewhere.
+        robins.results.NotWritten: a computed outcome could not be written; its numbers are kept
+            elsewhere.
     """
     with results.rescued(out):
         writer = results.ResultWriter(out, command=command, patience_s=patience_s)

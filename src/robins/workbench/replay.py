@@ -101,7 +101,7 @@ def replay(
 
 
 class OpenLog(NamedTuple):
-    """A log of which all is known that is not in its files, ready to be read."""
+    """A log with its configuration, ready to be read."""
 
     system: Any  # a `System` that replays logs
     files: Sequence[str | os.PathLike[str]]
@@ -138,7 +138,7 @@ def open_log(
     settings: Sequence[str] = (),
     columns: Sequence[str | os.PathLike[str]] = (),
 ) -> OpenLog:
-    """Part a log's files from their configuration and read this; as of `replay`.
+    """Separate a log's files from the configuration and read the latter; see `replay`.
 
     Raises:
         InputError: the system replays no logs.
@@ -169,9 +169,9 @@ def align(
 ) -> Outcome:
     """Align a recorded slave to its recorded master: doctor, clean, filter, measure.
 
-    What is believed of the two units is a scenario by name, "system/name" or the path of a TOML
-    file. What the master reported and the slave's inertial samples, along the axes of the slave,
-    are paths in any format of `robins.logs`. All else, and what is raised, is as of `replay`.
+    The model of the two units is a scenario by name, "system/name" or the path of a TOML file. The
+    outputs of the master and the inertial samples of the slave, along the axes of the slave, are
+    paths in any format of `robins.logs`. All other arguments and errors are as of `replay`.
     """
     _float64.require()
     system, label, text = find_scenario(name, recorded=True)
@@ -189,7 +189,7 @@ def align(
     progress(0.0, "reading")
     formats = logs.formats_of((master, slave), columns)
     dataset = logs.load_pair(master, slave, delay_s=parameters.master.delay, formats=formats)
-    # the doctor looks along the master's axes, the filter along those of the slave
+    # the doctor examines along the master's axes, the filter uses those of the slave
     turn = logs.Mounting(*np.degrees(system.orientation(parameters)))
     _examine(replace(dataset, imu=turn.turn(to_ned_frd(dataset.imu))), findings)
     dataset = logs.clean(dataset)

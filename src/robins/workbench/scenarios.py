@@ -75,7 +75,7 @@ def find_scenario(
 
 
 def study_of(system: System, text: str, source: str) -> Study:
-    """The study that a scenario is of.
+    """Study of a scenario.
 
     Raises:
         InputError: it names none of the system, which has several.
@@ -92,7 +92,7 @@ def study_of(system: System, text: str, source: str) -> Study:
 
 
 class Simulated(NamedTuple):
-    """A scenario that can be simulated, read."""
+    """A scenario for simulation, as read."""
 
     system: System
     label: str  # its name

@@ -37,13 +37,13 @@ from robins.workbench.options import MOST_OF_SEED, Filter, Option, Scenario
 from robins.workbench.scenarios import Simulated, check_filters, read_scenario, request_fields
 
 MOST = 1 << 14  # samples
-_TRACED = 0.1  # share of the time after which batches are computed
+_TRACED = 0.1  # share of the progress at which batches begin
 _RANGE = re.compile(r"(.+?)\s+to\s+(.+)")
 _NUMBER = re.compile(r"([-+0-9.eE]+)\s*(.*)")
 
 
 class UncertainParameter(NamedTuple):
-    """A parameter, and the quantities between which it may be anything."""
+    """An uncertain parameter and the ends of its range."""
 
     key: str
     low: float
@@ -56,7 +56,7 @@ class UncertainParameter(NamedTuple):
 
     @property
     def ends(self) -> tuple[str, str]:
-        """Both as settings."""
+        """Both ends as settings."""
         return f"{self.key}={self.text(self.low)}", f"{self.key}={self.text(self.high)}"
 
 
@@ -179,7 +179,7 @@ def _simulated(
     runs: int,
     progress: Progress,
 ) -> tuple[np.ndarray, list[bool], list[str]]:
-    """Squared errors (d + 2, samples, runs, s), as of `follows`, and as of `simulate_points`."""
+    """Squared errors (d + 2, samples, runs, s), flags of `follows`, parts that JAX computed."""
     count = points.shape[0] * points.shape[1]
 
     def done(share: float) -> None:

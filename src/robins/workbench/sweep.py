@@ -35,12 +35,12 @@ from robins.workbench.campaign import (
 from robins.workbench.errors import InputError
 from robins.workbench.workers import fill
 
-MOST = 400  # points; more are a campaign of another kind
+MOST = 400  # most points of a sweep
 _QUANTITY = re.compile(r"\s*([-+0-9.eE]+)\s*(.*?)\s*")
 
 
 class SweptParameter(NamedTuple):
-    """A parameter, and the values that it is given."""
+    """A parameter and its values."""
 
     key: str
     values: tuple[str, ...]
@@ -84,7 +84,7 @@ class SweepPoint(NamedTuple):
 
 
 def points(where: Where, vary: Sequence[SweptParameter]) -> Iterator[SweepPoint]:
-    """All choices, the last parameter first to change."""
+    """All points; the last parameter varies fastest."""
     for place in itertools.product(*(range(len(v.values)) for v in vary)):
         settings = tuple(f"{v.key}={v.values[k]}" for v, k in zip(vary, place, strict=True))
         yield SweepPoint(place, settings, f"{where}/{name_of(place)}")
@@ -156,7 +156,7 @@ def status(where: Where) -> CampaignStatus | dict[str, CampaignStatus]:
 
 
 def report(where: Where) -> Outcome:
-    """Outcome of the runs that are there of a campaign, or of all campaigns of a sweep.
+    """Outcome of the finished runs of a campaign, or of all campaigns of a sweep.
 
     Raises:
         InputError: there is no run of some filter.

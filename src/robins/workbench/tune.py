@@ -79,14 +79,14 @@ def tune(
             "innovations", the log density of the measurements. By default the error of simulated
             runs; a log has no truth.
         system: of a log.
-        settings: "path=value" texts that change scenario and filter before.
+        settings: "path=value" texts that change scenario and filter beforehand.
         columns: TOML files that declare formats of the log's files.
         progress: called with the share done and what is being done.
         findings: called with the doctor's findings on a log.
 
     Raises:
         InputError, robins.scenario.ScenarioError: the request cannot be fulfilled.
-        TooLittle: the data do not determine a parameter.
+        robins.campaign.tuning.UndeterminedError: the data do not determine a parameter.
     """
     _float64.require()
     if _is_log(names):

@@ -33,7 +33,7 @@ from robins.workbench.scenarios import check_filters, read_scenario
 
 ERROR, INNOVATIONS = "error", "innovations"
 SEGMENTS = 24  # of a log; every third is held out
-_FEWEST = 10  # components measured in a segment of a log, in the mean
+_FEWEST = 10  # components measured in a segment of a log, on average
 DENSITY, COMPONENTS = 0, 1
 FIRST_BLOCK = 2
 
@@ -169,7 +169,7 @@ def on_runs(
 
 
 def _trial(filter_: Filter, *others: Tree) -> Trial:
-    """A filter with what it is measured by; another number of it may leap, as a threshold."""
+    """Trial of a filter and its data; its kind is the filter's content, such as a threshold."""
     filter_ = scored(filter_)
     return Trial(content(filter_), (filter_, *others))
 
@@ -180,20 +180,20 @@ def overridden(text: str, settings: Sequence[str]) -> dict[str, Any]:
 
 
 def settings_at(tuned: Sequence[TunedParameter], x: np.ndarray) -> list[str]:
-    """The texts that set the parameters to what they are at some log factors."""
+    """Texts that set the parameters to their values at given log factors."""
     return [v.setting(math.exp(one)) for v, one in zip(tuned, x, strict=True)]
 
 
 @value
 class RunMeasure:
-    """Measures of each run: see above."""
+    """Measures of a simulated run, in the columns of this module."""
 
     blocks: Blocks = kind()
     count_from: int = kind()
     count_to: int | None = kind()
 
     def __call__(self, numbers: Any, world: Any) -> Array:
-        """(k,)."""
+        """(k,) measures of one run."""
         found = one_record(self.blocks, Contender(*numbers), world, over=one_by_one)
         notes = [update.notes for update in found["updates"].values()]
         density = sum(jnp.sum(n["predicted.log_density"]) for n in notes)
@@ -268,7 +268,7 @@ def on_log(
 
 
 def _held_out(first: Trial) -> np.ndarray:
-    """Bool by segment of equally many components: true for every third."""
+    """(segments,) true for every third, held out; few components make fewer segments."""
     _, model, cases = first.numbers
     count = sum(_components(y, model.dims[s]) for case in cases for s, y in case[1].items())
     held = np.arange(min(SEGMENTS, count // _FEWEST)) % 3 == 2
@@ -298,12 +298,12 @@ def _steps(filter_: Any, model: Any, given: Sequence[Any]) -> Array:
 
 @value
 class SegmentMeasure:
-    """The same of segments of equally many steps."""
+    """Measures of a log by segments of equally many steps."""
 
     segments: int = kind()
 
     def __call__(self, numbers: Any, _: Any) -> Array:
-        """(segments, 2)."""
+        """(segments, 2) log density and number of components."""
         steps = _steps(*numbers)
         place = jnp.arange(len(steps)) * self.segments // len(steps)
         return jax.ops.segment_sum(steps, place, self.segments)

@@ -22,7 +22,7 @@ from robins.systems import trust
 from robins.workbench.campaign import campaign_report, plan_campaign, remove_damaged
 
 POLL_S = 0.2
-DEATHS = 3  # of workers, without a shard between them, after which a campaign fails
+DEATHS = 3  # of workers without a new shard in between, after which a campaign fails
 _ROBINS = "from robins.cli import main; raise SystemExit(main())"
 
 
@@ -45,7 +45,7 @@ def work_here(where: str | os.PathLike[str], trusted: Sequence[str | os.PathLike
         trusted: files of user code that the campaign names and that may run here.
 
     Returns:
-        How many shards are there then.
+        Number of shards in the store afterwards.
 
     Raises:
         RobinsError: the worker failed.
@@ -81,7 +81,7 @@ class _Process:
         return self._errors.read().decode("utf-8", "replace").strip()
 
     def close(self) -> None:
-        """End it at once: what it puts, it puts whole."""
+        """Kill it at once: objects of a store are always whole."""
         self._process.kill()
         self._process.wait()
         if self._process.stdin:
@@ -97,7 +97,7 @@ def campaign_run(
     progress: Progress = ignore_progress,
     **options: Any,
 ) -> Outcome:
-    """Begin a campaign or go on with it, until all its runs are there; see `plan_campaign`.
+    """Begin or continue a campaign until all its runs are done; see `plan_campaign`.
 
     Args:
         where: a folder, or an address of object storage.
@@ -157,7 +157,7 @@ def fill(
 
 
 def _judged(process: _Process, where: str) -> int:
-    """One for a worker that was killed; nothing for one that found nothing to do.
+    """Number of deaths: 1 for a worker that was killed, 0 for one with nothing left to do.
 
     Raises:
         RobinsError: it failed by itself.
@@ -173,7 +173,7 @@ def _judged(process: _Process, where: str) -> int:
 
 
 def _failed(why: str, where: str) -> RobinsError:
-    """Error of a worker; what its own sentence has already, folder and advice, is not repeated."""
+    """Error of a worker; folder and advice are not repeated if its message contains them."""
     why = why.removeprefix(f"{where}: ")
     error = RobinsError(f"a worker failed: {why}", where, "" if why.endswith(GOES_ON) else GOES_ON)
     error.bad_input = False

@@ -1,4 +1,4 @@
-"""The rules of JAX's primitives, by what they do; importing this package registers them all."""
+"""Rules that translate JAX's primitives, by topic; importing this package registers them all."""
 
 from robins.program.primitives import (
     algebra,

@@ -1,8 +1,8 @@
 """Products and factorisations of small matrices, written out in scalars.
 
 Written out, they use every structural zero of a matrix. Above the size that `trace` is given, they
-are calls of a routine of `routines.h` instead. Eigenvalues and LU always are: they choose by
-numbers.
+are calls of a routine of `routines.h` instead. Eigenvalues and LU always are, as their steps depend
+on the numbers.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from robins.program.walk import JaxprWriter, Nodes, rule
 def per_matrix(
     walk: JaxprWriter, function: Callable[..., Sequence[Nodes]], *stacks: Nodes
 ) -> list[Nodes]:
-    """A function of matrices over their leading axes."""
+    """Apply a function of matrices over their leading axes."""
     lead = stacks[0].shape[:-2]
     flat = [s.reshape(-1, *s.shape[-2:]) for s in stacks]
     each = [function(walk, *matrices) for matrices in zip(*flat, strict=True)]
@@ -34,7 +34,7 @@ def call(
     arrays: list[Nodes],
     shapes: Sequence[tuple[int, ...]],
 ) -> list[Nodes]:
-    """A routine on arrays, one after the other, and its results, likewise."""
+    """Call a routine on arrays, one after the other, and split its results likewise."""
     counts = [int(np.prod(shape)) for shape in shapes]
     args = [n for a in arrays for n in a.ravel().tolist()]
     found = walk.graph.block(routine, sizes, args, sum(counts))
@@ -156,7 +156,7 @@ def _qr(walk: JaxprWriter, equation: Equation, A: Nodes) -> list[Nodes]:
     return per_matrix(walk, one, A)
 
 
-TINY = 1e-290  # of a sum of squares: what is shorter than its root is nothing
+TINY = 1e-290  # squared length of a column tail below which it counts as zero
 
 
 def _householder(walk: JaxprWriter, A: Nodes, wanted: bool, full: bool) -> tuple[Nodes, Nodes]:
@@ -164,7 +164,7 @@ def _householder(walk: JaxprWriter, A: Nodes, wanted: bool, full: bool) -> tuple
 
     H = I + g v v' takes a column to beta = -sign(alpha) |column|, with v = (alpha - beta, tail)
     and 1 / g = beta (alpha - beta): one division and one root a column (Golub & Van Loan 2013,
-    sec. 5.1). There is no reflection where nothing stands below the diagonal.
+    sec. 5.1). There is no reflection where all entries below the diagonal are zero.
     """
     apply, constant = walk.graph.apply, walk.graph.constant
     m, n = A.shape
@@ -172,7 +172,7 @@ def _householder(walk: JaxprWriter, A: Nodes, wanted: bool, full: bool) -> tuple
     width = m if full else min(m, n)
     upper = np.arange(width)[:, None] <= np.arange(n)
     if walk.stays_whole(2 * m * n * n):
-        # In calls of their own: what nothing reads is not called, and that is Q in most filters.
+        # Two calls, as one whose results nothing reads is left out: that of Q in most filters.
         (R,) = call(walk, "triangle", [m, n, width], [A], [(width, n)])
         Q, _ = call(walk, "householder", [m, n, width], [A], [(m, width), (width, n)])
         return Q, np.where(upper, R, zero)
@@ -215,7 +215,7 @@ def _reflect(walk: JaxprWriter, A: Nodes, j: int, v: list[tuple[int, Node]], g: 
 
 @rule("eigh")
 def _eigh(walk: JaxprWriter, equation: Equation, A: Nodes) -> list[Nodes]:
-    """Vectors as columns, and values from least to greatest."""
+    """Eigenvectors as columns, and eigenvalues in ascending order."""
     if equation.params.get("subset_by_index") not in (None, (0, A.shape[-1])):
         raise ProgramError("some of the eigenvalues of a matrix", "", "take all of them")
     lower = equation.params["lower"]
@@ -233,7 +233,7 @@ def _eigh(walk: JaxprWriter, equation: Equation, A: Nodes) -> list[Nodes]:
 
 @rule("lu")
 def _lu(walk: JaxprWriter, equation: Equation, A: Nodes) -> list[Nodes]:
-    """Triangles in one matrix, exchanges, and the permutation that they make."""
+    """L and U in one matrix, the exchanges of rows, and the permutation that they make."""
 
     def one(walk: JaxprWriter, A: Nodes) -> tuple[Nodes, Nodes, Nodes]:
         m, n = A.shape

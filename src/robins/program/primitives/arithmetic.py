@@ -88,7 +88,7 @@ def _select_n(walk: JaxprWriter, equation: Equation, which: Nodes, *cases: Nodes
 
 @rule("convert_element_type")
 def _convert(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
-    """Convert: reals are cut, at the ends of the new type too; whole numbers wrap round."""
+    """Convert: reals are truncated and saturate at the ends of the type; whole numbers wrap."""
     graph, given = walk.graph, equation.invars[0].aval.dtype
     dtype = np.dtype(equation.params["new_dtype"])
     kind = kind_of(dtype)
@@ -104,7 +104,7 @@ def _convert(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
 
 @rule("shift_right_logical")
 def _shift_right(walk: JaxprWriter, equation: Equation, a: Nodes, by: Nodes) -> Nodes:
-    """Zeros come in from the left: of a signed number its bits are moved, as those of a word."""
+    """Shift in zeros from the left; a signed number is shifted as an unsigned word."""
     graph, dtype = walk.graph, equation.invars[0].aval.dtype
     if dtype.kind == "u":
         return walk.apply("shift_right", a, by)
@@ -136,7 +136,7 @@ def _as_it_is(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> list[Nod
     "digamma", "igamma", "igammac", "random_gamma_grad", "bessel_i0e", "regularized_incomplete_beta"
 )
 def _special(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> Nodes:
-    """Functions of two and more pages: only of numbers that are known."""
+    """Evaluate special functions, too long to write out, of known numbers only."""
     import jax
 
     values = [walk.known(a) for a in arrays]

@@ -13,7 +13,7 @@ from robins.program.nodes import Node
 from robins.program.primitives.reductions import fold
 from robins.program.walk import JaxprWriter, Nodes, rule
 
-LONGEST = 100_000  # rounds of a loop that are written out
+LONGEST = 100_000  # most rounds of a loop that are written out
 
 
 CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call"}
@@ -31,7 +31,7 @@ def called(equation: Equation) -> jex.ClosedJaxpr | None:
 @rule("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat")
 @rule("checkpoint", "custom_vjp_call_jaxpr", "custom_vmap_call", "custom_lin", "remat2")
 def _call(walk: JaxprWriter, equation: Equation, *args: Nodes) -> list[Nodes]:
-    """A function called is a function written in its place."""
+    """Inline the function that is called."""
     p = equation.params
     inner = next(p[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr", "call") if k in p)
     return walk.closed(inner, *args) if hasattr(inner, "consts") else walk.open(inner, (), args)
@@ -47,7 +47,7 @@ def _linear_solve(walk: JaxprWriter, equation: Equation, *args: Nodes) -> list[N
 
 @rule("platform_index")
 def _platform(walk: JaxprWriter, equation: Equation) -> Nodes:
-    """The branch of a function written for several platforms that is meant for processors."""
+    """Index of the branch for CPUs, of a function written for several platforms."""
     platforms = equation.params["platforms"]
     default = next((k for k, names in enumerate(platforms) if names is None), len(platforms) - 1)
     mine = (k for k, names in enumerate(platforms) if names is not None and "cpu" in names)
@@ -78,7 +78,7 @@ def _flat(arrays: Iterable[Nodes]) -> list[Node]:
 
 
 def _shaped(nodes: list[Node], like: Iterable[Nodes]) -> list[Nodes]:
-    """Nodes one after the other as arrays of the shapes of some."""
+    """Split a list of nodes into arrays of the shapes of others."""
     out, at = [], 0
     for a in like:
         out.append(np.array(nodes[at : at + a.size], dtype=np.int64).reshape(a.shape))
@@ -87,7 +87,7 @@ def _shaped(nodes: list[Node], like: Iterable[Nodes]) -> list[Nodes]:
 
 
 def _converted(walk: JaxprWriter, arrays: list[Nodes], like: list[Nodes]) -> list[Nodes]:
-    """Arrays that a round leaves, in the kinds that it began with."""
+    """Carried arrays after a round, converted to the kinds before it."""
     graph = walk.graph
     return [
         walk.each(lambda n, old: graph.convert(n, graph.kind[old]), a, b) if a.size else a
@@ -120,7 +120,7 @@ def _rounds(
     carry: list[Nodes],
     rows: Sequence[Nodes],
 ) -> list[Nodes]:
-    """Arrays carried after a body has been carried out for each row, and arrays of its rows."""
+    """Final carry of a body applied to each row, and arrays of the rows that it makes."""
     if len(order) > 1 and walk.stays_whole(len(order) * size_of(body.jaxpr)):
         return _rolled(walk, body, order, consts, carry, rows)
     kept: dict[int, list[Nodes]] = {}
@@ -166,7 +166,7 @@ def _rolled(
 
 @rule("while")
 def _while(walk: JaxprWriter, equation: Equation, *args: Nodes) -> list[Nodes]:
-    """Written out where it is known when it ends, and that is soon; else a loop of C.
+    """Write out a loop that is known to end soon; else write a loop of C.
 
     In a batch each member goes on for as long as its own condition holds.
     """

@@ -1,7 +1,7 @@
 """Primitives that read and write at indices, known or not.
 
-Where an index is known, nodes are moved. Where it is not, each entry is a choice among those that
-it may be: few are chains of selects, many an array of C with an index.
+Where an index is known, nodes are moved. Where it is not, each entry is chosen among all
+candidates: few by a chain of selects, many by an index into an array of C.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from robins.program.nodes import Node
 from robins.program.walk import JaxprWriter, Nodes, rule
 
 SIZES = tuple[int, ...]
-# Axes of an array in which index vectors lie, and those of its batches with those of the indices.
+# Axes of an array that index vectors address; its batch axes, and those of the indices.
 Axes = tuple[Sequence[Any], Sequence[Any], Sequence[Any]]
 
 
 def _clamped(walk: JaxprWriter, index: Node, most: int) -> Node:
-    """An index between 0 and the most it may be."""
+    """Index clamped between 0 and its largest value."""
     graph = walk.graph
     kind = graph.kind[index]
     if most == 0:
@@ -32,7 +32,7 @@ def _clamped(walk: JaxprWriter, index: Node, most: int) -> Node:
 
 
 def window(walk: JaxprWriter, a: Nodes, start: list[Node], sizes: SIZES) -> Nodes:
-    """A window of an array, moved inside where it would reach beyond."""
+    """Window of an array, shifted inside where it would reach beyond an end."""
     graph = walk.graph
     for axis, (index, size) in enumerate(zip(start, sizes, strict=True)):
         most = a.shape[axis] - size
@@ -64,7 +64,7 @@ def _inside(walk: JaxprWriter, start: list[Node], shape: SIZES, sizes: SIZES) ->
 def _places(
     walk: JaxprWriter, start: list[Node], shape: SIZES, sizes: SIZES
 ) -> Iterator[tuple[tuple[slice, ...], Node]]:
-    """Every window that a start may mean, and whether it does."""
+    """Every window that a start may mean, with the flag that it does."""
     graph = walk.graph
     ranges = []
     for index, n, size in zip(start, shape, sizes, strict=True):
@@ -119,7 +119,7 @@ def _windows(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places of the entries of windows (batch..., *sizes) in an array, for indices that are known.
 
-    Windows are moved inside; also, which (batch...) lay inside before.
+    Windows are shifted inside; the mask (batch...) marks those that lay inside before.
     """
     axes, along, by = of
     start = np.zeros((*indices.shape[:-1], len(shape)), np.int64)
@@ -136,7 +136,7 @@ def _windows(
 
 
 def gathered(equation: Equation, indices: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Places that a gather takes at indices that are known; -1 is what it gives outside."""
+    """Places that a gather reads at known indices; -1 for the fill value outside."""
     p, d = equation.params, equation.params["dimension_numbers"]
     sizes = tuple(int(n) for n in p["slice_sizes"])
     axes = d.start_index_map, d.operand_batching_dims, d.start_indices_batching_dims
@@ -166,7 +166,7 @@ def _updates(equation: Equation, rank: int, new: Nodes) -> tuple[Nodes, SIZES, A
 def scattered(
     equation: Equation, indices: np.ndarray, places: np.ndarray, new: np.ndarray
 ) -> np.ndarray:
-    """Places of an array, those of what is scattered into it at indices that are known put in."""
+    """Places of an array after a scatter of other places at known indices."""
     rows, sizes, axes = _updates(equation, places.ndim, new)
     at, inside = _windows(places.shape, sizes, indices, axes)
     rows = rows.reshape(at.shape)

@@ -1,16 +1,15 @@
 """Random numbers: the keys and the bits of JAX's generator, Threefry 2x32.
 
-A key is one scalar of 64 bits: its two words, the first above the second. The generator makes of a
-key and a number of 64 bits another such number (Salmon et al., SC 2011); ``threefry`` of
-`routines.h` does. To split a key, to fold a number into it and to draw bits are this one function:
+A key is one scalar of 64 bits: its two words, the first in the upper half. The generator maps a key
+and a number of 64 bits to another such number (Salmon et al., SC 2011), by ``threefry`` of
+`routines.h`. Splitting a key, folding a number into it and drawing bits are this one function:
 
     split(key, n)[i]         = threefry(key, i)
     fold_in(key, number)     = threefry(key, number)
     bits(key, 64, shape)[i]  = threefry(key, i)
 
-and of 32 bits, its two words joined by an exclusive or. That is JAX where
-``jax_threefry_partitionable`` is set, as it is by default; else it numbers them in another way,
-which is refused.
+32 bits are the exclusive or of its two words. JAX does so where ``jax_threefry_partitionable`` is
+set, as it is by default; its older numbering is refused.
 """
 
 from __future__ import annotations
@@ -46,12 +45,12 @@ def words(walk: JaxprWriter, both: Node) -> tuple[Node, Node]:
 def numbered(
     walk: JaxprWriter, keys: Nodes, shape: tuple[int, ...], row: Node | None = None
 ) -> Nodes:
-    """Numbers of a generator for each key and the counts from 0, in the order of a shape.
+    """Numbers of the generator for each key and the counts from 0, in the order of a shape.
 
-    Where a row is given, of this shape, the numbers go on from those of the rows before it.
+    Where the index of a row of this shape is given, the counts continue those of the rows before.
 
     Raises:
-        ProgramError: JAX is set to number in another way.
+        ProgramError: JAX is set to its older numbering.
     """
     if not jax.config.values["jax_threefry_partitionable"]:
         raise ProgramError(
@@ -109,7 +108,7 @@ def _bits(walk: JaxprWriter, equation: Equation, keys: Nodes) -> Nodes:
 def bits_of(
     walk: JaxprWriter, keys: Nodes, shape: tuple[int, ...], dtype: Any, row: Node | None = None
 ) -> Nodes:
-    """Random bits; of a row those that its entries have in the whole array."""
+    """Random bits; for a row those of its entries in the whole array."""
     kind = kind_of(dtype)
     both = numbered(walk, keys, shape, row)
     if kind == "word64":

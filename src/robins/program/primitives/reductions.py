@@ -1,4 +1,4 @@
-"""Primitives that make one number of many: sums, products, extremes, sorting."""
+"""Primitives that reduce, cumulate or sort: sums, products, extremes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ REDUCED = {
 
 
 def _empty(walk: JaxprWriter, kind: str, number: float | int) -> Node:
-    """Value of a reduction of nothing."""
+    """Value of a reduction over no entries."""
     if kind == "whole" and not np.isfinite(number):
         number = np.iinfo(np.int64).min if number < 0 else np.iinfo(np.int64).max
     return walk.graph.constant(number, kind)
@@ -43,7 +43,7 @@ def fold(
 
 
 def _finite(walk: JaxprWriter, row: list[Node]) -> list[Node]:
-    """Flags of which all must hold, with those that numbers are finite made one.
+    """Flags to be joined by "and", their tests for finiteness replaced by one.
 
     x - x is zero of a finite number, NaN of any other: a sum of them is zero if all are finite, and
     costs two operations a number, none of them on flags.
@@ -82,7 +82,7 @@ def _cumulated(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
 
 @rule("argmax", "argmin")
 def _arg(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
-    """The first place of the extreme; a NaN is more extreme than any number."""
+    """Index of the first extreme; a NaN is more extreme than any number."""
     graph, (axis,) = walk.graph, equation.params["axes"]
     most = equation.primitive.name == "argmax"
 
@@ -105,7 +105,7 @@ def _arg(walk: JaxprWriter, equation: Equation, a: Nodes) -> Nodes:
 
 @rule("sort")
 def _sort(walk: JaxprWriter, equation: Equation, *arrays: Nodes) -> list[Nodes]:
-    """Stable, by exchanges of neighbours: n (n - 1) / 2 comparisons, none of them a branch."""
+    """Stable bubble sort: n (n - 1) / 2 comparisons of neighbours, none of them a branch."""
     axis, keys = equation.params["dimension"], equation.params["num_keys"]
     graph = walk.graph
     rows = [[np.asarray(row) for row in np.moveaxis(a, axis, 0)] for a in arrays]
