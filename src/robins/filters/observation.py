@@ -56,7 +56,7 @@ class Observation(NamedTuple):
 
 
 class Normalised(NamedTuple):
-    """An innovation in units of its expected standard deviation."""
+    """Innovation whitened by its predicted covariance."""
 
     factor: Array  # (m, m) lower factor of the innovation covariance; identity rows where not used
     used: Array  # (m,) bool, accepted and independent of the components above
@@ -143,7 +143,7 @@ def left_out(o: Observation) -> tuple[Array, Array, Array, Array | None, Array]:
 
 
 def whiten(factor: Array, used: Array, residual: Array) -> Normalised:
-    """Normalise a residual by the factor of its covariance."""
+    """Whiten a residual by the factor of its covariance."""
     rest = jnp.where(used, residual, 0.0)
     white = linalg.solve_lower(factor, rest[:, None])[:, 0]
     return Normalised(factor, used, white, jnp.sum(white**2), jnp.sum(used))

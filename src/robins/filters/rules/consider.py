@@ -1,4 +1,4 @@
-"""Consider states, which are uncertain but not estimated: the Schmidt filter."""
+"""Considered states, uncertain but not estimated: the Schmidt filter."""
 
 from __future__ import annotations
 

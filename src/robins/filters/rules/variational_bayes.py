@@ -19,11 +19,11 @@ from robins.filters.values import Numbers, kind, number, value
 
 
 class InverseGamma(NamedTuple):
-    """Distribution of each variance, as a multiple of its nominal value; mean rate / shape."""
+    """Distribution of each variance over its nominal value; the estimate is rate / shape."""
 
     shape: Array  # (m,) alpha, half the equivalent number of samples
     rate: Array  # (m,) beta
-    scale: Array  # (m,) multiple in use; the mean between updates
+    scale: Array  # (m,) multiple in use; between updates rate / shape
 
 
 def _left(factor: Array, residual: Array, noise: Array) -> Array:

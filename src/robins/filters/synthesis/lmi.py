@@ -175,7 +175,7 @@ def _search(plant: Plant, gamma: float, form: ObserverForm, tried: list[Design])
 
 
 class FrozenTimeWarning(UserWarning):
-    """A filter designed anew at every sample has no guarantee for the time-varying plant."""
+    """A filter redesigned at every sample has no guarantee for the time-varying plant."""
 
 
 class EveryStep:
