@@ -1,4 +1,4 @@
-"""Filters: a way to linearise and a chain of rules; without navigation, sensors or files."""
+"""Filters: a linearisation and a chain of rules, independent of navigation, sensors and files."""
 
 from robins.errors import moved
 from robins.filters.analysis import (

@@ -32,11 +32,12 @@ class Belief(NamedTuple):
 
     @classmethod
     def of(cls, mean: State, covariance: ArrayLike) -> Belief:
-        """Belief of a mean and a positive semidefinite covariance, checked, so not inside `jit`.
+        """Belief from a mean and a covariance; it checks both, so it cannot run inside `jit`.
 
         Raises:
             TypeError: the mean holds something that is not a real number.
-            ValueError: the mean is not finite, the covariance is not one, or has the wrong size.
+            ValueError: the mean is not finite, or the covariance is not positive semidefinite or
+                has the wrong size.
         """
         mean = jax.tree_util.tree_map(
             lambda leaf: jnp.asarray(finite_numbers("initial mean", leaf)), mean
@@ -48,7 +49,7 @@ class Belief(NamedTuple):
 
     @property
     def covariance(self) -> Array:
-        """(..., n, n)."""
+        """(..., n, n) covariance of the tangent components."""
         return self.factor @ jnp.swapaxes(self.factor, -1, -2)
 
     @property
@@ -73,7 +74,7 @@ class Code(IntEnum):
     APART = 10
 
 
-# A step was not taken, or a rule could not do its task.
+# Codes of steps that were not taken, or in which a rule failed.
 FAILURES = (
     Code.INDEFINITE,
     Code.NOT_FINITE,
@@ -84,7 +85,7 @@ FAILURES = (
 
 
 def is_failure(code: Array) -> Array:
-    """() bool: a code is one of `FAILURES`."""
+    """() bool: the code is one of `FAILURES`."""
     return jnp.any(code == jnp.array([int(one) for one in FAILURES]))
 
 
@@ -127,7 +128,7 @@ SENTENCES: dict[Code, str] = {
 def with_notes(
     known: Mapping[str, Numbers], rule: str, notes: Mapping[str, Numbers]
 ) -> dict[str, Numbers]:
-    """Notes extended by those of a rule as ``rule.name``, without a ``_`` at the end of a name."""
+    """Notes extended by those of a rule as ``rule.name``; a trailing ``_`` of a name is dropped."""
     return dict(known) | {f"{rule}.{name.rstrip('_')}": value for name, value in notes.items()}
 
 
@@ -135,10 +136,10 @@ class StepInfo(NamedTuple):
     """Innovation, gain and outcome of an update; m is the tangent dimension."""
 
     innovation: Array  # (m,) y minus its prediction; NaN where missing
-    expected: Array  # (m,) standard deviation of it, before a robust rule weighs it
+    expected: Array  # (m,) innovation standard deviation, before a robust rule raises the noise
     factor: Array  # (m, m) lower factor of the innovation covariance; identity rows where not used
     gain: Array  # (n, m); zero columns where not used
-    used: Array  # (m,) bool: there, not refused, and independent of the components above
+    used: Array  # (m,) bool: present, not refused, and independent of the components above
     # normalised innovation squared, chi-square of `dof`; infinite if a component is CONTRADICTED
     nis: Float[Array, ""]
     dof: Array  # number of components used
@@ -147,11 +148,11 @@ class StepInfo(NamedTuple):
     notes: dict[str, Numbers]  # added by rules, each as ``rule.name``
 
     def noted(self, rule: str, **notes: Numbers) -> StepInfo:
-        """A copy with notes of a rule (`with_notes`)."""
+        """Copy with notes of a rule (`with_notes`)."""
         return self._replace(notes=with_notes(self.notes, rule, notes))
 
     def contradicted_where(self, wrong: Array) -> StepInfo:
-        """A copy with code `Code.CONTRADICTED` and likelihood zero where a rule failed.
+        """Copy with code `Code.CONTRADICTED` and likelihood zero where a rule failed.
 
         A rule that notes a failure also reports it here, so that the tally of a run counts it.
         """

@@ -38,7 +38,7 @@ def sensor_names(what: str, given: str | Sequence[str]) -> tuple[str, ...]:
 def matrix(
     what: str, given: object, rows: int | None = None, columns: int | None = None
 ) -> np.ndarray:
-    """Matrix of finite floats, of the shape that is given.
+    """Matrix of finite floats; refuse a shape other than (rows, columns), where these are given.
 
     Raises:
         TypeError: it is not of real numbers.
@@ -68,7 +68,7 @@ def square(what: str, given: object) -> np.ndarray:
 
 
 def positive(what: str, given: object, of_infinity: str) -> None:
-    """Refuse all but a positive number; infinity is one.
+    """Require a positive number; infinity is allowed.
 
     Raises:
         TypeError: it is not one real number.

@@ -1,6 +1,7 @@
 """Quantiles of the chi-square distribution, the limits of gates and consistency tests.
 
-By the inverse incomplete gamma function: to import `scipy.stats` takes half a second.
+Computed by the inverse incomplete gamma function, since importing `scipy.stats` takes half a
+second.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from scipy.special import gammaincinv
 
 from robins.errors import require
 
-MOST = 64  # components of a measurement in a table of limits
+MOST = 64  # greatest number of components in a table of limits
 
 
 def chi_square(probability: ArrayLike, dof: ArrayLike) -> np.ndarray:
@@ -31,7 +32,7 @@ def limits(probability: ArrayLike, each: int = 1) -> np.ndarray:
 
 
 def within(table: ArrayLike, residual: Array) -> Array:
-    """Part of a table of `limits` that a measurement can reach, which saves code in C.
+    """Entries of a table of `limits` for 0 to m components of a residual; it shortens C code.
 
     Raises:
         ValueError: the measurement has more components than the table.
@@ -42,9 +43,9 @@ def within(table: ArrayLike, residual: Array) -> Array:
 
 
 def chi2_band(dof: ArrayLike, count: int = 1, level: float = 0.95) -> np.ndarray:
-    """(..., 2) two-sided band of the mean of ``count`` independent chi-square(dof) numbers.
+    """(..., 2) two-sided band of the mean of ``count`` independent chi-square(dof) variables.
 
-    Divide by dof for a normalised statistic.
+    Divide it by dof for a statistic per degree of freedom. ``level`` is the probability inside.
     """
     total = np.asarray(dof, dtype=float) * count
     tail = (1.0 - level) / 2.0

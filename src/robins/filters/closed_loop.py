@@ -1,7 +1,7 @@
-"""A filter in closed loop: its estimate controls the vehicle.
+"""Filters in closed loop: the estimate controls the vehicle.
 
-Where a controller acts on the estimate, the next measurement depends on the filter, so vehicle,
-controller, sensors and filter step together, in one scan.
+The next measurement then depends on the filter, so vehicle, controller, sensors and filter step
+together, in one scan.
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ _Carry = tuple[FilterState, Data, Tally]  # Data: the world
 
 
 class Reading(NamedTuple):
-    """Output of the world in a step."""
+    """Output of the world in one step."""
 
     u: Data  # input of the filter's motion
     y: Mapping[str, Data]  # measurements at the end of the step by sensor; NaN is missing
     truth: State  # true state at the end of the step, of the structure of the filter's
     aux: Mapping[str, Data] = {}
-    rows: Array | None = None  # (r, n) reported = rows @ tangent error; None: all of it
+    rows: Array | None = None  # (r, n), reported error = rows @ tangent error; None: identity
     outputs: Data = ()  # further outputs of the world to keep, such as the pointing error
 
 
 class Loop(NamedTuple):
-    """World around a filter.
+    """World around a filter: vehicle, controller and sensors.
 
     Attributes:
         react: ``(world, belief, row) -> (world, Reading)``, pure: one step of the world, given the
-            belief at its beginning. Data belongs into a ``jax.tree_util.Partial``.
+            belief at its beginning. Bind data with ``jax.tree_util.Partial``.
         world: its state before the first step, a pytree of arrays.
         rows: external inputs of the steps, a pytree with leading axis T.
         due: (T,) bool by sensor, True where there can be a measurement; by default everywhere.
-            Elsewhere the update is not computed at all. Do not batch it, or both branches are.
+            Elsewhere the update is skipped. If it is batched, both branches are computed.
     """
 
     react: Callable[[Data, Belief, Data], tuple[Data, Reading]]
@@ -57,7 +57,7 @@ class Loop(NamedTuple):
 
 
 def _without(filter_: Filter, sensor: Sensor, state: FilterState, y: Data, aux: Data) -> Updated:
-    """The same state, and the information of an update without a measurement."""
+    """Unchanged state, and the information of an update without a measurement."""
     like = jax.eval_shape(lambda s, z, a: filter_.update(s, sensor, z, a)[1], state, y, aux)
     blank = jax.tree_util.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
     m = sensor.dim
@@ -104,9 +104,9 @@ def _update(filter_: Filter, sensor: Sensor, state: FilterState, y: Data, aux: D
 
 
 def _apart(step: Callable[..., T], *args: Data) -> T:
-    """A step of the filter as `OnlineFilter` compiles it, not fused with the world around it.
+    """Call a step of the filter without fusing it with the world, as `OnlineFilter` compiles it.
 
-    So a loop has the same bits here and where filter and world are separate programs.
+    The results are then bit-identical to those of separate programs for filter and world.
     """
     leaves, shape = jax.tree_util.tree_flatten(args)
     barrier = jax.lax.optimization_barrier
@@ -114,7 +114,7 @@ def _apart(step: Callable[..., T], *args: Data) -> T:
 
 
 class ClosedLoopRun(NamedTuple):
-    """A run in closed loop; steps and readings have a leading axis of T steps."""
+    """Result of a closed-loop run; steps and readings have a leading axis of T steps."""
 
     steps: Data  # result of `keep` for each `robins.filters.Step`
     readings: Reading
@@ -131,11 +131,11 @@ def run_closed(
     keep: Keep = everything,
     time_s: ArrayLike | None = None,
 ) -> ClosedLoopRun:
-    """Run a filter in a loop: for each step the world reacts to the belief, then the filter
-    predicts with the reading's input and updates with each sensor.
+    """Run a filter in closed loop.
 
-    With the readings as its data, `run` gives the same estimates, to rounding. The arguments but
-    for the loop, errors and warnings are also those of `run`.
+    In each step the world reacts to the belief, then the filter predicts with the input of the
+    reading and updates with each sensor. With the readings as its data, `run` gives the same
+    estimates, to rounding. Other arguments, errors and warnings are those of `run`.
 
     Raises:
         ValueError: ``due`` or a reading names no sensor of the model, or ``due`` is not as long as

@@ -15,13 +15,13 @@ from robins.filters.observation import Observation, left_out, whiten
 from robins.filters.values import kind, value
 from robins.manifold import State
 
-# Below this share of the prior's spread, sigma points lie too close for their differences.
+# Below this share of the prior's spread, differences between sigma points are rounding.
 _NARROW = 1e-6
 
 
 @value
 class Iterated(Linearisation):
-    """The way of `iterated`: e_i+1 = K_i (y - g(e_i) + H_i e_i)."""
+    """Linearisation of `iterated`: e_i+1 = K_i (y - g(e_i) + H_i e_i)."""
 
     way: Linearisation
     iterations: int = kind()
@@ -33,7 +33,7 @@ class Iterated(Linearisation):
         first = self.way.observation(prior, sensor, y, aux)
         if self.iterations == 1:
             return first
-        by_slope = first.excess.shape[1] == 0  # Taylor, which does not depend on the covariance
+        by_slope = first.excess.shape[1] == 0  # Taylor: independent of the covariance
 
         def look(t: Array, M: Array) -> Observation:
             return self.look(prior, sensor, y, aux, t, M)
@@ -49,7 +49,7 @@ class Iterated(Linearisation):
     def look(
         self, prior: Belief, sensor: Sensor, y: Data, aux: Data, t: Array, M: Array
     ) -> Observation:
-        """Observation from the prior, linearised about retract(m, S t) over S M."""
+        """Observation relative to the prior, linearised at retract(m, S t) with factor S M."""
         mean, S = _carried(prior, t)
         o = self.way.observation(Belief(mean, S @ M), sensor, y, aux)
         spread = linalg.solve_lower_transposed(M, o.spread.T).T
@@ -78,20 +78,20 @@ def iterated(linearise: Linearisation | None = None, iterations: int = 4) -> Lin
 
     With sigma points it is iterated posterior linearisation: the regression is over the last
     posterior, mean and covariance (García-Fernández, Svensson, Morelande & Särkkä 2015, sec. III).
-    Where a measurement leaves less than 1e-6 of a prior deviation, differences of points would be
-    rounding: their spread is then the prior's, about the new mean (Sibley, Sukhatme & Matthies
-    2006).
+    Where a measurement leaves less than 1e-6 of a prior standard deviation, differences between
+    points would be rounding: their spread is then the prior's, about the new mean (Sibley, Sukhatme
+    & Matthies 2006).
 
     Rules and `StepInfo.innovation` get the *effective* residual y - g(e) + H e of the last
     linearisation; the earlier ones use the sensor's own noise and all components. Gauss-Newton is
-    not damped, so for a distant measurement it need not converge.
+    not damped, so it need not converge where the measurement is far from its prediction.
 
     Args:
         linearise: each linearisation; `taylor` by default.
         iterations: number of linearisations; 1 is the filter without iteration.
 
     Raises:
-        ValueError: iterations is not positive, or `linearise` uses its points again.
+        ValueError: iterations is not positive, or `linearise` reuses predicted sigma points.
     """
     require(iterations >= 1, "iterated: iterations must be at least 1", iterations)
     way = taylor() if linearise is None else linearise

@@ -1,8 +1,8 @@
 """The Kalman filter: predict and update atoms, and the filter that applies rules around them.
 
-The atoms know no time, no sensor by name and no rule. Both come in two forms with the same inputs
+The atoms do not depend on time, sensor names or rules. Both come in two forms with the same inputs
 and outputs: *square root*, one QR of a block matrix, no covariance ever formed (Kaminski, Bryson &
-Schmidt 1971); and *Joseph*, covariances summed up and factored again, faster and good down to
+Schmidt 1971); and *Joseph*, covariances summed and factored again, faster and accurate up to
 condition numbers of about 1e12.
 """
 
@@ -29,26 +29,26 @@ from robins.filters.trees import finite, select
 from robins.filters.values import kind, value
 
 Form = Literal["sqrt", "joseph"]
-# What rules change of an observation; the rest follows from the belief that it is seen from.
+# Fields of an observation that rules change; the others are recomputed from the prior.
 _OF_RULES = ("noise", "unweighed", "accepted", "notes")
 
 
 class FilterState(NamedTuple):
-    """All a filter carries from step to step."""
+    """Everything that a filter carries from step to step."""
 
     belief: Belief
-    memory: Any  # a tuple with one per rule; other filters keep what they need
-    points: Any = ()  # sigma points on their way from a prediction to its update
-    current: Any = np.True_  # () bool: the last prediction was taken, so the belief is of this time
+    memory: Any  # a tuple with one entry per rule; other filters define their own
+    points: Any = ()  # sigma points kept from a prediction for its update
+    current: Any = np.True_  # () bool: the last prediction was taken, so the belief is current
 
 
 class Prediction(NamedTuple):
     """Record of a predict step for a smoother and a log."""
 
-    transition: Transition | None  # None where there is not one, as in a mixture
+    transition: Transition | None  # None where there is no single one, as in a mixture
     belief: Belief  # predicted
     code: Array  # a `Code`
-    origin: Belief | None = None  # where it began, if a rule has settled another belief
+    origin: Belief | None = None  # belief before the step, after `settle` hooks, if there are any
 
 
 WRONG = "imm.wrong"  # note of a bank: (names,) probability that each of `Filter.suspects` is wrong
@@ -60,14 +60,14 @@ Again = Callable[["Filter"], FilterState]  # the same run with another filter, t
 
 
 class Filter:
-    """A filter: what a run, a campaign, a bench or a loop of yours steps.
+    """Base class of filters, stepped by a run, a campaign, a bench or your own loop.
 
-    A filter of your own is a `robins.filters.values.value` with the methods below; those that users
-    call, `predict` and `update`, are made of them.
+    A filter of your own is a `robins.filters.values.value` with the methods below. Users call
+    `predict` and `update`, which call `_predict` and `_update`.
     """
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        """The state to begin with; dims maps sensor names to dimensions (`Model.dims`)."""
+        """Initial state; dims maps sensor names to dimensions (`Model.dims`)."""
         raise NotImplementedError(f"{type(self).__name__} must have `init`")
 
     def _predict(self, state: FilterState, motion: Motion, u: Data) -> Advanced:
@@ -77,69 +77,69 @@ class Filter:
         raise NotImplementedError(f"{type(self).__name__} must have `_update`")
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
-        """Go on from another belief, keeping what was learned of the noise.
+        """Continue from another belief, keeping the memories of rules, such as a learnt noise.
 
-        For a filter inside a federated filter or a mixture.
+        Used on filters inside a federated filter or a mixture.
         """
         raise NotImplementedError(f"{type(self).__name__} must have `reset`")
 
     def members(self, state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
-        """Beliefs of the local filters of a joined filter, and how they go on from others.
+        """Beliefs of the local filters of a joined filter, and a function that replaces them.
 
         The only access of a filter to the parts of another one.
 
         Returns:
-            The beliefs, none by default, and ``follow(beliefs, belief) -> state``: the local
-            filters start again from beliefs, and the whole from their fusion.
+            The beliefs, none by default, and ``follow(beliefs, belief) -> state``: the state with
+            the local filters reset to beliefs, and the whole to their fusion.
         """
         return (), lambda beliefs, belief: state
 
     @property
     def suspects(self) -> tuple[str, ...]:
-        """Names of instruments, or "motion", that the filter may find wrong; none by default.
+        """Names of the instruments, or "motion", that the filter tests for faults; by default none.
 
-        Its updates note the probability of each as ``imm.wrong``, in this order.
+        Its updates note the fault probability of each as ``imm.wrong``, in this order.
         """
         return ()
 
     def suspicions(self, state: FilterState) -> Array:
-        """(names,) probability that each of the `suspects` is wrong."""
+        """(names,) fault probability of each of the `suspects`."""
         return jnp.zeros(0)
 
     @property
     def reports(self) -> bool:
-        """True if there can be something to report; a stream checks once."""
+        """True if `report` can raise; a stream checks this once."""
         return type(self).report is not Filter.report
 
     def report(
         self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
     ) -> None:
-        """Raise what the rules have to report of a run, which compiled code cannot.
+        """Raise the errors that rules found in a run; compiled code cannot raise them itself.
 
         Args:
-            start: state that the run began with.
-            final: the one that it ended with.
-            again: runs with another filter to another `final`; None where samples came one by one.
-            time: (T,) seconds of the steps.
+            start: state at the start of the run.
+            final: state at its end.
+            again: ``filter -> final state`` of the same run with another filter; None in a stream.
+            time: (T,) times of the steps [s].
 
         Raises:
-            Exception: what a rule reports.
+            Exception: error of a rule.
         """
 
     @jax.jit
     def predict(self, state: FilterState, motion: Motion, u: Data = None) -> Advanced:
         """Predict over one step; the state remembers whether the prediction was taken."""
         state, prediction = self._predict(state, motion, u)
-        # of a type of its own: with a weak one a stream would compile again after the first step
+        # strongly typed: with a weak type a stream would compile again after the first step
         current = (prediction.code == int(Code.DONE)).astype(bool)
         return state._replace(current=current), prediction
 
     @jax.jit
     def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None) -> Updated:
-        """Use a measurement, but none after a prediction that was not taken.
+        """Update with a measurement, which is ignored after a prediction that was not taken.
 
-        The belief is then of an earlier time than the measurement: to fuse it would be to leave out
-        the motion and its noise. It goes on with the next prediction that is taken, or a `reset`.
+        The belief is then older than the measurement, and fusing it would omit the motion and its
+        noise. Updates resume after the next prediction that is taken, or a `reset`.
         """
         new, info = self._update(state, sensor, y, aux)
         ok = state.current | (info.code == int(Code.MISSING))
@@ -148,12 +148,12 @@ class Filter:
 
 
 class Composite(Filter):
-    """A filter of filters; the reports of rules are taken from each by itself.
+    """Filter made of filters; `report` asks each of them separately.
 
     Attributes:
         filters: the filters it is made of.
-        with_filters: ``filters -> Filter``, the same made of others.
-        parts: ``state -> states``, theirs in its own.
+        with_filters: ``filters -> Filter``, the same composite of other filters.
+        parts: ``state -> states`` of these filters.
     """
 
     @property
@@ -186,7 +186,7 @@ class Composite(Filter):
 
 @value
 class Around(Composite):
-    """A filter around another one, `inner`, whose state it has unless it defines its own."""
+    """Wrapper of a filter, `inner`; it has the state of `inner` unless it defines its own."""
 
     inner: Filter
 
@@ -233,27 +233,27 @@ def _outcome(o: Observation) -> Array:
 
 
 def _aside(sound: Array, S_y: Array) -> Array:
-    """The factor to divide by; NaN in a step that is not taken would make all gradients NaN."""
+    """Factor S_y, or the identity where unsound: dividing by NaN would make all gradients NaN."""
     return jnp.where(sound, S_y, jnp.eye(S_y.shape[0]))
 
 
 def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo]:
-    """The Kalman update for a linearised observation.
+    """Kalman update for a linearised observation.
 
     With H S known as the spread, gain and covariance follow from S_y, the innovation's factor:
     K = (S spread') (S_y S_y')^-1 and P = (S - K spread)(..)' + K (Omega + R) K'. The mean moves by
-    the cross-covariance with the whitened innovation, S spread' S_y'^-1, times that innovation:
-    the gain's large numbers, which would cancel, do not come in.
+    the cross-covariance with the whitened innovation, S spread' S_y'^-1, times that innovation,
+    which avoids cancellation among large entries of the gain.
     """
     spread, excess, noise, deficit, used = left_out(o)
     S = prior.factor
     if form == "sqrt":
         S_y, cross, S_post = linalg.block_factor(spread, (excess, noise), S, deficit)
-        sound = finite(S_y * S_y)  # of a number without a finite square the rest is nonsense
+        sound = finite(S_y * S_y)  # where a square overflows, the other blocks are meaningless
         S_y, cross = _aside(sound, S_y), jnp.where(sound, cross, 0.0)
-        S_post = jnp.tril(jnp.where(sound, S_post, jnp.nan))  # zeros above, as code in C knows
-        # After an exact measurement nothing is left in its direction, not even rounding: that
-        # would be a covariance of its own to measurements yet to come.
+        S_post = jnp.tril(jnp.where(sound, S_post, jnp.nan))  # constant zeros above, for C code
+        # After an exact measurement no variance is left in its direction. Rounding is set to zero,
+        # since later updates would take it for variance.
         exact = jnp.any(used & ~jnp.any(noise != 0.0, axis=1) & ~jnp.any(excess != 0.0, axis=1))
         lost = linalg.lost_in_rounding(S_post, prior.sigma)
         S_post = jnp.where(exact & lost, 0.0, S_post)
@@ -280,7 +280,7 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
     mean = manifold.retract(prior.mean, cross @ seen.white)
     gain = linalg.solve_lower_transposed(S_y, cross.T).T
     likely = -0.5 * (seen.nis + seen.dof.astype(float) * math.log(2.0 * math.pi))
-    # With nothing to use the belief stands bit for bit, as if there had been no update.
+    # Without used components the belief is unchanged, bit for bit.
     posterior = select(jnp.any(used), Belief(mean, S_post), prior)
     info = StepInfo(
         innovation=jnp.where(o.present, o.residual, jnp.nan),
@@ -298,13 +298,13 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
 
 
 def _failure(inputs: Any, factor: Array) -> Array:
-    """Code of a failed step: a non-finite factor from finite inputs was not a covariance's."""
+    """Code of a failed step: INDEFINITE if finite inputs gave a factor that is not finite."""
     indefinite = finite(inputs) & ~finite(factor)
     return jnp.where(indefinite, int(Code.INDEFINITE), int(Code.NOT_FINITE))
 
 
 def not_taken(ok: Array, info: StepInfo, why: Array) -> StepInfo:
-    """The information of an update, or of one that was not taken: nothing used, likelihood zero."""
+    """Information of an update; unless `ok`, with nothing used, likelihood zero and code `why`."""
     return info._replace(
         used=info.used & ok,
         nis=jnp.where(ok, info.nis, 0.0),
@@ -315,7 +315,7 @@ def not_taken(ok: Array, info: StepInfo, why: Array) -> StepInfo:
 
 
 def _named(given: Any) -> str:
-    """A wrong argument in an error: a function by its name."""
+    """Text of a wrong argument in an error: a function by its name."""
     return getattr(given, "__name__", None) or repr(given)
 
 
@@ -347,7 +347,7 @@ def _as_rules(given: Any) -> tuple[Rule, ...]:
 
 @value
 class Kalman(Filter):
-    """The filter of `kalman`."""
+    """Filter made by `kalman`."""
 
     way: Linearisation
     rules: tuple[Rule, ...]
@@ -359,11 +359,11 @@ class Kalman(Filter):
 
     @property
     def settles(self) -> bool:
-        """True if a rule does something once a step."""
+        """True if a rule has the hook `settle`."""
         return any(rule.settles for rule in self.rules)
 
     def settled(self, state: FilterState) -> tuple[FilterState, Array]:
-        """The state of a step whose measurements are all in, as the rules leave it, and a code."""
+        """State after the `settle` hooks, when all measurements of a step are in, and a code."""
         belief, memory, code = state.belief, list(state.memory), jnp.asarray(int(Code.DONE))
         for i, rule in enumerate(self.rules):
             memory[i], belief, found = rule.settle(memory[i], belief)
@@ -394,12 +394,12 @@ class Kalman(Filter):
     def seen(
         self, state: FilterState, sensor: Sensor, y: Data, aux: Data
     ) -> tuple[list[Memory], Belief, Observation]:
-        """The measurement as the rules leave it, the prior it is seen from, their memories."""
+        """Memories, prior and observation after the `before` hooks of the rules."""
         prior, memory = state.belief, list(state.memory)
         seen = self.way.first_observation(state.points, prior, sensor, y, aux)
         for i, rule in enumerate(self.rules):
             memory[i], faded, seen = rule.before(memory[i], prior, seen)
-            if faded is not prior:  # the rule built another prior; seen while tracing
+            if faded is not prior:  # the rule made another prior; decided while tracing
                 prior = faded
                 again = self.way.observation(prior, sensor, y, aux)
                 seen = again._replace(**{name: getattr(seen, name) for name in _OF_RULES})
@@ -408,7 +408,7 @@ class Kalman(Filter):
     def _update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data) -> Updated:
         memory, prior, seen = self.seen(state, sensor, y, aux)
         posterior, info = updated(prior, seen, self.form)
-        # A contradiction alone has an infinite NIS that is no overflow.
+        # An infinite NIS is an overflow, unless it marks a contradiction.
         ok = finite(info.nis) | (info.code == int(Code.CONTRADICTED))
         for i, rule in enumerate(self.rules):
             memory[i], posterior, info = rule.after(memory[i], posterior, info, seen)
@@ -442,11 +442,11 @@ class Kalman(Filter):
 def kalman(
     linearise: Linearisation | None = None, rules: Sequence[Rule] = (), form: Form = "sqrt"
 ) -> Filter:
-    """A Kalman filter: a way to linearise, a chain of rules, a form.
+    """Kalman filter: a linearisation, a chain of rules, a form.
 
     A step that would leave a state, covariance or memory that is not finite is not taken, nor is
     one whose innovation is too large to be squared: the belief and the rules' memories stay, the
-    step's code reports it, and its log-likelihood is -inf, so that no search is drawn there.
+    step's code reports it, and its log-likelihood is -inf, so that an optimiser avoids it.
 
     Args:
         linearise: `taylor` (default), `unscented` or `cubature`.
@@ -454,8 +454,8 @@ def kalman(
         form: "sqrt" (default, keeps full accuracy) or "joseph" (about 2.5 times faster at n = 15).
 
     Raises:
-        TypeError: linearise is not what `taylor` and its kin return, or rules are none.
-        ValueError: the form is neither.
+        TypeError: linearise is no `Linearisation`, or rules is no sequence of rules.
+        ValueError: the form is neither "sqrt" nor "joseph".
     """
     one_of("form", form, Form)
     return Kalman(_as_way(linearise), _as_rules(rules), form)

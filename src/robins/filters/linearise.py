@@ -1,8 +1,9 @@
-r"""Ways to linearise: first-order Taylor, unscented, cubature.
+r"""Linearisations: first-order Taylor, unscented, cubature.
 
 All of them return a statistical linear regression y ~ F x + c + e, e ~ N(0, Omega) (Särkkä 2013,
 sec. 5.3; Arasaratnam, Haykin & Elliott 2007), so one Kalman update serves them all. The update
-needs not F but F S, the *spread*: sigma points give it without inverting S, which may be singular.
+needs F S, the *spread*, not F itself: sigma points give it without inverting S, which may be
+singular.
 
 Symmetric points m +- c s_i (s_i column i of S, c^2 = alpha^2 (n + kappa)) split each
 function value into an odd part o_i, which makes the spread, o_i / c, and an even part a_i =
@@ -36,7 +37,7 @@ from robins.filters.values import kind, value
 from robins.linalg.rows import each_row
 from robins.manifold import State
 
-NARROWEST = 1e3 * float(jnp.finfo(float).eps)  # (n + lambda) / n of sigma points
+NARROWEST = 1e3 * float(jnp.finfo(float).eps)  # least (n + lambda) / n of sigma points
 
 
 class Transition(NamedTuple):
@@ -68,12 +69,12 @@ Regressed = tuple[State, Array, Array, Array | None]  # mean, spread, excess, de
 
 
 class Linearisation:
-    """A way to linearise: `taylor`, `unscented`, `cubature`, `iterated`.
+    """Base class of linearisations: `taylor`, `unscented`, `cubature`, `iterated`.
 
     Attributes:
         transition: ``(belief, motion, u) -> Transition``, a prediction.
         observation: ``(prior, sensor, y, aux) -> Observation``, a measurement relative to a belief.
-        reuse: update with the points of the prediction; None where each update draws its own.
+        reuse: update with the points of the prediction; None if each update draws its own.
     """
 
     @property
@@ -98,13 +99,13 @@ class Linearisation:
 
 
 def _form(x: State) -> Hashable:
-    """Structure and shapes, which compare without `__eq__` of an element."""
+    """Structure and shapes, comparable without `__eq__` of an element."""
     leaves, tree = jax.tree_util.tree_flatten(x, is_leaf=lambda leaf: leaf is None)
     return tree, tuple(None if leaf is None else jnp.shape(leaf) for leaf in leaves)
 
 
 def _magnitude(x: State) -> Array:
-    """Size of the numbers behind each tangent component of a state: rounding is 1e-16 of it."""
+    """(n,) magnitude of the numbers behind each tangent component; rounding is 1e-16 of it."""
 
     def of(leaf: State) -> Array:
         if not manifold.is_element(leaf):
@@ -154,7 +155,7 @@ def _jacobian(g: Callable[[State], State], x: State) -> tuple[State, Array]:
 
 @value
 class Taylor(Linearisation):
-    """Value behind `taylor`."""
+    """Linearisation of `taylor`."""
 
     def transition(self, belief: Belief, motion: Motion, u: Data) -> Transition:
         if motion.linear is not None:
@@ -178,7 +179,7 @@ class Taylor(Linearisation):
 def taylor() -> Linearisation:
     """First-order Taylor expansion at the mean: the extended Kalman filter.
 
-    By ``linear`` of the model where it is given, else by forward-mode automatic differentiation.
+    It uses ``linear`` of the model if given, else forward-mode automatic differentiation.
     """
     return Taylor()
 
@@ -225,7 +226,7 @@ def sigma_points(belief: Belief, reach: Number) -> State:
 
 
 def _regress(values: State, n: int, alpha: Number, beta: Number, kappa: Number) -> Regressed:
-    """Mean, spread, excess, deficit of function values at the sigma points (module docstring)."""
+    """Mean, spread, excess and deficit of function values at sigma points (module docstring)."""
     w = sigma_weights(n, alpha, beta, kappa)
     ring = 1.0 / (2.0 * w.reach**2)
     centre = jax.tree_util.tree_map(lambda v: v[0], values)
@@ -259,7 +260,7 @@ def _regress(values: State, n: int, alpha: Number, beta: Number, kappa: Number) 
 
 @value
 class Unscented(Linearisation):
-    """Value behind `unscented`. Its numbers choose columns and signs, so they are kinds."""
+    """Linearisation of `unscented`. Its numbers choose columns and signs, so they are kinds."""
 
     numbers: tuple[float, float, float] = kind()
     redraw: bool = kind()
@@ -307,8 +308,8 @@ class Unscented(Linearisation):
                 f"alpha = {alpha}, beta = {beta}, kappa = {kappa}, n = {n}"
             )
         # State and reading are combinations of the same unit deviations, process noise aside:
-        # state = S T with T T' = I, so the part of the reading along T is its spread, and the part
-        # across T its excess.
+        # state = S T with T T' = I, so the part of the reading in the row space of T is its spread,
+        # and the orthogonal part its excess.
         wide = jnp.concatenate([*state, points.noise], axis=1)
         deviation = jnp.concatenate([*reading, jnp.zeros((sensor.dim, n))], axis=1)
         solid, independent = linalg.guard(prior.factor)
@@ -323,23 +324,24 @@ def unscented(
 ) -> Linearisation:
     """Sigma points (Julier & Uhlmann 2004), drawn before every prediction and update.
 
-    The defaults use points at +- sqrt(n) standard deviations. kappa alpha^2 + n beta >= 0 keeps
-    every covariance a sum of squares. On linear models all of them give the Kalman filter.
+    The defaults put points at +- sqrt(n) standard deviations. kappa alpha^2 + n beta >= 0 keeps
+    every covariance a sum of squares. On linear models any values give the Kalman filter.
 
     Args:
         alpha: spread of the points, without unit, as beta and kappa.
-        beta: 2 is best for Gaussians.
-        kappa: 3 - n in older texts, 0 here.
+        beta: addition to the covariance weight of the centre point; 2 is best for Gaussians.
+        kappa: second parameter of the spread; 3 - n in older texts, 0 here.
         redraw: False updates with the predicted points, as in many papers. These do not include the
-            process noise, so the gain ignores it: not optimal unless the noise is small. Only the
-            first update after a prediction that no rule has faded has such points; the others draw.
+            process noise, so the gain ignores it: not optimal unless the noise is small. They serve
+            the first update after a prediction, if no rule fades the prior; other updates draw new
+            points.
     """
     # kinds must be hashable, which arrays are not
     return Unscented((float(alpha), float(beta), float(kappa)), redraw)
 
 
 def of_width(factor: Array, width: int) -> Array:
-    """Factor of the same covariance with so many columns, at least one a row."""
+    """Factor of the same covariance with `width` columns; width is at least the number of rows."""
     n, k = factor.shape
     if k > width:
         factor, k = linalg.tria(factor), n

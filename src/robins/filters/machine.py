@@ -1,7 +1,7 @@
-"""Machines: a state of a filter, stepped by functions compiled by JAX or as programs.
+"""Machines: the state of a filter, stepped by functions that JAX compiles or by programs.
 
 `ProgramStepper` passes the functions of the filter, each under a name, to a `CompiledState`, which
-compiles them for this one state: in C it is that of `robins.program`, which knows no filter.
+compiles them for this one state. `robins.program`, which does not depend on filters, has one.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from robins.filters.values import Numbers, on_device, split_numbers
 
 T = TypeVar("T")
 Name = Literal["jax", "vm", "c"]
-Codes = tuple[Numbers, dict[str, Numbers]]  # of a step: of its prediction, and by sensor
+Codes = tuple[Numbers, dict[str, Numbers]]  # codes of a step: of its prediction, and by sensor
 
 
 class CompiledState(Protocol):
-    """A state with compiled functions that step it, such as `robins.program.NativeState`."""
+    """State with compiled functions that step it, such as `robins.program.NativeState`."""
 
     state: Data
 
@@ -36,7 +36,7 @@ class CompiledState(Protocol):
         ...
 
 
-# Of a state, and the content of the functions.
+# Makes the memory for a state; the second argument is a key of the content of its functions.
 Machine = Callable[[FilterState, Hashable], CompiledState]
 
 
@@ -67,22 +67,22 @@ _look = jax.jit(_answer, static_argnames=("question",))
 
 
 class JaxStepper:
-    """A state, stepped by functions that JAX compiles."""
+    """State stepped by functions that JAX compiles."""
 
     is_numpy = False
 
     def __init__(self, filter_: Filter, model: Model, state: FilterState):
-        """Take a filter and a model, whose numbers go to the device once."""
+        """Copy the numbers of a filter and a model to the device, once."""
         self._filter, self._model = on_device((filter_, model))
         self.state = state
 
     def predict(self, u: Data) -> Prediction:
-        """Move on by one step."""
+        """Predict over one step."""
         self.state, prediction = _predict(self._filter, self._model.motion, self.state, u)
         return prediction
 
     def update(self, name: str, y: Data, aux: Data) -> StepInfo:
-        """Use a measurement of a sensor."""
+        """Update with a measurement of a sensor."""
         self.state, info = _update(self._filter, self._model.sensor(name), self.state, y, aux)
         return info
 
@@ -99,15 +99,16 @@ class JaxStepper:
 
 
 class ProgramStepper:
-    """`JaxStepper` with a memory, which holds the numbers of filter and model too.
+    """State stepped by programs, in a memory that also holds the numbers of filter and model.
 
-    So programs made for one filter serve all that differ from it in numbers alone.
+    Programs made for one filter thus serve all that differ from it in numbers alone. The methods
+    are those of `JaxStepper`.
     """
 
     is_numpy = True
 
     def __init__(self, filter_: Filter, model: Model, state: FilterState, machine: Machine):
-        """Take a filter, a model and a state into the memory that a machine makes."""
+        """Put a filter, a model and a state into the memory that `machine` makes."""
         self._numbers, self._joined, key = split_numbers((filter_, model))
         self._memory = machine(self._held(state), key)
 
@@ -155,7 +156,7 @@ class ProgramStepper:
 
 
 def usual() -> Name:
-    """The machine that compiles nothing, "vm"; "jax" if no interpreter can be had."""
+    """Default machine: "vm", which compiles nothing, or "jax" if there is no interpreter."""
     from robins.program import BuildError
     from robins.program.interpreter import interpreter_of_one
 
@@ -173,8 +174,8 @@ def on(
 
     Raises:
         ValueError: there is no machine of this name.
-        robins.program.BuildError: there is no compiler of C, or for "vm" of C++.
-        robins.program.ProgramError: the state holds numbers that have no place in a program.
+        robins.program.BuildError: there is no C compiler for "c", or no C++ compiler for "vm".
+        robins.program.ProgramError: the state holds numbers that a program cannot represent.
     """
     if callable(machine):
         return ProgramStepper(filter_, model, state, machine)

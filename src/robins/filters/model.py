@@ -1,6 +1,6 @@
-"""The model of a filter: a motion, and sensors.
+"""Model of a filter: a motion, and sensors.
 
-Functions in a model are part of its *shape*: exchanging one compiles again. Everything else (noise
+Functions in a model are part of its *shape*: exchanging one recompiles. Everything else (noise
 factors, parameters bound with ``jax.tree_util.Partial``) is data: it may change, be batched with
 `jax.vmap` or differentiated without a new compilation.
 """
@@ -24,12 +24,12 @@ from robins.manifold import State
 
 T = TypeVar("T")
 Data = Any  # a pytree of arrays, such as a measurement or an input
-Given = ArrayLike | Sequence[Any]  # numbers of a user, or lists of them
-_LARGEST = float(np.sqrt(np.finfo(float).max))  # of a standard deviation
+Given = ArrayLike | Sequence[Any]  # numbers from a user, or lists of them
+_LARGEST = float(np.sqrt(np.finfo(float).max))  # largest standard deviation: its square is finite
 
 
 def as_noise(value: Data, n: int, whose: str) -> Array:
-    """Noise factor from standard deviations or a factor."""
+    """Noise factor with n rows, from (n,) standard deviations or an (n, k) factor."""
     noise = jnp.asarray(value, float)
     if noise.ndim not in (1, 2) or noise.shape[0] != n:
         raise ValueError(
@@ -48,7 +48,7 @@ def _settle_noise(own: Motion | Sensor, covariance: ArrayLike | None, whose: str
     if covariance is not None:
         object.__setattr__(own, "noise", linalg.factor(covariance, f"noise covariance of {whose}"))
     leaves = [] if callable(own.noise) else jax.tree_util.tree_leaves(own.noise)
-    # of NumPy, since comparisons of JAX arrays are traced inside a trace
+    # as NumPy, since comparisons of JAX arrays are traced inside a trace
     leaves = [np.asarray(x) for x in leaves if not isinstance(x, Tracer)]
     if any(x.dtype.kind not in "biuf" for x in leaves):
         raise TypeError(f"noise of {whose} is not of real numbers")
@@ -67,7 +67,7 @@ def _kinds(x: State) -> str:
 
 
 def _in_float64(whose: str, found: T) -> T:
-    """Result of a user's function, refused in another width than float64."""
+    """Result of a user's function; refuse any dtype but float64."""
     for leaf in jax.tree_util.tree_leaves(found):
         if (width := str(jnp.result_type(leaf))) != "float64":
             raise TypeError(
@@ -87,11 +87,11 @@ class Motion:
             deviations, (n, k) factor with Q = L L', or ``(x, u) -> `` one of these.
         linear: optional ``(x, u) -> (new x, F, noise)`` where an analytic transition exists;
             `taylor` then uses it in place of automatic differentiation.
-        noise_covariance: (n, n) Q, in the place of `noise` (not inside `jit`).
+        noise_covariance: (n, n) Q, in place of `noise` (not inside `jit`).
 
     Raises:
         TypeError: both of noise and its covariance are given, or neither.
-        ValueError: the covariance is none.
+        ValueError: the covariance is not positive semidefinite.
     """
 
     step: Callable[[State, Data], State]
@@ -104,7 +104,7 @@ class Motion:
         _settle_noise(self, noise_covariance, "the motion")
 
     def moved(self, x: State, u: Data) -> State:
-        """State after a step; refuses other widths than float64 and other forms than of a state."""
+        """State after a step; refuse any dtype but float64, and types or shapes other than x's."""
         new = _in_float64("step of the motion", self.step(x, u))
         if (found := _kinds(new)) != (wanted := _kinds(x)):
             raise ValueError(f"step of the motion returns {found} of a state {wanted}")
@@ -118,7 +118,7 @@ class Motion:
 
 @value
 class Sensor:
-    """Reading of one sensor at a state, and its noise.
+    """Measurement function of one sensor, and its noise.
 
     Attributes:
         read: ``(x, aux) -> z``, an (m,) array or a pytree with elements such as `Angle`; aux is
@@ -128,11 +128,11 @@ class Sensor:
         dim: tangent dimension m of the measurement; by default the length of the noise.
         name: key of its measurements in a run.
         linear: optional ``(x, aux) -> (z, H)`` with an analytic Jacobian.
-        noise_covariance: (m, m) R, in the place of `noise` (not inside `jit`).
+        noise_covariance: (m, m) R, in place of `noise` (not inside `jit`).
 
     Raises:
         TypeError: both of noise and its covariance are given, or neither; dim is not known.
-        ValueError: the covariance is none.
+        ValueError: the covariance is not positive semidefinite.
     """
 
     read: Callable[[State, Data], Data]
@@ -155,7 +155,7 @@ class Sensor:
             object.__setattr__(self, "dim", shape[0])
 
     def reading(self, x: State, aux: Data) -> Data:
-        """Predicted measurement at x; refuses other widths than float64."""
+        """Predicted measurement at x; refuse any dtype but float64."""
         return _in_float64(f"read of sensor '{self.name}'", self.read(x, aux))
 
     def noise_factor(self, x: State, aux: Data) -> Array:
@@ -181,7 +181,7 @@ class Model:
         return {s.name: s.dim for s in self.sensors}
 
     def sensor(self, name: str) -> Sensor:
-        """Sensor of this name.
+        """Sensor with this name.
 
         Raises:
             KeyError: there is none; the message lists all names.

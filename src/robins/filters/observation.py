@@ -16,7 +16,7 @@ from robins.filters.model import Data, Given
 from robins.filters.values import Numbers
 from robins.manifold import State
 
-# A quantity known exactly carries the rounding of many steps. This share of its summands is far
+# Exactly known quantities accumulate rounding over many steps. This share of the summands is far
 # above that rounding, and far below the noise of any sensor.
 CONTRADICTS = 1e-9
 
@@ -28,18 +28,18 @@ class Observation(NamedTuple):
     prior: Belief
     residual: Array  # (m,) y minus its prediction; 0 where missing
     present: Array  # (m,) bool, the component was measured
-    accepted: Array  # (m,) bool, the component is used; rules may refuse what is present
+    accepted: Array  # (m,) bool, the component is used; rules may refuse one that is present
     spread: Array  # (m, n) H S
     excess: Array  # (m, k) factor of the linearisation error Omega; k = 0 for Taylor
     noise: Array  # (m, q) measurement noise factor
     size: Array  # (m,) size of the summands of the spread: 1e-14 of it is rounding
     deficit: Array | None = None  # (m,) vector whose square is subtracted, for indefinite weights
     notes: Mapping[str, Number] = {}  # of rules, before the update
-    unweighed: Array | None = None  # (m, q) noise before a robust rule raised it; None: none did
+    unweighed: Array | None = None  # (m, q) noise before robust rules; None: none has raised it
 
     @property
     def expected(self) -> Array:
-        """(m,) standard deviation of the innovation, before a robust rule weighs it."""
+        """(m,) standard deviation of the innovation, before a robust rule raises the noise."""
         noise = self.noise if self.unweighed is None else self.unweighed
         square = sum(jnp.sum(root**2, axis=-1) for root in (self.spread, self.excess, noise))
         taken = 0.0 if self.deficit is None else self.deficit**2
@@ -56,11 +56,11 @@ class Observation(NamedTuple):
 
 
 class Normalised(NamedTuple):
-    """An innovation in units of its expected standard deviation."""
+    """Innovation whitened by its predicted covariance."""
 
     factor: Array  # (m, m) lower factor of the innovation covariance; identity rows where not used
     used: Array  # (m,) bool, accepted and independent of the components above
-    white: Array  # (m,) uncorrelated, of variance one if the filter is right; 0 where not used
+    white: Array  # (m,) white, of unit variance if the filter is consistent; 0 where not used
     nis: Array  # () sum of squares of white, chi-square of dof
     dof: Array  # () number of components used
 
@@ -74,7 +74,7 @@ def as_measurement(sensor: str, data: Data) -> Data:
 
 
 def as_real(sensor: str, data: Data) -> Data:
-    """Measurements as 64-bit floats, of NumPy where they are not of JAX; no copy where they are.
+    """Measurements as 64-bit floats, JAX arrays or else NumPy; NumPy float64 is not copied.
 
     Raises:
         TypeError: they are not real numbers.
@@ -101,7 +101,7 @@ def as_real(sensor: str, data: Data) -> Data:
 
 
 def innovation(z: State, y: Data) -> tuple[Array, Array]:
-    """Tangent vector from a predicted to a real measurement, and mask of present components.
+    """Tangent vector from a predicted to an actual measurement, and mask of present components.
 
     A component is missing where the measurement itself is NaN or infinite; a prediction that is
     not finite is a fault of the model and stays visible. Missing numbers are replaced before any
@@ -124,9 +124,9 @@ def _present(predicted: State, measured: State) -> Array:
 def left_out(o: Observation) -> tuple[Array, Array, Array, Array | None, Array]:
     """Spread, excess, noise and deficit without the rows not used, and the mask of used rows.
 
-    A row is not used if it was not accepted, or if it has no noise and repeats components above it
-    or reads what is known exactly: its spread is then rounding, correlated with everything. It
-    becomes unit noise, uncorrelated with the rest, which keeps shapes.
+    A row is not used if it was not accepted, or if it has no noise and either depends on components
+    above it or measures an exactly known quantity: its spread is then rounding, correlated with
+    everything. It becomes unit noise, uncorrelated with the rest, which keeps shapes.
     """
     kept = [jnp.where(o.accepted[:, None], b, 0.0) for b in (o.spread, o.excess, o.noise)]
     exact = o.accepted & ~jnp.any(kept[2] != 0.0, axis=1)
@@ -143,17 +143,17 @@ def left_out(o: Observation) -> tuple[Array, Array, Array, Array | None, Array]:
 
 
 def whiten(factor: Array, used: Array, residual: Array) -> Normalised:
-    """Normalise a residual by the factor of its covariance."""
+    """Whiten a residual by the factor of its covariance."""
     rest = jnp.where(used, residual, 0.0)
     white = linalg.solve_lower(factor, rest[:, None])[:, 0]
     return Normalised(factor, used, white, jnp.sum(white**2), jnp.sum(used))
 
 
 def contradicted(o: Observation, seen: Normalised) -> Array:
-    """(m,) bool: components that measure something else than what is known exactly.
+    """(m,) bool: components that contradict exactly known values.
 
-    It is known from the belief and the used components (R = 0 and P = 0, or one exact sensor
-    twice), so their residual follows from the other residuals.
+    These follow from the belief and the used components (R = 0 and P = 0, or one exact sensor
+    twice), so the residual of such a component is determined by the other residuals.
     """
     idle = o.accepted & ~seen.used
 
@@ -161,7 +161,7 @@ def contradicted(o: Observation, seen: Normalised) -> Array:
         wide = jnp.concatenate([o.spread, o.excess, o.noise], axis=1)
         used = jnp.where(seen.used[:, None], wide, 0.0)
         if o.deficit is None:
-            # An orthogonal transform, since products of rows over a small pivot are rounding.
+            # By an orthogonal transform: products of rows, divided by a small pivot, are rounding.
             m = len(used)
             top = jnp.concatenate([used, jnp.diag(jnp.where(seen.used, 0.0, 1.0))], axis=1)
             share = linalg.tria(jnp.concatenate([top, jnp.pad(wide, ((0, 0), (0, m)))]))[m:, :m]
@@ -175,7 +175,7 @@ def contradicted(o: Observation, seen: Normalised) -> Array:
 
 
 def normalised(o: Observation) -> Normalised:
-    """Innovation normalised as in the update, by which rules judge a measurement."""
+    """Innovation normalised as in the update, for rules that test a measurement."""
     spread, excess, noise, deficit, used = left_out(o)
     factor = linalg.tria(spread, excess, noise)
     if deficit is not None:

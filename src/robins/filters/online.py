@@ -28,10 +28,10 @@ _NAMES = {int(code): code.name for code in Code}
 
 
 class OnlineFilter:
-    """A filter with a current state; `predict` and `update` are those of a run, compiled.
+    """Filter with a current state; `predict` and `update` are those of a run, compiled.
 
-    It equals `robins.filters.run` to rounding. In C a call takes some ten microseconds where JAX
-    takes a hundred, and returns arrays of NumPy.
+    Its results equal those of `robins.filters.run` to rounding. In C a call takes some ten
+    microseconds where JAX takes a hundred, and returns NumPy arrays.
 
     Attributes:
         filter: the filter.
@@ -46,19 +46,20 @@ class OnlineFilter:
         start: Belief | FilterState,
         machine: Machine | str = "jax",
     ):
-        """Begin at a belief, or continue from a state.
+        """Start at a belief, or continue from a state.
 
         Args:
-            filter_: from `kalman` and its kin.
+            filter_: the filter, such as `kalman` returns.
             model: the motion and the sensors.
             start: initial belief or saved state.
-            machine: "jax", or "c" for compiled programs of scalars, which need a C compiler. The
-                first call of each kind takes seconds to compile; programs are kept on disk. Or a
-                function that makes a `robins.filters.machine.CompiledState` of a state.
+            machine: "jax"; "vm" for the interpreter, which compiles nothing; or "c" for compiled
+                programs of scalars, which need a C compiler. The first call of each kind takes
+                seconds to compile; programs are kept on disk. Or a function that makes a
+                `robins.filters.machine.CompiledState` of a state.
 
         Raises:
             ValueError: there is no such machine.
-            robins.program.BuildError: there is no C compiler.
+            robins.program.BuildError: there is no C compiler, or no interpreter.
             robins.program.ProgramError: the state holds numbers that C cannot represent; a call
                 raises it for an operation that C lacks, with the line of the model or the rule.
         """
@@ -74,7 +75,7 @@ class OnlineFilter:
 
     @property
     def state(self) -> FilterState:
-        """The filter's state, in C of arrays of NumPy; assign to restore a saved one."""
+        """State of the filter, in C as NumPy arrays; assign to restore a saved one."""
         return self._machine.state
 
     @state.setter
@@ -84,11 +85,11 @@ class OnlineFilter:
 
     @property
     def belief(self) -> Belief:
-        """The current belief."""
+        """Current belief."""
         return self.state.belief
 
     def predict(self, u: Data = None) -> Prediction:
-        """Move on by one step with input u."""
+        """Predict over one step with input u."""
         prediction = self._machine.predict(u)
         self._count(prediction.code)
         return prediction
@@ -113,7 +114,7 @@ class OnlineFilter:
         return kept
 
     def update(self, y: Data, sensor: str | None = None, aux: Data = None) -> StepInfo:
-        """Use a measurement of a sensor, optional where the model has one; NaN is missing.
+        """Update with a measurement; NaN is missing. A model of one sensor needs no `sensor` name.
 
         Raises:
             KeyError: the model has no sensor of this name.
@@ -134,8 +135,8 @@ class OnlineFilter:
     def doubts(self, bounds: bool = False, assumed: Collection[str] = ()) -> list[str]:
         """Sentences on reasons to doubt the last 400 updates of each sensor.
 
-        Updates by `step` count where it keeps the whole `Step`. The probability of a false alarm is
-        that of one call. Arguments are those of `robins.filters.doubts`.
+        Updates by `step` count if it keeps the whole `Step`. The false-alarm probability holds for
+        one call. Arguments are those of `robins.filters.doubts`.
         """
         tally = Tally.blank(tuple(self._last))
         info, readings = {}, {}
@@ -149,9 +150,9 @@ class OnlineFilter:
         return doubts(tally.looking(info, readings), bounds, assumed)
 
     def look(self, question: Callable[..., T], *args: Data) -> T:
-        """Return ``question(filter, model, state, *args)``, compiled; the state stays.
+        """Return ``question(filter, model, state, *args)``, compiled; the state is unchanged.
 
-        The question is a pure function, the same object at every call, such as one that predicts to
+        The question is a pure function, the same object at every call, such as a prediction to
         another time than that of the next step.
         """
         return self._machine.look(question, *args)
@@ -162,12 +163,12 @@ class OnlineFilter:
         self._last.setdefault(sensor, deque(maxlen=WINDOW)).append(kept)
 
     def _copied(self, tree: T) -> T:
-        """The same numbers, which the next call in C does not overwrite."""
+        """Tree of the same numbers that the next call in C does not overwrite."""
         return tree_map(np.array, tree) if self._machine.is_numpy else tree
 
     def _count(self, moved: Numbers | int, *used: Numbers) -> None:
         """Count a prediction that was not taken, and updates; let the filter report."""
-        # integers of Python: to compare one of NumPy with a `Code` takes as long as a step
+        # Python integers: comparing a NumPy one with a `Code` takes as long as a step
         if (code := int(moved)) != _DONE:
             self.counts[_NAMES[code]] += 1
         for one in used:

@@ -22,7 +22,7 @@ Again = Callable[["Rule"], Memory]  # memory at the end of the same run with ano
 
 
 class Rule:
-    """One adaptation; every hook in compiled code is pure, and by default the identity.
+    """Base class of rules; every hook in compiled code is pure, and by default the identity.
 
     Attributes:
         init: ``(belief, dims) -> memory``; dims maps each sensor's name to its dimension, in the
@@ -48,7 +48,7 @@ class Rule:
     name = "rule"
 
     def __new__(cls, *args: Any, **kw: Any) -> Any:
-        """``Rule(before=f)`` is a rule of functions."""
+        """Make ``Rule(before=f)`` a rule of functions (`Hooks`)."""
         return object.__new__(Hooks if cls is Rule else cls)
 
     def init(self, belief: Belief, dims: Mapping[str, int], /) -> Memory:
@@ -72,24 +72,25 @@ class Rule:
 
     @property
     def settles(self) -> bool:
-        """True if it has the hook `settle`."""
+        """True if the rule has the hook `settle`."""
         return type(self).settle is not Rule.settle
 
     @property
     def reports(self) -> bool:
-        """True if it has the hook `report`."""
+        """True if the rule has the hook `report`."""
         return type(self).report is not Rule.report
 
     def report(
         self, start: Memory, final: Memory, again: Again | None, time: ArrayLike | None
     ) -> None:
-        """Raise errors of a run, which compiled code cannot.
+        """Raise the errors found in a run; compiled code cannot raise them itself.
 
         Args:
             start: memory at the start of the run.
             final: memory at its end.
-            again: the run with another rule in the place of this one; None in a stream.
-            time: (T,) seconds of the steps.
+            again: ``rule -> final memory`` of the same run with another rule in place of this one;
+                None in a stream.
+            time: (T,) times of the steps [s].
         """
 
 
@@ -99,7 +100,7 @@ _SETTLE = partial(Rule.settle, _ANY)
 
 @value
 class Hooks(Rule):
-    """A rule of functions of a user, each equal to itself only."""
+    """Rule made of a user's functions, which are compared by identity."""
 
     init: Callable[..., Memory] = kind(default=partial(Rule.init, _ANY))
     process: Callable[..., tuple[Memory, Transition]] = kind(default=partial(Rule.process, _ANY))

@@ -1,4 +1,4 @@
-"""Driver of filters: a whole run is one scan, a batch of runs one `vmap` of it."""
+"""Driver of filters: a run is one scan, a batch of runs one `vmap` of it."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class Step(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """A run: every field has a leading axis of T steps."""
+    """Result of a run."""
 
-    steps: Data  # result of `keep` for each Step; by default the Step itself
-    final: FilterState  # after the last step, to go on from
+    steps: Data  # result of `keep` for each Step, leading axis T; by default the Step itself
+    final: FilterState  # after the last step, from which a run can continue
     log_likelihood: Float[Array, ""]
     tally: Tally  # outcomes of all steps, whatever was kept
 
@@ -84,7 +84,10 @@ def _by_sensor(model: Model, data: Data) -> dict[str, State]:
 def checked(
     model: Model, y: Data, u: Data, aux: Mapping[str, Data] | None
 ) -> tuple[dict[str, State], dict[str, Data]]:
-    """Measurements, and further inputs, by sensor; as of `run`, with its errors for them."""
+    """Measurements and further inputs by sensor, checked; arguments and errors are those of `run`.
+
+    The first result is the measurements, the second the further inputs.
+    """
     measurements, extra = _by_sensor(model, y), dict(aux or {})
     check_names(model, extra)
     _check_lengths(measurements, u, extra)
@@ -143,7 +146,7 @@ def _round(
     carry: tuple[Array, Carry],
     row: Rows,
 ) -> tuple[tuple[Array, Carry], Data]:
-    """`_body` with numbers of filter and model that are carried, so that its program has none."""
+    """`_body` with the numbers of filter and model in the carry, so that its program has none."""
     numbers, begun = carry
     after, kept = _body(*joined(numbers), keep, begun, row)
     return (numbers, after), kept
@@ -180,7 +183,7 @@ def report_run(
     again: Again,
     time_s: ArrayLike | None,
 ) -> None:
-    """Raise the report of a filter on a run and warn of its tally, unless they are traced."""
+    """Raise the errors of a filter's `report` and warn of its tally, unless they are traced."""
     if is_known(final):
         filter_.report(start, final, again, time_s)
     if is_known(tally):
@@ -200,11 +203,11 @@ def run(
 ) -> Solution:
     """Run a filter over measurements: for each step k predict, then update with row k of y.
 
-    By JAX one compiled scan, for `jax.vmap` over any of the data and for `jax.grad`. Runs share it
-    if functions of the user and `keep` are the same objects, and shapes are equal.
+    With JAX it is one compiled scan, open to `jax.vmap` over any of the data and to `jax.grad`.
+    Runs share it if shapes are equal and the user's functions and `keep` are the same objects.
 
     Args:
-        filter_: from `kalman` and its kin.
+        filter_: the filter, such as `kalman` returns.
         model: the motion and the sensors.
         start: belief before the first prediction, or the final state of another run.
         y: measurements, (T, m) for a model of one sensor, else a dict by sensor name; NaN is
@@ -212,16 +215,17 @@ def run(
         u: input of the motion at each step, a pytree of arrays with leading axis T.
         aux: further inputs of sensors, by sensor name, leading axis T.
         keep: part of each `Step` to keep; long campaigns keep little.
-        time_s: (T,) time of each step [s], which errors then name.
-        machine: "vm" for the interpreter, outside of what JAX transforms: nothing is compiled.
+        time_s: (T,) time of each step [s], stated in errors.
+        machine: "jax", or "vm" for the interpreter, which compiles nothing and does not work in
+            code that JAX transforms.
 
     Raises:
-        Exception: report of the filter (`Filter.report`); in transformed code see the codes.
-        robins.program.ProgramError: of "vm": filter or model have no place in a program.
-        robins.program.BuildError: of "vm": there is no interpreter.
+        Exception: error raised by `Filter.report`; in transformed code see the codes.
+        robins.program.ProgramError: "vm" cannot represent the filter or the model as a program.
+        robins.program.BuildError: "vm" has no interpreter.
         TypeError: a measurement is not a real number.
-        ValueError: no such machine; lengths differ; a measurement names no sensor or has another
-            shape than it.
+        ValueError: there is no such machine; lengths differ; measurements are for an unknown
+            sensor, or have another shape than its readings.
 
     Warns:
         StepWarning: steps were not taken, or measurements contradict what is known exactly; in
@@ -232,7 +236,7 @@ def run(
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
     rows = u, measurements, extra
     scan = _interpreted
-    if machine == "jax":  # each new shape of an array of JAX is a program
+    if machine == "jax":  # not for "vm": JAX compiles a program for each new shape of an array
         scan, (state, rows) = _scan, jax.tree_util.tree_map(jnp.asarray, (state, rows))
     solution = scan(filter_, model, state, rows, keep)
 

@@ -28,14 +28,14 @@ def rts_smoother(solution: Solution, machine: RunMachine = "jax") -> Belief:
     The first two terms of P_s are an update of P by the predicted state and come from its
     triangularisation, so nothing is subtracted (Park & Kailath 1995).
 
-    A motion that contracts without noise leaves only rounding of a direction of P-, which G would
-    amplify. Later measurements with less information on a direction than that rounding are ignored
-    there. Covariance added by a rule (fading, inflation) is treated as process noise.
+    A motion that contracts a direction without noise leaves only rounding in P- there, which G
+    would amplify. Later measurements with less information on that direction than the rounding are
+    ignored there. Covariance added by a rule (fading, inflation) is treated as process noise.
 
     Args:
         solution: the run.
-        machine: "vm" for the interpreter where it can, outside of what JAX transforms: nothing is
-            compiled.
+        machine: "jax", or "vm" for the interpreter where possible, which compiles nothing and does
+            not work in code that JAX transforms.
 
     Returns:
         Beliefs with leading axis T; the last one is the filter's.
@@ -83,7 +83,7 @@ def _end_and_rows(posterior: Belief, predictions: Prediction) -> tuple[Belief, D
 
 
 def _back(later: Belief, row: tuple[Belief, Prediction]) -> tuple[Belief, Belief]:
-    """Update `now` by the following state."""
+    """Smooth the belief of a row by the smoothed belief of the following step."""
     now, prediction = row
     now = now if prediction.origin is None else prediction.origin
     t = prediction.transition

@@ -16,19 +16,19 @@ from robins.filters.values import Numbers
 from robins.filters.whiteness import innovation_sums, suspicions
 from robins.manifold import State
 
-REFUSED_SHARE = 1.0 / 3.0  # of refused measurements that is reported: a sound gate refuses few
-APART_SHARE = 0.1  # of measurements with diverging local filters that is reported
-FEWEST = 20  # measurements, or degrees of freedom, below which no share and no mean is judged
+REFUSED_SHARE = 1.0 / 3.0  # share of refused measurements above which they are reported
+APART_SHARE = 0.1  # share of measurements with diverging local filters above which it is reported
+FEWEST = 20  # measurements, or degrees of freedom, below which no share and no mean is tested
 
-# Mean NIS per degree of freedom that is reported: standard deviations half of what they should
-# be, or four times. Robust filters are cautious by design, so that side is wider.
+# Mean NIS per degree of freedom above or below which it is reported: standard deviations are half
+# or four times what they should be. Robust filters are cautious by design, so that side is wider.
 NIS_HIGH, NIS_LOW = 4.0, 1.0 / 16.0
-CORRELATED = 10  # innovations of a wrong model are correlated: so many count as one
-LEVEL = 0.999
+CORRELATED = 10  # degrees of freedom that count as one, since innovations may be correlated
+LEVEL = 0.999  # of the two-sided band of the mean NIS
 
 
 class StepWarning(UserWarning):
-    """A run has steps that were not taken, or measurements that contradict what is exact."""
+    """A run has steps that were not taken, or measurements that contradict exact knowledge."""
 
 
 class Tally(NamedTuple):
@@ -44,7 +44,7 @@ class Tally(NamedTuple):
 
     @classmethod
     def blank(cls, sensors: Collection[str]) -> Tally:
-        """Tally of no step."""
+        """Tally of zero steps."""
         zeros = (jnp.zeros(len(Code), int), jnp.zeros(()), jnp.zeros((), int))
         updates, nis, dof = (dict.fromkeys(sensors, zero) for zero in zeros)
         return cls(zeros[0], updates, nis, dof)
@@ -67,8 +67,8 @@ class Tally(NamedTuple):
     ) -> Tally:
         """Add sums of innovations and readings over the steps, for `doubts`; not in `jit`.
 
-        Both are by sensor: a `StepInfo` of all steps, or a tuple with its innovation, sigma, nis
-        and dof; the readings as the run took them.
+        Both are by sensor: info is a `StepInfo` of all steps, or a tuple with its innovation,
+        sigma, nis and dof; readings are the measurements of the run.
         """
         given = readings or {}
         looks = {}
@@ -123,8 +123,8 @@ def doubts(tally: Tally, bounds: bool = False, assumed: Collection[str] = ()) ->
         tally: of a run (`Solution.tally`), or of several with leading axes.
         bounds: the filter states bounds, not standard deviations (an H-infinity filter), so the
             mean NIS of the run is not tested.
-        assumed: sensors with cautious noise: neither a small NIS nor the side and order of
-            innovations are tested.
+        assumed: sensors with deliberately large noise: neither a small NIS nor the sign and order
+            of their innovations are tested.
     """
     found = not_taken(tally)
     for sensor in tally.updates:

@@ -1,4 +1,4 @@
-"""Small functions of pytrees inside compiled code."""
+"""Small functions on pytrees for compiled code."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ def equal(a: Data, b: Data) -> Array:
 
 
 def row_of(tree: T, i: ArrayLike) -> T:
-    """Row i of each array; rows, where i is an array."""
+    """Row i of each array; several rows if i is an array."""
     return jax.tree_util.tree_map(lambda a: a[i], tree)
 
 
 def stack(trees: Sequence[T]) -> T:
-    """Arrays of JAX with a leading axis of trees."""
+    """Stack trees along a new leading axis, as JAX arrays."""
     return jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *trees)
 
 
 def repeated(tree: T, count: int) -> T:
-    """The same with a leading axis of so many copies."""
+    """Tree of `count` copies along a new leading axis."""
     return jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), tree)
 
 

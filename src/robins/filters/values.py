@@ -27,7 +27,7 @@ else:
 
 
 def kind(**how: Any) -> Any:
-    """Field that chooses what is compiled."""
+    """Field of a static value: another one compiles again."""
     return dataclasses.field(metadata={"kind": True}, **how)
 
 
@@ -72,7 +72,7 @@ def value(cls: type[T]) -> type[T]:
 
 
 def is_known(x: object) -> bool:
-    """True if it holds no tracer of a transformation."""
+    """True if x holds no tracer of a JAX transformation."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree_util.tree_leaves(x))
 
 
@@ -94,7 +94,7 @@ def is_factor(x: Numbers) -> Numbers:
 def number(
     what: str, given: object, holds: Callable[[Numbers], Numbers | bool] | None = None
 ) -> Numbers:
-    """A number as a leaf: of float64, not of a weak type as of Python; tracers pass.
+    """Number as a leaf: float64, without the weak type of a Python number; tracers pass.
 
     Raises:
         TypeError: ``what, got ...``: it is not of real numbers.
@@ -115,17 +115,17 @@ def finite_leaf(what: str, given: object) -> Numbers:
 
 
 def as_data(function: Callable[..., T]) -> Callable[..., T]:
-    """A function as data: a plain one as a `Partial` that binds nothing."""
+    """Function as data: a plain one becomes a `Partial` that binds nothing."""
     return Partial(function) if is_kind(function) else function
 
 
 def on_device(tree: T) -> T:
-    """Copy with arrays of JAX for numbers of NumPy, which each call would transfer again."""
+    """Copy with JAX arrays in place of NumPy ones, which each call would transfer again."""
     return jax.tree_util.tree_map(jax.numpy.asarray, tree)
 
 
 def content(*trees: object) -> Hashable:
-    """Key of values with equal kinds and numbers, for programs that fold them.
+    """Key that values with equal kinds and numbers share, for programs that fold numbers.
 
     Functions are compared by identity.
     """
@@ -145,11 +145,11 @@ def content(*trees: object) -> Hashable:
 def split_numbers(tree: T) -> tuple[np.ndarray, Callable[[Numbers], T], Hashable]:
     """Split a tree into numbers that are arguments of a program, and the rest that is its key.
 
-    Arguments are the reals of float64, but not zeros, ones, minus ones and what is not finite,
-    which spare operations as constants.
+    Arguments are the float64 numbers except zeros, ones, minus ones and those that are not finite,
+    which save operations as constants.
 
     Returns:
-        (n,) the numbers; a function that makes the tree with others in their places; and the key.
+        (n,) the numbers; a function that rebuilds the tree with other numbers; and the key.
     """
     leaves, structure = jax.tree_util.tree_flatten(tree)
     fixed, given, places = [], [np.zeros(0)], []

@@ -1,12 +1,12 @@
 """Tests of sequences of innovations and readings.
 
-The innovations of a consistent filter are independent of all before them, lie on either side of
-zero alike, and are as large late as they were early; a working sensor does not repeat itself.
-Each test compares one of these with a quantile of a stated probability, and with a least size of
-deviation: in a long log every model is wrong by many of its sigmas.
+The innovations of a consistent filter are independent of earlier ones, of either sign equally
+often, and as large at the end of a run as at its start; a working sensor does not repeat its
+readings. Each test compares one of these properties with a quantile of a stated probability, and
+with a least deviation worth reporting: in a long log any model error is significant.
 
-The innovations are those before a robust rule weighs them. All is NumPy on arrays that a run has
-kept, with any leading axes of runs.
+Innovations are those before a robust rule raises the noise. The functions use NumPy on arrays that
+a run has kept, with any leading axes of runs.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from robins.manifold import State
 
 FALSE_ALARM = 1e-5  # probability of a finding on a consistent run, over all sensors and tests
 BY_CHANCE = 1e-3  # probability that as many runs have a finding by chance
-TESTS = 5  # of a component: following, the side in all, the side late, size and share far late
-FEWEST = 20  # innovations below which nothing is judged
-BEFORE = 10  # innovations whose sum is compared with the next
-CLIPPED = 3.0  # sigmas at which an innovation is clipped
-FOLLOWING = 0.2  # least correlation with those before that is reported
-ONE_SIDE = 0.6  # least share on one side that is reported: a bias of a quarter of a sigma
+TESTS = 5  # per component: correlation, sign overall, sign late, NIS late, share beyond CLIPPED
+FEWEST = 20  # innovations below which nothing is tested
+BEFORE = 10  # preceding innovations whose sum each innovation is correlated with
+CLIPPED = 3.0  # limit at which an innovation is clipped [sigma]
+FOLLOWING = 0.2  # least correlation with preceding innovations that is reported
+ONE_SIDE = 0.6  # least share of one sign that is reported: a bias of a quarter of a sigma
 FAR_SHARE = 1.0 / 3.0  # least share of the last quarter beyond `CLIPPED` that is reported
 LATE_NIS = 2.0  # least mean NIS per degree of freedom in the last quarter that is reported
-REPEATS = 10  # equal readings in a row of a stuck sensor
-COARSE = 0.1  # resolution over sigma of the innovation above which readings may repeat
+REPEATS = 10  # equal readings in a row that mark a stuck sensor
+COARSE = 0.1  # resolution over innovation sigma above which a sensor may repeat readings
 
-# Columns of `innovation_sums`: the sums of several pieces of one log may be added.
+# Columns of `innovation_sums`, which may be added over several pieces of one log (`joined`).
 _COUNT, _PRODUCT, _SQUARE, _SEEN, _ABOVE, _LATE, _LATE_ABOVE, _FAR, _NIS, _DOF, _REPEATS = range(11)
 
 
@@ -46,9 +46,9 @@ def innovation_sums(
 
     Args:
         innovation: (..., T, m), NaN where missing.
-        sigma: (..., T, m), NaN where not used.
-        nis: (..., T).
-        dof: (..., T).
+        sigma: (..., T, m) standard deviations of the innovations, NaN where not used.
+        nis: (..., T) normalised innovations squared.
+        dof: (..., T) degrees of freedom of the NIS.
         readings: (..., T) pytree of measurements as a run takes it; None skips the test of
             repeated readings.
     """
@@ -86,9 +86,9 @@ def innovation_sums(
 
 
 def _standard(e: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Innovations over their sigmas, clipped; zero where missing.
+    """Innovations in units of their sigmas, clipped; zero where missing.
 
-    A refused innovation has no sigma and takes the mean one of the run.
+    A refused innovation has no sigma; the mean sigma of the run is used.
     """
     blank = np.isnan(sigma)
     if np.any(blank):
@@ -104,8 +104,8 @@ def _standard(e: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 def _repeats(readings: State, there: np.ndarray, e: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """Longest run of equal readings of each component; zero where repetition is legitimate.
 
-    A constant reading is a pseudo-measurement such as zero velocity, and a sensor at rest repeats
-    itself if its resolution is above a tenth of the innovation's sigma.
+    Legitimate are a reading that is constant throughout (a pseudo-measurement such as zero
+    velocity) and a sensor whose resolution exceeds a tenth of the innovation's sigma.
     """
     lead, m = e.shape[:-2], e.shape[-1]
     flat = [np.asarray(leaf, float) for leaf in tree_leaves(readings)]
@@ -130,26 +130,26 @@ def _longest(y: np.ndarray, sigma: float) -> int:
     if most < REPEATS:
         return 0
     steps = np.diff(np.unique(y))
-    steps = steps[steps > 1e-12 * np.max(np.abs(y))]  # the others are rounding
+    steps = steps[steps > 1e-12 * np.max(np.abs(y))]  # smaller steps are rounding
     return most if len(steps) and np.min(steps) <= COARSE * sigma else 0
 
 
 def joined(looks: Sequence[np.ndarray]) -> np.ndarray:
-    """Sums over all pieces of one log."""
+    """Sums over all pieces of one log; the greatest count of repeated readings."""
     table = np.sum(looks, axis=0)
     table[..., _REPEATS] = np.max([look[..., _REPEATS] for look in looks], axis=0)
     return table
 
 
 def suspicions(looks: Mapping[str, ArrayLike], assumed: Collection[str] = ()) -> list[str]:
-    """Sentences on sequences that a consistent filter would not show.
+    """Sentences on sequences of innovations that a consistent filter would not produce.
 
     Args:
-        looks: sums of `innovation_sums` by sensor; with leading axes each run is judged by itself,
-            and a sentence counts the runs for which it holds.
-        assumed: sensors with correlated errors by design, so that only the size of the innovations
-            and repeated readings count: their noise is a cautious guess, or the gain is held or
-            leaves states out (`constant_gain`, `consider`).
+        looks: sums of `innovation_sums` by sensor; with leading axes each run is tested separately,
+            and a sentence states the number of runs for which it holds.
+        assumed: sensors whose innovations are correlated by design, so that only their size and
+            repeated readings are tested: the noise is a cautious guess, or the gain is constant or
+            omits states (`constant_gain`, `consider`).
     """
     tables = {name: np.asarray(table, float) for name, table in looks.items()}
     components = sum(table.shape[-2] for table in tables.values())
@@ -222,7 +222,7 @@ def _late(row: np.ndarray, level: float, lasting: bool) -> Findings:
     nis, dof = row[_NIS], row[_DOF]
     if dof < FEWEST:
         return
-    # errors that last make all innovations of a run large or small together: they count as one
+    # with lasting errors all innovations of a run are large or small together: they count as one
     free = 1.0 if lasting else dof
     if not nis < dof * max(LATE_NIS, float(chi_square(1.0 - level, free)) / free):
         z = (nis - dof) / np.sqrt(2.0 * dof)

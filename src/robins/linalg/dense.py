@@ -85,7 +85,7 @@ def _with_diagonal(L: Array, diagonal: Array) -> Array:
 def independent_rows(
     rows: Float[Array, "m k"], size: Float[Array, "m"] | None = None
 ) -> Bool[Array, "m"]:
-    """Mask of the rows independent of those above them, to rounding; a row of zeros is not.
+    """Mask of the rows independent of those above them, to rounding; a zero row is dependent.
 
     A row that is not finite counts as independent, so that a fault is not taken for a dependence.
     Gram-Schmidt, each row twice (Parlett 1998, sec. 6.9). QR without row exchange cannot decide:
@@ -305,7 +305,7 @@ def as_factor(noise: Array) -> Array:
 
 
 def factor(P: ArrayLike, name: str = "covariance") -> Float[Array, "n n"]:
-    """Lower factor of a symmetric positive *semi*definite matrix, at the boundary.
+    """Lower factor of a symmetric positive *semi*definite matrix from a user, checked.
 
     Not for compiled code: it reads the numbers. Zero rows and exactly dependent rows are allowed (Q
     of rank one, P0 = 0). The matrix is scaled to unit diagonal first, so that variances in very
@@ -313,7 +313,7 @@ def factor(P: ArrayLike, name: str = "covariance") -> Float[Array, "n n"]:
 
     Args:
         P: (n, n) covariance.
-        name: what to call it in an error.
+        name: name of the matrix in errors.
 
     Raises:
         TypeError: P is not of real numbers.
@@ -357,7 +357,7 @@ def factor(P: ArrayLike, name: str = "covariance") -> Float[Array, "n n"]:
     return tria(jax.device_put(scale[:, None] * root))
 
 
-_DOUBLINGS = 20  # most halvings of a step: enough for |A| dt = 1e6
+_DOUBLINGS = 20  # limit of the halvings of a step: enough for |A| dt = 1e6
 
 
 def van_loan(
@@ -365,9 +365,9 @@ def van_loan(
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
     """Discretise ``dx = A x dt + dw``, ``E[dw dw'] = Qc dt`` over a step (Van Loan 1978).
 
-    His exponential contains exp(-A dt) too, which swamps the rest where A dt is large (fast sensor
-    dynamics over a long step). So it is computed for a step with |A| h of order one, and doubled:
-    Q(2h) = Q(h) + Phi(h) Q(h) Phi(h)'.
+    Van Loan's exponential also contains exp(-A dt), which swamps the rest where A dt is large (fast
+    sensor dynamics over a long step). So it is computed for a step h with |A| h of order one, then
+    doubled: Q(2h) = Q(h) + Phi(h) Q(h) Phi(h)'.
 
     Returns:
         Phi = exp(A dt), and Qd, the covariance that the noise adds over dt [s].

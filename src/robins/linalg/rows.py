@@ -31,7 +31,7 @@ def each_row(function: Callable[..., T], *args: Tree) -> T:
     """Return ``jax.vmap(function)(*args)``.
 
     Args:
-        function: of one row of each of the arguments; it may close over other values.
+        function: function of one row of each argument; it may close over other values.
         args: pytrees of arrays with an equal leading axis.
 
     Raises:

@@ -1,6 +1,6 @@
-"""Vectors, matrices and quaternions as tuples of scalars: in a compiled loop faster than arrays.
+"""Vectors, matrices and quaternions as tuples of scalars: faster than arrays in a compiled loop.
 
-A scan over small arrays spends its time starting kernels; scalar operations are fused into few.
+A scan over small arrays spends its time launching kernels; scalar operations are fused into few.
 Under `vmap` each scalar is an array over the batch. Long chains of them need `settled` in between.
 """
 
@@ -25,12 +25,12 @@ Matrix = Sequence[Three]
 
 
 def scalars(v: Array) -> tuple[Scalar, ...]:
-    """The components of a vector."""
+    """Components of a vector."""
     return tuple(v[i] for i in range(v.shape[0]))
 
 
 def matrix(m: Array) -> Matrix:
-    """The rows of a matrix, each a tuple of its components."""
+    """Rows of a matrix, each a tuple of its components."""
     return tuple(scalars(m[i]) for i in range(m.shape[0]))
 
 
@@ -49,23 +49,23 @@ def plus(a: Three, b: Three, *more: Three) -> Three:
 
 
 def minus(a: Three, b: Three) -> Three:
-    """Difference."""
+    """Difference of two vectors."""
     return tuple(x - y for x, y in zip(a, b, strict=True))
 
 
 def times(s: Scalar, a: Three) -> Three:
-    """A number times a vector."""
+    """Product of a scalar and a vector."""
     return tuple(s * x for x in a)
 
 
 def dot(a: Three, b: Three) -> Scalar:
-    """Scalar product, of any length."""
+    """Scalar product of two vectors of any length."""
     products = [x * y for x, y in zip(a, b, strict=True)]
     return sum(products[1:], products[0]) if products else 0.0
 
 
 def cross(a: Three, b: Three) -> Three:
-    """Vector product."""
+    """Vector product of two 3-vectors."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 

@@ -1,11 +1,12 @@
 """Covariance bound: the best accuracy that given sensors allow, without any data.
 
-The recursion of the Kalman filter's covariance with the model, its noise included, linearised about
-the *true* states. For Gaussian noise it is the posterior Cramer-Rao bound along that trajectory
-(Tichavsky, Muravchik & Nehorai 1998, eq. 34; Van Trees & Bell 2007, part I): no estimator with the
-same model has smaller mean square errors. For a linear model the Kalman filter attains it.
+It is the covariance recursion of the Kalman filter with the model, its noise included, linearised
+about the *true* states. For Gaussian noise this is the posterior Cramer-Rao bound along that
+trajectory (Tichavsky, Muravchik & Nehorai 1998, eq. 34; Van Trees & Bell 2007, part I): no
+estimator with the same model has smaller mean square errors. For a linear model the Kalman filter
+attains it.
 
-Of the measurements only the presence of components matters.
+It depends on which components of measurements are present, not on their values.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ class Bound(NamedTuple):
     predicted: Array  # (E, n, n) before the measurements of a step
     factor: Array  # (E, n, n) after them
 
-    covariance = Belief.covariance  # both after the measurements
+    covariance = Belief.covariance  # like sigma, after the measurements
     sigma = Belief.sigma
 
 
 class LinearisedSensor(NamedTuple):
-    """Sensor along a trajectory, leading axis E."""
+    """Sensor linearised along a trajectory of E steps."""
 
     H: Array  # (E, m, n)
     noise: Array  # (E, m, k) factor, R = noise noise'
@@ -50,7 +51,7 @@ class LinearisedSensor(NamedTuple):
     size: Array  # (E, m) magnitude of the terms of the reading
 
     def seen_with(self, factor: Array, use: Array) -> Observation:
-        """Observation of one step (no axis E) from an error with this factor."""
+        """Observation in one step (no axis E), the prior error having this covariance factor."""
         n = factor.shape[0]
         belief = Belief(jnp.zeros(n), factor)
         m = self.H.shape[0]
@@ -67,13 +68,13 @@ class LinearisedSensor(NamedTuple):
         )
 
     def updated_factor(self, factor: Array, use: Array) -> Array:
-        """Factor of the error after one step of it."""
+        """Covariance factor of the error after the update of one step."""
         o = self.seen_with(factor, use)
         return updated(o.prior, o, "sqrt")[0].factor
 
 
 class Linearised(NamedTuple):
-    """Model along a trajectory, leading axis E."""
+    """Model linearised along a trajectory of E steps."""
 
     F: Array  # (E, n, n) transition into each step
     noise: Array  # (E, n, q) factor, Q = noise noise'
@@ -90,9 +91,9 @@ def linearised(
 ) -> Linearised:
     """Linearise a model about a true trajectory.
 
-    The transition of step k is taken at the true state before it, of the first step at the mean of
-    the start; the sensors at ``truth[k]``. Arguments are those of `run`, with leading axis E, and
-    the true states at the measurements; of y, by sensor name, only NaN matters.
+    The transition of step k is linearised at the true state before it (in the first step at the
+    mean of ``start``), the sensors at ``truth[k]``. Arguments are those of `run`, with leading axis
+    E, and truth, the true states at the measurements. Of y, by sensor name, only NaN matters.
 
     Raises:
         ValueError: lengths differ.
@@ -125,14 +126,14 @@ def linearised(
 
 
 def delayed_by_one(first: State, states: State) -> State:
-    """States before each step, leading axis: the first one, then all but the last."""
+    """States before each step: ``first``, then all but the last of ``states`` (leading axis)."""
     return jax.tree_util.tree_map(
         lambda a, b: jnp.concatenate([jnp.asarray(a, float)[None], b[:-1]]), first, states
     )
 
 
 def used_sensors(model: Model, without: Sequence[str] = ()) -> np.ndarray:
-    """(S,) bool: sensors of a model but some.
+    """(S,) mask of the sensors of a model, False for those named in ``without``.
 
     Raises:
         KeyError: the model has no such sensor; the message lists its sensors.
@@ -162,13 +163,13 @@ def covariance_bound(
 def bound_along(
     line: Linearised, factor: Array, use: Use | None = None, known: Sequence[int] = ()
 ) -> Bound:
-    """Covariance bound of a linearised model; one scan.
+    """Covariance bound of a linearised model, by one scan.
 
     Args:
         line: from `linearised`.
-        factor: (n, n) of the prior covariance.
-        use: (S,) bool, sensors of the model to use, as `used_sensors` makes it; all by default. It
-            is data, so a batch of subsets is one `jax.vmap`.
+        factor: (n, n) factor of the prior covariance.
+        use: (S,) bool, sensors of the model to use, as `used_sensors` returns it; all by default.
+            It is data, so a batch of subsets is one `jax.vmap`.
         known: indices of the tangent components that are known exactly, before every prediction and
             every measurement.
 
@@ -193,7 +194,7 @@ def bound_along(
 
 
 def _conditioned(factor: Array, known: tuple[int, ...]) -> Array:
-    """Factor of the covariance given some components of the error."""
+    """Factor of the covariance conditioned on exactly known components of the error."""
     if not known:
         return factor
     rows = jnp.eye(factor.shape[0])[np.array(known)]

@@ -1,8 +1,9 @@
 """Consistency of a filter: chi-square tests of errors and innovations.
 
-NEES is e' P^-1 e (chi-square with n degrees of freedom if the filter is right), NIS the same for an
-innovation. Sums over independent runs stay chi-square, so an average over N runs has the band of
-chi-square with N n degrees of freedom over N (Bar-Shalom, Li & Kirubarajan 2001, sec. 5.4).
+NEES is e' P^-1 e (chi-square with n degrees of freedom if the filter is consistent), NIS the same
+for an innovation. Sums over independent runs are chi-square too, so the band of an average over N
+runs is that of chi-square with N n degrees of freedom, divided by N (Bar-Shalom, Li & Kirubarajan
+2001, sec. 5.4).
 """
 
 from __future__ import annotations
@@ -24,19 +25,19 @@ from robins.manifold import State
 def nees(belief: Belief, truth: State) -> Float[Array, ""]:
     """Normalised estimation error squared of one belief; batch with `jax.vmap`.
 
-    Directions without uncertainty (a known constant) do not count.
+    Directions without uncertainty (a known constant) are left out.
     """
     return normalised_sq(manifold.local(belief.mean, truth), belief.factor)
 
 
 def normalised_sq(error: Float[Array, "r"], factor: Float[Array, "r n"]) -> Float[Array, ""]:
-    """Squared error e' (S S')^-1 e of some components, S being their rows of the factor."""
+    """Normalised squared error e' (S S')^-1 e of r components, S being their factor rows."""
     solid, _ = linalg.guard(factor)
     return jnp.sum(linalg.solve_lower(solid, error[:, None]) ** 2)
 
 
 class Verdict(NamedTuple):
-    """A statistic and the band of its values under a consistent filter."""
+    """Value of a statistic, and its band for a consistent filter."""
 
     value: float
     low: float
@@ -53,11 +54,12 @@ def _require_level(level: float) -> None:
 
 
 def grand_mean_nis(nis: np.ndarray, dof: np.ndarray, level: float = 0.95) -> Verdict:
-    """Mean of all innovations squared per degree of freedom, over runs and time.
+    """Mean NIS per degree of freedom, over all runs and times.
 
-    Innovations of a consistent filter are white, so their sum over time is chi-square too; this is
-    the sharpest single test of R and Q. Steps without measurement (dof = 0) do not count; an
-    infinite NIS, that of a contradiction, does. `level` is of the two-sided band.
+    Innovations of a consistent filter are white, so the sum of NIS over time is chi-square too;
+    this is the sharpest single test of R and Q. Steps without measurement (dof = 0) do not count;
+    an infinite NIS, that of a contradiction, does. `level` is the probability of the two-sided
+    band.
 
     Raises:
         ValueError: the shapes differ, or the level is not between 0 and 1.
@@ -80,7 +82,7 @@ def anees(values: np.ndarray, n: int, level: float = 0.95) -> tuple[np.ndarray, 
     Args:
         values: (runs, T) NEES.
         n: state dimension.
-        level: of the two-sided band.
+        level: probability of the two-sided band.
 
     Returns:
         (T,) averages, their band (2,), and the share of epochs inside the band.
@@ -103,7 +105,7 @@ def anees(values: np.ndarray, n: int, level: float = 0.95) -> tuple[np.ndarray, 
 
 
 def whitened_innovations(info: StepInfo) -> Float[Array, "t m"]:
-    """(T, m) innovations of a sensor in units of their predicted spread; NaN where not used.
+    """(T, m) innovations of a sensor, whitened by their predicted covariance; NaN where not used.
 
     They are uncorrelated if the filter is consistent.
     """
@@ -121,11 +123,11 @@ def whiteness(series: np.ndarray, lags: int = 20, level: float = 0.95) -> Verdic
     Args:
         series: (T,) whitened innovations of one component; NaN steps are left out of the products.
         lags: number of autocorrelations.
-        level: of the one-sided bound.
+        level: probability of the one-sided bound.
 
     Raises:
-        ValueError: it is not (T,), has fewer than three samples a lag or equal ones, or the lags or
-            the level is out of range.
+        ValueError: the series is not (T,), has fewer than three samples per lag or is constant, or
+            lags or level is out of range.
     """
     x = np.asarray(series, dtype=float)
     require(x.ndim == 1, "whiteness takes one series, (T,)", x.shape)

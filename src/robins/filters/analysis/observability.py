@@ -1,20 +1,20 @@
-r"""Observability: the information of a window's measurements about the state at its beginning.
+r"""Observability: information of the measurements in a window about the state at its start.
 
 The observability Gramian of the linearised system, in comparable units of states and sensors
 (Ham & Brown 1983; Chen 1999, ch. 6),
 
     W_k = sum_{j <= k} D Phi_j' H_j' R_j^-1 H_j Phi_j D,
 
-with D the standard deviations of the prior and Phi_j the transition from the beginning to step j.
-An eigenvalue of W is the information measured of a direction over that of the prior.
+with D the prior standard deviations and Phi_j the transition from the start to step j. An
+eigenvalue of W is the ratio of measured to prior information along its eigenvector.
 
-The Gramian itself is never summed up: Phi may grow without bound, and small eigenvalues would be
-lost in the rounding of large ones. The recursion carries two factors, of the error e_0 at the
-beginning and e_k now, given the measurements so far and no process noise,
+The Gramian itself is never summed: Phi may grow without bound, and small eigenvalues would be lost
+in the rounding of large ones. The recursion carries two factors, of the error e_0 at the start and
+e_k now, given the measurements so far and no process noise,
 
     e_0 = D L_k z,  e_k = M_k z,  z ~ N(0, I),  L_k L_k' = (I + W_k)^-1.
 
-A measurement multiplies both by the factor T of the remaining covariance of z, one QR each time.
+A measurement multiplies both by the factor T of the posterior covariance of z, by one QR.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from robins.filters.model import Data, Model
 from robins.filters.observation import left_out
 from robins.manifold import State
 
-# An eigenvalue below this is unobservable: the prior has a million times the information.
+# Eigenvalue below which a direction is unobservable: the prior has a million times the information.
 NOTHING = 1e-6
 
 
@@ -56,7 +56,7 @@ def observability(
     deviations of ``start`` being the units, and of `observability_along`.
 
     Returns:
-        (E, n, n); `bits`, `gramian` and `spectrum` read it.
+        (E, n, n) factors, for `bits`, `gramian` and `spectrum`.
     """
     line = linearised(model, start, truth, y, u, aux)
     return observability_along(line, start.sigma, use, window)
@@ -65,17 +65,17 @@ def observability(
 def observability_along(
     line: Linearised, sigma: Array, use: Use | None = None, window: int | None = None
 ) -> Array:
-    """Factors L of (I + W)^-1 along a linearised model; one scan.
+    """Factors L of (I + W)^-1 along a linearised model, by one scan.
 
     Args:
         line: from `robins.filters.analysis.bound.linearised`.
         sigma: (n,) units of the states, their prior standard deviations.
         use: (S,) bool, sensors of the model to use; all by default.
-        window: steps of a window, each with the same units; by default the whole run. An unstable
-            direction that is not observed overflows after 700 of its time constants without one.
+        window: steps after which L starts again with the same units; None: never, and then an
+            unobserved unstable direction overflows after some 700 of its time constants.
 
     Raises:
-        ValueError: a window is shorter than a step.
+        ValueError: the window is shorter than one step.
     """
     require(window is None or window >= 1, f"a window of {window} steps: at least one is wanted")
     unit, D = jnp.eye(sigma.shape[0]), jnp.diag(sigma)
@@ -98,9 +98,9 @@ def observability_along(
 
 
 def bits(L: ArrayLike) -> np.ndarray:
-    """(..., n) mutual information of each state and the measurements [bit].
+    """(..., n) mutual information between each state and the measurements [bit].
 
-    One bit halves the standard deviation; inf where the state was measured exactly.
+    Each bit halves the standard deviation; inf where the state was measured exactly.
     """
     left = np.sqrt(np.sum(np.asarray(L) ** 2, axis=-1))
     with np.errstate(divide="ignore"):
@@ -114,10 +114,10 @@ def gramian(L: ArrayLike) -> np.ndarray:
 
 
 def spectrum(L: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) eigenvalues of W, least first, and (n, n) their unit vectors as columns.
+    """(n,) eigenvalues of W, ascending, and (n, n) unit eigenvectors as columns.
 
-    Vectors of values below `NOTHING` are any mixture of the unobservable directions; `unobservable`
-    separates them.
+    Eigenvectors of values below `NOTHING` are an arbitrary basis of the unobservable directions;
+    `unobservable` finds a sparse one.
 
     Raises:
         TypeError: L is not of real numbers.
@@ -132,7 +132,8 @@ def spectrum(L: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
 def unobservable(values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """(n, d) sparse basis of the unobservable directions.
 
-    Gauss-Jordan on the eigenvectors below `NOTHING`: each keeps one state that no other has.
+    Gauss-Jordan elimination on the eigenvectors of values below `NOTHING`: each column has one
+    state in which all others are zero.
     """
     basis = vectors[:, values < NOTHING].copy()
     free = np.ones(len(basis), bool)
@@ -148,13 +149,14 @@ def unobservable(values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def worded(vector: np.ndarray, names: Sequence[str]) -> str:
-    """Composition of a direction: "82 % heading against 17 % gyro bias z".
+    """Composition of a direction in words, such as "82 % heading against 17 % gyro bias z".
 
-    The shares are squares of the components, in units of the prior; "with" joins states of one
-    sign, "against" of opposite ones. At most four states are named, none of less than 1 %.
+    The shares are squares of the components, in units of the prior; "with" joins a state of the
+    same sign as the largest, "against" one of the opposite sign. At most four states are named,
+    none of less than 1 %.
 
     Raises:
-        ValueError: it has not a number for each name, or is no direction: zero, or not finite.
+        ValueError: the vector is not of one number per name, is zero, or is not finite.
     """
     shape = np.shape(vector)
     fits = shape == (len(names),)

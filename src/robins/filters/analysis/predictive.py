@@ -1,7 +1,7 @@
 """Predictive score of a filter: the log density of each measurement, before it is used.
 
-The density is that of the belief alone, before rules refuse or weigh, so that filters of any kind
-can be compared, and refusing more is no advantage.
+The density is that of the belief alone, before rules refuse or weigh the measurement, so that
+filters of any kind can be compared, and refusing more measurements is no advantage.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from robins.filters.observation import Normalised, normalised
 from robins.filters.run import Step
 from robins.filters.values import value
 
-OUTLIERS = 0.02  # share of measurements with errors `WIDER` times as large
-WIDER = 10.0
+OUTLIERS = 0.02  # e, share of outliers
+WIDER = 10.0  # k, their standard deviation over that of other measurements
 _RULE = "predicted"
 
 
 class Predicted(NamedTuple):
     """Score of a step, or of several with leading axes."""
 
-    log_density: Float[Array, "..."]  # of all its measurements
-    components: Array  # their number
+    log_density: Float[Array, "..."]  # sum over all its measurements
+    components: Array  # number of their components
 
 
 @cache
 def scale(m: int) -> float:
     """Factor c_m of `log_density`, by quadrature: without it 0.987 of the true sigma scores best.
 
-    For z normal with covariance S the expected score over S vanishes at S where q = z' S^-1 z / c^2
-    has E[w(q) q] = m; w is the mean of 1 for the normal part and 1 / k^2 for the outliers (the
-    consistency factor of an M-estimate of scale: Huber & Ronchetti 2009, sec. 5.2 and 8.4). By
-    symmetry that holds for all directions of S at once.
+    For z normal with covariance S, the expected score is stationary at S if q = z' S^-1 z / c^2 has
+    E[w(q) q] = m. The weight w is the average of 1 (normal part) and 1 / k^2 (outliers) under their
+    posterior probabilities: the consistency factor of an M-estimate of scale (Huber & Ronchetti
+    2009, sec. 5.2 and 8.4). By symmetry that holds for all directions of S at once.
     """
 
     def excess(c: float) -> float:
@@ -54,11 +54,11 @@ def scale(m: int) -> float:
             outlier = special.expit(far + 0.5 * x * (1.0 - WIDER**-2))
             return (1.0 - outlier * (1.0 - WIDER**-2)) * x * stats.chi2.pdf(q, m)
 
-        spans = (0.0, 0.5 * m, m + 10.0, 4.0 * m + 100.0)  # beyond is no mass
+        spans = (0.0, 0.5 * m, m + 10.0, 4.0 * m + 100.0)  # no mass beyond
         parts = [integrate.quad(weighted, *span)[0] for span in itertools.pairwise(spans)]
         return sum(parts) - m
 
-    if not 0 < m <= 16:  # beyond 16 it is one to 1e-9
+    if not 0 < m <= 16:  # above 16 c is one to 1e-9
         return 1.0
     return float(optimize.root_scalar(excess, bracket=(0.9, 1.01), xtol=1e-12).root)
 
@@ -70,8 +70,9 @@ def log_density(innovation: Normalised) -> Float[Array, ""]:
 
         p(z) = (1 - e) N(z; 0, c_m^2 S) + e N(z; 0, k^2 c_m^2 S)
 
-    A normal density would let one outlier outweigh all else; leaving outliers out would reward
-    their number. `scale` gives c_m, with which the true S scores best where z is normal.
+    With a purely normal density one outlier would dominate the score; leaving outliers out would
+    reward a filter that makes many. `scale` gives c_m, with which the true S scores best if z is
+    normal.
     """
     m = innovation.dof.astype(float)
     c = jnp.asarray([scale(n) for n in range(len(innovation.used) + 1)])[innovation.dof]
@@ -84,7 +85,7 @@ def log_density(innovation: Normalised) -> Float[Array, ""]:
 
 @value
 class Scored(Around):
-    """The filter of `scored`."""
+    """Filter made by `scored`."""
 
     # `Filter` wraps both for steps that are not taken; here the inner filter does so itself.
     @jax.jit
@@ -104,7 +105,7 @@ class Scored(Around):
 
 
 def scored(filter_: Filter) -> Filter:
-    """The same filter, whose updates note the score of the measurement, for `predicted`.
+    """Wrap a filter so that its updates note the score of the measurement, for `predicted`.
 
     Measurements are linearised about the mean of the belief (first-order Taylor). After a
     prediction that was not taken the score is -inf.
@@ -113,7 +114,7 @@ def scored(filter_: Filter) -> Filter:
 
 
 def predicted(step: Step) -> Predicted:
-    """Score of a step by a filter of `scored`, for ``run(..., keep=predicted)``."""
+    """Score of a step of a `scored` filter, for ``run(..., keep=predicted)``."""
     notes = [info.notes for info in step.info.values()]
     density = sum((n[f"{_RULE}.log_density"] for n in notes), jnp.zeros(()))
     return Predicted(density, sum((n[f"{_RULE}.components"] for n in notes), jnp.zeros((), int)))

@@ -38,12 +38,12 @@ from robins.manifold import State
 def existence_margin(belief: Belief, weight: Weight, gamma: Number) -> Float[Array, ""]:
     """Least eigenvalue of ``P^-1 - gamma^-2 L'L``: positive where an H-infinity filter exists.
 
-    In units of P^-1, of the belief after the measurement; NaN where P is singular. Batch with
-    `jax.vmap`. `weight` is L as `h_infinity` takes it.
+    P is the covariance after the measurement; the result has the units of P^-1 and is NaN where P
+    is singular. Batch with `jax.vmap`. `weight` is L as `h_infinity` takes it.
 
     Raises:
         TypeError: gamma is not one real number.
-        ValueError: it is not positive, outside of compiled code, or L has not n columns.
+        ValueError: gamma is not positive (not checked in compiled code), or L has not n columns.
     """
     if not isinstance(gamma, Tracer):
         positive("gamma", gamma, "the Kalman filter")
@@ -71,11 +71,11 @@ def gamma_min(
     """Least gamma for which the H-infinity filter exists over a whole run.
 
     The largest local bound of the Kalman filter is a lower bound; from there gamma is doubled until
-    the filter exists, then bisected. It grows with the horizon and with outages; for a linear model
-    it depends on the data only by the missing measurements.
+    the filter exists, then bisected. The result grows with the horizon and with outages; for a
+    linear model it depends on the data only through missing measurements.
 
-    Arguments are those of `run` and of `h_infinity`, but for rtol, the largest relative excess of
-    the result; the filter exists for the result itself.
+    Arguments are those of `run` and of `h_infinity`, and rtol, the largest relative excess of the
+    result; the filter exists for the result itself.
 
     Raises:
         ValueError: the Kalman filter itself cannot take every step, or rtol is below 1e-12.
@@ -105,13 +105,13 @@ def gamma_min(
 
 
 def _used(info: Mapping[str, StepInfo]) -> Array:
-    """(T,) bool: some sensor used a component in the step."""
+    """() or (T,) bool: some sensor used a component in the step."""
     some = [jnp.any(one.used, axis=-1) for one in info.values()]
     return jnp.any(jnp.stack(some), axis=0) if some else jnp.array(False)
 
 
 class SensorChannel(NamedTuple):
-    """Sensor over a run: e becomes (I - K H) e - K W v at each step, v of unit variance."""
+    """Sensor over a run: an update maps the error e to (I - K H) e - K W v, v of unit variance."""
 
     K: np.ndarray  # (T, n, m) gain, zero columns where nothing was used
     H: np.ndarray  # (T, m, n)
@@ -132,10 +132,10 @@ def error_operator(
         S0: (n, p) factor of the initial covariance.
         F: (T, n, n) transitions.
         G: (T, n, q) factors of the process noise.
-        channels: sensors in the order in which they update; k sums their noises.
+        channels: sensors in the order in which they update; k is the number of all their noises.
         weight: (T, r, n) rows L of each step; zero rows do not count.
-        gain_on: (T, n, n) counts the error *before* the measurement, and multiplies the correction
-            from which the filter predicts. By default the error after the measurement counts.
+        gain_on: (T, n, n) factor of the correction from which the filter predicts; the error
+            *before* the measurement then counts. None: the error after it counts.
     """
     T, n, q = G.shape
     width = q + sum(c.W.shape[2] for c in channels)
@@ -161,7 +161,7 @@ def error_operator(
 
 
 def spectral_norm(matrix: np.ndarray) -> float:
-    """Largest singular value, by the smaller Gram matrix: exact to rounding for the largest."""
+    """Largest singular value, from the smaller Gram matrix, which is accurate for the largest."""
     gram = matrix @ matrix.T if matrix.shape[0] <= matrix.shape[1] else matrix.T @ matrix
     last = len(gram) - 1
     (value,) = scipy.linalg.eigvalsh(gram, subset_by_index=[last, last])
@@ -180,8 +180,8 @@ def worst_case_gain(
 ) -> float:
     """Worst-case gain from initial error and noises to the error L e of a run.
 
-    The 2-norm of the matrix that stacks the recursion of the error with the gains of the run. The
-    model is linearised about the means of the run, so a nonlinear one has this gain to small
+    It is the 2-norm of the matrix that stacks the error recursion with the gains of the run. The
+    model is linearised about the means of the run, so for a nonlinear one the gain holds for small
     disturbances. Arguments are those of the run, its solution with all steps, and those of
     `h_infinity`: "a-posteriori" counts the error after the measurements of a step, "a-priori" and
     "predictor" the error before them.
@@ -201,7 +201,7 @@ def worst_case_gain(
         last = [steps.info[s.name].notes for s in model.sensors if s.name in steps.info][-1:]
         gamma = [notes["h_infinity.gamma"] for notes in last if "h_infinity.gamma" in notes]
         if steps.prediction.origin is not None and gamma:
-            # P~ L'L / gamma^2 of the settled belief that the next prediction began with
+            # P~ L'L / gamma^2, P~ the inflated covariance with which the next prediction started
             scaled = L[:-1] / np.asarray(gamma[0])[:-1, None, None]
             wide = np.asarray(steps.prediction.origin.covariance)[1:]
             gain_on[:-1] += wide @ np.swapaxes(scaled, 1, 2) @ scaled
@@ -211,7 +211,7 @@ def worst_case_gain(
 def _linearised(
     model: Model, start: Belief, steps: Step, weight: Weight, u: Data, aux: Mapping[str, Data]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[SensorChannel], np.ndarray]:
-    """S0, F, G, channels and L of `error_operator` along a run."""
+    """Arguments S0, F, G, channels and L of `error_operator` along a run."""
     prediction = steps.prediction
     if prediction.origin is not None:
         before = prediction.origin.mean
@@ -255,10 +255,10 @@ def _sensor_along(
 class SteadyHInfinity(NamedTuple):
     """A time-invariant Kalman or H-infinity filter."""
 
-    P_pred: np.ndarray  # (n, n) before the measurement
-    P: np.ndarray  # (n, n) after it
-    K: np.ndarray  # (n, m) P H' R^-1, of the estimate after the measurement
-    K_a_priori: np.ndarray  # (n, m) P~ H' R^-1, of the estimate before it; P~ is P inflated
+    P_pred: np.ndarray  # (n, n) covariance before the measurement
+    P: np.ndarray  # (n, n) covariance after it
+    K: np.ndarray  # (n, m) gain P H' R^-1 of the estimate after the measurement
+    K_a_priori: np.ndarray  # (n, m) gain P~ H' R^-1 of the estimate before it; P~ is P inflated
 
 
 def _matrices(
@@ -274,13 +274,13 @@ def steady_kalman(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> Ste
     """Steady gain and covariances of the Kalman filter of a time-invariant system.
 
     For x' = F x + w, y = H x + v with noise covariances Q and R, by the discrete algebraic Riccati
-    equation (DARE), accurate to the last digits also with very different units
+    equation (DARE), accurate to rounding even for states in very different units
     (`robins.filters.synthesis.kalman_gain`).
 
     Raises:
         TypeError: a matrix is not of real numbers.
-        ValueError: a matrix is of another shape, not finite, or no covariance where it must be one,
-            or there is no steady state, with the reason.
+        ValueError: a matrix is of another shape or not finite, Q or R is no covariance, or there is
+            no steady state, with the reason.
     """
     # Imported here to keep designs out of the imports of filters.
     from robins.filters.synthesis import current_form, kalman_gain
@@ -300,7 +300,7 @@ def steady_h_infinity(
     """Steady state of `h_infinity` on a time-invariant system.
 
     The stabilising solution of the Riccati equation of F' and [H' L'] with weights R and -gamma^2 I
-    (Hassibi, Sayed & Kailath 1999, ch. 4), checked against existence and against the recursion.
+    (Hassibi, Sayed & Kailath 1999, ch. 4), checked for existence and against the recursion.
     Arguments are those of `steady_kalman`, the weight L (q, n) and the bound gamma; inf gives the
     Kalman filter.
 

@@ -1,4 +1,4 @@
-"""Filters made of filters: of locals, of modes, of particles; guarded; of late measurements."""
+"""Filters made of filters: federated, multiple-model, particle, guarded, delayed and others."""
 
 from robins.filters.composite.adaptive import adaptive
 from robins.filters.composite.alternative import alternative

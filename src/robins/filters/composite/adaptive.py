@@ -1,28 +1,28 @@
 """Adaptive filter for a model that may be wrong at unknown times: a bank over the process noise.
 
-An innovation that is too large is a bad record or a motion that was not foreseen. A robust weight
-alone takes it for the first, and once the motion is wrong it refuses the truth; a fading factor
-takes it for the second, and follows outliers. The bank (`robins.filters.composite.imm`) holds both:
-each mode weighs its records by Huber's rule (`robins.filters.rules.huber`) and believes in another
+An innovation that is too large comes from an outlier or from an unmodelled motion. A robust weight
+alone assumes the first, and rejects correct measurements once the motion is wrong; a fading factor
+assumes the second, and follows outliers. The bank (`robins.filters.composite.imm`) covers both:
+each mode weighs measurements by Huber's rule (`robins.filters.rules.huber`) and assumes another
 scale of the process noise,
 
     Q_s = s^2 Q,     s of the scales
 
-so a wrong motion model that lasts makes a mode of more noise likely, and a bad record, which is
-gone at the next step, does not. There is no gate, and where no mode has given weight to a sensor
-for long, its next record is believed by all.
+so a motion error that lasts makes a mode of more noise likely, and an outlier of a single step does
+not. There is no gate, and where no mode has given weight to a sensor for long, all use its next
+measurement with full weight.
 
-States that the model holds for constant (biases, misalignments) stay constant in every mode: a
-bias that may wander explains what was something else, and what the quiet mode has learnt of it is
-lost when the modes are mixed.
+States that the model keeps constant (biases, misalignments) stay constant in every mode: a bias
+that may wander would absorb other errors, and the knowledge of it in the mode of least noise would
+be lost when modes are mixed.
 
-Where several instruments drive the motion, one goes wrong at a time. So a mode scales one part of
-the noise, and the part that is sound still shows the error of the other: a gyro that drifts must
-not make an accelerometer doubtful by which the tilt is known.
+Where several instruments drive the motion, one is assumed to fail at a time. So a mode scales one
+part of the noise, and the sound part still shows the error of the other: a drifting gyro must not
+inflate the noise of the accelerometer, which determines the tilt.
 
-Neither more noise nor less weight answers a sensor whose records are off and stay off, or that
-contradicts another because the model between the two is wrong. Where that may be, the sensors are
-named, and each has two modes more (`robins.filters.composite.offsets`).
+Neither more noise nor less weight suits a sensor whose readings have a lasting offset, or that
+contradicts another because the model between the two is wrong. Such sensors are named in ``off``,
+and each gets two more modes (`robins.filters.composite.offsets`).
 """
 
 from __future__ import annotations
@@ -56,19 +56,19 @@ SCALES = (1.0, 8.0, 64.0)
 UP, BACK = 1e-5, 1e-2
 
 Part = Sequence[int] | slice
-"""Tangent components whose process noise goes wrong together, such as all that one instrument
-drives."""
+"""Tangent components whose process noise changes together, such as those driven by one
+instrument."""
 
 MOTION: Mapping[str, Part] = MappingProxyType({"motion": slice(None)})
-"""All of the process noise, under the name of what is then wrong."""
+"""All of the process noise, under the name of the fault that its scale represents."""
 
 
 @value
 class Excited(Rule):
-    """The rule of `excited`: the process noise of each part times its scale."""
+    """Rule of `excited`: the process noise of each part times its scale."""
 
     scales: Numbers  # (parts,)
-    parts: tuple[tuple[Any, ...], ...] = kind()  # rows of each; `slice` and its three numbers
+    parts: tuple[tuple[Any, ...], ...] = kind()  # rows of each, or `slice` and its three numbers
 
     name = "excited"
 
@@ -76,7 +76,7 @@ class Excited(Rule):
         return memory, transition._replace(noise=self.scale_noise(transition.noise))
 
     def scale_noise(self, noise: Array) -> Array:
-        """A factor (n, q) of the process noise, each part of its rows times its scale."""
+        """(n, q) factor of the process noise, with the rows of each part times its scale."""
         for i, part in enumerate(self.parts):
             rows = slice(*part[1:]) if part[:1] == (slice,) else np.asarray(part, int)
             noise = noise.at[rows].multiply(jnp.asarray(self.scales)[i])
@@ -84,11 +84,11 @@ class Excited(Rule):
 
 
 def excited(parts: Sequence[Part], scales: ArrayLike) -> Rule:
-    """Process noise of another scale, part by part.
+    """Scale the process noise part by part.
 
     Args:
-        parts: of the process noise.
-        scales: (parts,) of the standard deviations of the noise.
+        parts: tangent components of each part.
+        scales: (parts,) factors of the standard deviations of the noise.
     """
     # before Python 3.12 a slice has no hash
     kinds = tuple(
@@ -101,10 +101,10 @@ def excited(parts: Sequence[Part], scales: ArrayLike) -> Rule:
 def scale_changes(scales: Sequence[float | int], up: float = UP, back: float = BACK) -> np.ndarray:
     """(n, n) probabilities of a change in one step between modes of these scales.
 
-    From any to each that is not quieter up, to each that is quieter back.
+    ``back`` from a mode to each of a smaller scale, ``up`` to each other one.
 
     Raises:
-        ValueError: they are no probabilities.
+        ValueError: up or back is not between 0 and 1, or leaves no probability of staying.
     """
     change = transitions(len(scales), [(EVERY, EVERY, scale_transitions(scales, up, back))])
     good = 0.0 < up < 1.0 and 0.0 < back < 1.0 and bool(np.all(np.diag(change) > 0.0))
@@ -114,7 +114,7 @@ def scale_changes(scales: Sequence[float | int], up: float = UP, back: float = B
 
 @value
 class Adapted:
-    """Maker of a mode of `adaptive`, of the noise it believes in and of what is off if any."""
+    """Maker of a mode of `adaptive`, given its noise rule and its offset hypothesis, if any."""
 
     way: Linearisation
     weight: Rule
@@ -140,28 +140,29 @@ def adaptive(
     off: Sequence[str] = (),
     patience: int | None = PATIENCE,
 ) -> Filter:
-    """A bank of Kalman filters over the scale of the process noise, with Huber's rule in each.
+    """Bank of Kalman filters over the scale of the process noise, with Huber's rule in each.
 
-    Nothing in it belongs to a scenario: the numbers are decades of what a motion may do, and the
-    same for every system.
+    The defaults are not tuned to a scenario: they span decades of motion errors, and are the same
+    for every system.
 
     Args:
-        scales: of the standard deviations of the process noise, rising; the first is the model's.
-        robust: share of right records that keep their weight (`huber`).
-        up: probability of a change to one louder scale in a step.
-        back: of a change to one quieter scale.
-        parts: of the process noise, by the name of the instrument that drives each; a mode makes
-            one of them louder, and holds that instrument for wrong.
-        linearise: of each mode; by Taylor where not given.
-        form: of the update, "sqrt" or "joseph".
-        off: names of sensors whose records may be off for some time, one at a time. It costs a
-            state for each of their components, and two modes for each of them.
-        patience: records of a sensor in a row with hardly any weight before one is believed
-            (`huber`); None never does.
+        scales: factors of the standard deviations of the process noise, rising from above zero; all
+            parts have the first, and one part at a time another.
+        robust: share of correct measurements that keep their weight (`huber`).
+        up: probability per step of a change to each mode of a larger or equal scale.
+        back: probability per step of a change to each mode of a smaller scale.
+        parts: parts of the process noise, by the name of the instrument that drives each; a mode
+            raises one of them, and takes that instrument as faulty.
+        linearise: linearisation of each mode; `taylor()` by default.
+        form: form of the update, "sqrt" or "joseph".
+        off: names of sensors whose readings may have an offset for some time, one at a time. Each
+            of their components costs a state, and each sensor two modes.
+        patience: measurements of a sensor in a row with a weight below 1e-2 before one is used
+            (`huber`); None never recovers.
 
     Raises:
-        ValueError: scales that do not rise from above zero; probabilities that are none. When a run
-            begins: the model has no sensor of a name in `off`.
+        ValueError: scales do not rise from above zero; up or back is no probability. When a run
+            starts: the model has no sensor of a name in `off`.
     """
     s = np.asarray(scales, float)
     rising = s.ndim == 1 and len(s) > 0 and s[0] > 0.0 and bool(np.all(np.diff(s) > 0.0))

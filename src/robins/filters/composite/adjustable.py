@@ -1,7 +1,7 @@
-"""A filter with some of its numbers in its state: to be set on board, without a new program.
+"""Filter with some of its parameters in its state, to be set on board without a new program.
 
-A program of scalars folds the numbers of a filter: a threshold is a constant of the C. Numbers that
-`adjustable` names are fields of the state in their place, which begin with the filter's own.
+A program of scalars folds the numbers of a filter: a threshold is a constant in the C code. Numbers
+named in `adjustable` are fields of the state instead, with the filter's own as initial values.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from robins.filters.values import kind, number, value
 
 @value
 class AdjustableMemory:
-    """Memory of a filter with numbers in its state."""
+    """Memory of an `adjustable` filter."""
 
     inner: Data  # memory of the filter itself
     numbers: dict[str, Array]  # by name
@@ -29,18 +29,18 @@ class AdjustableMemory:
 
 @value
 class Adjustable(Around):
-    """The filter of `adjustable`."""
+    """Filter made by `adjustable`."""
 
     names: tuple[str, ...] = kind()
 
     def begun(self, state: FilterState) -> FilterState:
-        """A state of the filter inside with its numbers."""
+        """Extend a state of the inner filter by the named numbers of that filter."""
         named = named_numbers(self.inner)
         numbers = {name: jnp.asarray(named[name], float) for name in self.names}
         return state._replace(memory=AdjustableMemory(state.memory, numbers))
 
     def filter_of(self, state: FilterState) -> Filter:
-        """The filter inside with the numbers of a state."""
+        """Inner filter with the numbers of a state."""
         held = {name: state.memory.numbers[name] for name in self.names}
         flat, shape = jax.tree_util.tree_flatten_with_path(self.inner)
         return shape.unflatten([held.get(_named(path), leaf) for path, leaf in flat])
@@ -67,7 +67,7 @@ class Adjustable(Around):
     def report(
         self, start: FilterState, final: FilterState, again: Again | None, time: ArrayLike | None
     ) -> None:
-        # a rerun with other numbers must not take those of the state
+        # a rerun with other numbers must not use those of the state
         own = replace(self, inner=self.filter_of(start), names=())
         super(Adjustable, own).report(start, final, again, time)
 
@@ -76,7 +76,7 @@ class Adjustable(Around):
 
 
 def named_numbers(filter_: Filter) -> dict[str, ArrayLike]:
-    """The numbers of a filter by their names, such as "rules[0].limit"."""
+    """Numbers of a filter by name, such as "rules[0].limit"."""
     flat, _ = jax.tree_util.tree_flatten_with_path(filter_)
     return {_named(path): leaf for path, leaf in flat}
 
@@ -86,17 +86,17 @@ def _named(path: tuple[Hashable, ...]) -> str:
 
 
 def adjustable(filter_: Filter, names: Sequence[str]) -> Adjustable:
-    """The same filter with some of its numbers in its state.
+    """Move some of the numbers of a filter into its state.
 
-    It gives the estimates of the filter inside. `adjusted` sets a number; in exported C it is a
+    The estimates are those of the given filter. `adjusted` sets a number; in exported C it is a
     field of the state, ``memory_numbers_`` and its name.
 
     Args:
-        filter_: from `kalman` and its kin.
-        names: of numbers, as `named_numbers` lists them.
+        filter_: the filter, such as `kalman` returns.
+        names: names of numbers, as `named_numbers` lists them.
 
     Raises:
-        ValueError: the filter has no number of a name.
+        ValueError: the filter has no number of such a name.
     """
     known = list(named_numbers(filter_))
     for name in names:
@@ -107,11 +107,11 @@ def adjustable(filter_: Filter, names: Sequence[str]) -> Adjustable:
 
 
 def adjusted(state: FilterState, numbers: Mapping[str, ArrayLike]) -> FilterState:
-    """A state of an `adjustable` filter with other numbers, by name; one number fills a table.
+    """State of an `adjustable` filter with other numbers, by name; a scalar fills an array.
 
     Raises:
-        TypeError: one is not of real numbers.
-        ValueError: the state has no number of a name, or one of another shape.
+        TypeError: a value is not of real numbers.
+        ValueError: the state has no number of such a name, or one of another shape.
     """
     held = state.memory.numbers
     for name, given in numbers.items():

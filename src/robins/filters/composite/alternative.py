@@ -1,8 +1,8 @@
-"""A filter and its second run from a wider start, which counts once the measurements are for it.
+"""Filter run from two priors; the wider one takes over once the measurements favour it.
 
-A prior that most units keep is worth having, and a unit that does not keep it leaves it only in
-small steps: what the prior forbids goes into other states meanwhile. So both are run from the
-beginning, and what the second has found by then is there at once.
+A tight prior is useful for most units of a product. A filter of a unit outside it corrects the
+state only slowly, and other states absorb the error meanwhile. Both filters run from the start, so
+the estimate from the wider prior has converged when it is needed.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ T = TypeVar("T")
 
 @value
 class Alternative(Filter):
-    """The filter of `alternative`.
+    """Filter made by `alternative`.
 
-    Its memory: states with a leading axis of two, of the start given and of the wider one; () nats
-    for the second, since they were least; () bool, the second counts, now and for good.
+    Its memory: states with a leading axis of two, from the given prior and from the wider one; ()
+    evidence for the second [nat], above its minimum; () bool, the second has taken over for good.
     """
 
     inner: Filter
@@ -98,24 +98,24 @@ def _one(tree: T, second: Array) -> T:
 def alternative(
     inner: Filter, spread: Given, judging: Sequence[str], nats: float, wrong: str
 ) -> Filter:
-    """A filter and a second run of it from a wider start, which takes over once it is likelier.
+    """Filter run from the given prior and from a wider one, which takes over once it is likelier.
 
-    Both take every step. The evidence is the logarithm of the likelihood ratio of their
-    innovations, summed from where it was least (Page's test, Biometrika 41, 1954). Before, the
-    answer is bit for bit that of the first, afterwards that of the second. Updates note
-    ``alternative.evidence`` and, as ``imm.wrong`` (1,), whether what is called `wrong` is. To
-    smooth a run, run `inner` from the start that counts at its end. A `reset` has both go on from
-    one belief, so that there is no evidence for the second any more.
+    Both take every step. The evidence is the log-likelihood ratio of their innovations, summed from
+    its minimum (Page's test, Biometrika 41, 1954). Until it exceeds ``nats`` the result is bit for
+    bit that of the given prior, afterwards that of the wider one. Updates note
+    ``alternative.evidence`` and, as ``imm.wrong`` (1,), 1 if the wider one has taken over, else 0.
+    To smooth a run, run `inner` from the prior that was in use at its end. After a `reset` both
+    continue from the same belief, so no more evidence for the second arises.
 
     Args:
-        inner: what both run.
-        spread: (n,) standard deviations of the second start, in addition to those given.
+        inner: filter that both run.
+        spread: (n,) standard deviations that the wider prior has in addition to the given one.
         judging: names of the sensors whose innovations are compared.
-        nats: evidence at which the second takes over, above 0.
-        wrong: name of what the first start is wrong about (`Filter.suspects`).
+        nats: evidence at which the wider one takes over [nat], above 0.
+        wrong: name for a wrong given prior, in `Filter.suspects`.
 
     Raises:
-        ValueError: a spread is negative or not finite, nats are not positive, no sensor judges.
+        ValueError: spread is negative or not finite, nats is not positive, judging is empty.
     """
     spread = np.asarray(spread, float)
     if spread.ndim != 1 or not np.all(np.isfinite(spread) & (spread >= 0.0)):

@@ -1,4 +1,4 @@
-"""Banks of hypotheses: each row is one, with what it holds for wrong; edges are changes."""
+"""Banks of filters: one row per hypothesis, with its faulty instruments; edges are transitions."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from robins.filters.model import Data
 from robins.filters.values import Numbers, kind, value
 
 Hypotheses = int | slice | Sequence[int] | np.ndarray
-"""One of a bank, or some."""
+"""Indices of one hypothesis of a bank, or of several."""
 
 EVERY = slice(None)
 
 
 @value
 class HypothesisRow:
-    """A hypothesis."""
+    """Hypothesis of a bank."""
 
     numbers: Data  # of its mode
-    # names of instruments, or "motion", that are wrong where it holds
+    # names of instruments, or "motion", that are faulty under it
     wrong: tuple[str, ...] = kind(default=())
 
 
 def stacked(rows: Sequence[HypothesisRow]) -> Data:
-    """The numbers of all rows, with a leading axis of hypotheses."""
+    """Numbers of all rows, with a leading axis of hypotheses."""
     return jax.tree_util.tree_map(lambda *x: np.stack(x), *(row.numbers for row in rows))
 
 
@@ -40,14 +40,14 @@ def bank(
     start: ArrayLike | None = None,
     likeliest: bool = False,
 ) -> Filter:
-    """An interacting multiple model over hypotheses that differ in numbers.
+    """Interacting multiple model over hypotheses that differ in numbers.
 
     Args:
-        make: makes a mode of the numbers of a row (`ModeFamily`).
-        rows: the hypotheses; the names in them are the `Filter.suspects`.
-        change: (rows, rows) probabilities of a change in one step, by `transitions`.
-        start: (rows,) probabilities at the start; by default those that last under `change`.
-        likeliest: as of `imm`.
+        make: function from the numbers of a row to a mode (`ModeFamily`).
+        rows: the hypotheses; their names of instruments are the `Filter.suspects`.
+        change: (rows, rows) transition probabilities per step, from `transitions`.
+        start: (rows,) initial probabilities; by default the stationary ones of `change`.
+        likeliest: as in `imm`.
     """
     names = dict.fromkeys(name for row in rows for name in row.wrong)
     wrong = {name: [i for i, row in enumerate(rows) if name in row.wrong] for name in names}
@@ -60,12 +60,13 @@ def transitions(
     edges: Sequence[tuple[Hypotheses, Hypotheses, ArrayLike | Sequence[float]]],
     rest: Sequence[int] | np.ndarray | None = None,
 ) -> np.ndarray:
-    """(count, count) probabilities of a change in one step, row i those from hypothesis i.
+    """(count, count) transition probabilities per step, row i those from hypothesis i.
 
     Args:
         count: number of hypotheses.
-        edges: from, to, probability; of a pair named twice the last holds.
-        rest: (count,) where each goes with the probability that is left; by default it stays.
+        edges: (from, to, probability); later edges replace earlier ones of the same pair.
+        rest: (count,) hypothesis that receives the remaining probability of each row; by default
+            the row's own.
     """
     at = np.arange(count)
     left = at if rest is None else np.asarray(rest, int)
@@ -78,7 +79,7 @@ def transitions(
 
 
 def scale_transitions(scales: Sequence[float | int], up: float, back: float) -> np.ndarray:
-    """Probabilities of a change between modes of these scales: up to none quieter, back to quieter.
+    """(n, n) transition probabilities: ``back`` to each smaller scale, ``up`` to each other one.
 
     The diagonal is left to `transitions`.
     """

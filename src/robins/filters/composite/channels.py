@@ -1,7 +1,7 @@
-"""Channels: filters side by side, each with sensors of its own, joined into one filter.
+"""Channels: parallel local filters, each with sensors of its own, joined into one filter.
 
-What the federated and the distributed filter have in common: who reads which sensor, a measurement
-on its way to its local filter, the belief fused again after it, and steps that cannot be taken.
+Common parts of the federated and the distributed filter: assignment of sensors to local filters,
+update of a local filter, fusion after it, and steps that cannot be taken.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from robins.manifold import State
 
 @value
 class Channel:
-    """A local filter and the sensors it uses; made by `channel`."""
+    """Local filter and the sensors it uses; made by `channel`."""
 
     sensors: tuple[str, ...] = kind()
     filter: Filter
@@ -52,7 +52,7 @@ class Channel:
 
 
 def channel(sensors: str | Sequence[str], filter: Filter | None = None) -> Channel:
-    """A local filter and the names of the sensors it uses.
+    """Channel of a local filter and the names of the sensors it uses.
 
     Args:
         sensors: a name, or several.
@@ -68,7 +68,7 @@ def channel(sensors: str | Sequence[str], filter: Filter | None = None) -> Chann
 
 
 def owners(channels: Sequence[Channel]) -> dict[str, int]:
-    """Number of the channel of each sensor.
+    """Index of the channel of each sensor.
 
     Raises:
         ValueError: there are no channels, or a sensor belongs to two.
@@ -106,14 +106,14 @@ def local_dims(channels: Sequence[Channel], dims: Mapping[str, int]) -> list[dic
 class JoinedMemory(NamedTuple):
     """Memory of a filter of channels besides the fused belief."""
 
-    members: tuple[FilterState, ...]  # by channel; a master last, where there is one
+    members: tuple[FilterState, ...]  # by channel; last the master, if there is one
     shares: Array  # (members, 1 or n) of the information
     silent: Array  # (channels,) steps since a measurement was used
-    singular: Array  # (members,) steps not taken because information was infinite
+    singular: Array  # (members,) steps not taken because the information was infinite
 
 
 class JoinedPrediction(NamedTuple):
-    """Members after a prediction, and how it went with each filter that predicted."""
+    """Members after a prediction, and the outcome of each filter that predicted."""
 
     members: tuple[FilterState, ...]
     codes: tuple[Any, ...]  # by member
@@ -131,9 +131,9 @@ class JoinedFilter(Composite):
         channels: the local filters, each with its sensors.
         title: prefix of its notes.
         fuse: ``beliefs -> Belief`` of all members.
-        apart: ``(beliefs, i) -> bool``, whether local filter i contradicts another.
+        apart: ``(beliefs, i) -> bool``, true if local filter i contradicts another.
         first_shares: ``belief -> shares`` at the start.
-        parted: ``(belief, shares) -> beliefs`` by member.
+        parted: ``(belief, shares) -> beliefs`` of the members.
         moved: ``(state, motion, u) -> JoinedPrediction``.
     """
 
@@ -161,7 +161,7 @@ class JoinedFilter(Composite):
         return tuple(one.filter for one in self.channels)
 
     def with_filters(self, filters: tuple[Filter, ...]) -> Any:
-        each = zip(self.channels, filters, strict=False)  # a master's is no channel's
+        each = zip(self.channels, filters, strict=False)  # a master has no channel
         return replace(self, channels=tuple(replace(c, filter=f) for c, f in each))
 
     def parts(self, state: FilterState) -> tuple[FilterState, ...]:
@@ -192,7 +192,7 @@ class JoinedFilter(Composite):
     def predict_separately(
         self, begun: Sequence[FilterState], motions: Sequence[Motion], u: Data, shares: Array
     ) -> JoinedPrediction:
-        """Members that each predict, from where they begin."""
+        """Predict each member from its own state."""
         each = zip(self.filters, begun, motions, strict=True)
         done = [f.predict(member, motion, u) for f, member, motion in each]
         members = tuple(member for member, _ in done)
@@ -212,7 +212,7 @@ class JoinedFilter(Composite):
         after, info = self.channels[i].filter.update(before, sensor, y, aux)
         members = (*joined.members[:i], after, *joined.members[i + 1 :])
         silent = jnp.where(info.dof > 0, joined.silent.at[i].set(0), joined.silent)
-        # What a measurement did not touch stands bit for bit.
+        # Where the local belief is unchanged, the fused one stays the same bit for bit.
         same = equal(before.belief, after.belief)
         belief = select(same, state.belief, self.fuse([m.belief for m in members]))
         info = self.compared(members, i, info)
@@ -224,7 +224,7 @@ class JoinedFilter(Composite):
         return select(ok, new, _refused(state, singular)), info
 
     def compared(self, members: Sequence[FilterState], i: int, info: StepInfo) -> StepInfo:
-        """The information of local filter i, or that it is now apart from another."""
+        """Information of local filter i, with code `Code.APART` if it now contradicts another."""
         locals_ = [m.belief for m in members[: len(self.channels)]]
         apart = self.apart(locals_, i) & (info.code == int(Code.DONE))
         return info._replace(code=jnp.where(apart, int(Code.APART), info.code))
@@ -248,14 +248,15 @@ class JoinedFilter(Composite):
             )
 
 
-FAR = 5.0  # standard deviations of a difference of local filters that chance does not make
+FAR = 5.0  # difference of local filters that is not chance, in standard deviations
 
 
 def disagree(beliefs: Sequence[Belief], index: int, common: int | None) -> Array:
     """() bool: a local filter differs from another by more than `FAR` standard deviations.
 
-    The errors of local filters with the same process noise are not negatively correlated, so that
-    the sum of the variances is an upper bound of that of the difference.
+    Only the first ``common`` tangent components are compared; None: all. The errors of local
+    filters with the same process noise are not negatively correlated, so that the sum of the
+    variances is an upper bound of that of the difference.
     """
     own, others = beliefs[index], (*beliefs[:index], *beliefs[index + 1 :])
     found = jnp.zeros((), bool)
@@ -267,9 +268,9 @@ def disagree(beliefs: Sequence[Belief], index: int, common: int | None) -> Array
 
 
 def conclude_prediction(state: FilterState, moved: JoinedPrediction) -> Advanced:
-    """The end of the `predict` of a joined filter: taken by all members, or by none.
+    """State and record of the prediction of a joined filter, taken by all members or by none.
 
-    A member that cannot take the step keeps its memory of that (`Rule.settle`).
+    A member that cannot take the step keeps its new memory, which records that (`Rule.settle`).
     """
     joined: JoinedMemory = state.memory
     joined = joined._replace(silent=joined.silent + 1)
@@ -301,7 +302,7 @@ def composed_motion(
     state: Callable[[State], State] = lambda x: x,
     slope: Callable[[Array], Array] = lambda F: F,
 ) -> Motion:
-    """A motion whose noise factor, new state and slope F are each put through a function."""
+    """Motion whose noise factor, new state and Jacobian F are each mapped by a function."""
     known = motion.linear
 
     def linear(x: State, u: Data):
@@ -320,15 +321,15 @@ def composed_motion(
 
 
 class MasterMemory(NamedTuple):
-    """Memory of a joined filter with sensors at its master, besides the belief given out."""
+    """Memory of a joined filter with sensors at its master, besides the reported belief."""
 
-    joined: FilterState  # its belief is the one given out
+    joined: FilterState  # its belief is the reported one
     master: FilterState
 
 
 @value
 class AtMaster(Composite):
-    """The filter of `at_master`."""
+    """Filter made by `at_master`."""
 
     joined: Filter
     master: Filter
@@ -355,7 +356,7 @@ class AtMaster(Composite):
         return FilterState(joined.belief, MasterMemory(joined, own))
 
     def check_order(self, dims: Mapping[str, int]) -> None:
-        """Refuse a model that has not the sensors, or not as its last ones."""
+        """Refuse a model that lacks one of the sensors, or does not have them last."""
         if unknown := [name for name in self.sensors if name not in dims]:
             raise ValueError(f"at_master: no sensor {unknown[0]!r}; this model has {sorted(dims)}")
         last = list(dims)[-len(self.sensors) :]
@@ -397,26 +398,26 @@ class AtMaster(Composite):
 
 
 def at_master(filter: Filter, sensors: str | Sequence[str], master: Filter | None = None) -> Filter:
-    """A joined filter, some of whose sensors update what was fused and no local filter.
+    """Joined filter with some sensors that update the fused belief instead of a local filter.
 
     A hard constraint makes the covariance of a local filter singular, so that it cannot be fused
-    (51 of the airship paper wants its inverse), and one that several locals use is counted several
-    times. Applied to what was fused, it is counted once and may be exact. Whether it lasts depends
-    on what the joined filter makes of the fused belief when it predicts:
+    (eq. 51 of Zhao, Gao, Ding & Wei 2017 needs its inverse), and one that several locals use is
+    counted several times. Applied to the fused belief, it is counted once and may be exact. Its
+    effect on later steps depends on the use of the fused belief in the next prediction:
 
-        distributed, intersecting   own: locals go on from their own, the constraint is output only
-                                    mean: its mean goes back; full: its mean and covariance
-        federated                   fusion-reset, zero-reset: shared out like all that was fused
+        distributed, intersecting   own: locals keep their own beliefs, the constraint is output
+                                    only; mean: its mean is fed back; full: mean and covariance
+        federated                   fusion-reset, zero-reset: shared like the rest of the belief
                                     no-reset, rescale: output only
 
-    The sensors must come last in the model: a local measurement after them is fused again from the
-    locals, which do not contain them.
+    The sensors must come last in the model: after a local measurement the belief is fused again
+    from the locals, which have not used them.
 
     Args:
         filter: `distributed`, `intersecting` or `federated`, of the other sensors.
-        sensors: those that update what was fused.
-        master: how they do: its way to linearise and what its rules do before and after an update
-            (it never predicts). `kalman()` by default.
+        sensors: sensors that update the fused belief.
+        master: filter that makes these updates, by its linearisation and its hooks `before` and
+            `after`; it never predicts. `kalman()` by default.
 
     Raises:
         ValueError: no sensor is named; at `init`, the model has no such sensor or has another one

@@ -1,10 +1,10 @@
-"""Measurements that come late: put each in its place and filter again from there.
+"""Delayed measurements: insert each in its own step and repeat the filter from there.
 
-The last steps are kept: the state each began with, its input, and what was measured. A late
-measurement is entered at the step it belongs to, and the filter, its rules and their memories
-included, goes once more through what followed. That costs as many steps as the measurement is old,
-and is exact where shortcuts that move the belief back in time are not (Bar-Shalom, Li & Kirubarajan
-2001, sec. 6.2; Larsen, Andersen, Ravn & Poulsen 1998 compare the shortcuts).
+A buffer keeps the last steps: the state before each, its input and its measurements. A late
+measurement is inserted in its step, and the filter, with its rules and their memories, repeats the
+steps that followed. The cost is one step per step of delay; the result is exact, unlike that of
+methods that propagate the belief back in time (Bar-Shalom, Li & Kirubarajan 2001, sec. 6.2; Larsen,
+Andersen, Ravn & Poulsen 1998 compare these).
 """
 
 from __future__ import annotations
@@ -27,23 +27,26 @@ from robins.filters.trees import repeated, row_of, select
 from robins.filters.values import kind, value
 
 T = TypeVar("T")
-_WHOLE = 1e-6  # how far an age may be off a whole number: the rounding of a ratio of times
+_WHOLE = 1e-6  # tolerance of an age as a whole number: the rounding of a ratio of times
 
 
 class DelayedMeasurement(NamedTuple):
-    """A measurement and how many steps ago it was made; 0 is now."""
+    """Measurement and its age in steps; 0 is the present step."""
 
     value: Data  # as the sensor reads it, NaN where missing
     age: ArrayLike  # whole steps
 
 
 class _StepBuffer(NamedTuple):
-    """The last steps, each with a leading axis of ``depth + 1``; step k lies at k mod that."""
+    """Last steps as a ring, each field with a leading axis of depth + 1; step k is row k mod that.
 
-    before: FilterState  # the state a step begins with
-    moved: Array  # bool, begins with a prediction; False where the run or a reset begins
+    A dot in a shape stands for that axis.
+    """
+
+    before: FilterState  # state before the step
+    moved: Array  # (.) bool, the step has a prediction; False at the start and after a reset
     u: Data
-    y: dict[str, Data]  # by sensor, NaN where nothing is known yet
+    y: dict[str, Data]  # by sensor, NaN where not measured yet
     aux: dict[str, Data]
     asked: Array  # (., sensors) bool, an update with the sensor has been requested
     known: Array  # (., sensors) bool, a measurement has been used
@@ -56,21 +59,21 @@ class DelayMemory(NamedTuple):
     inner: Data  # memory of the filter itself
     past: _StepBuffer
     now: Array  # number of the present step
-    reach: Array  # how many steps back there are to go
-    model: Model  # its numbers, as last seen
+    reach: Array  # greatest age that can be inserted [steps]
+    model: Model  # with its latest numbers
 
 
 class _Place(NamedTuple):
-    """Place of a measurement in the buffer, and what becomes of it."""
+    """Place of a measurement in the buffer, and its treatment."""
 
-    which: int  # its sensor, in the model's order
-    at: Array  # the row of its step
-    now: Array  # the row of the present step
-    steps: Array  # from there to here
-    there: Array  # bool, it is informative
+    which: int  # index of its sensor in the model
+    at: Array  # row of its step
+    now: Array  # row of the present step
+    steps: Array  # age [steps]
+    there: Array  # bool, it has a finite component
     too_old: Array  # bool
-    used: Array  # bool, it is entered
-    at_once: Array  # bool, the filter takes it as it stands
+    used: Array  # bool, it is inserted
+    at_once: Array  # bool, it is used in the present state, without repeated steps
 
     @property
     def again(self) -> Array:
@@ -79,23 +82,23 @@ class _Place(NamedTuple):
 
 
 class _RepeatedSteps(NamedTuple):
-    """Results of the steps that are repeated."""
+    """Results of the repeated steps."""
 
     inner: FilterState
     before: FilterState  # as in `_StepBuffer`
-    log_likelihood: Array  # likewise
+    log_likelihood: Array  # as in `_StepBuffer`
     own: StepInfo  # of the late measurement
-    taken: Array  # bool, all predictions were
-    failed: Array  # the first failure, a `Code`
+    taken: Array  # bool, all predictions were taken
+    failed: Array  # first failure, a `Code`
 
 
 @value
 class Delayed(Around):
-    """The filter of `delayed`."""
+    """Filter made by `delayed`."""
 
     model: Model
-    u: Data  # one input
-    aux: dict[str, Data]  # one of each sensor
+    u: Data  # an example of an input
+    aux: dict[str, Data]  # an example by sensor
     depth: int = kind()
 
     def parts(self, state: FilterState) -> tuple[FilterState, ...]:
@@ -131,14 +134,15 @@ class Delayed(Around):
         return self.begin(self.inner.init(belief, dims), _numbers(self.model))
 
     def reset(self, state: FilterState, belief: Belief) -> FilterState:
-        # What was measured before the new belief is part of it, or meant to be forgotten.
+        # Earlier measurements are part of the new belief, or meant to be forgotten.
         return self.begin(self.inner.reset(_inner(state), belief), state.memory.model)
 
-    # The filter itself knows whether its prediction was taken: what comes late can change that.
+    # `predict` and `update` are overridden: the inner filter tracks whether its prediction was
+    # taken, since a late measurement can change that.
 
     @jax.jit
     def predict(self, state: FilterState, motion: Motion, u: Data = None) -> Advanced:
-        """Predict, and begin a row of the buffer."""
+        """Predict, and open a row of the buffer."""
         held = state.memory
         _check_same("the motion", motion, held.model.motion)
         _check_same("an input u", u, row_of(held.past.u, 0))
@@ -151,7 +155,7 @@ class Delayed(Around):
         return new, prediction._replace(transition=None, origin=None)
 
     def opened(self, past: _StepBuffer, at: Array, inner: FilterState, u: Data) -> _StepBuffer:
-        """Open a row for a step that begins."""
+        """Open the row of a new step."""
         none = jnp.zeros(len(self.names), bool)
         entry = _StepBuffer(
             before=inner,
@@ -167,7 +171,7 @@ class Delayed(Around):
 
     @jax.jit
     def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data = None) -> Updated:
-        """Enter a measurement in its step, and filter again from there."""
+        """Insert a measurement in its step, and repeat the filter from there."""
         held = state.memory
         which, known = self.recognised(held.model, sensor, aux)
         value, age = y if isinstance(y, DelayedMeasurement) else (y, jnp.zeros(()))
@@ -182,10 +186,10 @@ class Delayed(Around):
         return _outer(inner, DelayMemory(inner.memory, past, held.now, held.reach, known)), told
 
     def recognised(self, model: Model, sensor: Sensor, aux: Data) -> tuple[int, Model]:
-        """Index of a sensor, and the model with its numbers.
+        """Index of a sensor, and the model with the numbers of that sensor.
 
         Raises:
-            ValueError: the sensor is new, or its shapes or those of ``aux`` differ.
+            ValueError: the sensor is unknown, or its shapes or those of ``aux`` differ.
         """
         names = self.names
         if sensor.name not in names:
@@ -198,7 +202,7 @@ class Delayed(Around):
         return which, Model(model.motion, sensors)
 
     def placed(self, held: DelayMemory, which: int, value: Data, age: ArrayLike) -> _Place:
-        """Place of a measurement of this age."""
+        """Place in the buffer of a measurement of this age [steps]."""
         age = jnp.asarray(age, float)
         there = jnp.any(jnp.stack([jnp.any(jnp.isfinite(x)) for x in jax.tree.leaves(value)]))
         steps = jnp.round(jnp.where(jnp.isfinite(age), age, -1.0)).astype(int)
@@ -207,7 +211,7 @@ class Delayed(Around):
         steps = jnp.clip(steps, 0, self.depth)
         at, now = (held.now - steps) % self.size, held.now % self.size
         used = there & sound & ~too_old & ~held.past.known[at, which]
-        # One of this step is used at once, unless a sensor whose turn comes later already was.
+        # One of this step is used at once, unless a later sensor of the model has been used.
         overtaken = jnp.any(held.past.known[now, which + 1 :])
         at_once = used & (steps == 0) & ~overtaken
         return _Place(which, at, now, steps, there, too_old, used, at_once)
@@ -215,7 +219,7 @@ class Delayed(Around):
     def redone(
         self, past: _StepBuffer, place: _Place, known: Model, inner: FilterState, info: StepInfo
     ) -> _RepeatedSteps:
-        """The steps from that of the measurement on, filtered again where they must be."""
+        """Repeat the steps from that of the measurement on, if `place.again`."""
         inner = select(place.again, row_of(past.before, place.at), inner)
         fine = (jnp.ones((), bool), jnp.asarray(int(Code.DONE)))
         return jax.lax.fori_loop(
@@ -228,7 +232,7 @@ class Delayed(Around):
     def step_again(
         self, past: _StepBuffer, place: _Place, known: Model, i: Array, done: _RepeatedSteps
     ) -> _RepeatedSteps:
-        """The step that is i steps after that of the measurement."""
+        """Repeat the step i steps after that of the measurement."""
         inner, before, gained, own, taken, failed = done
         j = (place.at + i) % self.size
         row = row_of(past, j)
@@ -240,7 +244,7 @@ class Delayed(Around):
             after, seen = self.inner.update(inner, each, row.y[each.name], row.aux[each.name])
             inner = select(row.asked[k], after, inner)
             gained = gained.at[j, k].set(jnp.where(row.asked[k], seen.log_likelihood, 0.0))
-            told = jnp.isneginf(row.log_likelihood[k])  # at its first request
+            told = jnp.isneginf(row.log_likelihood[k])  # reported as failed the first time
             failed = _first_failure(failed, row.asked[k] & ~told, seen.code)
             if k == place.which:
                 own = select(i == 0, seen, own)
@@ -250,36 +254,36 @@ class Delayed(Around):
 def delayed(
     filter_: Filter, model: Model, depth: int, u: Data = None, aux: Mapping[str, Data] | None = None
 ) -> Filter:
-    """A filter that takes measurements up to ``depth`` steps late, in any order.
+    """Filter that accepts measurements up to ``depth`` steps late, in any order.
 
-    Give a late measurement as `DelayedMeasurement`; a plain one is of age 0. However they come in,
-    the belief and the sum of the log-likelihoods are those of a run in which each came in its own
-    step, sensors in the model's order. A rule that counts its updates sees one of each sensor in a
-    step, as in `run`.
+    Give a late measurement as `DelayedMeasurement`; a plain one is of age 0. For any order of
+    arrival, the belief and the sum of the log-likelihoods are those of a run in which each
+    measurement came in its own step, sensors in the model's order. A rule that counts its updates
+    gets one of each sensor per step, as in `run`.
 
-    A measurement older than the buffer, or than the start, has the code ``TOO_OLD``. ``REFUSED``
-    are: a second one of a sensor for the same step, one from the future (a negative age: keep it
-    until its step has been predicted), and one whose age is not a whole number. In all these cases
-    the belief stands, as if it were missing.
+    A measurement older than the buffer, or than the start, has the code ``TOO_OLD``. The code is
+    ``REFUSED`` for a second measurement of a sensor for the same step, one from the future (a
+    negative age: keep it until its step has been predicted), and one whose age is not a whole
+    number. In all these cases the belief is unchanged, as if it were missing.
 
-    The `StepInfo` of a late measurement is that of its own step, with its innovation there; only
-    ``log_likelihood`` is what it adds to that of all measurements so far, and ``code`` the first
-    update that fails now that it is repeated, where there is one.
+    The `StepInfo` of a late measurement is that of its own step, with its innovation there, with
+    two exceptions: ``log_likelihood`` is the change in that of all measurements so far, and
+    ``code`` is that of the first repeated update that newly fails, if any.
 
-    A prediction holds no transition, for what follows may revise it: such a run is not smoothed.
-    Forward derivatives work (`jax.jvp`, `jax.jacfwd`), backward ones do not: how many steps are
-    repeated is only known as it runs.
+    A prediction holds no transition, since later measurements may revise it: such a run cannot be
+    smoothed. Forward derivatives work (`jax.jvp`, `jax.jacfwd`), backward ones do not: the number
+    of repeated steps is only known at run time.
 
     Args:
-        filter_: the filter to go back with, from `kalman` and its kin.
-        model: the motion and sensors of the run; its numbers may later be others, not its shape.
+        filter_: the filter to repeat, such as `kalman` returns.
+        model: the motion and sensors of the run; its numbers may change later, not its shapes.
         depth: greatest age [steps]; memory and the cost of the oldest measurement grow with it.
-        u: any one input of a step (its shapes are wanted), where the motion has inputs.
-        aux: any one ``aux`` by sensor name, for those that need it.
+        u: an example of the input of a step, for its shapes, if the motion has inputs.
+        aux: an example of ``aux`` by sensor name, for sensors that need it.
 
     Raises:
-        ValueError: depth is negative, or aux names no sensor. Of a run: its model or its inputs are
-            of other shapes than were given here.
+        ValueError: depth is negative, or aux names no sensor; in a run, its model or its inputs
+            have other shapes than were given here.
     """
     depth = operator.index(depth)
     require(depth >= 0, "depth of a delayed filter must not be negative", depth)
@@ -294,7 +298,7 @@ def delayed(
 def _entered(
     past: _StepBuffer, place: _Place, name: str, value: Data, aux: Data, info: StepInfo
 ) -> _StepBuffer:
-    """Enter a measurement in its own step, and in this one where its sensor is due too."""
+    """Buffer with a measurement in its own step, and its sensor marked as requested in this one."""
     now, at, which, used = place.now, place.at, place.which, place.used
 
     def entered(rows: Array, v: Array, here: Array | bool) -> Array:
@@ -314,7 +318,7 @@ def _entered(
 
 
 def _update_info(past: _StepBuffer, place: _Place, redone: _RepeatedSteps) -> StepInfo:
-    """Information of an update: of its own step, with what it changes in the whole."""
+    """Information of an update in its own step, with its effect on all steps so far."""
     own, again = redone.own, place.again
     total = jnp.sum(past.log_likelihood), jnp.sum(redone.log_likelihood)
     added = _change(*total, own, redone.taken)
@@ -328,7 +332,7 @@ def _update_info(past: _StepBuffer, place: _Place, redone: _RepeatedSteps) -> St
 
 
 def _inner(state: FilterState) -> FilterState:
-    """The state of the filter that is delayed."""
+    """State of the inner filter."""
     return state._replace(memory=state.memory.inner)
 
 
@@ -341,37 +345,41 @@ def _numbers(tree: T) -> T:
 
 
 def _plain(tree: Data) -> Data:
-    """The same with arrays for numbers of Python, which are of weak types."""
+    """Tree with arrays in place of Python numbers, which have weak types."""
     return jax.tree_util.tree_map(lambda x: x if isinstance(x, jax.Array) else np.asarray(x), tree)
 
 
 def _with(
     rows: dict[str, Data], name: str, enter: Callable[..., Array], value: Data
 ) -> dict[str, Data]:
-    """The same rows with something entered for one sensor."""
+    """Rows with a value inserted for one sensor."""
     return {**rows, name: jax.tree_util.tree_map(enter, rows[name], value)}
 
 
 def _unread(sensor: Sensor, state: FilterState, aux: Data) -> Data:
-    """A measurement of a sensor without information."""
+    """Measurement of a sensor without information: all NaN."""
     like = jax.eval_shape(sensor.read, state.belief.mean, aux)
     return jax.tree_util.tree_map(lambda leaf: jnp.full(leaf.shape, jnp.nan), like)
 
 
 def _first_failure(code: Array, asked: Array, found: Array) -> Array:
-    """The code, or the first failure that is found among the requested updates."""
+    """The first failure: ``code`` if it is one, else ``found`` if requested and a failure."""
     return jnp.where(asked & ~is_failure(code) & is_failure(found), found, code)
 
 
 def _change(earlier: Array, later: Array, own: StepInfo, taken: Array) -> Array:
     """Change of the total log-likelihood by a late measurement; -inf where a step failed."""
-    # Steps that failed before have made the whole minus infinity already.
+    # If a step failed earlier, the total is minus infinity already.
     change = jnp.where(jnp.isfinite(earlier), later - earlier, own.log_likelihood)
     return jnp.where(taken, change, -jnp.inf)
 
 
 def _check_same(what: str, found: Data, known: Data) -> None:
-    """Raise if two pytrees differ in structure, shapes or kinds of number."""
+    """Raise if two pytrees differ in structure, shapes or dtypes.
+
+    Raises:
+        ValueError: they differ; the message names `what` and states both.
+    """
     if _form(found) != _form(known):
         raise ValueError(
             f"{what} is of another form than delayed() was told of: {_form(found)}, not "

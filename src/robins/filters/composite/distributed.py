@@ -1,23 +1,24 @@
 r"""Distributed filters: locals that each have the whole prior, and the fusion of their estimates.
 
-The airship paper fuses two full filters as if they were independent (its eq. 51):
+Zhao, Gao, Ding & Wei (J. National University of Defense Technology 39(2), 2017, eq. 51) fuse two
+full filters as if they were independent:
 
     P_g = (P_1^-1 + P_2^-1)^-1        x_g = P_g (P_1^-1 x_1 + P_2^-1 x_2)
 
-and feeds x_g back to the navigation state. It does not define how the local filters continue;
-the three readings are ``feedback``:
+and feed x_g back to the navigation state. The paper does not define how the local filters continue;
+the three possibilities are the values of ``feedback``:
 
-    own    each goes on from its own mean and covariance: error states shifted by -x_g
+    own    each continues from its own mean and covariance: error states shifted by -x_g
     mean   each takes the fused mean, and keeps its covariance: error states set to zero
     full   each takes the fused mean and covariance: all information counted again at every step
 
 Locals with the same prior and process noise are not independent, so even the first is somewhat
-overconfident. The federated filter (`federated`) shares both out and is not;
-covariance intersection is safe whatever the correlation.
+overconfident. The federated filter (`federated`) divides both among the locals and is not;
+covariance intersection is consistent whatever the correlation.
 
-States that only one local has (the errors of a wind that only its sensors see) cannot be fused:
-with ``common`` the first so many tangent components are, from the marginals of all locals, and the
-rest follows from the estimate of the first local.
+States that only one local estimates (wind errors that only its sensors observe) cannot be fused:
+with ``common=n`` the first n tangent components are fused, from the marginals of all locals, and
+the rest follows from the estimate of the first local.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class SideBySide(JoinedFilter):
         return [belief] * len(self.channels)
 
     def fed_back(self, state: FilterState) -> list[FilterState]:
-        """The local filters as the feedback leaves them at the start of a step."""
+        """States of the local filters at the start of a step, after the feedback."""
         members, fused = state.memory.members, state.belief
         if self.feedback == "own":
             return list(members)
@@ -89,7 +90,7 @@ class SideBySide(JoinedFilter):
 
 @value
 class Distributed(SideBySide):
-    """The filter of `distributed`."""
+    """Filter made by `distributed`."""
 
     common: int | None = kind()
 
@@ -112,7 +113,7 @@ class Distributed(SideBySide):
 
 @value
 class Intersecting(SideBySide):
-    """The filter of `intersecting`."""
+    """Filter made by `intersecting`."""
 
     criterion: Criterion | Numbers  # or (channels,) weights
 
@@ -127,25 +128,25 @@ def distributed(
 ) -> Filter:
     """Local filters with the whole prior and process noise, fused by an information sum (51).
 
-    The belief of its state is the fused one. Locals have their prior and process noise in common,
-    which (51) takes for independent: expect too small a covariance, and see `federated` for the
-    filter that is right. The report of an update is that of the sensor's local filter.
+    The belief of its state is the fused one. Locals share their prior and process noise, but (51)
+    assumes them independent: expect too small a covariance; `federated` is the consistent filter.
+    The `StepInfo` of an update is that of the sensor's local filter.
 
     A local covariance that is singular (a hard constraint, a measurement without noise) has no
-    inverse. The step is not taken, with `Code.NOT_FINITE`, and a run raises a ValueError with what
-    to do at its end; nothing is added to make it regular.
+    inverse. The step is not taken, with `Code.NOT_FINITE`, and at its end a run raises a ValueError
+    that states the remedy; the covariance is not regularised.
 
     Args:
         channels: from `channel`; every sensor of the model belongs to exactly one.
         feedback: "own", "mean" or "full" (module docstring).
-        common: how many tangent components, from the first on, are fused by (51); all by default.
-            The others belong to the first channel, and follow from its conditional distribution
-            given the common ones (`common_information_sum`). Locals are of one state, so the other
+        common: number of leading tangent components that are fused by (51); all by default. The
+            others belong to the first channel, and follow from its conditional distribution given
+            the common ones (`common_information_sum`). All locals have the same state, so the other
             channels carry those components as well, but their estimates of them are not used.
 
     Raises:
-        ValueError: a sensor in two channels, an unknown feedback, no common component; at `init`, a
-            sensor without a channel, or a state with fewer components than are common.
+        ValueError: a sensor is in two channels, the feedback is unknown, or no component is common;
+            at `init`, a sensor has no channel, or the state has fewer components than are common.
     """
     one_of("feedback", feedback, Feedback)
     if feedback == "full":
@@ -163,14 +164,14 @@ def intersecting(
 ) -> Filter:
     """Local filters with the whole prior and process noise, fused by covariance intersection.
 
-    Consistent whatever the correlation of the locals, at the price of a covariance that is never
-    smaller than that of the best combination of one's own (Julier & Uhlmann 1997).
+    It is consistent whatever the correlation of the locals, at the price of a larger covariance
+    than that of independent fusion (Julier & Uhlmann 1997).
 
     Args:
         channels: from `channel`; every sensor of the model belongs to exactly one.
         criterion: "trace", "det", or (N,) weights; see `covariance_intersection`.
-        feedback: "own" or "mean"; "full" makes the locals one and the same, which loses information
-            without harm.
+        feedback: "own" or "mean"; "full" makes all locals equal, which loses information but stays
+            consistent.
 
     Raises:
         ValueError: as `distributed`, or the criterion is none of these.

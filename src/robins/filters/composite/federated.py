@@ -1,28 +1,30 @@
-"""The federated filter: parallel local filters whose information is shared and fused.
+"""Federated filter: parallel local filters whose information is shared and fused.
 
-Each local filter has sensors of its own, and a share of what is known and of the process noise, so
-that their information adds up to the whole (Carlson 1990):
+Each local filter has sensors of its own, and a share of the prior information and of the process
+noise, so that their information adds up to the whole (Carlson 1990):
 
     fuse     Y_g = sum_i Y_i + Y_m,  x_g = Y_g^-1 (sum_i Y_i x_i + Y_m x_m)
     share    x_i = x_g,  P_i = P_g / b_i,  Q_i = Q / b_i,  sum_i b_i + b_m = 1
 
     mode          at the start of each step
-    fusion-reset  locals and master take their shares of what was fused
-    no-reset      locals go on from what they have; the master only fuses
-    zero-reset    locals forget all, the master keeps it
+    fusion-reset  locals and master take their shares of the fused belief
+    no-reset      locals continue from their own beliefs; the master only fuses
+    zero-reset    locals lose their information, the master keeps it
     rescale       locals keep c Y_i, the master takes the (1 - c) Y_i that they give away
 
-Zero-reset leaves a local filter nothing to judge measurements by, and sigma points of an unknown
-state reach beyond any model: give it Taylor and no robust rules.
+After a zero-reset a local filter has no prior to test measurements against, and sigma points of an
+unknown state lie outside the range of any model: use Taylor and no robust rules.
 
-A local filter that measures nothing stays in the fusion: it holds a share of what was known, and to
-leave it out would multiply P by 1 / (1 - b_i). With linear models fusion-reset with scalar or root
-sharing, and zero-reset, *are* the centralised filter. With a ``timeout`` one that has been silent
-for so long, since it is not measured or refuses what is, hands its share over at the next reset:
-the others get it in proportion to theirs, and it keeps the `FLOOR`, until it measures again.
+A local filter without measurements stays in the fusion: it holds a share of the information, and
+leaving it out would multiply P by 1 / (1 - b_i). With linear models fusion-reset with scalar or
+root sharing, and zero-reset, *are* the centralised filter. With a ``timeout``, a local filter that
+has used no measurement for so many steps (none came, or its rules refused them) gives its share
+away at the next reset: the others get it in proportion to theirs, and it keeps `FLOOR` until it
+uses a measurement again.
 
-A share a_ij in (0, 1) is what local filter i gets of the information about state j (or about all of
-them, b_i). Four ways to choose them (Zhao, Li & Wang 2016; Xiong et al. 2013):
+A share a_ij in (0, 1) is the part of the information about state j that local filter i gets (b_i if
+it is the same for all states). There are four ways to choose them (Zhao, Li & Wang 2016; Xiong et
+al. 2013):
 
     equal          b_i  = 1 / N
     trace          b_i  ~ 1 / tr P_i                        states scaled first
@@ -31,9 +33,9 @@ them, b_i). Four ways to choose them (Zhao, Li & Wang 2016; Xiong et al. 2013):
                    O_i = [R_i^-1/2 H_i; R_i^-1/2 H_i F; ...; R_i^-1/2 H_i F^(k-1)] D
 
 With a reset at every step and linear models shares cannot change the fused accuracy. They matter
-where a local filter judges its measurements by its own covariance, and where it is not reset. In
-terms of O = U S V' the last is sum_l S_l^2 V_jl^2: a singular value belongs to a direction, not to
-the state of the same number. D, the standard deviations of the belief, makes the states unit-free.
+where a local filter tests measurements by its own covariance, and where it is not reset. In terms
+of O = U S V', sigma_j^2 is sum_l S_l^2 V_jl^2: a singular value belongs to a direction, not to the
+state of the same index. D, the standard deviations of the belief, makes the states unit-free.
 """
 
 from __future__ import annotations
@@ -66,15 +68,15 @@ from robins.filters.model import Data, Model, Motion
 from robins.filters.values import Numbers, is_known, kind, number, value
 from robins.manifold import State
 
-# Without a floor a share of zero is an infinite covariance.
+# Least share: a share of zero would be an infinite covariance.
 FLOOR = 0.05
 
 
 def floored(weights: Array) -> Array:
-    """Shares from weights (N, ...): over N they sum to one, and none is below about `FLOOR`.
+    """Shares from weights (N, ...): they sum to one over N, and none is below about `FLOOR`.
 
-    Where no filter has any weight, all get the same. Shares that sum to one and lie above the floor
-    come back unchanged but for rounding.
+    If all weights are zero, the shares are equal. Shares that sum to one and lie above the floor
+    are returned unchanged, to rounding.
     """
     total = jnp.sum(weights, axis=0, keepdims=True)
     some = total > 0.0
@@ -84,15 +86,15 @@ def floored(weights: Array) -> Array:
 
 
 def equal_shares(count: int) -> Array:
-    """(N, 1), all the same."""
+    """(N, 1) equal shares."""
     return jnp.full((count, 1), 1.0 / count)
 
 
 def trace_shares(beliefs: Sequence[Belief], sigma: Array) -> Array:
-    """(N, 1), inverse to the trace of each local covariance.
+    """(N, 1) shares inverse to the trace of each local covariance.
 
     Args:
-        beliefs: of the local filters.
+        beliefs: beliefs of the local filters.
         sigma: (n,) unit of each state, such as its fused standard deviation.
     """
     unit = jnp.where(sigma > 0.0, sigma, 1.0)
@@ -100,7 +102,7 @@ def trace_shares(beliefs: Sequence[Belief], sigma: Array) -> Array:
 
 
 def diagonal_shares(beliefs: Sequence[Belief]) -> Array:
-    """(N, n), inverse to the variance of each state in each local filter."""
+    """(N, n) shares inverse to the variance of each state in each local filter."""
     return floored(jnp.stack([1.0 / b.sigma**2 for b in beliefs]))
 
 
@@ -112,21 +114,21 @@ def observability_shares(
     u: Data = None,
     aux: dict[str, Any] | None = None,
 ) -> np.ndarray:
-    """(N, n) shares by how well each channel sees each state; computed once, before a run.
+    """(N, n) shares by the observability of each state in each channel; computed before a run.
 
-    A state that no channel sees is shared equally.
+    A state that no channel observes is shared equally.
 
     Args:
-        model: its motion and sensors, linearised at the belief.
-        belief: about which to linearise; its standard deviations are the units of the states.
+        model: motion and sensors, linearised at the belief.
+        belief: point of linearisation; its standard deviations are the units of the states.
         channels: from `channel`.
         steps: number k of blocks in O_i; by default n, the dimension of the state.
         u: input of the motion for one step.
         aux: what sensors need besides the state, by sensor name.
 
     Raises:
-        KeyError: a channel names a sensor that the model has not.
-        ValueError: fewer than one step, or a sensor without noise, which sees infinitely well.
+        KeyError: a channel names a sensor that the model does not have.
+        ValueError: there is less than one step, or a sensor has no noise, thus infinite weight.
     """
     n = manifold.dim(belief.mean)
     count = n if steps is None else steps
@@ -156,34 +158,34 @@ HALF = (
     "information at every reset (det P falls with no data at all): use 'root', which conserves it"
 )
 
-# Zero-reset: what a local filter is left with of the prior. A filter cannot begin from nothing, so
-# it gets this much of what the master knows, and the master the rest: the sum is exact.
+# Share of a local filter in zero-reset. A filter cannot start without information, so it gets this
+# share of the prior, and the master the rest: the sum is exact.
 _TRACE = 1e-8
 
 
 @value
 class Federated(JoinedFilter):
-    """The filter of `federated`.
+    """Filter made by `federated`.
 
-    The belief of its state is the fused one, after a prediction and after each sensor. The report
-    of an update (innovation, gain, NIS, log-likelihood) is that of the sensor's local filter, which
-    has less information than the whole: the log-likelihoods of a run do not sum to that of the
-    data. Notes: ``federated.share``, the mean share of that local filter, and ``federated.silent``,
-    steps since it used a measurement.
+    The belief of its state is the fused one, after a prediction and after each sensor. The
+    `StepInfo` of an update (innovation, gain, NIS, log-likelihood) is that of the sensor's local
+    filter, which has less information than the whole: the log-likelihoods of a run do not sum to
+    that of the data. Notes: ``federated.share``, the mean share of that local filter, and
+    ``federated.silent``, steps since it used a measurement.
 
-    Rules of a local filter work on its share. With sharing after the prediction a local filter with
-    rules predicts for itself, through the map that makes its share of the common prediction; one
-    without rules only corrects.
+    Rules of a local filter act on its share. With sharing after the prediction, a local filter with
+    rules makes its own prediction, by a motion that leads to its share of the common prediction;
+    one without rules only updates.
     """
 
-    centre: Filter  # how the fused belief and the master's are predicted
-    fixed: Numbers | None  # (channels,) or (channels, n) shares, where they are given
-    master: Numbers  # () its share
+    centre: Filter  # predicts the fused belief and the master's
+    fixed: Numbers | None  # (channels,) or (channels, n) shares, if given
+    master: Numbers  # () share of the master
     keep: Numbers  # () c of mode "rescale"
     timeout: Numbers | None  # () steps
     mode: Mode = kind()
     sharing: Sharing = kind()
-    weighing: str = kind()  # "given", or how shares are chosen
+    weighing: str = kind()  # "given", or the way in which shares are chosen
     has_master: bool = kind()
     late: bool = kind()  # shared after the prediction
 
@@ -220,25 +222,25 @@ class Federated(JoinedFilter):
         return self.with_master(floored(jnp.asarray(self.fixed.reshape(self.count, -1))))
 
     def with_master(self, a: Array) -> Array:
-        """Shares of the channels, left by the master's, and its own."""
+        """Shares of the channels, scaled to sum to 1 - b_m, then b_m of the master if any."""
         if not self.has_master:
             return a
         own = jnp.full((1, a.shape[1]), self.master)
         return jnp.concatenate([(1.0 - self.master) * a, own])
 
     def next_shares(self, state: FilterState) -> Array:
-        """Shares of a step: chosen, and handed over by local filters that have been silent."""
+        """Shares of a step, with those of silent local filters given to the others."""
         a = self.chosen_shares(state)
         if self.timeout is None:
             return a
-        # The master's share is its own; where all are silent there is no filter to hand over to.
+        # The master's share does not change; where all are silent, none can take a share.
         heard = (state.memory.silent.astype(float) < self.timeout)[:, None]
         mine = a[: self.count]
         left = floored(jnp.where(heard, mine, 0.0)) * jnp.sum(mine, axis=0, keepdims=True)
         return jnp.where(jnp.any(heard), a.at[: self.count].set(left), a)
 
     def chosen_shares(self, state: FilterState) -> Array:
-        """Shares as given, or by what the local filters believe."""
+        """Shares as given, or from the covariances of the local filters."""
         locals_ = [m.belief for m in state.memory.members[: self.count]]
         if self.weighing == "trace":
             return self.with_master(trace_shares(locals_, state.belief.sigma))
@@ -247,7 +249,7 @@ class Federated(JoinedFilter):
         return self.first_shares(state.belief)
 
     def begun(self, state: FilterState, a: Array) -> list[FilterState]:
-        """Members as the mode leaves them at the start of a step."""
+        """Members at the start of a step, after the reset of the mode."""
         members = state.memory.members
         if self.mode == "no-reset":
             return list(members)
@@ -269,7 +271,7 @@ class Federated(JoinedFilter):
     def predict_fused(
         self, state: FilterState, motion: Motion, u: Data, a: Array
     ) -> JoinedPrediction:
-        """Predict what was fused, then share it out."""
+        """Predict the fused belief, then divide it among the members."""
         _, common = self.centre.predict(self.centre.init(state.belief, {}), motion, u)
         members, codes, own = [], [], False
         beliefs = self.parted(common.belief, a)
@@ -284,7 +286,7 @@ class Federated(JoinedFilter):
                 code = prediction.code
             members.append(member)
             codes.append(code)
-        # Half sharing does not add up to what was shared, and rules may have changed a share.
+        # The parts of half sharing do not sum to the whole, and rules may have changed a share.
         lossless = not own and (self.sharing != "half" or a.shape[1] == 1)
         fused = common.belief if lossless else self.fuse([m.belief for m in members])
         return JoinedPrediction(
@@ -304,29 +306,29 @@ def federated(
     linearise: Linearisation | None = None,
     timeout: int | None = None,
 ) -> Filter:
-    """A federated Kalman filter (Carlson 1990); runs, streams and batches as any `Filter`.
+    """Federated Kalman filter (Carlson 1990); runs, streams and batches like any `Filter`.
 
     Args:
         channels: from `channel`; every sensor of the model belongs to exactly one.
         mode: "fusion-reset", "no-reset", "zero-reset" or "rescale" (module docstring).
-        sharing: "root", "scalar" or "half"; how, see `robins.filters.composite.fusion`.
+        sharing: "root", "scalar" or "half" (`robins.filters.composite.fusion`).
         shares: "equal"; "trace" or "diagonal", from the local covariances at every step; or (N,) or
             (N, n) numbers that sum to one with the master's, such as `observability_shares`.
             Shares below 0.05 are raised to it.
-        master: share of a master that measures nothing, from 0 to below 1.
-        keep: c of mode "rescale", what a local filter keeps of its information.
-        after_prediction: fusion-reset: predict what was fused, then share it out (True), or share
-            it out and let all predict (False). By default True with root sharing, which is exact
-            only so, and False else.
-        linearise: how the fused belief is predicted, as in the local filters; default `taylor()`.
-        timeout: fusion-reset: steps without a measurement that it used after which the share of a
-            local filter goes to the others, until it uses one again; None never. With linear models
-            it changes what is fused only where local filters have rules.
+        master: share of a master, which has no sensors, from 0 to below 1.
+        keep: c of mode "rescale", the share of its information that a local filter keeps.
+        after_prediction: fusion-reset: predict the fused belief, then share it (True), or share it
+            and predict each part (False). By default True with root sharing, which is exact only in
+            this way, else False.
+        linearise: linearisation of the fused prediction, as in the locals; `taylor()` by default.
+        timeout: fusion-reset: number of steps without a used measurement after which the share of a
+            local filter goes to the others, until it uses one again; None: never. With linear
+            models it changes the fused belief only if local filters have rules.
 
     Raises:
-        ValueError: a sensor in two channels, an unknown mode, sharing or kind of shares, shares
-            that do not sum to one, a master or a timeout that the mode has not; at `init`, a
-            sensor without a channel.
+        ValueError: a sensor is in two channels; the mode, the sharing or the kind of shares is
+            unknown; shares do not sum to one; the mode has no master or no timeout; at `init`, a
+            sensor has no channel.
     """
     channels = tuple(channels)
     owners(channels)
@@ -364,7 +366,7 @@ def _check_kinds(mode: str, sharing: str, after_prediction: bool | None) -> None
 
 
 def _steps(mode: str, timeout: int | None) -> Numbers | None:
-    """Steps of silence before a share is handed over; refused where the mode has none."""
+    """Timeout [steps], refused in modes that have none."""
     if timeout is None:
         return None
     require(mode == "fusion-reset", f"mode {mode!r} does not share anew: it has no timeout")
@@ -373,7 +375,7 @@ def _steps(mode: str, timeout: int | None) -> Numbers | None:
 
 
 def _rescaled(members: Sequence[FilterState], keep: Numbers) -> list[Belief]:
-    """Locals with c Y_i; the master with Y_g - c sum Y_i = Y_m + (1 - c) sum Y_i: no difference."""
+    """Locals with c Y_i, and the master with Y_m + (1 - c) sum Y_i, which needs no subtraction."""
     *locals_, master = (m.belief for m in members)
     kept = [Belief(b.mean, b.factor / jnp.sqrt(keep)) for b in locals_]
     weights = jnp.array([1.0] + [1.0 - keep] * len(locals_))
@@ -381,11 +383,11 @@ def _rescaled(members: Sequence[FilterState], keep: Numbers) -> list[Belief]:
 
 
 def _through(motion: Motion, common: Belief, mine: Belief) -> Motion:
-    """A motion that predicts, from what was fused, a share of the common prediction.
+    """Motion that predicts, from the fused belief, a share of the common prediction.
 
     With S- the factor of the common prediction and S_i that of the share, T = S_i S-^-1 maps one
     covariance to the other: T (F P F' + Q) T' = P_i. So the motion is followed by T about the
-    predicted mean, and its noise multiplied by T.
+    predicted mean, and its noise is multiplied by T.
     """
     solid, _ = linalg.guard(common.factor)
     T = linalg.solve_lower_transposed(solid, mine.factor.T).T
@@ -397,7 +399,7 @@ def _through(motion: Motion, common: Belief, mine: Belief) -> Motion:
 
 
 def _has_master(mode: str, shares: Any, master: Numbers) -> bool:
-    """True if there is one; refused where it does not go with the mode."""
+    """True if there is a master; refuse one, or shares, that the mode excludes."""
     some = not is_known(master) or bool(master > 0.0)
     if mode == "rescale" and not some:
         raise ValueError(
@@ -410,7 +412,7 @@ def _has_master(mode: str, shares: Any, master: Numbers) -> bool:
 
 
 def _fixed_shares(shares: Any, count: int, master: Numbers) -> Numbers | None:
-    """Shares of the channels, scaled to sum to one; None where they are not given as numbers."""
+    """Shares of the channels, scaled to sum to one; None if they are not given as numbers."""
     if isinstance(shares, str):
         if shares == "observability":
             raise ValueError(

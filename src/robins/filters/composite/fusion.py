@@ -1,26 +1,26 @@
-r"""Share one belief out to several filters, and make one of several: functions on beliefs.
+r"""Fusion of beliefs, sharing of one belief among filters, and covariance intersection.
 
 **Fuse** independent beliefs in information form, Y = P^-1 (Carlson 1990; Zhao, Li & Wang 2016,
 eq. 3-4):
 
     Y_g = sum_i Y_i        x_g = Y_g^-1 sum_i Y_i x_i
 
-as the least squares problem it is, min over x of sum_i |S_i^-1 (x - x_i)|^2: the rows S_i^-1 and
-their right sides go through one QR, and only triangles are solved with. Means are read off as
-deviations from the first one, so angles may lie on either side of +-pi.
+solved as a least squares problem, min over x of sum_i |S_i^-1 (x - x_i)|^2: one QR of the rows
+S_i^-1 and their right-hand sides, and triangular solves. Means are expressed as deviations from the
+first one, so angles may lie on either side of +-pi.
 
-**Share** so that fusing gives the belief back. With shares A_i = diag(a_i), sum_i A_i = I:
+**Share** so that fusion restores the belief. With shares A_i = diag(a_i), sum_i A_i = I:
 
     scalar   P_i = P / b_i                     one share b_i for all states
     root     P_i = B A_i^-1 B',  B B' = P      sum_i Y_i = Y for any shares
     half     P_i = A_i^-1/2 P A_i^-1/2         keeps the diagonal of Y only, adds information
 
 Any root B conserves the information. Here B = D C^1/2 with D the standard deviations and C the
-correlations: no unit enters, and a share stays with the state it was given to, as nearly as a root
-can (C^1/2 is the root of C nearest to the identity).
+correlation matrix: the result is independent of units, and each share acts on its own state as
+nearly as a root allows (C^1/2 is the root of C nearest to the identity).
 
 **Intersect** beliefs whose errors have an unknown correlation (Julier & Uhlmann 1997):
-Y = sum_i w_i Y_i, sum_i w_i = 1, which is an upper bound for every correlation.
+Y = sum_i w_i Y_i, sum_i w_i = 1; Y^-1 is an upper bound of the covariance for every correlation.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ NAIVE = (
 
 
 def fuse(beliefs: Sequence[Belief]) -> Belief:
-    """One belief from several whose errors are independent; an information sum.
+    """Belief from several with independent errors, by an information sum.
 
-    Covariances are taken as they stand in the tangent space of their own mean, as an update does;
-    where means differ by a rotation of angle d that errs by a share d^2 of them.
+    Each covariance is used in the tangent space of its own mean without transport, as in an update;
+    where means differ by a rotation of d [rad], its relative error is of order d^2.
 
     Args:
-        beliefs: about the same state, at the same instant.
+        beliefs: beliefs of the same state at the same time.
 
     Raises:
         ValueError: there is none, or a covariance is singular: infinite information has no sum.
@@ -91,7 +91,7 @@ def is_singular(belief: Belief) -> Array:
 
 @jax.jit
 def information_sum(beliefs: Sequence[Belief], weights: Array | None = None) -> Belief:
-    """`fuse` without a look at the numbers, each information times a weight where there are some.
+    """`fuse` without checks, each information matrix times its weight if weights are given.
 
     A singular covariance gives infinities or NaN.
     """
@@ -103,10 +103,10 @@ def information_sum(beliefs: Sequence[Belief], weights: Array | None = None) -> 
 
 @partial(jax.jit, static_argnames="common")
 def common_information_sum(beliefs: Sequence[Belief], common: int) -> Belief:
-    """`information_sum` of the first ``common`` tangent components; the others follow the first.
+    """`information_sum` of the first ``common`` tangent components; the others from ``beliefs[0]``.
 
-    The marginals x_ic, P_icc of all beliefs are summed. What else the first belief knows, x_w, goes
-    with its conditional distribution given the common components c, which is left as it is:
+    The marginals x_ic, P_icc of all beliefs are summed. The other components of the first belief,
+    x_w, keep their conditional distribution given the common components c:
 
         G = P_1wc P_1cc^-1,   x_w = x_1w + G (x_c - x_1c),   P_w = G P_c G' + (P_1ww - G P_1cw)
 
@@ -127,7 +127,7 @@ def common_information_sum(beliefs: Sequence[Belief], common: int) -> Belief:
 def _summed(
     factors: Sequence[Array], aways: Sequence[Array], weights: Array | None
 ) -> tuple[Array, Array]:
-    """Deviation and factor of an information sum, from factors and deviations of its parts."""
+    """Deviation (n,) and factor (n, n) of an information sum, from those of its terms."""
     n = factors[0].shape[0]
     columns = []
     for i, (factor, away) in enumerate(zip(factors, aways, strict=True)):
@@ -149,17 +149,17 @@ def _summed(
 def share(
     belief: Belief, shares: ArrayLike | Sequence[Any], sharing: Sharing = "root"
 ) -> tuple[Belief, ...]:
-    """Share a belief out: the same mean to all, and to each its part of the information.
+    """Divide a belief into N with the same mean, each with its share of the information.
 
     Args:
-        belief: what there is to share.
-        shares: (N,), or (N, n) for one share a state; positive, without unit. `fuse` gives the
-            belief back if they sum to one, except with ``sharing="half"``.
+        belief: belief to divide.
+        shares: (N,), or (N, n) for one share per state; positive, without unit. `fuse` restores the
+            belief if they sum to one, except with ``sharing="half"``.
         sharing: "root", "scalar" or "half" (module docstring).
 
     Raises:
         ValueError: the sharing is unknown or "naive", shares are of another shape or not positive,
-            or a share a state was given to scalar sharing.
+            or scalar sharing was given shares per state.
     """
     check_sharing(sharing)
     n = belief.factor.shape[0]
@@ -178,13 +178,13 @@ def share(
 
 
 def check_sharing(sharing: str) -> None:
-    """Refuse a way of sharing that there is not."""
+    """Refuse an unknown way of sharing, or "naive"."""
     require(sharing != "naive", NAIVE)
     one_of("sharing", sharing, Sharing)
 
 
 def part(factor: Array, shares: Array, sharing: Sharing) -> list[Array]:
-    """Factors of the parts of a covariance; of a belief or of noise.
+    """Factors of the parts of a covariance of a belief or of noise.
 
     Args:
         factor: (n, k).
@@ -192,7 +192,7 @@ def part(factor: Array, shares: Array, sharing: Sharing) -> list[Array]:
         sharing: "root", "scalar" or "half".
     """
     if shares.shape[1] == 1 or sharing == "half":
-        # Rows scaled; with one share for all states every way is this one.
+        # Scale the rows; with one share for all states every way of sharing is this one.
         return [factor / jnp.sqrt(a)[:, None] for a in shares]
     n, k = factor.shape
     square = factor if n == k else linalg.tria(factor)
@@ -201,7 +201,7 @@ def part(factor: Array, shares: Array, sharing: Sharing) -> list[Array]:
 
 
 def _halley_weights(least: float) -> list[tuple[float, float, float]]:
-    """Weights (a, b, c) that bring singular values from [least, 1] to one."""
+    """Weights (a, b, c) of Halley's iterations that bring singular values in [least, 1] to one."""
     weights = []
     while least < 1.0 - 1e-15:
         d = (4.0 * (1.0 - least**2) / least**4) ** (1.0 / 3.0)
@@ -214,18 +214,18 @@ def _halley_weights(least: float) -> list[tuple[float, float, float]]:
     return weights
 
 
-# Below 1e-10 a direction is a correlation that differs from one by rounding alone.
+# A smaller singular value stems from a correlation that differs from one by rounding alone.
 _WEIGHTS = _halley_weights(1e-10)
 
 
 @jax.jit
 def _to_symmetric(factor: Array) -> Array:
-    """The rotation W that makes D^-1 factor W symmetric, D the lengths of the rows.
+    """Orthogonal matrix W that makes D^-1 factor W symmetric, D the norms of the rows.
 
     It is the orthogonal polar factor of (D^-1 factor)', found by Halley's iteration with dynamic
-    weights (Nakatsukasa, Bai & Gygi 2010) for three reasons: orthogonal to rounding, so that no
-    information is lost however nearly singular the covariance; derivatives that do not divide by
-    differences of eigenvalues, which are zero for P = I; and Cholesky only.
+    weights (Nakatsukasa, Bai & Gygi 2010) for three reasons: W is orthogonal to rounding, so that
+    no information is lost even for a nearly singular covariance; its derivatives do not divide by
+    differences of eigenvalues, which are zero for P = I; and it needs only Cholesky factors.
     """
     n = factor.shape[0]
     square = jnp.sum(factor**2, axis=1)
@@ -248,17 +248,17 @@ _BARRIERS = [10.0**-k for k in range(11) for _ in range(2)]
 def covariance_intersection(
     beliefs: Sequence[Belief], criterion: Criterion | ArrayLike | Sequence[float] = "trace"
 ) -> Belief:
-    """One belief from several, consistent whatever the correlation of their errors.
+    """Belief from several, consistent whatever the correlation of their errors.
 
-    Weights are found by Newton's method behind a logarithmic barrier, in a fixed number of steps;
+    Weights are found by Newton's method with a logarithmic barrier, in a fixed number of steps;
     both criteria are convex in them. A belief that another one dominates keeps a weight of about
     1e-10.
 
     Args:
-        beliefs: about the same state, at the same instant.
-        criterion: what to make least: "trace" of the covariance, in units of the smallest standard
-            deviation any of the beliefs claims for each state; "det", its determinant; or (N,)
-            weights, not negative, which sum to one.
+        beliefs: beliefs of the same state at the same time.
+        criterion: quantity to minimise: "trace" of the covariance, in units of the smallest
+            standard deviation of each state in any belief; "det", its determinant; or (N,) weights,
+            not negative, which sum to one.
 
     Raises:
         ValueError: there is no belief, one is singular, or the criterion is none of these.
@@ -304,7 +304,7 @@ def _best_weights(beliefs: list[Belief], criterion: Criterion) -> Array:
 
 
 def check_criterion(criterion: Any, count: int) -> None:
-    """Refuse a criterion that there is not, or weights that are none."""
+    """Refuse an unknown criterion, or weights that are negative or do not sum to one."""
     if isinstance(criterion, str):
         if criterion not in _SLOPES:
             raise ValueError(f"criterion must be 'trace', 'det' or weights, got {criterion!r}")
@@ -325,7 +325,7 @@ def _det_slopes(X: Array, lower: Array) -> tuple[Array, Array]:
 
 
 def _trace_slopes(X: Array, lower: Array) -> tuple[Array, Array]:
-    """The same of trace P over its value, held constant."""
+    """First and second derivatives of trace P, divided by its present value."""
     inverse = linalg.solve_lower(lower, jnp.eye(lower.shape[0]))
     K = inverse @ inverse.T
     size = jnp.trace(K)

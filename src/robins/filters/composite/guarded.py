@@ -1,32 +1,33 @@
-r"""Guarded filters: an assumption is weighed by the error that is learnt of it.
+r"""Guarded filters: an assumption is weighted by its error, which is estimated online.
 
 A wrong assumption (an exact constraint, air data whose errors are modelled as white) makes the
-covariance of a filter too small, so its own residuals do not show the fault. A *reference* that
-does without the assumption shows it: where the assumption is right, the estimate x_c that uses it
-is efficient, and differs from the reference's x_u by exactly what was gained (Hausman 1978),
+covariance of a filter too small, so its own residuals do not show the fault. A *reference* filter
+without the assumption shows it: if the assumption is right, the estimate x_c that uses it is
+efficient, and the covariance of its difference from the reference's x_u is the reduction of the
+covariance (Hausman 1978),
 
     E (x_c - x_u)(x_c - x_u)' = P_u - P_c = G
 
-Where it brings in an error of variance B of its own, this is G + B, and the best estimate from both
-weighs them (cov(x_u error, x_c - x_u) = -G): with B = beta G
+If the assumption adds an error of covariance B, this becomes G + B, and the best estimate is a
+weighted mean (the covariance of the error of x_u and x_c - x_u is -G): with B = beta G
 
     x = x_u + w (x_c - x_u),   P = P_u - w (2 - w (1 + beta)) G,   w = 1 / (1 + beta)
 
-which is never worse than the reference; a weight that is wrong is, where it is above 2 w. P holds
-for any w, and is stated with a beta larger by what the test does not see. beta is learnt from the
-same differences,
+which is never worse than the reference; a weight above 2 / (1 + beta) would be. P holds for any w,
+and is computed with a beta that is larger by the error that the test cannot detect. beta is
+estimated from the same differences,
 
     T_i = (x_c - x_u)_i^2 / P_u,ii        v_i = 1 - P_c,ii / P_u,ii  (not below 0)
 
-whose means are E T_i = (1 + beta) v_i, in sums that forget. The sum of w_i makes samples
-comparable: differences of consecutive steps are nearly the same number. A measurement of a
-*judge*, a sensor that both filters use, renews the share w_i = 1 - P+_u,ii/P-_u,ii of what the
-reference knows; the sums count in such renewals, *looks*. Where no judge measures nothing is
-renewed, and the weight stands.
+whose means are E T_i = (1 + beta) v_i, in sums with exponential forgetting. Differences of
+consecutive steps are strongly correlated, so samples are weighted by new information: a measurement
+of a *judge*, a sensor that both filters use, renews the share w_i = 1 - P+_u,ii/P-_u,ii of the
+reference's knowledge of state i. The sums are counted in such renewals, *looks*. Without
+measurements of a judge nothing is renewed, and the weight stays.
 
-A filter that has gone astray does not come back by itself when its assumption is right again. So
-it goes on from the reference's belief, with what was learnt, where it is worse than that: B > G, in
-evidence that is summed up as Page (1954) has it for the quickest detection of a change,
+A filter that has diverged does not recover by itself when its assumption is right again. So it is
+reset to the reference's belief, with beta kept, when it is worse than the reference, B > G. The
+evidence for that is summed as in Page's test (1954) for the quickest detection of a change,
 
     g_i := max(0, g_i + w_i (T_i - ratio v_i - slack)),   g_i > limit
 """
@@ -52,14 +53,14 @@ from robins.filters.values import Numbers, kind, number, value
 
 Groups = Sequence[Sequence[int]]
 
-# Harm that is not worth a word: a tenth of the reference's variance, 5 % of its deviation.
+# Negligible harm: a tenth of the reference's variance, 5 % of its standard deviation.
 SLACK = 0.1
 
-# beta up to a half is chance, in sums over some ten looks. To neglect it costs little: at most a
-# sixth of what is gained, at beta = 1/2.
+# A beta up to 1/2 can be chance, in sums over some ten looks. Neglecting it costs at most a sixth
+# of G in variance, at beta = 1/2.
 _CHANCE = 0.5
 
-# Six deviations of the reference, squared, are conclusive; more would not be forgotten.
+# Limit of T: six standard deviations, squared, are conclusive, and more would not be forgotten.
 _SURE = 36.0
 
 
@@ -69,30 +70,30 @@ class GuardMemory(NamedTuple):
     filter: FilterState
     reference: FilterState
     evidence: Array  # (groups,) g
-    excess: Array  # (groups,) sum of T - v, of a component
-    gained: Array  # (groups,) sum of v
-    looks: Array  # (groups,) sum of renewals
-    trips: Array  # () how often the filter was sent back to its reference
+    excess: Array  # (groups,) sum of T - v, mean over the components
+    gained: Array  # (groups,) sum of v, mean over the components
+    looks: Array  # (groups,) sum of renewals, mean over the components
+    trips: Array  # () number of resets of the filter to its reference
 
     @property
     def beta(self) -> Array:
-        """() of the worst group, not below 0."""
+        """() beta of the worst group, not below 0."""
         beta = self.excess / (self.gained + SLACK * jnp.maximum(self.looks, 1.0))
         return jnp.maximum(jnp.max(beta), 0.0)
 
     @property
     def weight(self) -> Array:
-        """() w."""
+        """() weight w of the filter."""
         return 1.0 / (1.0 + jnp.maximum(self.beta - _CHANCE, 0.0))
 
 
 @value
 class Guarded(Composite):
-    """The filter of `guarded`.
+    """Filter made by `guarded`.
 
-    The report of an update is that of the filter with the greater weight; a sensor of the
-    assumption that has the smaller one is refused. Notes: those of the filter, those of the
-    reference as ``reference.`` and their name, ``guarded.weight``, ``guarded.evidence`` (the
+    The `StepInfo` of an update is that of the filter with the greater weight; if this is the
+    reference, a sensor of the assumption is reported as refused. Notes: those of the filter, those
+    of the reference as ``reference.`` and their name, ``guarded.weight``, ``guarded.evidence`` (the
     greatest, as a share of the limit) and ``guarded.trips``.
     """
 
@@ -127,10 +128,10 @@ class Guarded(Composite):
         return _given_out(GuardMemory(*states, none, excess, none, none, jnp.zeros((), int)))
 
     def taken_over(self, watch: GuardMemory) -> FilterState:
-        """The filter gone on from what the reference believes.
+        """State of the filter, reset to the belief of the reference.
 
-        Where both are filters of as many locals, local by local: a joined filter that is reset to
-        one belief would have it in every local, and so count it more than once.
+        If both are joined filters with the same number of locals, each local is reset to its
+        counterpart: one belief in all locals would be counted more than once.
         """
         mine, follow = self.filter.members(watch.filter)
         others, _ = self.reference.members(watch.reference)
@@ -139,7 +140,7 @@ class Guarded(Composite):
         return self.filter.reset(watch.filter, watch.reference.belief)
 
     def judged(self, watch: GuardMemory, failed: Array, renewed: Array | float) -> GuardMemory:
-        """Watch after a step, in which the filter may go on from its reference."""
+        """Memory after a step, with the filter reset to its reference if the evidence requires."""
         square, gained = _difference(watch.filter.belief, watch.reference.belief)
         renewed = jnp.broadcast_to(jnp.asarray(renewed), square.shape)
         M = _members(self.groups, len(square))
@@ -163,9 +164,9 @@ class Guarded(Composite):
         gained: Array,
         sure: Array,
     ) -> GuardMemory:
-        """The sums after a step, each by group: a mean over its components."""
+        """Sums after a step, by group, each a mean over its components."""
         looks = mean @ renewed
-        # One clock for all, or a group that no judge sees would never forget.
+        # All groups forget at the same rate, else one that no judge observes would never forget.
         kept = jnp.exp(-jnp.max(looks) / self.patience)
         gain = kept * watch.gained + mean @ (renewed * gained)
         looks = kept * watch.looks + looks
@@ -175,7 +176,7 @@ class Guarded(Composite):
         return watch._replace(excess=jnp.where(sure, most, excess), gained=gain, looks=looks)
 
     def renewed(self, sensor: Sensor, before: Belief, after: Belief, dof: Array) -> Array | float:
-        """Share of what the reference knows that a measurement of a judge renewed."""
+        """Share of the reference's information that a measurement of a judge has renewed."""
         if sensor.name not in self.judging:
             return 0.0
         was, now = before.sigma, after.sigma
@@ -186,7 +187,7 @@ class Guarded(Composite):
         watch: GuardMemory = state.memory
         mine, first = self.filter.predict(watch.filter, motion, u)
         other, second = self.reference.predict(watch.reference, motion, u)
-        # Without its reference a filter cannot be judged: they take a step together.
+        # Without its reference the filter cannot be tested: they take a step together.
         together = second.code == int(Code.DONE)
         moved = watch._replace(filter=select(together, mine, watch.filter), reference=other)
         new = _given_out(self.judged(moved, together & (first.code != int(Code.DONE)), 0.0))
@@ -232,38 +233,38 @@ def guarded(
     leap: Number = 6.0,
     trusted: bool = True,
 ) -> Filter:
-    """A filter under an assumption, weighed against one without by the error learnt of it.
+    """Combine a filter that uses an assumption with one that does not, weighted by its error.
 
-    The belief lies between those of ``filter`` and of ``reference``, which never sees the sensors
+    The belief lies between those of ``filter`` and of ``reference``, which never uses the sensors
     of the assumption, by the weight w of the worst group (module docstring); without evidence
-    against the assumption it is that of ``filter``. What was learnt is forgotten to 1/e in
-    ``patience`` looks. The filter goes on from the reference's belief when the evidence of a group
-    of states exceeds its limit, when a component is further off than ``leap`` deviations of the
-    reference, or when it cannot take a step that the reference can; by the last two its weight
-    falls at once.
+    against the assumption it is that of ``filter``. The estimated error is forgotten to 1/e in
+    ``patience`` looks. The filter is reset to the reference's belief when the evidence of a group
+    of states exceeds the limit, when a component differs by more than ``leap`` standard deviations
+    of the reference, or when it cannot take a step that the reference can; in the last two cases
+    its weight falls at once.
 
-    The test is of harm to the estimate, and relies on the reference's covariance: where that is
-    overconfident (NEES per state above one) a ratio larger by that makes up for it.
+    The test detects harm to the estimate, and relies on the reference's covariance: if that is
+    overconfident (NEES per state above one), multiply ``ratio`` by that NEES.
 
     Args:
-        filter: believes the assumption.
-        reference: does without; of the same state. Each may be a filter of filters.
+        filter: filter that uses the assumption.
+        reference: filter of the same state that does not. Each may be a filter of filters.
         assumption: sensors that the reference does not use.
-        judges: sensors that both use and that are beyond question.
-        groups: tangent components judged together, by their sum, such as ``[(3, 4), (6, 7)]``:
-            faster than one by one, the default. Others are not watched.
-        ratio: how many times what it should be a squared difference may be on average before the
-            filter goes on from its reference, which then is as good as it; half of it is what is
-            expected under a right assumption.
-        limit: of the evidence. Small: quick; large: rarely wrong.
-        patience: looks in which the learnt error is forgotten.
-        leap: deviations of the reference that no difference exceeds by chance; `inf` to leave out.
-        trusted: whether the assumption is taken to be right at the start.
+        judges: sensors that both use and that are beyond doubt.
+        groups: tangent components tested together, by their sum, such as ``[(3, 4), (6, 7)]``,
+            which is faster than testing each component, the default. Others are not tested.
+        ratio: mean of T over v (module docstring) above which the filter is reset; half of it is
+            the mean expected under a right assumption. At 2 the filter is as bad as the reference.
+        limit: limit of the evidence; a small one detects quickly, a large one is rarely wrong.
+        patience: time constant of forgetting the estimated error [looks].
+        leap: difference that chance does not exceed, in standard deviations of the reference;
+            `inf` for none.
+        trusted: True if the assumption is taken as right at the start.
 
     Raises:
         ValueError: a sensor is on both sides, no judge or no assumption is named, a group is empty
-            or a parameter is not of its range; at `init`, the model has no sensor of such a name,
-            or the state no such component.
+            or a parameter is out of its range; at `init`, the model has no sensor of such a name,
+            or the state has no such component.
     """
     assumed, judging = _two_sides(assumption, judges)
     named = groups is None or (len(groups) > 0 and all(len(one) > 0 for one in groups))
@@ -307,7 +308,7 @@ def _given_out(watch: GuardMemory) -> FilterState:
 
 
 def _quotient(a: Array, b: Array) -> Array:
-    """The ratio, or 0 where b is 0: what the reference knows exactly is not in question."""
+    """Ratio a / b; 0 where b is 0, since exactly known components are not tested."""
     some = b > 0.0
     return jnp.where(some, a / jnp.where(some, b, 1.0), 0.0)
 
@@ -333,7 +334,7 @@ def _members(groups: Groups | None, n: int) -> np.ndarray:
 
 
 def _not_believed(info: StepInfo) -> StepInfo:
-    """Report of a measurement that did not change the belief given out."""
+    """Information of a measurement that did not change the reported belief."""
     missing = info.code == int(Code.MISSING)
     return info._replace(
         factor=jnp.eye(len(info.used)),

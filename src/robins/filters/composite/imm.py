@@ -1,15 +1,15 @@
-"""Interacting multiple model: several filters of one state, and how likely each is the right one.
+"""Interacting multiple model: several filters of one state, and the probability of each.
 
 Blom & Bar-Shalom, *The interacting multiple model algorithm for systems with Markovian switching
 coefficients*, IEEE Trans. Automatic Control 33 (1988). With p_ij the probability of a change from
 mode i to mode j in a step and mu_i that of mode i, each step
 
     predicts    c_j = sum_i p_ij mu_i
-    mixes       filter j begins with the moments of the mixture of all, weights p_ij mu_i / c_j
-    updates     mu_j = c_j L_j / sum_k c_k L_k, L_j the likelihood that filter j gives what is seen
+    mixes       filter j starts from the moments of the mixture of all, weights p_ij mu_i / c_j
+    updates     mu_j = c_j L_j / sum_k c_k L_k, L_j the likelihood of the measurement in filter j
 
-and answers with the moments of the mixture under mu. Probabilities are kept as logarithms, and
-moments are taken on the state's manifold and on factors, so that nothing is subtracted.
+and returns the moments of the mixture under mu. Probabilities are kept as logarithms, and moments
+are computed on the state's manifold and on factors, so that nothing is subtracted.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ from robins.filters.values import Numbers, is_known, kind, value
 from robins.linalg.rows import each_row
 
 T = TypeVar("T")
-One = tuple[Data, Data, dict[str, Array]]  # state, what was found, and notes
+One = tuple[Data, Data, dict[str, Array]]  # state, result and notes of one mode
 Of = Callable[..., One]
 Every = tuple[Data, Data, Sequence[dict[str, Array]]]
 
 
 @value
 class Mode:
-    """A filter and what of the model is its own."""
+    """Filter of a mode, with a motion and sensors of its own if any."""
 
     filter_: Filter
     motion: Motion | None = None
     sensors: tuple[Sensor, ...] = ()
 
     def predict(self, state: FilterState, motion: Motion, u: Data) -> One:
-        """State, code and no notes of a prediction, by the motion of this mode if it has one."""
+        """State and code of a prediction, by the motion of this mode if it has one; no notes."""
         own = motion if self.motion is None else self.motion
         state, prediction = self.filter_.predict(state, own, u)
         return state, prediction.code, {}
 
     def update(self, state: FilterState, sensor: Sensor, y: Data, aux: Data) -> One:
-        """State, information and notes of an update, by its own sensor of that name if any."""
+        """State, information and notes of an update, by the mode's own sensor if it has one."""
         own = next((s for s in self.sensors if s.name == sensor.name), sensor)
         state, info = self.filter_.update(state, own, y, aux)
         return state, info._replace(notes={}), info.notes
@@ -72,11 +72,11 @@ class SeparateModes:
         return len(self.modes)
 
     def mode(self, i: int) -> Mode:
-        """One of them."""
+        """Mode i."""
         return self.modes[i]
 
     def every(self, of: Of, states: Data, *rows: Data) -> Every:
-        """States, what was found with a leading axis of modes, and the notes of each.
+        """Apply a function to all modes; return states, results with a leading axis, and notes.
 
         Args:
             of: ``(mode, state, *row) -> (state, found, notes)``.
@@ -99,7 +99,7 @@ class SeparateModes:
         return states[i]
 
     def exchanged(self, i: int, filter_: Filter) -> SeparateModes:
-        """The modes with another filter in one of them."""
+        """Copy with another filter in mode i."""
         own = replace(self.modes[i], filter_=filter_)
         return SeparateModes((*self.modes[:i], own, *self.modes[i + 1 :]))
 
@@ -112,10 +112,10 @@ class ModeFamily:
     batched: seven modes compile in the time of one.
 
     Attributes:
-        make: makes a filter, or what `mode` makes of one, of one row of the numbers. What depends
-            on a number is computed with it, not decided by it: the numbers are stand-ins then. A
-            function that is made at each call compiles again: give a `Partial` of a module's.
-        numbers: pytree of arrays, one row a mode.
+        make: function from one row of the numbers to a filter, or to the result of `mode`. It may
+            compute with the numbers but not branch on them, since they are traced. A function
+            created at each call compiles again: give a `Partial` of a module-level function.
+        numbers: pytree of arrays, one row per mode.
     """
 
     make: Callable[[Data], Filter | Mode]
@@ -133,7 +133,7 @@ class ModeFamily:
         return next(iter(lengths))[0]
 
     def of(self, row: Data) -> Mode:
-        """The mode of one row."""
+        """Mode of one row of numbers."""
         return _as_mode(self.make(row))
 
     def mode(self, i: int) -> Mode:
@@ -141,8 +141,9 @@ class ModeFamily:
         return self.of(row_of(jax.tree_util.tree_map(np.asarray, self.numbers), i))
 
     def every(self, of: Of, states: Data, *rows: Data) -> Every:
-        """Step of all modes, as `SeparateModes.every`: one mode is traced for all; states have a
-        leading axis.
+        """Apply a function to all modes, as `SeparateModes.every`, tracing it only once.
+
+        States have a leading axis of modes.
         """
         numbers = jax.tree_util.tree_map(jnp.asarray, self.numbers)
         after, found, notes = each_row(
@@ -159,7 +160,7 @@ class ModeFamily:
         return row_of(states, i)
 
     def exchanged(self, i: int, filter_: Filter) -> ModeFamily:
-        """The modes with another filter in one of them, which differs in numbers only."""
+        """Copy with another filter in mode i, which may differ in numbers only."""
         modes = jax.vmap(self.of)(jax.tree_util.tree_map(jnp.asarray, self.numbers))
         put = jax.tree_util.tree_map(lambda x, new: x.at[i].set(new), modes.filter_, filter_)
         return ModeFamily(_as_mode, replace(modes, filter_=put))
@@ -169,11 +170,11 @@ def _as_mode(one: Filter | Mode) -> Mode:
     return one if isinstance(one, Mode) else Mode(one)
 
 
-_ONE = 1e-9  # how far a sum of probabilities may be off
+_ONE = 1e-9  # tolerance of a sum of probabilities
 
 
 class Interaction(NamedTuple):
-    """Memory of a mixture of filters."""
+    """Memory of an `imm` filter."""
 
     states: Data  # of the modes: a tuple, or those of a family with a leading axis
     log_probability: Array  # (modes,)
@@ -183,22 +184,22 @@ def mode(filter_: Filter, motion: Motion | None = None, sensors: Sequence[Sensor
     """One mode of `imm`.
 
     Args:
-        filter_: from `kalman` and its kin.
-        motion: of this mode, of the same state; else the run's.
-        sensors: of this mode, each in the place of the run's sensor of its name.
+        filter_: the filter, such as `kalman` returns.
+        motion: motion of this mode, of the same state; None: that of the run.
+        sensors: sensors of this mode, each in place of the run's sensor of its name.
     """
     return Mode(filter_, motion, tuple(sensors))
 
 
 @value
 class Imm(Filter):
-    """The filter of `imm`."""
+    """Filter made by `imm`."""
 
     modes: SeparateModes | ModeFamily
     log_change: Numbers  # (modes, modes)
     log_first: Numbers  # (modes,)
     likeliest: bool = kind()
-    wrong: tuple[tuple[str, tuple[int, ...]], ...] = kind()  # names, and the modes of each
+    wrong: tuple[tuple[str, tuple[int, ...]], ...] = kind()  # each name, with its modes
 
     @property
     def suspects(self) -> tuple[str, ...]:
@@ -224,13 +225,14 @@ class Imm(Filter):
         return FilterState(belief, Interaction(states, jnp.asarray(self.log_first)))
 
     def mixed(self, states: Data, log_now: Array) -> tuple[Data, Array]:
-        """States that the filters begin with, and the predicted log-probabilities."""
+        """States of the filters after mixing, and the predicted log-probabilities."""
         joint = log_now[:, None] + jnp.asarray(self.log_change)
         log_weight, log_next = jax.vmap(log_normalised, in_axes=1)(joint)
         weight = jnp.exp(log_weight)  # (to, from)
         beliefs = self.modes.beliefs(states)
         begun = each_row(partial(matched, beliefs), weight, beliefs.mean)
-        # A mode that receives nothing goes on alone, as does one that mixes with none, bit for bit.
+        # A mode of zero predicted probability, or without contribution from others, is not mixed
+        # and keeps its state bit for bit.
         alone = ~jnp.isfinite(log_next) | (jnp.diagonal(weight) == 1.0)
 
         def restart(mode: Mode, state: FilterState, belief: Belief, alone: Array) -> One:
@@ -258,7 +260,7 @@ class Imm(Filter):
         if self.wrong:
             notes[WRONG] = self._by_name(probability)
         info = self.mixture_info(seen, log_prior, log_post, used)._replace(notes=notes)
-        # Where no mode has moved the mixture stands bit for bit.
+        # If no mode has changed its belief, that of the mixture stays the same bit for bit.
         was, now = self.modes.beliefs(states), self.modes.beliefs(after)
         same = jnp.all(each_row(equal, now, was))
         belief = select(same, state.belief, _mixture(now, log_post))
@@ -267,7 +269,7 @@ class Imm(Filter):
     def mixture_info(
         self, seen: StepInfo, log_prior: Array, log_post: Array, used: Array
     ) -> StepInfo:
-        """Information of the modes as one."""
+        """Information of the mixture, or with `likeliest` mostly that of the likeliest mode."""
         info = row_of(seen, 0) if self.modes.size == 1 else _seen(seen, log_prior, log_post, used)
         if not self.likeliest:
             return info
@@ -295,7 +297,7 @@ class Imm(Filter):
             self.modes.mode(i).filter_.report(first, last, anew, time)
 
     def rerun_mode(self, again: Again, i: int, filter_: Filter) -> FilterState:
-        """The final state of mode i in a run with another filter in its place."""
+        """Final state of mode i in a run with another filter in its place."""
         final = again(replace(self, modes=self.modes.exchanged(i, filter_)))
         return self.modes.state(final.memory.states, i)
 
@@ -310,32 +312,33 @@ def imm(
     """Interacting multiple model filter over any filters of the same state.
 
     Modes may differ in rules, in linearisation, and by `mode` in motion and sensors. Each keeps the
-    memory of its rules; only beliefs are mixed. With nothing measured, probabilities only mix.
+    memory of its rules; only beliefs are mixed. Without measurements, the probabilities follow the
+    Markov chain alone.
 
     The `StepInfo` is that of the mixture: innovation and factor are its moments before the update,
-    the gain is the mean of the modes' gains, and ``imm.probability`` (modes,) is noted. What rules
-    of mode i note is found under ``imm.i.`` and its name. A mode that is rare and wide makes these
-    moments those of no Gaussian, and the NIS meaningless: then set ``likeliest``.
+    the gain is the mean of the modes' gains, and ``imm.probability`` (modes,) is noted. Notes by
+    rules of mode i have ``imm.i.`` before their name. With a mode of small probability and large
+    covariance the mixture is far from Gaussian, and its NIS meaningless: then set ``likeliest``.
 
-    Likelihoods only compare where all modes use the same components. Where a rule of one mode
-    refuses what another uses, the measurement leaves the probabilities as they are. A mode whose
-    step fails is out until the next mixing; the code is a failure only where all fail.
+    Likelihoods are comparable only if all modes use the same components. If a rule of one mode
+    refuses a component that another uses, the measurement leaves the probabilities unchanged. A
+    mode whose step fails has probability zero until the next mixing; the code is a failure only if
+    all fail.
 
     Args:
-        modes: filters, or what `mode` makes of one; a `ModeFamily` where they differ in numbers
-            only.
-        transition: (modes, modes), row i the probabilities to change from i in one step.
-        start: (modes,) probabilities before the first prediction; all equal where not given.
-        likeliest: innovation, factor, NIS and what was used are those of the mode that is likeliest
-            after the update. Beliefs and likelihoods are the same either way.
-        wrong: numbers of the modes in which something is wrong, by the name of an instrument or
-            "motion"; a mode may stand under several names. The probability of each name is noted as
-            ``imm.wrong`` (names,), and `Filter.suspects` has the names.
+        modes: filters, or results of `mode`; a `ModeFamily` if they differ in numbers only.
+        transition: (modes, modes), row i the probabilities of a change from i in one step.
+        start: (modes,) probabilities before the first prediction; equal by default.
+        likeliest: take innovation, factor, NIS and the mask of used components from the mode that
+            is likeliest after the update. Beliefs and likelihoods are the same either way.
+        wrong: indices of the modes in which an instrument, or "motion", is faulty, by its name; a
+            mode may be under several names. The probability of each name is noted as ``imm.wrong``
+            (names,), and `Filter.suspects` has the names.
 
     Raises:
-        ValueError: no modes, or probabilities that are negative, of a wrong shape or do not sum to
-            one; `wrong` numbers a mode that is not there. When a run begins: a mode brings a sensor
-            that the model does not have.
+        ValueError: there is no mode; probabilities are negative, of a wrong shape or do not sum to
+            one; `wrong` has an index without a mode. When a run starts: a mode has a sensor that
+            the model does not have.
     """
     all_ = modes if isinstance(modes, ModeFamily) else SeparateModes(tuple(map(_as_mode, modes)))
     count = all_.size
@@ -369,7 +372,10 @@ def _log_probabilities(name: str, given: Given, shape: tuple[int, ...]) -> Numbe
 
 
 def _judged(seen: StepInfo, log_prior: Array) -> tuple[Array, Array, Array]:
-    """Log-probabilities before and after, and what was used; of modes whose step failed none."""
+    """Log-probabilities before and after, and the mask of used components, by successful modes.
+
+    The first result is -inf for modes whose step failed.
+    """
     sound = ~jnp.isneginf(seen.log_likelihood)
     used = jnp.any(seen.used & sound[:, None], axis=0)
     alike = jnp.all((seen.used == used[None]) | ~sound[:, None])
@@ -380,13 +386,13 @@ def _judged(seen: StepInfo, log_prior: Array) -> tuple[Array, Array, Array]:
 
 
 def _among(taken: Array, log_probability: Array) -> Array:
-    """The same without modes whose step failed, unless all did."""
+    """Log-probabilities with zero probability for modes whose step failed, unless all did."""
     kept = jnp.where(taken | ~jnp.any(taken), log_probability, -jnp.inf)
     return log_normalised(kept)[0]
 
 
 def _mixture(beliefs: Belief, log_probability: Array) -> Belief:
-    """Moments of all modes; those of one that is certain are its own, bit for bit."""
+    """Moments of the mixture; if one mode is certain, its own belief bit for bit."""
     likely = jnp.argmax(log_probability)
     best = row_of(beliefs, likely)
     if len(log_probability) == 1:
@@ -396,7 +402,7 @@ def _mixture(beliefs: Belief, log_probability: Array) -> Belief:
 
 
 def _seen(seen: StepInfo, log_prior: Array, log_post: Array, used: Array) -> StepInfo:
-    """One `StepInfo` for the mixture of predicted measurements."""
+    """Information of the mixture of predicted measurements."""
     _, log_likelihood = log_normalised(log_prior + seen.log_likelihood)
     lost = jnp.isneginf(log_likelihood)
     used = used & ~lost

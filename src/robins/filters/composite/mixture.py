@@ -1,4 +1,4 @@
-"""The Gaussian that has the mean and covariance of several, weighted: moments on a manifold."""
+"""Moments of Gaussian mixtures on a manifold: the Gaussian with the same mean and covariance."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from robins.filters.trees import select
 from robins.linalg.rows import each_row
 from robins.manifold import State
 
-_ROUNDS = 6  # of the mean on a curved space: it comes nearer by about the square of the spread
+_ROUNDS = 6  # iterations of the mean on a curved space: error times about spread^2 in each
 
 
 def log_normalised(log_weight: Array) -> tuple[Array, Array]:
-    """Logarithms of weights that sum to one, and the logarithm of the sum they had.
+    """Logarithms of weights scaled to sum to one, and the logarithm of their previous sum.
 
-    Weights that are all zero (or not a number) become equal, and their sum is then -inf.
+    If all weights are zero or NaN they become equal, and the second result is -inf.
     """
     log_weight = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight)
     total = jax.scipy.special.logsumexp(log_weight)
     lost = ~jnp.isfinite(total)
     even = jnp.full_like(log_weight, -jnp.log(float(log_weight.shape[0])))
-    # The sum is taken of safe numbers where it is lost, so that no derivative is NaN.
+    # A sum that is not finite is replaced, so that no derivative is NaN.
     safe = jnp.where(lost, 0.0, total)
     return jnp.where(lost, even, log_weight - safe), jnp.where(lost, -jnp.inf, total)
 
@@ -40,7 +40,7 @@ def root(weight: Array) -> Array:
 def mean_of(states: State, weight: Array, about: State) -> State:
     """Weighted mean of states (leading axis), by Gauss-Newton steps from ``about``.
 
-    States of weight zero do not count, even if they are not finite.
+    States of weight zero are ignored, even if they are not finite.
     """
     curved = any(manifold.is_element(leaf) for leaf in manifold.leaves(about))
     for _ in range(_ROUNDS if curved else 1):
@@ -49,24 +49,24 @@ def mean_of(states: State, weight: Array, about: State) -> State:
 
 
 def deviations(states: State, factors: Array, weight: Array, mean: State) -> Array:
-    """Columns of a factor of the mixture's covariance about a mean, one block a state.
+    """Columns of a factor of the mixture's covariance about a mean, one block per state.
 
-    The covariance is the sum of w_i (J_i P_i J_i' + d_i d_i'), with d_i leading from the mean to
-    state i and J_i what becomes of small errors at state i when they are seen from the mean.
+    The covariance is the sum of w_i (J_i P_i J_i' + d_i d_i'), with d_i the tangent vector from the
+    mean to state i, and J_i the Jacobian from the tangent space at state i to that at the mean.
 
     Args:
         states: leading axis r.
-        factors: (r, n, k), zero rows and columns welcome; k = 0 for points.
+        factors: (r, n, k), zero rows and columns allowed; k = 0 for points.
         weight: (r,), sums to one.
         mean: a single state.
 
     Returns:
-        (r, n, k + 1).
+        (r, n, k + 1) blocks.
     """
     curved = any(manifold.is_element(leaf) for leaf in manifold.leaves(mean))
 
     def block(x: State, S: Array, w: Array) -> Array:
-        x = select(w > 0.0, x, mean)  # what does not count may not be finite
+        x = select(w > 0.0, x, mean)  # a state of weight zero may not be finite
         share = root(w)
         kept = jnp.where(share > 0.0, S, 0.0)
         if S.shape[1] and curved:
@@ -77,14 +77,14 @@ def deviations(states: State, factors: Array, weight: Array, mean: State) -> Arr
 
 
 def matched(beliefs: Belief, weight: Array, about: State) -> Belief:
-    """The Gaussian with the first two moments of a mixture (leading axis r)."""
+    """Gaussian with the first two moments of a mixture (leading axis r), mean near ``about``."""
     mean = mean_of(beliefs.mean, weight, about)
     blocks = deviations(beliefs.mean, beliefs.factor, weight, mean)
     return Belief(mean, linalg.tria(side_by_side(blocks)))
 
 
 def side_by_side(blocks: Array) -> Array:
-    """(r, n, k) blocks side by side, (n, r k)."""
+    """(n, r k) matrix of (r, n, k) blocks side by side."""
     r, n, k = blocks.shape
     return jnp.moveaxis(blocks, 0, 1).reshape(n, r * k)
 
@@ -93,22 +93,22 @@ class Innovation(NamedTuple):
     """Innovation of a mixture of filters, with its covariance."""
 
     mean: Array  # (m,) y minus its prediction; NaN where missing
-    expected: Array  # (m,) standard deviation of it, before robust rules weigh it
-    factor: Array  # (m, m) of its covariance; identity rows where not used
+    expected: Array  # (m,) standard deviation of y - prediction, before robust rules raise noise
+    factor: Array  # (m, m) factor of the innovation covariance; identity rows where not used
     nis: Array
     dof: Array
 
     def info(
         self, used: Array, gain: Array, code: Array, wrong: Array, log_likelihood: Array
     ) -> StepInfo:
-        """Information of an update by it, without notes; wrong: () bool, it is contradicted."""
+        """Information of an update with this innovation, no notes; wrong: it is contradicted."""
         nis = jnp.where(wrong, jnp.inf, self.nis)
         innovation = self.mean, self.expected, self.factor
         return StepInfo(*innovation, gain, used, nis, self.dof, log_likelihood, code, {})
 
 
 def innovation(seen: StepInfo, weight: Array, used: Array) -> Innovation:
-    """Moments of the innovations of several filters (leading axis), weighted."""
+    """Weighted moments of the innovations of several filters (leading axis)."""
     counts = (weight > 0.0)[:, None]
     missing = jnp.any(jnp.isnan(seen.innovation) & counts, axis=0)
     residual = jnp.where(counts & ~missing[None], seen.innovation, 0.0)
@@ -122,7 +122,7 @@ def innovation(seen: StepInfo, weight: Array, used: Array) -> Innovation:
 
 
 def _offsets(states: State, weight: Array, about: State) -> Array:
-    """(r, n) from a state to others; zero for those that do not count."""
+    """(r, n) tangent vectors from a state to others; zero for those of weight zero."""
 
     def offset(x: State, w: Array) -> Array:
         return manifold.local(about, select(w > 0.0, x, about))

@@ -1,25 +1,25 @@
-"""Hypotheses of sensors whose records are off for some time: an offset as a state, on and off.
+"""Hypotheses of temporary sensor offsets: an additional state that modes switch on and off.
 
     y = h(x) [+] sigma * b + v,      v ~ N(0, R),  sigma the standard deviations of R
 
-b is a state in addition to x, counted in the noise of its sensor, so that the same numbers serve
+b is a state in addition to x, in units of the noise of its sensor, so that the same numbers serve
 every sensor. Modes of a bank (`robins.filters.composite.imm`) assume that
 
-    no sensor is off        b is not read
-    an offset begins        b is read, b ~ N(0, BEGINS^2 I): drawn again
-    it lasts                b is read, and wanders by N(0, WANDERS^2 I) in a step
+    no sensor is off        b does not act
+    an offset begins        b acts, b ~ N(0, BEGINS^2 I): a new offset
+    it lasts                b acts, and changes by N(0, WANDERS^2 I) in a step
 
 and change by
 
     none is off  -- BEGIN -->  begins  -- at once -->  lasts  -- END -->  none is off
 
-The last two are apart because a mode that is unlikely is mixed again from the likely ones in every
-step: a single one would start with an unknown offset again and again, at a cost each time.
+"Begins" and "lasts" are separate because an unlikely mode is mixed with likely ones in every step:
+a single mode would repeatedly restart with an unknown offset, at a cost in likelihood each time.
 
-A weight (`robins.filters.rules.huber`) marks a record as bad, and forgets it at once. Where
-records stay away, because a sensor is disturbed for a while or because the model between two
-sensors is wrong, the offset is learnt, and the information of the records on changes of x is not
-lost.
+A weight (`robins.filters.rules.huber`) reduces the effect of one outlier, without memory. If
+readings stay off, because a sensor is disturbed for a while or because the model between two
+sensors is wrong, the offset is estimated, and the information of the readings on changes of x is
+kept.
 """
 
 from __future__ import annotations
@@ -40,44 +40,45 @@ from robins.filters.kalman import Advanced, Around, Filter, FilterState, Predict
 from robins.filters.model import Data, Motion, Sensor
 from robins.filters.values import Numbers, kind, value
 
-BEGINS = 10.0  # sigma of an offset that begins, in standard deviations of the records
-WANDERS = 0.03  # by which it wanders in a step, in the same
-BEGIN, END = 1e-3, 1e-2  # probabilities in a step that an offset begins, and that it ends
+BEGINS = 10.0  # sigma of a new offset, in standard deviations of the sensor noise
+WANDERS = 0.03  # sigma of its change per step, in the same unit
+BEGIN, END = 1e-3, 1e-2  # probabilities per step that an offset begins, and that it ends
 
 
 class Augmented(NamedTuple):
-    """A state, and by how much each sensor is off."""
+    """State, and the offset of each sensor."""
 
     state: Any
     offset: tuple[Array, ...]  # (m,) of each sensor, in standard deviations of its noise
 
 
 class OffsetHypothesis(NamedTuple):
-    """A hypothesis, or with a leading axis those of a bank."""
+    """Offset hypothesis, or with a leading axis those of a bank."""
 
-    off: Any  # (sensors,) one where the records are off, else zero
-    lasts: Any  # (sensors,) one where the offset is the one of the step before, else zero
+    off: Any  # (sensors,) 1 if the readings have an offset, else 0
+    lasts: Any  # (sensors,) 1 if the offset continues that of the step before, else 0
 
 
 # ------------------------------------------------------------------------------------- the bank
 
 
 def offset_hypotheses(plain: int, sensors: int) -> OffsetHypothesis:
-    """The hypotheses of a bank: of each sensor two, behind plain ones in which none is off."""
+    """Hypotheses of a bank: first plain ones without offsets, then two for each sensor."""
     none, each = np.zeros((plain, sensors)), np.repeat(np.eye(sensors), 2, axis=0)
     second = np.tile([0.0, 1.0], sensors)[:, None]
     return OffsetHypothesis(np.vstack([none, each]), np.vstack([none, second * each]))
 
 
 def offset_transitions(change: np.ndarray, sensors: int) -> np.ndarray:
-    """Probabilities of a change in one step, with those of the hypotheses of `offset_hypotheses`.
+    """Transition probabilities per step of the hypotheses of `offset_hypotheses`.
 
     Args:
-        change: (plain, plain) between modes without offsets, the first that in which all is right.
-        sensors: how many may be off, one at a time.
+        change: (plain, plain) probabilities between modes without offsets, the first that without
+            faults.
+        sensors: number of sensors that may have an offset, one at a time.
 
     Returns:
-        (plain + 2 sensors, plain + 2 sensors).
+        (plain + 2 sensors, plain + 2 sensors) probabilities.
     """
     plain, count = len(change), len(change) + 2 * sensors
     begins = plain + 2 * np.arange(sensors)
@@ -91,7 +92,7 @@ def offset_transitions(change: np.ndarray, sensors: int) -> np.ndarray:
 
 
 def _components(x: Augmented, each: Array) -> Array:
-    """A number of each sensor, for every component of its offset."""
+    """One number per sensor, repeated for every component of its offset."""
     return jnp.concatenate([jnp.broadcast_to(each[i], b.shape) for i, b in enumerate(x.offset)])
 
 
@@ -103,7 +104,7 @@ def _drawn(x: Augmented, of: OffsetHypothesis) -> Array:
     return jnp.diag(_components(x, jnp.where(of.lasts > 0.0, WANDERS, BEGINS)))
 
 
-Scaled = Partial  # what a mode makes of a factor of the process noise
+Scaled = Partial  # function of a factor of the process noise to that of a mode
 
 
 def _step(motion: Motion, of: OffsetHypothesis, x: Augmented, u: Data) -> Augmented:
@@ -132,11 +133,11 @@ def _read_noise(sensor: Sensor, x: Augmented, aux: Data):
 
 @value
 class OffsetReading:
-    """A reading that is off by an offset of the state."""
+    """Measurement function of a sensor with an offset from the state."""
 
     sensor: Sensor
-    off: Numbers  # () one where it is, else zero
-    at: int = kind()  # which offset
+    off: Numbers  # () 1 if the offset acts, else 0
+    at: int = kind()  # index of the offset
 
     def __call__(self, x: Augmented, aux: Data):
         noise = self.sensor.noise_factor(x.state, aux)
@@ -146,7 +147,7 @@ class OffsetReading:
 
 
 def _augmented_sensor(sensor: Sensor, names: Sequence[str], of: OffsetHypothesis) -> Sensor:
-    """Sensor of the augmented state; a `linear` of its own is not used."""
+    """Sensor of the augmented state; a `linear` of the given sensor is not used."""
     read: Any = Partial(_read, sensor)
     if sensor.name in names:
         at = names.index(sensor.name)
@@ -156,7 +157,7 @@ def _augmented_sensor(sensor: Sensor, names: Sequence[str], of: OffsetHypothesis
 
 @value
 class UnderHypothesis(Around):
-    """The filter of `under_hypothesis`."""
+    """Filter made by `under_hypothesis`."""
 
     of: OffsetHypothesis
     scaled: Scaled
@@ -178,13 +179,13 @@ class UnderHypothesis(Around):
 def under_hypothesis(
     filter_: Filter, names: Sequence[str], of: OffsetHypothesis, scaled: Scaled
 ) -> Filter:
-    """A filter of the `Augmented` state under a hypothesis, given motion and sensors of the state.
+    """Filter of the `Augmented` state under a hypothesis, for motion and sensors of the state.
 
     Args:
-        filter_: of any state, as `kalman` makes it.
-        names: of the sensors that may be off, in the order of the offsets.
+        filter_: filter for any state, such as `kalman` returns.
+        names: names of the sensors that may have an offset, in the order of the offsets.
         of: the hypothesis; its numbers may be traced.
-        scaled: what the mode makes of a factor of the process noise; data of a program.
+        scaled: function of a factor of the process noise to that of the mode; data of a program.
     """
     return UnderHypothesis(filter_, of, scaled, tuple(names))
 
@@ -201,7 +202,7 @@ def _marginal_belief(wide: FilterState) -> FilterState:
 
 @value
 class Marginal(Around):
-    """The filter of `marginal`."""
+    """Filter made by `marginal`."""
 
     names: tuple[str, ...] = kind()
 
@@ -238,13 +239,13 @@ class Marginal(Around):
 
 
 def marginal(filter_: Filter, names: Sequence[str]) -> Filter:
-    """Filter of the state, made of one of the `Augmented` state, that keeps its belief of offsets.
+    """Filter of the plain state from one of the `Augmented` state; `reset` keeps the offsets.
 
     Args:
-        filter_: of the wide state.
-        names: of the sensors that may be off.
+        filter_: filter of the augmented state.
+        names: names of the sensors that may have an offset.
 
     Raises:
-        ValueError: when a run begins: the model has no sensor of one of these names.
+        ValueError: when a run starts: the model has no sensor of one of these names.
     """
     return Marginal(filter_, tuple(names))

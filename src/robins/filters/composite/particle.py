@@ -1,4 +1,4 @@
-"""The particle filter, bootstrap and Rao-Blackwellised in one.
+"""Particle filter, bootstrap and Rao-Blackwellised in one.
 
 Gordon, Salmond & Smith, *Novel approach to nonlinear/non-Gaussian Bayesian state estimation*, IEE
 Proc. F 140 (1993); Schön, Gustafsson & Nordlund, *Marginalized particle filters for mixed
@@ -7,13 +7,13 @@ linear/nonlinear state-space models*, IEEE Trans. Signal Processing 53 (2005).
 A particle is a belief: exact in the components that are *sampled*, Gaussian in the rest. Each step
 
     predicts   a Kalman prediction of every particle, m and S S'. With the sampled components first,
-               S = [[A, 0], [B, C]]: draw xi ~ N(0, I), move the mean by [A; B] xi, and what is left
-               to be uncertain is [[0, 0], [0, C]].
+               S = [[A, 0], [B, C]]: draw xi ~ N(0, I) and move the mean by [A; B] xi; the factor
+               of the remaining covariance is [[0, 0], [0, C]].
     updates    a Kalman update of every particle; its likelihood, N(y; z, H S S' H' + R), weighs it.
 
-With all components sampled nothing is left of S: that is the bootstrap filter. With none it would
-be the Kalman filter. The draw conditions the rest on what was sampled, so where the model is linear
-in the rest given the sampled, each particle is exact (Rao-Blackwell).
+With all components sampled no covariance remains: that is the bootstrap filter. With none it is the
+Kalman filter. The draw conditions the rest on the sampled components, so if the model is linear in
+the rest given these, each particle is exact (Rao-Blackwell).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from robins.filters.values import Numbers, is_known, kind, number, value
 from robins.linalg.rows import each_row
 from robins.manifold import State
 
-_GENERATOR = "threefry2x32"  # named, so that a key gives the same draws under any setting of JAX
+_GENERATOR = "threefry2x32"  # explicit, so that a key gives the same draws under any JAX setting
 
 
 class ParticleCloud(NamedTuple):
@@ -56,28 +56,28 @@ class ParticleCloud(NamedTuple):
 
     particles: Belief  # leading axis; rows of sampled components are zero in the factors
     log_weight: Array  # (count,), the weights sum to one
-    key: Array  # (2,) uint32, of the draws to come
+    key: Array  # (2,) uint32, key of the next draws
 
 
 @value
 class Particle(Filter):
-    """The filter of `particle`."""
+    """Filter made by `particle`."""
 
     way: Linearisation
-    key: Numbers  # (2,) its words, as floats: JAX derives by no whole number
+    key: Numbers  # (2,) words of the key as floats: JAX cannot differentiate by integers
     resample: Numbers  # () share of the count
-    jitter: Numbers  # (2,) what a copy keeps of its deviation, and what it is moved by
+    jitter: Numbers  # (2,) factor of a copy's deviation from the mean, and of its random move
     count: int = kind()
     chosen: tuple[int, ...] | None = kind()
-    moves: bool = kind()  # copies
+    moves: bool = kind()  # resampled copies are moved
 
     def order(self, n: int) -> tuple[np.ndarray, int]:
-        """Tangent components with the sampled ones first, and how many these are."""
+        """Indices of the tangent components, sampled ones first, and the number of these."""
         first = tuple(range(n)) if self.chosen is None else self.chosen
         return np.array([*first, *(i for i in range(n) if i not in first)], dtype=int), len(first)
 
     def even(self) -> Array:
-        """The logarithm of the weight of each, where all have the same."""
+        """Logarithm of the weight of each particle if all are equal."""
         return -jnp.log(float(self.count))
 
     def drawn(self, key: Array, means: State, factors: Array) -> Belief:
@@ -95,14 +95,14 @@ class Particle(Filter):
         return each_row(one, xi, means, factors)
 
     def spread(self, belief: Belief, key: Array) -> FilterState:
-        """A new cloud from a Gaussian belief."""
+        """New cloud drawn from a Gaussian belief."""
         key, now = _split(key, 1)
         weight = jnp.full(self.count, self.even())
         drawn = self.drawn(now, *repeated(belief, self.count))
         return FilterState(belief, ParticleCloud(drawn, weight, key))
 
     def gaussian(self, cloud: ParticleCloud) -> Belief:
-        """The cloud's moments."""
+        """Gaussian with the moments of the cloud."""
         return _moments(cloud, self.order(cloud.particles.factor.shape[1])[1])
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> FilterState:
@@ -115,7 +115,7 @@ class Particle(Filter):
         return self.spread(belief, state.memory.key)
 
     def refreshed(self, state: FilterState, choose: Array, jitter: Array) -> tuple[Belief, Array]:
-        """The cloud, resampled if its weights are too uneven."""
+        """Particles and log-weights, resampled if the weights are too uneven."""
         cloud = state.memory
         weight = jnp.exp(cloud.log_weight)
         due = _effective(weight) < jnp.asarray(self.resample) * float(self.count)
@@ -126,7 +126,7 @@ class Particle(Filter):
         return particles, jnp.where(due, self.even(), cloud.log_weight)
 
     def jittered(self, particles: Belief, cloud: Belief, key: Array) -> Belief:
-        """Particles moved at random, and towards the mean, so that they keep the moments."""
+        """Particles moved at random, and towards the mean, so that the moments are preserved."""
         order, k = self.order(cloud.factor.shape[0])
         some = order[:k]
         L = linalg.tria(cloud.factor[some])
@@ -189,35 +189,35 @@ def particle(
     resample: Number = 0.5,
     regularise: Number = 0.0,
 ) -> Filter:
-    """A particle filter; its belief is the Gaussian with the moments of the weighted cloud.
+    """Particle filter; its belief is the Gaussian with the moments of the weighted cloud.
 
     The cloud itself is the state's memory, a `ParticleCloud`. The log-likelihood of an update is
-    the logarithm of the mean weight it gives; ``particle.ess`` notes the effective number of
-    particles, 1 / sum w^2. Before a prediction the cloud is resampled (systematic: Kitagawa 1996)
-    if that number has fallen below ``resample * count``.
+    that of the weighted particles, log sum_i w_i L_i; ``particle.ess`` notes the effective number
+    of particles, 1 / sum w^2. Before a prediction the cloud is resampled (systematic: Kitagawa
+    1996) if that number has fallen below ``resample * count``.
 
-    A particle that leaves the finite numbers gets no weight. A measurement that no particle can
-    explain, not even as the logarithm of a likelihood, is not used (``NOT_FINITE``).
+    A particle that is not finite gets no weight. If the log-likelihood of a measurement is finite
+    in no particle, the measurement is not used (``NOT_FINITE``).
 
-    Runs with the same key draw the same numbers: give each run of a campaign its own, by
+    Runs with the same key draw the same numbers: give each run of a campaign its own key, by
     ``jax.vmap`` over keys or by `reseed`. There are no derivatives through the draws.
 
     Args:
         count: number of particles.
         key: seed or JAX key; may be traced.
-        sampled: tangent components that are sampled; None, all of them. The rest is to be (nearly)
-            linear given these.
-        linearise: how the rest is propagated and measured; `taylor` where not given. Where all is
-            sampled only its noise and readings count.
+        sampled: tangent components that are sampled; None: all. The model should be (nearly) linear
+            in the rest given these.
+        linearise: linearisation in the rest; `taylor()` by default. If all components are sampled,
+            only its noise and predicted measurements are used.
         resample: share of ``count``, 0 (never) to 1 (always).
-        regularise: after resampling each sampled component moves at random by this share of the
+        regularise: after resampling, each sampled component moves at random by this share of the
             cloud's standard deviation and towards its mean, so that the cloud keeps its moments
-            (Liu & West 2001): for states without process noise, whose particles would become
-            copies. 0 leaves the copies; 0.1 is usual.
+            (Liu & West 2001): for states without process noise, whose particles would otherwise
+            become identical. 0 leaves the copies; 0.1 is usual.
 
     Raises:
         ValueError: count is not positive, a share is not between 0 and 1, or sampled components
-            are negative or named twice. When a run begins: one is not of the state.
+            are negative or repeated. When a run starts: the state has no such component.
     """
     count = operator.index(count)
     require(count >= 1, "a particle filter needs a positive count of particles", count)
@@ -241,18 +241,19 @@ def particle(
 
 
 def reseed(state: FilterState, key: ArrayLike) -> FilterState:
-    """The same state of a particle filter with other draws to come; `reset` it to draw the
-    particles again.
+    """State of a particle filter with another key for the next draws.
+
+    The particles stay; `Filter.reset` draws them again.
 
     Args:
-        state: of a `particle` filter.
+        state: state of a `particle` filter.
         key: seed or JAX key.
     """
     return state._replace(memory=state.memory._replace(key=_as_key(key)))
 
 
 def _as_key(key: ArrayLike) -> Array:
-    """The numbers of a key, which unlike keys can be saved."""
+    """Words of a key as numbers, which unlike keys can be saved."""
     if not jnp.issubdtype(jnp.result_type(key), jax.dtypes.prng_key):
         if jnp.shape(key) == (2,):
             return jnp.asarray(key, jnp.uint32)
@@ -261,7 +262,7 @@ def _as_key(key: ArrayLike) -> Array:
 
 
 def _split(key: Array, count: int) -> tuple[Array, ...]:
-    """The numbers of a key to keep, and keys to use."""
+    """Words of the next key to keep, and keys to use."""
     keys = jax.random.split(jax.random.wrap_key_data(key, impl=_GENERATOR), count + 1)
     return jax.random.key_data(keys[0]), *keys[1:]
 
@@ -272,7 +273,7 @@ def _systematic(key: Array, weight: Array) -> Array:
     upto = jnp.cumsum(weight)
     at = (jnp.arange(count, dtype=float) + jax.random.uniform(key)) / count * upto[-1]
     index = jnp.searchsorted(upto, at, side="right").astype(int)
-    # Rounding may lead past the end, to a particle without weight.
+    # Rounding may give an index past the end, or of a particle without weight.
     return jnp.minimum(index, jnp.max(jnp.where(weight > 0.0, jnp.arange(count), 0)))
 
 
@@ -281,7 +282,7 @@ def _effective(weight: Array) -> Array:
 
 
 def _moments(cloud: ParticleCloud, k: int) -> Belief:
-    """The cloud's Gaussian; the first k columns of its factors are zero."""
+    """Gaussian with the moments of the cloud; the first k columns of its factors are zero."""
     best = row_of(cloud.particles.mean, jnp.argmax(cloud.log_weight))
     slim = cloud.particles._replace(factor=cloud.particles.factor[:, :, k:])
     return matched(slim, jnp.exp(cloud.log_weight), best)
@@ -299,18 +300,18 @@ def _update_info(
     """Information of the whole cloud.
 
     Args:
-        state: before it.
-        log_prior: (count,) weights then, of those that can be updated.
-        infos: reports of each particle.
-        cross: (count, n, m) covariance of state and measurement in each.
-        cloud: after it.
-        used: (m,) components.
-        total: logarithm of the mean weight that it gives.
+        state: state before the update.
+        log_prior: (count,) log-weights before it; -inf for particles that cannot be updated.
+        infos: information of each particle.
+        cross: (count, n, m) covariance of state and measurement in each particle.
+        cloud: cloud after the update.
+        used: (m,) bool, components used.
+        total: () log-likelihood of the measurement.
     """
     weight = jnp.exp(log_normalised(log_prior)[0])
     expected = innovation(infos, weight, used)
     gain = _gain(state.belief, state.memory.particles, infos, weight, cross, expected)
-    # Where no particle is left, each may have been contradicted: all sampled and R = 0.
+    # If no particle is left, each may have been contradicted: all sampled and R = 0.
     best = jnp.argmax(cloud.log_weight)
     wrong = infos.code[best] == int(Code.CONTRADICTED)
     lost = ~jnp.isfinite(total)
@@ -323,7 +324,7 @@ def _update_info(
 def _gain(
     prior: Belief, cloud: Belief, infos: StepInfo, weight: Array, cross: Array, expected: Innovation
 ) -> Array:
-    """Covariance of state and measurement over that of the measurement, in the whole cloud."""
+    """(n, m) gain of the whole cloud: cross-covariance times inverse innovation covariance."""
     d = jax.vmap(lambda x: manifold.local(prior.mean, x))(cloud.mean)
     apart = jnp.where(jnp.isnan(expected.mean)[None], 0.0, expected.mean[None] - infos.innovation)
     counts = weight > 0.0
@@ -334,5 +335,5 @@ def _gain(
 
 
 def _each(condition: Array, new: Belief, old: Belief) -> Belief:
-    """Particle by particle."""
+    """Select new or old particle by particle."""
     return jax.vmap(select)(condition, new, old)

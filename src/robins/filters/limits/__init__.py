@@ -1,4 +1,4 @@
-"""Beliefs held to constraints: equalities, exact or noisy, and bounds."""
+"""Constraints on beliefs: equalities, exact or noisy, and bounds."""
 
 from robins.filters.limits.constrain import Constrained, constrain
 from robins.filters.limits.interval import Bounded, clip, truncate

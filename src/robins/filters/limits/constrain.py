@@ -1,13 +1,13 @@
-"""Hold a belief to an equality: exact or noisy, linear or not, nearest in any metric.
+"""Equality constraints on a belief: exact or noisy, linear or not, nearest in any metric.
 
-A constraint g(x) = d is a measurement of g that reads d, without noise if it is exact; components
-already known are left out. Only its gain may differ: with V = P the constrained state is the most
-probable one, with V = W^-1 the one nearest to the mean in the metric W,
+A constraint g(x) = d is a measurement d of g(x), without noise if exact; components already known
+are left out. Only its gain may differ: with V = P the constrained state is the most probable one,
+with V = W^-1 the one nearest to the mean in the metric W,
 
     G = V D' (D V D')^-1,   x* = x - G (g(x) - d),   P* = (I - G D) P (I - G D)' + G R_d G'
 
-(Simon & Chia 2002, sec. II), D the slope of g and R_d the covariance of the constraint's error. No
-covariances are subtracted.
+(Simon & Chia 2002, sec. II), D the Jacobian of g and R_d the covariance of the constraint's error.
+No covariances are subtracted.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ Weight = Literal["covariance", "identity"] | Given
 
 ITERATIONS = 4
 
-# Least remainder of a row of unit length after those above; cond(D D') is then below 1e12.
+# Least residual of a row of unit length orthogonal to those above; cond(D D') is then below 1e12.
 _INDEPENDENT = 1e-6
 
 
 class Constrained(NamedTuple):
-    """A belief held to a constraint of c components, and its residual before."""
+    """Belief under a constraint of c components, and the residual before it was applied."""
 
     belief: Belief
     residual: Array  # (c,) d - g(x) before
     used: Array  # (c,) bool: not known already, and independent of the components above
-    # () residual squared by D P D' + R_d before, chi-square of `dof`; infinite where an exact
-    # component contradicts what is known exactly or the components above it
+    # () squared residual normalised by D P D' + R_d, chi-square of `dof`; infinite if an exact
+    # component contradicts exact knowledge or the components above it
     nis: Array
     dof: Array  # () number of components that were not known already
 
@@ -62,23 +62,23 @@ def constrain(
     hard: bool = False,
     iterations: int = ITERATIONS,
 ) -> Constrained:
-    """Hold a belief to ``g(x) = d``; may be compiled, with D, d, weight and noise as data.
+    """Constrain a belief to ``g(x) = d``; may be compiled, with D, d, weight and noise as data.
 
-    Without noise the mean is put on the constraint and nothing is uncertain across it. With noise
-    the constraint is weighed as a measurement.
+    Without noise the mean is put on the constraint, with no variance across it. With noise the
+    constraint is used as a measurement.
 
     Args:
-        belief: to be held.
+        belief: belief to constrain.
         g: (c, n) matrix D, for D x with x the numbers of a state of arrays in tangent order; or a
             function of the state, with values in an array or in elements such as `Angle`.
-        d: value of g(x), of the same form; zero if left out.
+        d: value of g(x), of the same form; zero by default.
         weight: metric W in which the constrained state is nearest to the mean: "covariance" for
             P^-1 (the only one that weighs noise), "identity", or a positive definite (n, n) matrix
             in tangent coordinates.
         noise: (c,) standard deviations of the constraint's error, or a (c, k) factor of R_d.
         hard: put the mean on a noisy constraint, and its noise into the covariance, as weights
-            other than "covariance" always do. Worse than no constraint where R_d exceeds D P D'.
-        iterations: linearisations of a function, by Gauss-Newton.
+            other than "covariance" always do. Worse than no constraint if R_d exceeds D P D'.
+        iterations: number of linearisations of a function, by Gauss-Newton.
 
     Raises:
         ValueError: shapes do not fit, a matrix is given for a state that holds elements, or
@@ -111,9 +111,9 @@ def constrain(
 
 
 def nearest(metric: Belief, o: Observation) -> tuple[State, Array, Array, Array]:
-    """State nearest to the mean that meets an exact observation, its gain, and two masks.
+    """State nearest to the mean that satisfies an exact observation, its gain, and two masks.
 
-    The masks are of the components used, and of those that contradict what is known exactly.
+    The masks are of the components used, and of those that contradict exact knowledge.
     """
     seen = normalised(o)
     spread = jnp.where(seen.used[:, None], o.spread, 0.0)
@@ -124,7 +124,7 @@ def nearest(metric: Belief, o: Observation) -> tuple[State, Array, Array, Array]
 
 
 def as_sensor(mean: State, g: Function, d: Data, noise: Given | None) -> tuple[Sensor, Data]:
-    """A constraint as a sensor, and its measurement."""
+    """Sensor that represents a constraint, and its measurement."""
     read, linear, value = (g, None, g(mean)) if callable(g) else _by_matrix(mean, g)
     c = manifold.dim(value)
     if d is not None:
@@ -140,7 +140,7 @@ def as_sensor(mean: State, g: Function, d: Data, noise: Given | None) -> tuple[S
 
 
 def _by_matrix(mean: State, matrix: Given) -> tuple[Partial, Partial, Array]:
-    # D x as a function, as a function with its slope, and a value of its shape
+    # D x as a function, as a function with its Jacobian, and a value of its shape
     if any(manifold.is_element(leaf) for leaf in manifold.leaves(mean)):
         raise ValueError(
             "a matrix constrains a state of plain arrays, this one holds elements: "
@@ -167,7 +167,7 @@ def _product_linear(D: Array, x: State, aux: Data) -> tuple[Array, Array]:
 
 
 def metric_of(belief: Belief, weight: Weight) -> tuple[Belief, Array | None]:
-    """A belief of covariance W^-1, and the factor of W; the belief itself for W = P^-1."""
+    """Belief of covariance W^-1, and a factor of W; the belief itself and None for W = P^-1."""
     n = belief.factor.shape[0]
     if isinstance(weight, str):
         known = weight in ("covariance", "identity")
@@ -183,11 +183,11 @@ def metric_of(belief: Belief, weight: Weight) -> tuple[Belief, Array | None]:
 
 
 def check_rows(rule: str, D: np.ndarray, d: np.ndarray, exact: np.ndarray) -> None:
-    """Refuse constraints D x = d whose rows repeat each other where they are ``exact``, (c,) bool.
+    """Refuse constraints D x = d with dependent rows among those that are ``exact``, (c,) bool.
 
     Raises:
-        ValueError: a row of D is zero, or depends on those above it; with the row, the rank, and
-            whether all rows can be met.
+        ValueError: a row of D is zero, or depends on those above it; the message states the row,
+            the rank, and whether d contradicts the rows above.
     """
     length = np.linalg.norm(D, axis=1)
     zero = length <= 1e-14 * np.max(length, initial=0.0)
@@ -229,6 +229,6 @@ def as_weight(rule: str, weight: Weight) -> Weight:
 
 
 def check_size(rule: str, weight: Weight, n: int) -> None:
-    """Refuse a metric W of another size than the state's."""
+    """Refuse a metric W whose size is not that of the state."""
     if not isinstance(weight, str) and np.shape(weight) != (n, n):
         raise ValueError(f"{rule} weight is {np.shape(weight)}, the state needs ({n}, {n})")

@@ -1,4 +1,4 @@
-"""Hold a belief within bounds: clip its mean to the nearest state inside, or truncate it."""
+"""Bounds on a belief: clip its mean to the nearest state inside, or truncate its density."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from robins.filters.model import Data, Given
 from robins.filters.observation import CONTRADICTS, Observation
 from robins.filters.trees import select
 
-# Gauss-Legendre nodes and how many e-folds of a density they span: moments to 1e-15.
+# Gauss-Legendre nodes, and the number of e-folds of a density that they span: moments to 1e-15.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 _FOLDS = 40.0
 
 
 class Bounded(NamedTuple):
-    """A belief within bounds on c components."""
+    """Belief within bounds on c components."""
 
     belief: Belief
     outside: Array  # (c,) bool: the mean violated these bounds
-    # () bool: no state fulfils all bounds, and the belief stays; or a component that is known
-    # exactly violates its own
+    # () bool: no state satisfies all bounds, and the belief is unchanged; or an exactly known
+    # component violates its bound
     infeasible: Array
 
 
 def _observed(belief: Belief, g: Function) -> Observation:
-    """Measurement of g(x) that reads zero: its residual is -g(x)."""
+    """Observation of g(x) with the measurement zero: its residual is -g(x)."""
     sensor, zero = as_sensor(belief.mean, g, None, None)
     return taylor().observation(belief, sensor, zero, None)
 
@@ -45,14 +45,14 @@ def clip(
 
         x* = argmin (x - m)' W (x - m)   subject to   lower <= D x <= upper
 
-    exactly, by the dual active-set method (Goldfarb & Idnani 1983): the projection on the active
-    rows. Functions are linearised once, about the mean.
+    solved exactly by the dual active-set method (Goldfarb & Idnani 1983), as a projection on the
+    active rows. Functions are linearised once, about the mean.
 
     Args:
-        belief: to be held.
+        belief: belief to constrain.
         g: (c, n) matrix or function of the state with values in an array, as in `constrain`.
-        lower: (c,); -inf where there is none.
-        upper: (c,); inf where there is none.
+        lower: (c,) lower bounds; -inf for none.
+        upper: (c,) upper bounds; inf for none.
         weight: W, as in `constrain`.
 
     Raises:
@@ -75,12 +75,13 @@ def _active(o: Observation, low: Array, high: Array) -> tuple[Array, Array, Arra
     """Lower and upper bounds that are active at the nearest state.
 
     Returns:
-        (c,) and (c,) bool; () no state fulfils the bounds of components that may move; () a
-        component that is known exactly violates its own.
+        (c,) bool, active lower bounds; (c,) bool, active upper bounds; () bool, no state satisfies
+        the bounds of components that can move; () bool, an exactly known component violates its
+        bound.
 
-    In units of the belief: the least t with N t >= b, rows of N of unit length. A violated row is
-    met by a step in the space of the active ones; a row whose multiplier would turn negative on the
-    way is dropped first.
+    In units of the belief: the shortest t with N t >= b, rows of N of unit length. Each step
+    satisfies one violated row while the active ones stay satisfied; a row whose multiplier would
+    become negative on the way is dropped first.
     """
     spread, size, low, high = jax.lax.stop_gradient((o.spread, o.size, low, high))
     c = len(low)
@@ -132,16 +133,16 @@ def _active(o: Observation, low: Array, high: Array) -> tuple[Array, Array, Arra
 
 
 def truncate(belief: Belief, g: Function, lower: Given, upper: Given) -> Bounded:
-    """Cut the density at ``lower <= g(x) <= upper`` and keep its mean and covariance.
+    """Truncate the density to ``lower <= g(x) <= upper``; keep its mean and covariance.
 
     Row by row: z = D_i x is N(mu, s^2), truncated it has mean mu + s alpha and variance s^2 v, and
     the regression of the state on z stays (Simon & Simon 2010, sec. 2.4),
 
         x := x + P D_i' alpha / s,   S := S (I - (1 - v^1/2) a a'),   a = S' D_i' / s
 
-    whose square is P - (1 - v) P D_i' D_i P / s^2: no variance grows. Exact for one row, and for
-    uncorrelated rows; for others it depends on their order. Where no state is inside all bounds the
-    belief stays. Arguments and errors are those of `clip`.
+    whose square is P - (1 - v) P D_i' D_i P / s^2: no variance grows. This is exact for one row and
+    for uncorrelated rows; otherwise it depends on the order of rows. If no state is inside all
+    bounds the belief is unchanged. Arguments and errors are those of `clip`.
     """
     o = _observed(belief, g)
     low = jnp.asarray(lower, float) + o.residual
@@ -176,10 +177,10 @@ def truncate(belief: Belief, g: Function, lower: Given, upper: Given) -> Bounded
 
 
 def truncated_moments(low: Array, high: Array) -> tuple[Array, Array]:
-    """Mean and variance of a standard normal number truncated to low <= z <= high.
+    """Mean and variance of a standard normal variable truncated to low <= z <= high.
 
-    By quadrature about the greatest density inside: the closed forms in erf lose a variance of
-    1/low^2 among numbers of low^2, and all digits a hundred deviations out.
+    Computed by quadrature about the greatest density inside: the closed forms in erf obtain a
+    variance of 1/low^2 from terms of low^2, and lose all digits at a hundred standard deviations.
     """
     peak = jnp.clip(0.0, low, high)
     reach = 2.0 * _FOLDS / (jnp.abs(peak) + jnp.sqrt(peak**2 + 2.0 * _FOLDS))

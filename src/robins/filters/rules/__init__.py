@@ -1,4 +1,4 @@
-"""Rules: one published adaptation a file; each composes with every way to linearise."""
+"""Rules: one published adaptation per file; each composes with every linearisation."""
 
 from robins.filters.rules.adaptive_h_infinity import adaptive_h_infinity
 from robins.filters.rules.channel_inflation import channel_inflation

@@ -19,19 +19,19 @@ from robins.filters.values import Numbers, number
 
 Weights = ArrayLike | Sequence[Number] | None
 
-_SOLID = 1e-6  # least pivot that is divided by, as a share of a state's deviation
-_FLOOR = 1e-10  # least deviation otherwise, as the same share
+_SOLID = 1e-6  # least pivot to divide by, as a share of a state's standard deviation
+_FLOOR = 1e-10  # least deviation where pivots are smaller, as a share of the same
 
 
 class WhitenedInnovation(NamedTuple):
-    """A measurement whitened by R^-1/2, so that traces have no unit."""
+    """Measurement whitened by R^-1/2, so that traces have no unit."""
 
     residual: Array  # (m,) R^-1/2 r
     spread: Array  # (m, n) R^-1/2 H S
     left_over: Array  # () trace of R^-1 Omega, the linearisation error
-    counts: Array  # (m,) bool: used, and with noise of its own; the others are zero
+    counts: Array  # (m,) bool: used, and with noise of its own; the other rows are zero
     seen: Array  # (m, n) H S in the sensor's units
-    size: Array  # (m,) size of its summands
+    size: Array  # (m,) magnitude of the summands of H S
 
     @property
     def predicted(self) -> Array:
@@ -45,7 +45,7 @@ class WhitenedInnovation(NamedTuple):
 
 
 def whitened(o: Observation) -> WhitenedInnovation:
-    """Innovation and its expectation in units of the noise, for components that have noise."""
+    """Innovation and its predicted covariance in units of the noise, for components with noise."""
     root, counts = _root(o.noise, o.accepted & o.present)
     n = o.spread.shape[1]
     away = jnp.zeros_like(o.residual) if o.deficit is None else o.deficit
@@ -53,8 +53,8 @@ def whitened(o: Observation) -> WhitenedInnovation:
     white = linalg.solve_lower(root, jnp.concatenate(columns, axis=1))
     left_over = jnp.sum(white[:, n + 2 :] ** 2) - jnp.sum(white[:, 1] ** 2)
     seen = jnp.where(counts[:, None], o.spread, 0.0)
-    # A component may be a combination of others, as of a rotated vector: in units of the noise it
-    # has the rounding of the largest.
+    # A component may be a combination of others, as in a rotated vector: in units of the noise its
+    # rounding is that of the largest.
     deviation = jnp.where(counts, jnp.sqrt(jnp.sum(o.noise**2, axis=1)), 1.0)
     largest = jnp.max(jnp.where(counts, o.size / deviation, 0.0))
     size = jnp.where(counts, jnp.maximum(o.size, largest * deviation), o.size)
@@ -62,7 +62,7 @@ def whitened(o: Observation) -> WhitenedInnovation:
 
 
 def _root(noise: Array, taken: Array) -> tuple[Array, Array]:
-    """Factor of R without the rows not taken, safe to solve with, and its independent rows."""
+    """Factor of R without the rows not taken, safe to solve with, and the independent rows."""
     m = len(noise)
     kept = jnp.where(taken[:, None], noise, 0.0)
     if noise.shape[1] < m:
@@ -80,13 +80,13 @@ def _root(noise: Array, taken: Array) -> tuple[Array, Array]:
 
 
 def averaged(power: Array, white: WhitenedInnovation, keep: Number) -> Array:
-    """Exponential average of squared residuals; components that do not count stay."""
+    """Exponential average of squared residuals; components that do not count are unchanged."""
     fresh = keep * power + (1.0 - keep) * white.residual**2
     return jnp.where(white.counts, fresh, power)
 
 
 def significant(power: Array, white: WhitenedInnovation, keep: Number, sigmas: Number) -> Array:
-    """() bool: averaged squares exceed their expectation by so many standard deviations.
+    """() bool: averaged squares exceed their expectation by ``sigmas`` standard deviations.
 
     An average with weights (1 - keep) keep^i of squares of m unit normals has mean m and relative
     variance 2 (1 - keep) / ((1 + keep) m).
@@ -97,16 +97,17 @@ def significant(power: Array, white: WhitenedInnovation, keep: Number, sigmas: N
 
 
 def exceeds(power: Array, white: WhitenedInnovation, level: Array) -> Array:
-    """() bool: averaged squares exceed so many times their expectation."""
+    """() bool: averaged squares exceed ``level`` times their expectation."""
     return power > level * (white.predicted + white.dof)
 
 
 def chance_levels(keep: float, most: int, probability: float) -> np.ndarray:
-    """(most + 1,) quantiles of the average of `significant`, of 0, 1, ..., most squares.
+    """(most + 1,) levels that the average of `significant` exceeds with a given probability.
 
-    With weights w = (1 - keep) keep^i its cumulants are those of c_s = m sum w^s, s = 1, 2, 3. The
-    chi-square of h = c_2^3 / c_3^2 degrees, shifted and scaled to the first two, has the third as
-    well (Imhof, Biometrika 48, 1961, after Pearson 1959):
+    Entry m is for m squares, over their expectation. With weights w = (1 - keep) keep^i the first
+    three cumulants follow from c_s = m sum w^s, s = 1, 2, 3. A chi-square variable of
+    h = c_2^3 / c_3^2 degrees of freedom, shifted and scaled to the first two, has the third as well
+    (Imhof, Biometrika 48, 1961, after Pearson 1959):
 
         level = 1 + (chi2_h^-1(1 - probability) - h) sqrt(c_2 / h) / m
     """
@@ -125,7 +126,7 @@ def total(power: Array, white: WhitenedInnovation) -> Array:
 
 
 def ratio(N: Array, M: Array, limit: Number) -> Array:
-    """Fading factor max(1, N / M), up to a limit; 1 where M is 0."""
+    """Fading factor max(1, N / M), at most ``limit``; 1 where M is 0."""
     solid = M > 0.0
     return jnp.where(solid, jnp.clip(N / jnp.where(solid, M, 1.0), 1.0, limit), 1.0)
 
@@ -133,8 +134,9 @@ def ratio(N: Array, M: Array, limit: Number) -> Array:
 def seen_by(spread: Array, S: Array) -> Array:
     """H from S and the spread H S.
 
-    For S nearly singular H = (H S) S' (S S')^-1 has a floor under small deviations: for A in the
-    range of S, H A errs by 1e-10 of a state's deviation at most; states may be known exactly.
+    If S is nearly singular, H = (H S) S' (S S')^-1 is computed with a floor under small deviations:
+    for A in the range of S, H A errs by at most 1e-10 of a state's standard deviation. States may
+    be known exactly.
     """
     sigma = jnp.sqrt(jnp.sum(S**2, axis=1))
 
@@ -152,12 +154,12 @@ def seen_by(spread: Array, S: Array) -> Array:
 def faded(
     S: Array, white: WhitenedInnovation, N: Array, form: str, weights: Numbers | None, limit: Number
 ) -> tuple[Array, Array]:
-    """Factor S of P faded such that its share of the innovation has the power N, and lambda.
+    """Factor S of P faded so that its share of the innovation has the power N, and lambda.
 
     Args:
-        S: (n, n).
+        S: (n, n) factor of P.
         white: the measurement relative to S.
-        N: () power beyond that of the noise.
+        N: () power of the whitened innovation beyond that of the noise.
         form: "lumped" lambda P, "multiple" Lam^1/2 P Lam^1/2, or "projected"
             P + (lambda - 1) P H' (H P H')^+ H P, by which only H P H' grows.
         weights: (n,) of states for "multiple", greatest 1; None: equal.
@@ -182,7 +184,7 @@ def faded(
 
 
 def checked_weights(rule: str, weights: Weights, form: str) -> Numbers | None:
-    """Weights a_j of the states for the form "multiple", scaled to a greatest of 1."""
+    """Weights a_j of the states for the form "multiple", scaled so that the greatest is 1."""
     if weights is None:
         return None
     require(form == "multiple", f"{rule} weights are for 'multiple', not {form!r}")
@@ -195,7 +197,7 @@ def checked_weights(rule: str, weights: Weights, form: str) -> Numbers | None:
 
 
 def check_size(rule: str, a: Numbers | None, belief: Belief) -> None:
-    """Refuse weights that are not one a component of the state."""
+    """Refuse weights whose number is not that of the state's components."""
     n = belief.factor.shape[0]
     count = n if a is None else len(a)
     require(count == n, f"{rule} weights are {count}, the state has {n} components")

@@ -22,9 +22,9 @@ GivenWeight = Weight | Given
 
 
 def as_weight(weight: GivenWeight, whose: str) -> Weight:
-    """L, the rows whose error is bounded, as a leaf of the rule named for messages.
+    """Checked weight L, the rows whose error is bounded, as a leaf; ``whose`` names it in errors.
 
-    From a (q, n) matrix, an (n,) diagonal, or ``mean -> `` one of these, which stays as it is.
+    From a (q, n) matrix, an (n,) diagonal, or ``mean -> `` one of these, which is kept as it is.
     """
     if callable(weight):
         return weight
@@ -38,7 +38,7 @@ def as_weight(weight: GivenWeight, whose: str) -> Weight:
 
 
 def rows_of(weight: Weight, mean: State, whose: str) -> Array:
-    """L at a mean."""
+    """(q, n) L at a mean."""
     if callable(weight):
         return _rows(jnp.asarray(weight(mean), float), whose)
     return jnp.asarray(weight)
@@ -58,7 +58,7 @@ def _check_shape(L: Numbers, whose: str) -> None:
 
 
 def weighted_factor(weight: Weight, belief: Belief, whose: str) -> Float[Array, "q n"]:
-    """L S, whose greatest singular value is the local bound."""
+    """(q, n) L S, whose greatest singular value is the local bound."""
     L, n = rows_of(weight, belief.mean, whose), belief.factor.shape[0]
     if L.shape[1] != n:
         raise ValueError(f"{whose}: weight has {L.shape[1]} columns, the state has {n} components")
@@ -66,7 +66,7 @@ def weighted_factor(weight: Weight, belief: Belief, whose: str) -> Float[Array, 
 
 
 def local_bound(weighted: Float[Array, "q n"]) -> Float[Array, ""]:
-    """sqrt(lambda_max(L P L')), the least gamma that this step alone allows; no derivative."""
+    """sqrt(lambda_max(L P L')), the infimum of gamma for this step alone; it has no derivative."""
     B = jax.lax.stop_gradient(weighted)
     gram = B @ B.T if B.shape[0] <= B.shape[1] else B.T @ B
     return jnp.sqrt(jnp.maximum(linalg.eigenvalue_bounds(gram)[1], 0.0))
@@ -75,7 +75,7 @@ def local_bound(weighted: Float[Array, "q n"]) -> Float[Array, ""]:
 def inflated(
     factor: Float[Array, "n n"], A: Float[Array, "q n"]
 ) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
-    """Factor of ``S (I - A'A)^-1 S'`` for A = L S / gamma, and whether that exists.
+    """Factor of ``S (I - A'A)^-1 S'`` for A = L S / gamma, and () bool: it exists.
 
     It exists when I - A'A has a Cholesky factor; otherwise S is returned.
     """
@@ -85,11 +85,11 @@ def inflated(
 def deflated(
     factor: Float[Array, "n n"], A: Float[Array, "q n"], share: ArrayLike
 ) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
-    """Factor of the largest P that leaves L P L' within share gamma^2, and whether that is less.
+    """Factor of P reduced so that L P L' is within share gamma^2, and () bool: it was reduced.
 
-    With S'L'LS / gamma^2 = U diag(a) U' it is S U diag(min(1, share / a)) U'S'. As an inverse that
-    is I + (a - share)_+ / share, so that only the excess has a root taken. Derivatives take the
-    excess as given.
+    With A'A = S'L'LS / gamma^2 = U diag(a) U' the result is S U diag(min(1, share / a)) U'S'. The
+    inverse of the middle is I + U diag((a - share)_+ / share) U', so that a root is needed of the
+    excess only. Derivatives treat the excess as constant.
     """
     n = factor.shape[0]
     excess = linalg.symmetric_root(jax.lax.stop_gradient(A.T @ A - share * jnp.eye(n)))
@@ -98,7 +98,7 @@ def deflated(
 
 
 def _divided(factor: Array, M: Array) -> tuple[Array, Array]:
-    """Lower factor of S M^-1 S', and whether M is positive definite.
+    """Lower factor of S M^-1 S', and () bool: M is positive definite.
 
     With N upper triangular, N N' = M, the product S N^-T is lower triangular as S is. N is the
     Cholesky factor of M with rows and columns in reverse.
@@ -111,7 +111,7 @@ def _divided(factor: Array, M: Array) -> tuple[Array, Array]:
 
 @jax.custom_jvp
 def _root(M: Array) -> Array:
-    """Cholesky factor, zero where there is none: derivatives must not meet NaN."""
+    """Cholesky factor, zero where there is none, so that derivatives are never NaN."""
     C = linalg.cholesky(M)
     return jnp.where(jnp.all(jnp.isfinite(C)), C, 0.0)
 

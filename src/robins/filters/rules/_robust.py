@@ -1,4 +1,4 @@
-"""Parts of an innovation, weights, refusals and recovery from them, shared by robust rules."""
+"""Parts of an innovation covariance, weights, refusals and recovery, shared by robust rules."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from robins.filters.values import Numbers, number, value
 
 
 class Shares(NamedTuple):
-    """Parts of S = H P H' + Omega + R in units of S = L L', where they add up to the identity.
+    """Parts of S = H P H' + Omega + R in units of S = L L', where they sum to the identity.
 
-    With R and P rescaled, L^-1 S L^-T is a weighted sum of these m x m parts: no subtraction.
+    If R and P are rescaled, L^-1 S L^-T is a weighted sum of these m x m parts: no subtraction.
     """
 
     seen: Normalised  # the innovation, with L and w = L^-1 r
@@ -49,11 +49,11 @@ def shares(o: Observation) -> Shares:
     return Shares(seen, noise, rest, prior, jnp.diag(jnp.where(used, 0.0, 1.0)))
 
 
-MOST = 1e12  # greatest factor of a noise: as good as infinite, and still leaves digits
-PATIENCE = 30  # measurements in a row with hardly any weight before one is used
-HARDLY = 1e-2  # weight of a measurement; less is that of an innovation beyond some 30 deviations
-_STEPS = 40  # bound of Newton's iterations; some four are needed
-_CLOSE = 1e-13
+MOST = 1e12  # greatest factor of a noise: practically infinite, yet without loss of all digits
+PATIENCE = 30  # measurements in a row with a weight below HARDLY before one is used
+HARDLY = 1e-2  # negligible weight: an innovation beyond some 30 standard deviations has less
+_STEPS = 40  # limit of Newton's iterations; about four are needed
+_CLOSE = 1e-13  # relative tolerance of Newton's iterations
 
 
 def scale_to_quantile(o: Observation, limit: ArrayLike, seen: Normalised | None = None) -> Array:
@@ -64,13 +64,13 @@ def scale_to_quantile(o: Observation, limit: ArrayLike, seen: Normalised | None 
 
         g(s) = w' (I + (s - 1) B)^-1 w,
 
-    and 1 / g is concave in s, so that Newton's steps on it climb from s = 1 to the root without
-    passing it (the secular equation of trust regions; Moré & Sorensen 1983), in one step for one
-    component.
+    and 1 / g is concave in s, so that Newton's steps on it increase s from 1 to the root without
+    overshoot (the secular equation of trust regions; Moré & Sorensen 1983), in a single step if
+    there is one component.
 
-    It is at most `MOST`, which components without noise of their own need; components not used do
-    not count. The limit is () and positive, ``seen`` is `normalised` of o where known. The
-    derivative is that of the root.
+    The result is at most `MOST`, which is reached if the excess is in components without noise;
+    components not used do not count. The limit is () and positive; ``seen`` is `normalised` of o if
+    already computed. The derivative is that of the root.
     """
     seen = normalised(o) if seen is None else seen
     noise = jnp.where(seen.used[:, None], o.noise, 0.0)
@@ -101,7 +101,7 @@ def scale_to_quantile(o: Observation, limit: ArrayLike, seen: Normalised | None 
 
     first = jnp.ones(()), (unit_, jnp.sum(unit_**2), unit_ @ (B_ @ unit_)), 0
     s, (v, g, slope), _ = jax.lax.while_loop(unfinished, newton, first)
-    # One more step, of a value within rounding, has the derivative of the root: dg is 2 v'du -
+    # One more step changes s by rounding only, but has the derivative of the root: dg is 2 v'du -
     # (s-1) v'dB v, independent of dv.
     again = 2.0 * (v @ unit) - v @ v - (s - 1.0) * (v @ (B @ v))
     free = above & (s < MOST) & (slope > 0.0)
@@ -110,10 +110,10 @@ def scale_to_quantile(o: Observation, limit: ArrayLike, seen: Normalised | None 
 
 
 def weighed(o: Observation, scale: Array) -> tuple[Observation, Array]:
-    """A measurement with noise R_ij sqrt(s_i s_j), and its weights 1 / s.
+    """Measurement with noise R_ij sqrt(s_i s_j), and its weights 1 / s.
 
-    s is () of the whole, or (m,) of its components. Below a weight of 1 / `MOST` the correction
-    would grow with the innovation again: there a component with noise is refused, with weight 0.
+    s is (), or (m,) for the components. Below a weight of 1 / `MOST` the correction would grow with
+    the innovation again: there a component with noise is refused, with weight 0.
     """
     lost = scale >= (1.0 - 1e-9) * MOST
     refused = lost & jnp.any(o.noise != 0.0, axis=1)
@@ -123,9 +123,10 @@ def weighed(o: Observation, scale: Array) -> tuple[Observation, Array]:
 
 
 def reweighted(o: Observation, weight: Callable[[Array], Array], iterations: int) -> Array:
-    """(m,) weights w(e_i), R_ij becoming R_ij / sqrt(w_i w_j); started at the Kalman filter, w = 1.
+    """(m,) weights w(e_i) with which R_ij becomes R_ij / sqrt(w_i w_j), iterated from w = 1.
 
-    e are the (m,) residuals *after* that update, in deviations of their own noise, 0 without noise.
+    e are the (m,) residuals *after* the update with these weights, in standard deviations of their
+    own noise; 0 for components without noise.
     """
     of = shares(o)
     L, white, R = of.seen.factor, of.seen.white[:, None], variance(of.noise)
@@ -144,7 +145,7 @@ def reweighted(o: Observation, weight: Callable[[Array], Array], iterations: int
 
 @value
 class PatientRule(Rule):
-    """The rule of `opening`."""
+    """Rule of `opening`."""
 
     inner: Rule
     patience: Numbers  # () measurements in a row
@@ -154,7 +155,7 @@ class PatientRule(Rule):
         return self.inner.name
 
     def init(self, belief: Belief, dims: Mapping[str, int]) -> Memory:
-        # of the inner rule, and hopeless measurements in a row
+        # memory of the inner rule, and measurements in a row with negligible weight
         return self.inner.init(belief, dims), {name: jnp.zeros((), int) for name in dims}
 
     def before(self, memory: Memory, prior: Belief, o: Observation):
@@ -178,13 +179,13 @@ class PatientRule(Rule):
 
 
 def opening(rule: Rule, patience: Number | None) -> Rule:
-    r"""A robust rule that does not refuse for ever, as a diverged filter would.
+    r"""Wrap a robust rule so that it recovers from refusals in a row, as in a diverged filter.
 
-    When ``patience`` measurements of a sensor in a row were refused or had a weight below 1e-2, its
-    next one like that is used with full weight, and the prior is first widened along the innovation
-    r until the NIS is that of m right components (`widened` by a r r', a = 1 / m - 1 / NIS). The
-    rule has no other hook than `before`; it gets the note ``recovered``. Without patience the rule
-    itself is returned.
+    After ``patience`` measurements of a sensor in a row that were refused or had a weight below
+    1e-2, the next such one is used with full weight, and the prior is first widened along the
+    innovation r until the NIS equals m, its mean for m components (`widened` by a r r',
+    a = 1 / m - 1 / NIS). Only the hook `before` of the rule is used; the note ``recovered`` is
+    added. With patience None the rule itself is returned.
     """
     if patience is None:
         return rule
@@ -193,26 +194,26 @@ def opening(rule: Rule, patience: Number | None) -> Rule:
 
 
 def widened_to_dof(due: Array, prior: Belief, o: Observation, seen: Normalised) -> Belief:
-    """Prior `widened` along the innovation until the NIS is at most its degrees of freedom."""
+    """Prior `widened` along the innovation, if due, until the NIS is at most its dof."""
     a = ratio(jnp.ones(()), seen.dof.astype(float)) - ratio(jnp.ones(()), seen.nis)
     due = due & (a > 0.0)
     return widened(due, prior, o, seen.used, jnp.sqrt(jnp.where(due, a, 1.0)) * o.residual[:, None])
 
 
 def widened(due: Array, prior: Belief, o: Observation, chosen: Array, root: Array) -> Belief:
-    r"""Prior with a covariance D added in the measurement space of some components, where due.
+    r"""Prior with a covariance D added in the measurement space of chosen components, if due.
 
         P' = P + G D G' + E,   G = P H' (H P H')^-1,   H G = I,   so that H P' H' >= H P H' + D,
 
-    H being the rows of those components. The correction also moves states correlated with them, by
-    as much as the error: after the jump of a position a velocity would be far off, with its old
-    variance. So the covariance given the components, P_c = P - G H P, grows by the share of each
-    state that they determine,
+    H being the rows of those components. The correction also moves states correlated with them, in
+    proportion to the error: after a position jump the velocity would be far off, with its old
+    variance. So the covariance conditioned on the components, P_c = P - G H P, grows by the share
+    of each state that they determine,
 
         E = k V P_c V,   V_ii^2 = (G H P)_ii / P_ii,   k = max_i r_i^2 / (H P H')_ii
 
-    r being the innovation. Uncorrelated states do not change, nor does a component that is known
-    exactly: its column of G is 0. ``root`` is an (m, k) root of D, ``chosen`` (m,) bool.
+    r being the innovation. Uncorrelated states do not change, nor does an exactly known component:
+    its column of G is 0. ``due`` is () bool, ``chosen`` (m,) bool, ``root`` an (m, k) root of D.
     """
 
     def wider() -> Belief:

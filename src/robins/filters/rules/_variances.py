@@ -1,7 +1,7 @@
-"""Noise by its variances, for rules that learn or weigh a noise.
+"""Noise variances, for rules that estimate or weigh a noise.
 
-A learnt noise is a ratio to the nominal one, component by component: without units, and valid for a
-nominal noise that changes from step to step.
+An estimated noise is kept as its ratio to the nominal one, component by component: this has no
+unit, and is valid for a nominal noise that changes from step to step.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def variance(factor: Array) -> Array:
 
 
 def reading_variance(o: Observation) -> Array:
-    """(m,) diagonal of ``H P H' + Omega``, the share of the state in the innovation."""
+    """(m,) diagonal of ``H P H' + Omega``, the part of the innovation variance due to the state."""
     total = variance(o.spread) + variance(o.excess)
     return total if o.deficit is None else total - o.deficit**2
 
@@ -37,12 +37,12 @@ def scaled(factor: Array, scale: Array) -> Array:
 
 
 def numbered(name: str, values: Array) -> dict[str, Array]:
-    """Notes of one scalar a component: ``name.0``, ``name.1``, ..."""
+    """Notes with one scalar per component: ``name.0``, ``name.1``, ..."""
     return {f"{name}.{i}": values[i] for i in range(len(values))}
 
 
 def bounded(rule: str, forgetting: Number, floor: Number, ceiling: Number) -> dict[str, Numbers]:
-    """Forgetting factor and bounds of a scale that starts at 1, checked."""
+    """Forgetting factor and bounds of a scale with initial value 1, checked."""
     return {
         "forgetting": number(f"{rule} forgetting must lie in (0, 1]", forgetting, is_share),
         "floor": number(f"{rule} floor must lie in (0, 1]", floor, is_share),

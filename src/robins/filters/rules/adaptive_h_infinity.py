@@ -18,8 +18,8 @@ from robins.filters.rules._inflation import GivenWeight, Weight, local_bound
 from robins.filters.values import Numbers, is_known, kind, number, value
 
 NAME = "adaptive_h_infinity"
-SHARE = 0.95  # of xi^2 that a compensated P is left with
-LARGEST = 1e200  # a NIS beyond it counts as this, so that sums stay finite
+SHARE = 0.95  # greatest lambda_max(L P L') / xi^2 of a compensated P
+LARGEST = 1e200  # limit of a NIS, so that sums stay finite
 
 
 class AdaptiveMemory(NamedTuple):
@@ -27,13 +27,13 @@ class AdaptiveMemory(NamedTuple):
 
     nis: Array  # (window,) NIS of the last steps, summed over sensors; a ring
     dof: Array  # (window,) components used in them
-    at: Array  # () place of this step in the ring
-    inverse: Array  # () 1 / xi of the last step; 0 before there was one
+    at: Array  # () index of this step in the ring
+    inverse: Array  # () 1 / xi of the last step; 0 before the first
 
 
 @value
 class AdaptiveHInfinity(Rule):
-    """The rule of `adaptive_h_infinity`: P becomes (P^-1 - xi^-2 L'L)^-1 before a prediction."""
+    """Rule of `adaptive_h_infinity`: P becomes (P^-1 - xi^-2 L'L)^-1 before a prediction."""
 
     weight: Weight
     zeta: Numbers
@@ -54,14 +54,14 @@ class AdaptiveHInfinity(Rule):
         return AdaptiveMemory(ring, ring, jnp.zeros((), int), jnp.zeros(()))
 
     def chosen(self, memory: AdaptiveMemory) -> tuple[Array, Array]:
-        """Ratio q, and alpha."""
+        """Ratio q of the window, and alpha from it."""
         dof = jnp.sum(memory.dof)
         q = jnp.where(dof > 0.0, jnp.sum(memory.nis) / jnp.maximum(dof, 1.0), 1.0)
         alpha = 1.0 + 1.0 / (self.zeta * jnp.maximum(q - 1.0, 1e-6))
         return q, jnp.clip(alpha, self.floor, self.ceiling)
 
     def compensated(self, memory: AdaptiveMemory, factor: Array, weighted: Array):
-        """Factor that allows the last xi, and whether it had to be shrunk."""
+        """Factor for which the last xi is feasible, and () bool: it had to be reduced."""
         needed = memory.inverse * local_bound(weighted) >= 1.0
         shrunk, _ = _inflation.deflated(factor, memory.inverse * weighted, SHARE)
         return jnp.where(needed, shrunk, factor), needed
@@ -96,7 +96,7 @@ class AdaptiveHInfinity(Rule):
         acts = counts & exists & (shrunk | (inverse > 0.0))
         code = jnp.where(counts & ~exists, int(Code.INFEASIBLE), int(Code.DONE))
         new = belief._replace(factor=jnp.where(acts, wide, belief.factor))
-        # the place of the next step in the ring is emptied
+        # clear the entry of the next step in the ring
         following = jnp.where(counts, (memory.at + 1) % self.window, memory.at)
         memory = AdaptiveMemory(
             nis=memory.nis.at[following].multiply(jnp.where(counts, 0.0, 1.0)),
@@ -115,11 +115,11 @@ def adaptive_h_infinity(
     ceiling: Number = 1e6,
     compensate_first: bool = False,
 ) -> Rule:
-    """H-infinity filter with a bound of its own at each step: a *reconstruction*.
+    """H-infinity filter with its own bound at each step: a *reconstruction*.
 
-    After the adaptive-compensation H-infinity filter of a patent on transfer alignment (Southeast
-    University) whose formulas (6) to (24) are lost; the formulas here are a reading of its text and
-    were not checked against the source:
+    It follows the adaptive-compensation H-infinity filter of a patent on transfer alignment
+    (Southeast University) whose formulas (6) to (24) are lost; the formulas here are derived from
+    its text and were not checked against the source:
 
         q      NIS over its degrees of freedom, over the last ``window`` steps with a measurement
         alpha  1 + 1 / (zeta max(q - 1, 1e-6)), kept between ``floor`` and ``ceiling``
@@ -127,23 +127,23 @@ def adaptive_h_infinity(
         P      becomes (P^-1 - xi^-2 L'L)^-1 before the next prediction, as in `h_infinity`
 
     so it exists by construction, is nearly the Kalman filter while innovations are as expected
-    (q = 1 if the model is right), and raises the gain when they are not: rightly for a wrong
-    motion, wrongly for a wrong measurement, which it cannot distinguish. With L / xi_k for the
-    weights of the steps, the bound of `h_infinity` holds for gamma = 1.
+    (q = 1 if the model is right), and raises the gain when they are larger: correctly if the motion
+    is wrong, wrongly if the measurement is, which it cannot distinguish. With weights L / xi_k in
+    step k, the bound of `h_infinity` holds for gamma = 1.
 
-    Notes, after each sensor (the last one's are the step's): ``adaptive_h_infinity.q``, ``.alpha``,
-    ``.xi`` and ``.bound``, sqrt(lambda_max(L P L')), in units of L x; ``.compensated`` with
-    ``compensate_first``. Derivatives take the local bound as given. ``floor = ceiling = inf`` is
-    the Kalman filter.
+    Notes, after each sensor (those of the last one are for the step): ``adaptive_h_infinity.q``,
+    ``.alpha``, ``.xi`` and ``.bound``, sqrt(lambda_max(L P L')), in units of L x; ``.compensated``
+    with ``compensate_first``. Derivatives treat the local bound as constant.
+    ``floor = ceiling = inf`` is the Kalman filter.
 
     Args:
         weight: L as in `h_infinity`.
         zeta: sensitivity of the gain to large innovations, positive; 0.01 to 1 hardly differ.
-        window: steps that q is taken over, at least 1.
-        floor: least alpha, above 1: 1.05 inflates by up to 21.
+        window: number of steps over which q is computed, at least 1.
+        floor: least alpha, above 1; with 1.05 variances grow up to 21 times.
         ceiling: largest alpha, at least the floor.
-        compensate_first: where P does not allow the xi of the step before, shrink it as in the
-            patent (``policy="compensate"`` of `h_infinity`, to 0.95 xi^2) before the new one is
+        compensate_first: if the xi of the step before is infeasible for P, reduce P as in the
+            patent (``policy="compensate"`` of `h_infinity`, to 0.95 xi^2) before the new xi is
             chosen. The smaller P has no justification in the data.
 
     Raises:

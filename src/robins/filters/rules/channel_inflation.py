@@ -1,4 +1,4 @@
-"""Treat a modelling error as process noise."""
+"""Modelling errors treated as process noise."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from robins.manifold import State
 
 @value
 class ChannelInflation(Rule):
-    """The rule of `channel_inflation`: Q + lambda B B'."""
+    """Rule of `channel_inflation`: Q + lambda B B'."""
 
     size: Numbers  # () lambda
     B: Numbers | Callable[[State], ArrayLike]  # (n, q), or a function of the mean
@@ -29,7 +29,7 @@ class ChannelInflation(Rule):
     name = "channel_inflation"
 
     def rows(self, mean: State, n: int) -> Array:
-        """B at a mean of n components."""
+        """(n, q) B at a mean of n components."""
         given = jnp.asarray(self.B(mean) if callable(self.B) else self.B, float)
         fits = given.ndim == 2 and given.shape[0] == n
         require(fits, f"channel_inflation B is {given.shape}, the state needs ({n}, q)")
@@ -54,20 +54,22 @@ def channel_inflation(lambda_: Number, B: Given | Callable[[State], ArrayLike]) 
     """Process noise Q + lambda B B' for a modelling error that enters the state through B.
 
     Fictitious noise (Jazwinski 1970, ch. 8) whose size can be derived: with the lambda of a
-    `robins.filters.synthesis.riccati` design the steady gain is the design's, whose true
-    H-infinity norm from the modelling error to the estimate is gamma. Start, outages and a motion
-    that changes are treated as in the Kalman filter; the bound is proved for the steady state only.
-    A channel that is in the measurement too (Dn of a plant) is not covered.
+    `robins.filters.synthesis.riccati` design the steady gain is that of the design, whose true
+    H-infinity norm from the modelling error to the estimation error is gamma. Initial transients,
+    outages and a varying motion are treated as in the Kalman filter; the bound is proved for the
+    steady state only. A modelling error that also enters the measurement (Dn of a plant) is not
+    covered.
 
     Notes: ``channel_inflation.lambda``. lambda = 0 is the Kalman filter, bit for bit.
 
     Args:
-        lambda_: spectral size of the error where w has unit covariance, not negative.
+        lambda_: variance of the error, as white noise per step, where the noise w of the plant has
+            unit covariance; not negative.
         B: (n, q) matrix in the tangent space of the state, over one prediction, or ``mean -> ``
             such a matrix; the mean is the predicted one.
 
     Raises:
-        ValueError: lambda is negative or not finite, B is no matrix or not finite; by `init`, B has
+        ValueError: lambda is negative or not finite, B is no matrix or not finite; at `init`, B has
             another number of rows than the state has components.
     """
     negative = "channel_inflation lambda must be a number from 0 on"

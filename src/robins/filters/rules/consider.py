@@ -1,4 +1,4 @@
-"""Account for states that are not estimated: the Schmidt filter."""
+"""Considered states, uncertain but not estimated: the Schmidt filter."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from robins.filters.values import kind, value
 
 @value
 class Consider(Rule):
-    """The rule of `consider`: K_c = (I - M) K, P+ = P_best + (M K) S_y (M K)'."""
+    """Rule of `consider`: K_c = (I - M) K, P+ = P_best + (M K) S_y (M K)'."""
 
     states: tuple[int, ...] = kind()  # indices of the considered states
     size: int | None = kind()  # size of a given mask
@@ -26,7 +26,7 @@ class Consider(Rule):
     name = "consider"
 
     def held(self, n: int) -> np.ndarray:
-        """Diagonal of M, for a state of n components."""
+        """(n,) bool, diagonal of M for a state of n components."""
         fits = self.size in (None, n)
         require(fits, f"consider mask is ({self.size},), the state needs ({n},)")
         last = max(self.states, default=-1)
@@ -57,30 +57,30 @@ class Consider(Rule):
 
 
 def consider(states: Given) -> Rule:
-    """Schmidt filter: considered states keep their mean and count in every covariance.
+    """Schmidt filter: considered states keep their mean, and their uncertainty is accounted for.
 
-    The gain of the considered states p is put to zero (Schmidt 1966; Zanetti & D'Souza 2012,
-    sec. III), which leaves the covariance of any other gain than the best,
+    The gain of the considered states p is set to zero (Schmidt 1966; Zanetti & D'Souza 2012,
+    sec. III); the covariance is that of a gain that is not optimal,
 
         K_c = (I - M) K,   P+ = (I - K_c H) P (I - K_c H)' + K_c R K_c'
                               = P_best + (M K) S_y (M K)',         M = diag(1 on p, else 0)
 
-    S_y the covariance of the innovation: the information on p is added as columns next to the
-    factor. So P_pp stays as predicted and nothing is subtracted. For states that are weakly
-    observed and wrongly modelled (a scale factor, a lever arm): their uncertainty counts, but they
-    do not absorb model errors.
+    S_y the innovation covariance: the last term is added as columns next to the factor. So P_pp
+    stays as predicted and nothing is subtracted. Use it for states that are weakly observed and
+    wrongly modelled (a scale factor, a lever arm): their uncertainty counts, but they do not absorb
+    model errors.
 
-    Put it first: corrections of considered states by `after` of rules before it are undone.
+    Put it first: corrections of considered states by `after` of earlier rules are undone.
     `StepInfo.gain` becomes K_c.
 
     Notes: ``consider.withheld``, the greatest correction withheld from a considered state, in its
-    standard deviations. No state considered is the Kalman filter, bit for bit.
+    standard deviations. Without considered states it is the Kalman filter, bit for bit.
 
     Args:
         states: indices of tangent components, or an (n,) mask of booleans.
 
     Raises:
-        ValueError: an index is negative, repeated or no integer; by `init`, sizes do not fit.
+        ValueError: an index is negative, repeated or no integer; at `init`, sizes do not fit.
     """
     given = np.asarray(states)
     given = given if given.size else np.zeros(0, int)

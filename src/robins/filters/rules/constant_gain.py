@@ -1,4 +1,4 @@
-"""Update with a gain that was designed offline."""
+"""Updates with a gain designed offline."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from robins.filters.values import Numbers, finite_leaf, value
 
 
 class GainMemory(NamedTuple):
-    """Memory of the rule. Gains are data: another one in a state compiles nothing."""
+    """Memory of the rule. Gains are data: exchanging one in a state compiles nothing."""
 
     gains: dict[str, Array]  # (n, m) by sensor
 
 
 @value
 class ConstantGain(Rule):
-    """The rule of `constant_gain`: `corrected` by the gains in the memory."""
+    """Rule of `constant_gain`: `corrected` by the gains in the memory."""
 
     gains: dict[str, Numbers]  # (n, m) by sensor
 
@@ -53,10 +53,10 @@ class ConstantGain(Rule):
 def corrected(
     gain: Array, posterior: Belief, info: StepInfo, o: Observation
 ) -> tuple[Belief, StepInfo]:
-    """x- + K (y - h(x-)) and (I - K H) P- (I - K H)' + K (Omega + R) K'.
+    """Belief x- + K (y - h(x-)), (I - K H) P- (I - K H)' + K (Omega + R) K', and its information.
 
     Args:
-        gain: (n, m) K, whose columns of components not used are left out.
+        gain: (n, m) K; columns of components not used are set to zero.
         posterior: belief of the usual update, returned if nothing is used.
         info: information of the usual update.
         o: the measurement relative to the prior.
@@ -79,18 +79,19 @@ def constant_gain(gains: Mapping[str, Given]) -> Rule:
 
         x+ = x- + K (y - h(x-)),   P+ = (I - K H) P- (I - K H)' + K (Omega + R) K'
 
-    The gain of a steady-state design (`robins.filters.synthesis`), in current form. The covariance
-    holds for any gain (Joseph's form; Brown & Hwang 2012, eq. 4.2.11), and grows while the sensor
-    is lost. Columns of components that are missing or refused are left out; sensors without a gain
-    are updated as usual. Put it after rules that fade the prior.
+    K is the gain of a steady-state design (`robins.filters.synthesis`), in current form. The
+    covariance holds for any gain (Joseph form; Brown & Hwang 2012, eq. 4.2.11), and grows during
+    outages of the sensor. Columns of components that are missing or refused are set to zero;
+    sensors without a gain are updated as usual. Put it after rules that fade the prior.
 
     Notes: ``constant_gain.moved``, the largest component of the correction.
 
     Args:
-        gains: (n, m) by name of the sensor, tangent spaces of state and measurement.
+        gains: (n, m) by name of the sensor, in the tangent spaces of state and measurement.
 
     Raises:
-        ValueError: no gain, or not finite; by `init`, an unknown sensor or a gain of wrong shape.
+        ValueError: there is no gain, or one is not finite; at `init`, a sensor is unknown or a gain
+            has the wrong shape.
     """
     require(gains, "constant_gain: give at least one gain, {'sensor': (n, m) array}")
     what = "constant_gain: the gain of"

@@ -15,7 +15,7 @@ from robins.filters.values import Numbers, kind, number, value
 
 @value
 class Correntropy(Rule):
-    """The rule of `correntropy`: R_ij / sqrt(w_i w_j), w_i = G(e_i) of posterior residuals."""
+    """Rule of `correntropy`: R_ij / sqrt(w_i w_j), w_i = G(e_i) of posterior residuals."""
 
     kernel: Numbers  # () sigma
     iterations: int = kind()
@@ -27,9 +27,9 @@ class Correntropy(Rule):
         return memory, prior, o.noted("correntropy", weight=jnp.min(w))
 
     def weight(self, e: Array) -> Array:
-        """Weights of residuals in deviations of their noise."""
+        """Weights of residuals in standard deviations of their noise."""
         w = jnp.exp(-0.5 * (e * (1.0 / self.kernel)) ** 2)
-        # least weight that leaves digits: 1e-8, less if that corrected by a milli-sigma
+        # least weight for numerical accuracy: 1e-8, less if that would correct by a milli-sigma
         return jnp.maximum(w, 1e-3 / jnp.minimum(1e5 + jnp.abs(e), 1e-3 * MOST))
 
 
@@ -45,7 +45,7 @@ def correntropy(kernel: Number = 3.0, iterations: int = 3, patience: int | None 
     started at the Kalman filter, w = 1: each iteration then raises the objective. Chen et al. start
     at the prior, where a poor prior makes every measurement an outlier, and weigh the components of
     the prior in the same way: the result then depends on the order of the states in the factor of
-    P, and a diverged state is not corrected. Here the prior stays quadratic.
+    P, and a diverged state is not corrected. Here the term of the prior stays quadratic.
 
     Notes: ``correntropy.weight``, the least of the measurement, 0 if refused (1e-12 or less), and
     ``correntropy.recovered``. Components without noise of their own keep their weight. The Kalman
@@ -53,8 +53,8 @@ def correntropy(kernel: Number = 3.0, iterations: int = 3, patience: int | None 
 
     Args:
         kernel: width sigma of the kernel, in standard deviations of the noise: below 2 good
-            measurements are lost, above 6 outliers of 10 sigma still count.
-        iterations: of the weights, at least 1.
+            measurements lose weight, above 6 outliers of 10 sigma keep some.
+        iterations: number of iterations of the weights, at least 1.
         patience: measurements in a row with a weight below 1e-2 before one is used
             (`robins.filters.rules._robust.opening`); None never recovers.
 

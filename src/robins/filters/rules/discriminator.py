@@ -1,11 +1,12 @@
 """Distinguish outliers from model errors by their duration: reweigh the former, fade the latter.
 
-An average V of squares shows an error of the model where it exceeds a factor that chance alone
-exceeds in a whole run with about the probability ``false_alarm``: each of the run's ``looks`` may
-fail with false_alarm / looks (Bonferroni), and the factor is the quantile of such an average
-(`chance_levels` in `robins.filters.rules._fading`). Since consecutive averages are correlated,
-false alarms are three to four times rarer than stated with rho = 0.98; with rho = 0.9 they are 1.3
-times as many. With a ``threshold`` the factor is 1 + threshold sqrt(2 (1 - rho) / ((1 + rho) m)).
+An average V of squared innovations indicates a model error if it exceeds a factor times its
+expectation. Chance alone exceeds that factor in a whole run with about the probability
+``false_alarm``: it is the quantile of such an average (`chance_levels` in
+`robins.filters.rules._fading`) at false_alarm / looks for each of the run's ``looks`` (Bonferroni).
+Since consecutive averages are correlated, false alarms are three to four times rarer than stated
+with rho = 0.98; with rho = 0.9 they are 1.3 times as many. With a ``threshold`` the factor is
+1 + threshold sqrt(2 (1 - rho) / ((1 + rho) m)).
 """
 
 from __future__ import annotations
@@ -30,12 +31,13 @@ from robins.filters.values import Numbers, is_chance, is_factor, is_share, kind,
 Fade = Literal["projected", "multiple"]
 Robust = Literal["huber", "gate"]
 
-# Deviations of the specification; in nine of ten runs of 6000 measurements chance exceeds them.
+# Threshold of the original specification [standard deviations]; in nine of ten runs of 6000
+# measurements chance exceeds it.
 PUBLISHED = 3.0
 
 
 class DiscriminatorVerdict(IntEnum):
-    """Judgement of a measurement by the discriminator, noted as ``discriminator.state``."""
+    """Classification of a measurement, noted as ``discriminator.state``."""
 
     CLEAN = 0
     OUTLIER = 1
@@ -49,14 +51,14 @@ class _DiscriminatorMemory(NamedTuple):
 
 @value
 class Discriminator(Rule):
-    """The rule of `discriminator`: c innovations in a row, r' S^-1 r > k^2 of each."""
+    """Rule of `discriminator`: it counts c innovations in a row with r' S^-1 r > k2."""
 
     patience: Numbers  # () measurements in a row
-    quantile: Numbers  # (most + 1,) k^2 by the number of components used
-    rho: Numbers  # ()
-    levels: Numbers  # (most + 1,) of tr V over its expectation, by the number that count
-    limit: Numbers  # () of lambda
-    weights: Numbers | None  # (n,) a_j, greatest 1
+    quantile: Numbers  # (MOST + 1,) k2 by the number of components used
+    rho: Numbers  # () forgetting factor of V
+    levels: Numbers  # (MOST + 1,) limit of tr V over its expectation, by number of components
+    limit: Numbers  # () greatest lambda
+    weights: Numbers | None  # (n,) a_j, the greatest 1
     fade: Fade = kind()
     robust: Robust = kind()
 
@@ -115,38 +117,38 @@ def discriminator(
     false_alarm: Number = 0.01,
     looks: Number = 10_000,
 ) -> Rule:
-    r"""Short excess is a fault of the sensor, lasting excess one of the model (a rule of robins).
+    r"""Treat short excess of innovations as outliers, lasting excess as model error (own method).
 
     c counts measurements of a sensor in a row with g = r' S^-1 r above k2, a chi-square quantile.
 
         0 < c < patience   outlier: R becomes s R with r' (H P H' + s R)^-1 r = k2
-                           ("huber"), or the measurement is refused ("gate"); V stands
-        c = patience       where g > 100 k2, the prior is widened until g = m, once; V stands
-        otherwise          V = rho V + (1 - rho) r r', from V = R; where V is significantly above
+                           ("huber"), or the measurement is refused ("gate"); V is unchanged
+        c = patience       if g > 100 k2, the prior is widened once until g = m; V is unchanged
+        otherwise          V = rho V + (1 - rho) r r', from V = R; if V is significantly above
                            H P H' + R the model is wrong, and the prior is faded by
                            lambda = (tr V - m) / tr H P H'
 
-    with r, H whitened by R^-1/2 as in `strong_tracking`. A fault of the sensor that lasts longer
-    than ``patience`` measurements is taken for an error of the model.
+    with r, H whitened by R^-1/2 as in `strong_tracking`. A sensor fault that lasts ``patience``
+    measurements or longer is taken as a model error.
 
     Notes: ``discriminator.weight`` (1 / s, 0 if refused), ``.lambda``, ``.counter`` (c) and
     ``.state`` (a `DiscriminatorVerdict`: 2 if faded, or c >= patience). Components missing, refused
     before or without noise do not count. ``probability=1, limit=1`` is the Kalman filter.
 
     Args:
-        patience: most measurements in a row with a fault of the sensor, plus one; 1: no outliers.
-        probability: share of right measurements with g <= k2, in (0, 1].
+        patience: longest sensor fault in measurements, plus one; with 1 nothing is an outlier.
+        probability: share of correct measurements with g <= k2, in (0, 1].
         rho: forgetting factor of V, in (0, 1].
         fade: form of `strong_tracking`. "multiple" adapts faster, but unobserved states may grow.
-        robust: treatment of outliers. "gate" is safer where they last long.
+        robust: treatment of outliers. "gate" is safer if they last long.
         threshold: standard deviations, such as `PUBLISHED`, in place of false_alarm and looks.
         limit: upper bound of lambda, at least 1.
-        weights: (n,) a_j >= 0 of the states for "multiple"; None: equal, which fades all P.
-        false_alarm: probability of a false model error in a run, by sensor, in (0, 1).
-        looks: measurements of a sensor in a run, at least 1.
+        weights: (n,) a_j >= 0 of the states for "multiple"; None: equal, which fades all of P.
+        false_alarm: probability of a false model error in a run, per sensor, in (0, 1).
+        looks: number of measurements of a sensor in a run, at least 1.
 
     Raises:
-        ValueError: an argument is out of its range; by `init`, the weights are not one a state.
+        ValueError: an argument is out of its range; at `init`, weights is not one number per state.
     """
     keep = number("discriminator rho must lie in (0, 1]", rho, is_share)
     one_of("discriminator fade", fade, Fade)
@@ -165,7 +167,7 @@ def discriminator(
 
 
 def _levels(rho: Numbers, threshold: Number | None, false_alarm: Number, looks: Number) -> Numbers:
-    """(MOST + 1,) of what tr V exceeds by chance alone, or by a threshold of deviations."""
+    """(MOST + 1,) limits of tr V over its expectation, by false_alarm or by a threshold."""
     chance = number("discriminator false_alarm must lie in (0, 1)", false_alarm, is_chance)
     often = number("discriminator looks must be at least 1 and finite", looks, is_factor)
     if threshold is None:
@@ -173,5 +175,5 @@ def _levels(rho: Numbers, threshold: Number | None, false_alarm: Number, looks: 
     negative = "discriminator threshold must not be negative"
     sigmas = number(negative, threshold, lambda x: x >= 0.0)
     dof = np.maximum(np.arange(MOST + 1.0), 1.0)
-    with np.errstate(invalid="ignore"):  # V that never moves exceeds nothing
+    with np.errstate(invalid="ignore"):  # with rho = 1 V is constant and exceeds nothing
         return 1.0 + sigmas * (2.0 * (1.0 - rho) / ((1.0 + rho) * dof)) ** 0.5

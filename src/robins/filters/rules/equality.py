@@ -1,4 +1,4 @@
-"""Hold the state to an equality constraint throughout a run."""
+"""Equality constraint on the state throughout a run."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from robins.filters.values import Numbers, finite_leaf, is_chance, is_known, kin
 
 @value
 class Equality(Rule):
-    """The rule of `equality`: x - G (g(x) - d), G = V D' (D V D')^-1."""
+    """Rule of `equality`: x - G (g(x) - d), G = V D' (D V D')^-1."""
 
     g: Function
     d: Data  # of the form of g(x); None is zero
     weight: Weight
     noise: Numbers | None
-    limit: Numbers | None  # (most + 1,) of the NIS by components, where there is a gate
+    limit: Numbers | None  # (MOST + 1,) limit of the NIS by components; None: no gate
     hard: bool = kind()
     iterations: int = kind()
 
@@ -48,7 +48,7 @@ class Equality(Rule):
         n = belief.factor.shape[0]
         check_size("equality", self.weight, n)
         require(not sensor.dim > n, f"equality has {sensor.dim} components, the state only {n}")
-        return jnp.zeros((), bool)  # this step has used a noisy constraint
+        return jnp.zeros((), bool)  # True if this step has used a noisy constraint
 
     def process(self, memory: Memory, transition: Transition):
         return jnp.zeros((), bool), transition
@@ -79,35 +79,35 @@ def equality(
     gate: Number | None = None,
     iterations: int = ITERATIONS,
 ) -> Rule:
-    """Hold the state to ``g(x) = d`` after each update (Simon & Chia 2002; `constrain`).
+    """Constrain the state to ``g(x) = d`` after each update (Simon & Chia 2002; `constrain`).
 
         G = V D' (D V D')^-1,   x* = x - G (g(x) - d),   P* = (I - G D) P (I - G D)' + G R_d G'
 
-    with V = P or W^-1. A constraint without noise holds after each sensor's update, also where its
-    measurement is missing, and nothing is uncertain across it, so that no trace of P grows (W =
-    P^-1: no variance at all). P is singular: where other sensors follow use ``form="sqrt"``. A
-    noisy constraint is information: it is used once a step, by the first sensor, as a measurement,
-    K = P D' (D P D' + R_d)^-1. If its errors are not white, give them a state. A constraint that
-    comes with data (air data, a map) is a sensor, not a rule.
+    with V = P or W^-1. A constraint without noise is applied after each sensor's update, even if
+    its measurement is missing, and leaves no variance across it, so that no trace of P grows (with
+    W = P^-1, no variance at all). P is then singular: if other sensors follow, use
+    ``form="sqrt"``. A noisy constraint is information: it is used once per step, at the first
+    sensor, as a measurement, K = P D' (D P D' + R_d)^-1. If its errors are not white, model them as
+    a state. A constraint that comes with data (air data, a map) is a sensor, not a rule.
 
-    Notes: ``equality.residual``, the greatest entry of d - g(x) before; ``equality.nis``, all of
-    them squared by D P D' + R_d; ``equality.refused``. A constraint that contradicts what is known
-    exactly makes the update `Code.CONTRADICTED`, one that the gate refuses ``PARTLY_MISSING``.
-    Infinite noise is the Kalman filter.
+    Notes: ``equality.residual``, the greatest entry of |d - g(x)| before; ``equality.nis``, the
+    squared residual normalised by D P D' + R_d; ``equality.refused``. A constraint that contradicts
+    exact knowledge makes the update `Code.CONTRADICTED`, one that the gate refuses
+    ``PARTLY_MISSING``. Infinite noise is the Kalman filter.
 
     Args:
         g: (c, n) matrix D or a function of the state, as in `constrain`.
-        d: value of g(x); zero if left out.
+        d: value of g(x); zero by default.
         weight: "covariance", "identity" or an (n, n) matrix W.
-        noise: (c,) standard deviations or a (c, k) factor of R_d; exact if left out.
+        noise: (c,) standard deviations or a (c, k) factor of R_d; None: exact.
         hard: put the mean on a noisy constraint, as other weights always do.
-        gate: probability of the chi-square quantile beyond which the constraint is refused. None:
+        gate: probability of the chi-square quantile beyond which the constraint is refused; None:
             never.
-        iterations: linearisations of a function.
+        iterations: number of linearisations of a function.
 
     Raises:
-        ValueError: rows of D depend on each other or contradict, numbers are not finite, an
-            argument is out of its range; by `init`, D, noise or weight do not fit the state.
+        ValueError: rows of D are dependent or contradict each other, numbers are not finite, or an
+            argument is out of its range; at `init`, D, noise or weight do not fit the state.
     """
     if gate is not None:
         gate = number("equality gate must lie between 0 and 1, or be None", gate, is_chance)
@@ -123,7 +123,7 @@ def equality(
 
 
 def _rows(D: Numbers, d: Data, noise: Numbers | None) -> Numbers:
-    """D, checked where all is known."""
+    """D, checked unless it, d or the noise is traced."""
     if not is_known((D, d, noise)):
         return D
     if D.ndim != 2 or D.shape[0] == 0:

@@ -1,4 +1,4 @@
-"""Inflate the covariance by a constant factor in every step."""
+"""Inflation of the covariance by a constant factor in every step."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from robins.filters.values import Numbers, is_factor, number, value
 
 @value
 class FadingMemory(Rule):
-    """The rule of `fading_memory`: alpha^2 P before a prediction."""
+    """Rule of `fading_memory`: alpha^2 P before a prediction."""
 
     factor: Numbers  # () alpha
 
@@ -35,14 +35,14 @@ def fading_memory(factor: Number = 1.01) -> Rule:
     new data, so accumulated model errors are forgotten. The covariance is then a weight, an upper
     bound where the model is right.
 
-    The belief is widened by alpha after all measurements of a step, before the prediction, so that
-    sigma points and smoothers use the widened belief. It fades every step, measured or not, and
-    every state: variances never measured grow as alpha^(2k).
+    Standard deviations are multiplied by alpha after all measurements of a step, before the
+    prediction, so that sigma points and smoothers use the widened belief. This is done in every
+    step, measured or not, and to every state: variances of unobserved states grow as alpha^(2k).
 
     Notes: ``fading_memory.factor``. factor = 1 is the Kalman filter, bit for bit.
 
     Args:
-        factor: alpha, without unit; from a time constant by `per_step`.
+        factor: alpha, without unit; `per_step` computes it from a time constant.
 
     Raises:
         ValueError: the factor is not finite or below 1.
@@ -53,7 +53,7 @@ def fading_memory(factor: Number = 1.01) -> Rule:
 
 
 def per_step(memory_s: Number, step_s: Number) -> float:
-    """Factor with which the weight of data falls to 1/e in a time: exp(step / (2 memory)).
+    """Factor for which the weight of data falls to 1/e in ``memory_s``: exp(step / (2 memory)).
 
     Args:
         memory_s: time constant [s] of the weight, infinity for the Kalman filter.

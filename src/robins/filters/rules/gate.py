@@ -1,4 +1,4 @@
-"""Refuse a measurement whose innovation is too large to be chance, with recovery."""
+"""Chi-square gate on innovations, with recovery of a diverged filter."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from robins.filters.values import Numbers, is_chance, kind, number, value
 Recovery = Literal["accept", "inflate", "reinitialise"]
 Scope = Literal["joint", "component"]
 
-# Covariance added on re-initialisation, in units of R: the gain is then at least 0.99 of a copy.
+# Covariance added on re-initialisation, in units of R: H K is then at least 0.99.
 _OPEN = 100.0
 
 
 class _SensorMemory(NamedTuple):
-    """Memory of a sensor; g is () for a joint gate, (m,) for one by component."""
+    """Gate memory of a sensor; g is () for a joint gate, (m,) for one by component."""
 
     refused: Array  # (g) refusals in a row
     ratio: Array  # () greatest test ratio of the last measurement
     residual: Array  # (k, m) the last innovations that were too large, newest last
-    known: Array  # (k, m) bool, their components
+    known: Array  # (k, m) bool, components of these that were used
 
 
 @value
 class Gate(Rule):
-    """The rule of `gate`."""
+    """Rule of `gate`."""
 
-    limit: Numbers  # (most + 1,) q by the number of components present
-    scatter: Numbers | None  # the same for the scatter of refusals; where they must agree
+    limit: Numbers  # (MOST + 1,) q by the number of components used
+    scatter: Numbers | None  # (MOST + 1,) limit of the scatter of refusals; None: not tested
     patience: Numbers  # () refusals in a row before recovery
-    kept: int = kind()  # refusals remembered; 0 where they need not agree
+    kept: int = kind()  # number of stored innovations; 0 if refusals need not agree
     recovery: Recovery = kind()
     joint: bool = kind()
 
@@ -73,7 +73,7 @@ class Gate(Rule):
         return memory, prior, o._replace(accepted=o.accepted & passed)
 
     def judge(self, o: Observation):
-        """Limit q, ratio to it, whether something is judged, and the components used."""
+        """Limit q, ratio of the test to it, mask of tests made, and mask of components used."""
         seen = normalised(o)
         if self.joint:
             q = within(self.limit, o.residual)[seen.dof]
@@ -85,7 +85,7 @@ class Gate(Rule):
     def due(
         self, was: _SensorMemory, over: Array, used: Array, o: Observation
     ) -> tuple[Array, Array, Array]:
-        """Recoveries that are due, and the refusals remembered."""
+        """Mask of recoveries due, and the stored innovations with their components."""
         due, scatter = over & (was.refused.astype(float) >= self.patience), self.scatter
         if scatter is None:
             return due, was.residual, was.known
@@ -101,10 +101,10 @@ class Gate(Rule):
     def recovered(
         self, due: Array, chosen: Array, ratio: Array, q: Numbers, prior: Belief, o: Observation
     ) -> Belief:
-        """Prior, widened where recovery is due."""
+        """Prior, widened if recovery is due."""
         jump = jnp.where(chosen, o.residual, 0.0)
         if not self.kept:
-            # keeps the root off 0 where none is due: its derivative in q would be NaN
+            # keeps the root off 0 if no recovery is due: its derivative in q would be NaN
             excess = 1.0 - 1.0 / jnp.where(due, ratio, 2.0)
             jump = jump * jnp.where(due, jnp.sqrt(excess / q), 0.0)
         root = jump[:, None] if self.joint else jnp.diag(jump)
@@ -121,30 +121,30 @@ def gate(
 ) -> Rule:
     r"""Chi-square gate on the innovation of a sensor (Bar-Shalom et al. 2001, sec. 2.3.2).
 
-    A measurement is refused when its NIS r' S^-1 r exceeds q, the chi-square quantile for the
-    components present; by component, when r_i^2 / S_ii exceeds that of one. A diverged filter would
-    refuse for ever, so after ``patience`` refusals of a sensor in a row the next measurement that
-    is too large recovers it:
+    A measurement is refused if its NIS r' S^-1 r exceeds q, the chi-square quantile for the
+    components present; with scope "component", if r_i^2 / S_ii exceeds that of one. A diverged
+    filter would refuse all measurements, so after ``patience`` refusals of a sensor in a row the
+    next measurement that is too large recovers it:
 
-    - ``accept`` uses it with the present gain, which follows a jump of many deviations only in
-      hundreds of measurements;
+    - ``accept`` uses it with the present gain; after a jump of many standard deviations the state
+      then converges only within hundreds of measurements;
     - ``inflate`` first widens the prior covariance along the innovation until the NIS is q or
-      less, by D = a r r', a = 1 / q - 1 / NIS; by component by D = diag(a_i r_i^2), with a_i =
-      1 / q - S_ii / r_i^2 (`robins.filters.rules._robust.widened`);
+      less, by D = a r r', a = 1 / q - 1 / NIS; with scope "component" by D = diag(a_i r_i^2),
+      a_i = 1 / q - S_ii / r_i^2 (`robins.filters.rules._robust.widened`);
     - ``reinitialise`` uses it only if it and the refused ones before it *agree*: their scatter
       about their mean, sum (r_k - mean)' R^-1 (r_k - mean), is within the chi-square quantile of
-      patience times m degrees of freedom. It then widens what is seen by D = r r' + 100 R, and
-      the state follows the measurement. Otherwise it is refused.
+      patience times m degrees of freedom. It then widens the measured components by
+      D = r r' + 100 R, so that the state follows the measurement. Otherwise it is refused.
 
     Notes: ``gate.ratio``, min(NIS / q, 1), where 1 is refused or recovered (the innovation test
-    ratio of autopilots; by component the greatest), ``gate.refused``, refusals in a row (the most),
-    and ``gate.recovered``.
+    ratio of autopilots; the greatest of the components), ``gate.refused``, refusals in a row (the
+    greatest number), and ``gate.recovered``.
 
     Args:
-        probability: share of right measurements that pass.
+        probability: share of correct measurements that pass.
         patience: refusals in a row before recovery; at least 1 to ``reinitialise``.
         recovery: one of the above.
-        scope: judge the measurement as a whole, or each component by itself.
+        scope: "joint" tests the measurement as a whole, "component" each component separately.
 
     Raises:
         ValueError: an argument is out of its range.
@@ -170,7 +170,7 @@ def _push(rows: Array, newest: Array) -> Array:
 
 
 def _scatter(residual: Array, known: Array) -> Array:
-    """Deviations from the mean, 0 in components that were not always present."""
+    """Deviations of residuals from their mean; 0 in components that were not always present."""
     shared = jnp.all(known, axis=0, keepdims=True)
     return jnp.where(shared, residual - jnp.mean(residual, axis=0, keepdims=True), 0.0)
 
@@ -179,7 +179,8 @@ def _agree_as_one(table: Array, residual: Array, known: Array, noise: Array) -> 
     shared = jnp.all(known, axis=0)
     N = jnp.where(shared[:, None], noise, 0.0)
     L = linalg.tria(N, jnp.diag(jnp.where(shared, 0.0, 1.0)))
-    # A component without noise agrees only if it repeats: over the least pivot all else is huge.
+    # A component without noise agrees only if it repeats exactly: any other deviation is huge when
+    # divided by the tiny pivot.
     L = L + jnp.diag(jnp.where(jnp.diagonal(L) == 0.0, jnp.finfo(float).tiny, 0.0))
     white = linalg.solve_lower(L, _scatter(residual, known).T)
     count = jnp.sum(shared)

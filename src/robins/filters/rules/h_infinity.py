@@ -1,4 +1,4 @@
-"""Bound the worst case: a Kalman update, an inflation, a prediction."""
+"""H-infinity filter: a Kalman update, an inflation, a prediction."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ class Infeasible(RobinsError, ValueError):
     """No H-infinity filter exists for the given gamma.
 
     Attributes:
-        step: row of the measurements after which the bound broke, from 0; in a stream, number of
-            predictions before it less one.
-        time_s: time of that step [s], or None where times are not known.
+        step: row of the measurements, from 0, after which no filter exists; in a stream, the number
+            of predictions before it minus one.
+        time_s: time of that step [s], or None if times are not known.
         gamma: the given bound.
         local_bound: sqrt(lambda_max(L P L')) there, which gamma must exceed.
-        gamma_min: least gamma for the whole run, or None where it cannot be run again.
+        gamma_min: least gamma for the whole run, or None if it cannot be run again.
     """
 
     def __init__(
@@ -68,18 +68,18 @@ class Infeasible(RobinsError, ValueError):
 class HInfinityMemory(NamedTuple):
     """Memory of `h_infinity`."""
 
-    steps: Array  # () predictions so far
+    steps: Array  # () number of predictions
     fresh: Array  # () bool, no update since the prediction
-    measured: Array  # () bool, something was used since the prediction
-    predicted: State  # mean as predicted; () where the estimate does not need it
-    weighted: Array  # (q, n) L S that the last step is judged by
-    events: Array  # () steps in which the policy acted
-    first: Array  # () the first of them
-    weighted_first: Array  # (q, n) L S there
+    measured: Array  # () bool, a component was used since the prediction
+    predicted: State  # predicted mean; () if the estimate does not need it
+    weighted: Array  # (q, n) L S of the existence test of the last step
+    events: Array  # () number of steps in which the policy acted or the filter did not exist
+    first: Array  # () the first of these steps; -1: none
+    weighted_first: Array  # (q, n) L S in that step
 
 
 def least_gamma(exists: Callable[[float], bool], lower: float, rtol: float = 1e-4) -> float:
-    """Least feasible gamma above a lower bound, at most rtol too large: doubled, then bisected.
+    """Least feasible gamma above a lower bound, within rtol from above, by doubling and bisection.
 
     Raises:
         ValueError: no gamma up to 2^100 times the lower bound is feasible.
@@ -97,7 +97,7 @@ def least_gamma(exists: Callable[[float], bool], lower: float, rtol: float = 1e-
 
 @value
 class HInfinity(Rule):
-    """The rule of `h_infinity`: P becomes (P^-1 - gamma^-2 L'L)^-1 before a prediction."""
+    """Rule of `h_infinity`: P becomes (P^-1 - gamma^-2 L'L)^-1 before a prediction."""
 
     inverse: Numbers  # () 1 / gamma: 0 is the Kalman filter, and has a finite derivative
     weight: Weight  # (q, n) L, or a function of the mean
@@ -113,7 +113,7 @@ class HInfinity(Rule):
         return _inflation.weighted_factor(self.weight, belief, NAME)
 
     def in_force(self, bound: Array) -> Numbers:
-        """1 / gamma of this step, as the policy leaves it."""
+        """1 / gamma of this step under the policy."""
         if self.policy != "raise_gamma":
             return self.inverse
         some = jnp.where(bound > 0.0, bound, 1.0)
@@ -139,7 +139,7 @@ class HInfinity(Rule):
         return memory, transition
 
     def before(self, memory: HInfinityMemory, prior: Belief, o: Observation):
-        if self.estimate == "a-priori":  # the predicted P decides on existence
+        if self.estimate == "a-priori":  # existence depends on the predicted P
             weighted = jnp.where(memory.fresh, self.weighted(prior), memory.weighted)
             memory = memory._replace(weighted=weighted)
         return memory._replace(fresh=jnp.array(False)), prior, o
@@ -148,7 +148,7 @@ class HInfinity(Rule):
         if self.estimate != "a-priori":
             memory = memory._replace(weighted=self.weighted(posterior))
         memory = memory._replace(measured=memory.measured | jnp.any(info.used))
-        # Noted but not remembered, so that a run which does not keep it does not compute it.
+        # A note, not part of the memory: a run that does not keep it does not compute it.
         bound = local_bound(memory.weighted)
         inverse = self.in_force(bound)
         left = 1.0 - (bound * inverse) ** 2
@@ -185,7 +185,7 @@ class HInfinity(Rule):
         return memory, new, jnp.where(missed, int(Code.INFEASIBLE), int(Code.DONE))
 
     def eased(self, belief: Belief, weighted: Array, judged: Array):
-        """1 / gamma, factor and L S under the policy, and whether it acted."""
+        """1 / gamma, factor and L S under the policy, and () bool: the policy acted."""
         if self.policy == "raise_gamma":
             inverse = self.in_force(local_bound(judged))
             return inverse, belief.factor, weighted, inverse < self.inverse
@@ -199,10 +199,10 @@ class HInfinity(Rule):
     def moved(
         self, memory: HInfinityMemory, belief: Belief, inverse: Numbers, wide: Array
     ) -> Belief:
-        """Belief with the inflated factor, and the mean that belongs to it."""
+        """Belief with the inflated factor, and the mean of the chosen estimate."""
         if self.estimate == "a-posteriori":
             return Belief(belief.mean, wide)
-        # P~ L'L d / gamma^2 takes the mean on from P H'R^-1 r to P~ H'R^-1 r.
+        # P~ L'L d / gamma^2 changes the correction from P H'R^-1 r to P~ H'R^-1 r.
         d = manifold.local(memory.predicted, belief.mean)
         L = inverse * _inflation.rows_of(self.weight, belief.mean, NAME)
         return Belief(manifold.retract(belief.mean, wide @ ((L @ wide).T @ (L @ d))), wide)
@@ -210,17 +210,17 @@ class HInfinity(Rule):
     def first_infeasible(
         self, final: HInfinityMemory, before: int = 0, whole: bool = True
     ) -> tuple[int, Numbers] | None:
-        """First step without a filter, and L S there; None if it existed throughout.
+        """First step without a filter, and L S there; None if the filter existed throughout.
 
-        ``before`` are events in the memory at the start, of another filter; ``whole`` judges the
-        last step too, from which nothing has been predicted.
+        ``before`` is the number of events before this run, with perhaps another gamma; ``whole``
+        also tests the last step, from which nothing has been predicted.
         """
         missed = int(final.events) - before
-        # Arrays are NumPy's in a stream in C and from the interpreter.
+        # Arrays are NumPy arrays in a stream in C and from the interpreter.
         first, weighted = jnp.asarray(final.weighted_first), jnp.asarray(final.weighted)
         if missed > 0 and before == 0:
             return int(final.first), first
-        if missed > 0:  # the first was another filter's; after a missed step all are missed
+        if missed > 0:  # `first` is of an earlier run; after a missed step all are missed
             return int(final.steps) - 1 - missed, weighted
         if not whole or not final.measured:
             return None
@@ -238,12 +238,12 @@ class HInfinity(Rule):
         again: Again | None,
         time: ArrayLike | None,
     ) -> None:
-        """Raise under policy "raise" where the filter did not exist at some step.
+        """Raise under policy "raise" if the filter did not exist at some step.
 
-        In a stream a step is judged by the next prediction: until then more sensors may come.
+        In a stream a step is tested at the next prediction, since more sensors may come until then.
 
         Raises:
-            Infeasible: it did not exist.
+            Infeasible: the filter did not exist.
         """
         if not self.reports:
             return
@@ -263,7 +263,7 @@ class HInfinity(Rule):
             least = least_gamma(exists, gamma)
         times = () if time is None else np.asarray(time)
         time_s = float(times[step]) if 0 <= step < len(times) else None
-        bound = float(local_bound(jnp.asarray(weighted)))  # NumPy in a stream in C
+        bound = float(local_bound(jnp.asarray(weighted)))  # a NumPy array in a stream in C
         raise Infeasible(step, time_s, gamma, bound, least)
 
 
@@ -275,9 +275,9 @@ def h_infinity(
     margin: float = 0.05,
     count_missing: bool = False,
 ) -> HInfinity:
-    """The central H-infinity filter (Hassibi, Sayed & Kailath 1999, ch. 4).
+    """Central H-infinity filter (Hassibi, Sayed & Kailath 1999, ch. 4).
 
-    Keeps the energy of the estimation error L (x - x_hat), summed over a run, below gamma^2 times
+    The energy of the estimation error L (x - x_hat), summed over a run, stays below gamma^2 times
 
         |x0 - x0_hat|^2_{P0^-1} + sum |w_k|^2_{Q^-1} + sum |v_k|^2_{R^-1}
 
@@ -286,30 +286,30 @@ def h_infinity(
         it exists if   lambda_max(L P L') < gamma^2
         P becomes      (P^-1 - gamma^-2 L'L)^-1 = P + P L' (gamma^2 I - L P L')^-1 L P
 
-    in square-root form S N^-T with N N' = I - (L S / gamma)' (L S / gamma): it exists where this
-    has a Cholesky factor. A run reports the beliefs before the inflation. P is then no covariance
-    of the error: NEES, NIS and chi-square gates do not apply as they stand.
+    in square-root form S N^-T with N N' = I - (L S / gamma)' (L S / gamma): it exists if this has a
+    Cholesky factor. A run reports the beliefs before the inflation. P is then no covariance of the
+    error: NEES, NIS and chi-square gates do not apply unchanged.
 
-    Notes, after each sensor (the last one's are the step's): ``h_infinity.bound``,
-    sqrt(lambda_max(L P L')); ``.gamma``, in force by the policy; ``.margin``, 1 - bound^2 /
-    gamma^2; ``.raised`` or ``.compensated`` under these policies. Derivatives take a raised gamma
-    as given.
+    Notes, after each sensor (those of the last one are for the step): ``h_infinity.bound``,
+    sqrt(lambda_max(L P L')); ``.gamma``, the value used under the policy; ``.margin``,
+    1 - bound^2 / gamma^2; ``.raised`` or ``.compensated`` under these policies. Derivatives treat a
+    raised gamma as constant.
 
     Args:
         gamma: bound, in units of L x per unit of whitened noise; inf is the Kalman filter, bit for
             bit. `with_gamma` exchanges it.
-        weight: L, the errors that count, in their units: (q, n) matrix, (n,) diagonal, or
-            ``mean -> `` one of these. gamma means nothing without it.
-        policy: action where the filter does not exist. "raise": stop predicting, with code
-            ``INFEASIBLE``; `run` then raises `Infeasible`. "raise_gamma": in that step, the least
-            gamma that leaves ``margin``. "compensate": shrink P in the directions at fault until
-            ``margin`` is left; the smaller P has no justification in the data.
+        weight: L, which maps the state to the error that is bounded: (q, n) matrix, (n,) diagonal,
+            or ``mean -> `` one of these. Its units fix those of gamma.
+        policy: action if the filter does not exist. "raise": stop predicting, with code
+            ``INFEASIBLE``; `run` then raises `Infeasible`. "raise_gamma": use in that step the
+            least gamma that leaves ``margin``. "compensate": shrink P in the violating directions
+            until ``margin`` is left; the smaller P has no justification in the data.
         estimate: estimate whose error is bounded. "a-posteriori": after the measurement.
             "a-priori": before it, with gain P~ H' R^-1 for the inflated P~; exists where
             lambda_max(L P L') < gamma^2 for the *predicted* P. "predictor": the same gain with the
             test after the measurement (Simon 2006, eq. 11.89 and 11.90), which is weaker and does
             not guarantee the bound.
-        margin: 1 - bound^2 / gamma^2 that the policies leave, between 0 and 1.
+        margin: value of 1 - bound^2 / gamma^2 that the policies leave, between 0 and 1.
         count_missing: inflate also in steps in which nothing was measured, or all was refused.
 
     Raises:
@@ -340,10 +340,10 @@ def _as_gamma(gamma: Given) -> Numbers:
 
 
 def with_gamma(filter_: F, gamma: Given) -> F:
-    """Filter with another gamma in each of its `h_infinity` rules, also in its parts.
+    """Filter with another gamma in each of its `h_infinity` rules, also in filters it is made of.
 
-    Gamma may be traced, so that a batch of gammas is one `jax.vmap`, without a new compilation. A
-    state of the filter continues with it.
+    Gamma may be traced, so that a batch of gammas is one `jax.vmap`, without a new compilation. The
+    new filter can continue from a state of the old one.
 
     Raises:
         TypeError: gamma is not one real number.

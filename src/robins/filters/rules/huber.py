@@ -1,4 +1,4 @@
-"""Raise the noise of a measurement whose innovation is too large to be chance."""
+"""Huber weight: a larger noise for a measurement whose innovation is too large to be chance."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from robins.filters.values import Numbers, is_share, number, value
 
 @value
 class Huber(Rule):
-    """The rule of `huber`: s of r' (H P H' + s R)^-1 r = k^2 where the NIS exceeds k^2."""
+    """Rule of `huber`: s R with r' (H P H' + s R)^-1 r = k^2 where the NIS exceeds k^2."""
 
-    limit: Numbers  # (MOST + 1,) k^2 by the number of components present
+    limit: Numbers  # (MOST + 1,) k^2 by the number of components used
 
     name = "huber"
 
@@ -37,15 +37,15 @@ def huber(
         r' (H P H' + s R)^-1 r = k^2,   k^2 = the chi-square quantile of the components present,
 
     solved exactly (Chang iterates his eq. 23, s <- s NIS(s) / k^2). One weight for the whole
-    measurement keeps correlations of its noise. The correction is about k^2 / |r| at most, so it
-    falls with the size of the innovation.
+    measurement keeps the correlations of its noise. The correction is proportional to k^2 / |r| for
+    large r, so it decreases as the innovation grows.
 
     Notes: ``huber.weight``, 1 / s, 0 if refused (1e-12 or less), and ``huber.recovered``.
     Components without noise of their own keep their weight. The Kalman filter is ``probability=1``
     or ``threshold=inf``.
 
     Args:
-        probability: share of right measurements that keep their weight, in (0, 1].
+        probability: share of correct measurements that keep their weight, in (0, 1].
         threshold: k > 0, in standard deviations, for any number of components; None takes it from
             the probability.
         patience: measurements in a row with a weight below 1e-2 before one is used

@@ -18,7 +18,7 @@ from robins.filters.values import Numbers, is_known, number, value
 
 @value
 class Igg3(Rule):
-    """The rule of `igg3`: R_ij / sqrt(w_i w_j), of weights in three zones of |r_i| / sqrt(S_ii)."""
+    """Rule of `igg3`: R_ij / sqrt(w_i w_j), weights in three zones of |r_i| / sqrt(S_ii)."""
 
     k0: Numbers  # ()
     k1: Numbers  # ()
@@ -54,7 +54,7 @@ class Igg3(Rule):
         return {**memory, o.sensor: count}, prior, o
 
     def weights(self, t: Array) -> Array:
-        """Weights of innovations in their standard deviations."""
+        """(m,) weights of innovations in units of their standard deviations."""
         far = t > self.k0
         beyond = jnp.where(far, t, self.k1)
         share = jnp.maximum(self.k1 - beyond, 0.0) * (1.0 / (self.k1 - self.k0))
@@ -73,12 +73,12 @@ def igg3(
               floor                                  beyond k1
         R_ij becomes R_ij / sqrt(w_i w_j)
 
-    With the floor at zero a component beyond k1 is refused; else one beyond k0 / floor, which even
-    with the floor would correct more than one of full weight can.
+    With a floor of zero a component beyond k1 is refused; otherwise one beyond k0 / floor, which
+    even at the floor would cause a larger correction than any of full weight.
 
-    When no component of a sensor has had more weight than the floor ``patience`` times in a row, as
-    of a diverged filter, its next such measurement is used with full weight, and the prior
-    covariance is first widened along the innovation until no t_i exceeds k0, by
+    After ``patience`` measurements of a sensor in a row without a component above the floor, as in
+    a diverged filter, the next such measurement is used with full weight, and the prior covariance
+    is first widened along the innovation until no t_i exceeds k0, by
     `robins.filters.rules._robust.widened` with
 
         D = a r r',   a = max_i (1 / k0^2 - 1 / t_i^2)
@@ -90,7 +90,8 @@ def igg3(
         k0: end of full weight, in standard deviations of the innovation, positive.
         k1: start of the floor, finite.
         floor: least weight, in [0, 1).
-        patience: measurements in a row without weight before one is used; None never recovers.
+        patience: measurements in a row with no weight above the floor before one is used; None
+            never recovers.
 
     Raises:
         ValueError: an argument is out of its range, or not k0 < k1.

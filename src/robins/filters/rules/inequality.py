@@ -1,4 +1,4 @@
-"""Keep the state within bounds that always hold."""
+"""Bounds on the state throughout a run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Method = Literal["active-set", "truncation"]
 
 @value
 class Inequality(Rule):
-    """The rule of `inequality`: low <= g(x) <= high after each update."""
+    """Rule of `inequality`: low <= g(x) <= high after each update."""
 
     g: Function
     low: Numbers  # (c,)
@@ -39,7 +39,7 @@ class Inequality(Rule):
         count = len(self.low)
         if sensor.dim != count:
             raise ValueError(f"inequality has {count} bounds for {sensor.dim} components of g")
-        return jnp.zeros((), bool)  # this step has been truncated
+        return jnp.zeros((), bool)  # True if this step has been truncated
 
     def process(self, memory: Memory, transition: Transition):
         return jnp.zeros((), bool), transition
@@ -68,27 +68,28 @@ def inequality(
 
     "active-set" moves a mean that is outside to the nearest state inside, in the metric P^-1 (Gupta
     & Hauser 2007), and keeps P. A projection on a convex set, in its own metric, never increases
-    the distance to a truth inside, so P stays consistent; as an equality the bound would freeze the
-    states. "truncation" takes mean and covariance of the density inside the bounds (Simon & Simon
-    2010): smaller errors while the bound is active. But it reuses the bound as information: where
-    the state hardly moves between steps the mean is pushed away from it, and P gets too small.
+    the distance to a true state inside, so P stays consistent; treated as an equality, an active
+    bound would leave no variance across it. "truncation" takes mean and covariance of the density
+    inside the bounds (Simon & Simon 2010): its errors are smaller while the bound is active. But it
+    reuses the bound as information: if the state hardly moves between steps, the mean is pushed
+    away from the bound, and P becomes too small.
 
-    Truncation acts when something was measured, and at the first sensor of each step; clipping
-    always. Notes: ``inequality.outside``, the number of bounds that the mean violated;
-    ``inequality.infeasible``, true where no state fulfils them all (the belief then stays) or one
-    that is known exactly does not: the update is then `Code.CONTRADICTED`. Bounds at infinity are
-    the Kalman filter.
+    Truncation acts at the first sensor of each step and at each used measurement; clipping always.
+    Notes: ``inequality.outside``, the number of bounds that the mean violated;
+    ``inequality.infeasible``, true if no state satisfies them all (the belief is then unchanged) or
+    an exactly known component violates its bound: the update is then `Code.CONTRADICTED`. Infinite
+    bounds are the Kalman filter.
 
     Args:
         g: (c, n) matrix D, or a function of the state with values in an array, linearised about
             the mean.
-        lower: (c,) least values; None or -inf where there are none.
-        upper: (c,) greatest values; None or inf where there are none.
+        lower: (c,) lower bounds; None or -inf for none.
+        upper: (c,) upper bounds; None or inf for none.
         method: "active-set" or "truncation".
 
     Raises:
         ValueError: there is no bound, one is NaN, lower exceeds upper, a row of D is zero, the
-            method is unknown; by `init`, D does not fit the state.
+            method is unknown; at `init`, D does not fit the state.
     """
     one_of("inequality method", method, Method)
     low, high = _bounds(lower, upper)

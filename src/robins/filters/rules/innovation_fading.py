@@ -1,4 +1,4 @@
-"""Widen the prior while the innovations of a sensor are larger than expected."""
+"""Fading of the prior while the innovations of a sensor are larger than expected."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from robins.filters.values import Numbers, is_factor, kind, number, value
 
 
 class Window(NamedTuple):
-    """The last samples of each component of a sensor, newest first."""
+    """Last samples of each component of a sensor, newest first."""
 
     surplus: Array  # (window, m) e_i^2 / R_ii - 1; 0 where not filled yet
-    filled: Array  # (m,) int, samples in it
+    filled: Array  # (m,) int, number of samples
 
 
 class InnovationMemory(NamedTuple):
     """Windows by sensor, and state of the step."""
 
     windows: dict[str, Window]
-    faded: Array  # () bool, this step has been faded
+    faded: Array  # () bool, the prior of this step has been faded
     start: Array  # (n,) standard deviations at the start, the unit of `reach`
 
 
 @value
 class InnovationFading(Rule):
-    """The rule of `innovation_fading`: lambda P- by the mean innovation of a window."""
+    """Rule of `innovation_fading`: lambda P- from the mean squared innovations of a window."""
 
     limit: Numbers  # () greatest lambda
     reach: Numbers  # () greatest standard deviation, over the one at the start
@@ -75,31 +75,31 @@ class InnovationFading(Rule):
 
 
 def innovation_fading(window: int = 10, limit: Number = 5.0, reach: Number = float("inf")) -> Rule:
-    """One fading factor from the mean innovation of a window (Mehra 1972, covariance matching).
+    """One fading factor from the innovations of a window (Mehra 1972, covariance matching).
 
-    The form of robust adaptive filters of integrated navigation (RAUKF), whitened by R so that
-    radians and metres may be added. With e the innovation and the mean over the last ``window``
-    samples of the sensor:
+    This is the form of robust adaptive filters of integrated navigation (RAUKF), normalised by R so
+    that terms of radians and metres can be added. With e the innovation and the mean over the last
+    ``window`` samples of the sensor:
 
         lambda = clip( sum_i (mean e_i^2 / R_ii - 1) / sum_i (H P- H')_ii / R_ii,  1,  limit )
         P-  :=  lambda P-
 
-    R is the noise after the rules before this one: with a robust weight w the terms are
-    w_i e_i^2 / R_ii, so that an outlier does not fade. A component that is missing or refused, or
-    whose window is not full, does not count. A step is faded once, by the first of its sensors
-    whose lambda exceeds 1.
+    R is the noise after earlier rules: with a robust weight w the terms are w_i e_i^2 / R_ii, so
+    that an outlier does not cause fading. A component that is missing or refused, or whose window
+    is not full, does not count. The prior of a step is faded once, at the first of its sensors with
+    a lambda above 1.
 
-    One factor for all states also fades those that no sensor of the filter sees, and no measurement
-    reduces their covariance again: with a star sensor alone the covariance of the position grows
-    until the model is no longer linear over it. So a step that would take any standard deviation
-    beyond ``reach`` times the one at the start is not faded.
+    One factor for all states also fades those that no sensor observes, and no measurement reduces
+    their covariance again: with a star sensor alone the covariance of the position grows until the
+    linearisation is invalid over it. So no fading is done in a step in which it would take any
+    standard deviation beyond ``reach`` times its initial value.
 
     Notes: ``innovation_fading.lambda``. limit = 1 is the Kalman filter, bit for bit.
 
     Args:
-        window: samples in the mean.
+        window: number of samples in the mean.
         limit: greatest lambda.
-        reach: greatest standard deviation after fading, over the one at the start.
+        reach: greatest standard deviation after fading, over that at the start.
 
     Raises:
         ValueError: a parameter is out of its range.

@@ -1,4 +1,4 @@
-"""Restrict a rule to some sensors."""
+"""Restriction of a rule to some sensors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from robins.filters.values import kind, value
 
 @value
 class Only(Rule):
-    """The rule of `only`."""
+    """Rule of `only`."""
 
     inner: Rule
     names: tuple[str, ...] = kind()
@@ -65,17 +65,17 @@ class Only(Rule):
 
 
 def only(sensors: str | Sequence[str], rule: Rule) -> Rule:
-    """A rule that acts on measurements of the named sensors only.
+    """Rule that acts on measurements of the named sensors only.
 
-    `before` and `after` are called, and dimensions given to `init`, for these alone; `process` and
-    `settle` are called as usual.
+    `before` and `after` are called for these sensors alone, and `init` gets only their dimensions;
+    `process` and `settle` are called as usual.
 
     Args:
         sensors: a name, or several; those that a filter does not have are ignored, so that one rule
             can serve several local filters.
-        rule: any other.
+        rule: any other rule.
 
     Raises:
-        ValueError: no sensor is named; by `init`, the filter has none of them.
+        ValueError: no sensor is named; at `init`, the filter has none of them.
     """
     return Only(rule, sensor_names(f"only, for the rule '{rule.name}'", sensors))

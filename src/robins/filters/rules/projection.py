@@ -1,4 +1,4 @@
-"""Project the state on a constraint whose numbers come with the data."""
+"""Projection of the state on a constraint whose numbers come with the data."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from robins.filters.values import kind, value
 
 @value
 class Projection(Rule):
-    """The rule of `projection`: x - G (D x - d), G = V D' (D V D')^-1."""
+    """Rule of `projection`: x - G (D x - d), G = V D' (D V D')^-1."""
 
     weight: Weight
     names: tuple[str, ...] = kind()
@@ -62,36 +62,36 @@ class Projection(Rule):
 def projection(
     sensors: str | Sequence[str], weight: Weight = "covariance", project_covariance: bool = True
 ) -> Rule:
-    """Take measurements of the named sensors as constraints, by projection.
+    """Use measurements of the named sensors as constraints, by projection.
 
     With the measurement linearised as d = D x + error, error ~ N(0, R_d), the projection (Simon &
     Chia 2002, sec. II) replaces the Kalman update,
 
         G = V D' (D V D')^-1,   x* = x - G (D x - d),   P* = (I - G D) P (I - G D)' + G R_d G'
 
-    with V = P, or W^-1. The gain takes the constraint as exact; its noise and the linearisation
-    error count in P* alone. For a constraint whose numbers are the same throughout a run use
-    `equality`.
+    with V = P, or W^-1. The gain treats the constraint as exact; its noise and the linearisation
+    error enter P* only. For a constraint that is the same throughout a run use `equality`.
 
-    Where R_d is zero P* is *singular*. Later updates, predictions and sigma points then need
+    If R_d is zero, P* is *singular*. Later updates, predictions and sigma points then need
     ``form="sqrt"``: ``form="joseph"`` returns `Code.INDEFINITE`, and the information sum of
     `distributed` does not take the step, since P* has no inverse: give the sensor a small noise
-    (1e-3 m/s), or apply it ``at_master``. Components already met are left out. A weight other than
+    (1e-3 m/s), or use `at_master`. Components already satisfied are left out. A weight other than
     "covariance" needs a prior that is not singular, to recover D.
 
-    Put it before rules that use the posterior: changes of it by earlier rules are lost. A
-    constraint that contradicts what is known exactly makes the update `Code.CONTRADICTED`.
+    Put it before rules that use the posterior: changes of the posterior by earlier rules are lost.
+    A constraint that contradicts exact knowledge makes the update `Code.CONTRADICTED`.
 
-    Notes: ``projection.residual``, the greatest component of d - D x.
+    Notes: ``projection.residual``, the greatest component of |d - D x|.
 
     Args:
         sensors: a name, or several.
-        weight: metric W in which the state is moved least: "covariance" for P^-1, "identity", or a
-            positive definite (n, n) matrix in tangent coordinates.
-        project_covariance: False keeps P. Better where errors of the constraint are not white.
+        weight: metric W in which the change of the state is least: "covariance" for P^-1,
+            "identity", or a positive definite (n, n) matrix in tangent coordinates.
+        project_covariance: False keeps P, which is better if errors of the constraint are not
+            white.
 
     Raises:
-        ValueError: no sensor is named, the weight is not valid; by `init`, sizes do not fit.
+        ValueError: no sensor is named, the weight is not valid; at `init`, sizes do not fit.
     """
     names = sensor_names("projection", sensors)
     return Projection(as_weight("projection", weight), names, project_covariance)

@@ -1,4 +1,4 @@
-"""Estimate the variance of measurement or process noise from the innovations."""
+"""Variances of measurement or process noise estimated from the innovations."""
 
 from __future__ import annotations
 
@@ -20,37 +20,37 @@ from robins.filters.values import Numbers, is_known, kind, value
 
 
 class VarianceScale(NamedTuple):
-    """Variances as multiples of the nominal ones, and the samples of each."""
+    """Variances as multiples of the nominal ones, and the number of samples of each."""
 
-    ratio: Array  # (k,)
+    ratio: Array  # (k,) variance over nominal variance
     samples: Array  # (k,) int
 
 
 class LastStep(NamedTuple):
-    """Sample of Q, for the next step."""
+    """Quantities of a step from which the next one forms a sample of Q."""
 
     moved: Array  # (n,) diagonal of F P F' + Omega
     nominal: Array  # (n,) diagonal of the model's Q
     posterior: Array  # (n,) diagonal of P after the last update
     correction: Array  # (n,) sum of the corrections of the mean
-    measured: Array  # () bool
+    measured: Array  # () bool, a component was used
 
 
 @value
 class SageHusa(Rule):
-    """The rule of `sage_husa`: R_k and Q_k by moments of the innovation, weighed by age."""
+    """Rule of `sage_husa`: R_k and Q_k from moments of the innovation, weighted by age."""
 
     forgetting: Numbers  # () b
-    floor: Numbers  # () of a ratio
-    ceiling: Numbers  # ()
-    endless: bool = kind()  # b is 1, where d_k has another form
-    of_sensor: bool = kind()
-    of_motion: bool = kind()
+    floor: Numbers  # () least ratio
+    ceiling: Numbers  # () greatest ratio
+    endless: bool = kind()  # b is 1, for which d_k has another form
+    of_sensor: bool = kind()  # estimate R
+    of_motion: bool = kind()  # estimate Q
 
     name = "sage_husa"
 
     def learnt(self, old: VarianceScale, sample: Array, here: Array) -> VarianceScale:
-        """Scale after a sample of the components that are here."""
+        """Scale after a sample of the components in the mask ``here``."""
         k, b = (old.samples + 1).astype(float), self.forgetting
         d = 1.0 / (k + 1.0) if self.endless else (1.0 - b) / (1.0 - b ** (k + 1.0))
         new = jnp.clip((1.0 - d) * old.ratio + d * sample, self.floor, self.ceiling)
@@ -116,7 +116,7 @@ def sage_husa(
     floor: Number = 0.1,
     ceiling: Number = 10.0,
 ) -> Rule:
-    """Noise by moments of the innovation (Sage & Husa 1969), weighed by age.
+    """Noise variances from moments of the innovation (Sage & Husa 1969), weighted by age.
 
     With e the innovation, P- the predicted covariance, b the forgetting factor and k = 1, 2, ...
     the samples of a component:
@@ -125,22 +125,22 @@ def sage_husa(
         R_k = (1 - d_k) R_(k-1) + d_k diag(e e' - H P- H')               used in update k
         Q_k = (1 - d_k) Q_(k-1) + d_k diag(K e e' K' + P+ - F P F')      used in prediction k + 1
 
-    The bracket may be negative, so only variances are learnt (the nominal correlations stay), and
-    each is clipped to [floor, ceiling] times its nominal value after every sample. The nominal
-    values are those of the model at that step; for R, the noise after the rules before this one: so
-    put a gate before it, and weights of single samples after it. A component that is missing or
-    refused does not count.
+    The argument of diag may be negative, so only variances are estimated (the nominal correlations
+    are kept), and each is clipped to [floor, ceiling] times its nominal value after every sample.
+    The nominal values are those of the model at that step; for R, the noise after earlier rules: so
+    put a gate before this rule, and weights of single samples after it. A component that is missing
+    or refused does not count.
 
     R and Q are not identifiable together from e: either explains an innovation that is too large.
-    "QR" is for comparison with papers; use "R", or "Q" where the sensor is known. With "R" a wrong
-    model of motion is taken for a noisy sensor, which the filter then ignores.
+    "QR" is for comparison with papers; use "R", or "Q" if the noise of the sensor is known. With
+    "R" a motion error is taken as sensor noise, and the filter then ignores the sensor.
 
-    Notes, a number a component: ``sage_husa.r_scale.i`` and ``sage_husa.q_scale.i``, the ratios in
-    use. floor = ceiling = 1 is the Kalman filter, bit for bit.
+    Notes, one number per component: ``sage_husa.r_scale.i`` and ``sage_husa.q_scale.i``, the ratios
+    in use. floor = ceiling = 1 is the Kalman filter, bit for bit.
 
     Args:
         forgetting: b, in (0, 1]: about 1 / (1 - b) samples are remembered, 1 remembers all.
-        adapt: noise to learn.
+        adapt: noise to estimate, "R", "Q" or "QR".
         floor: least variance, as a share of the nominal one.
         ceiling: greatest variance, as a multiple of the nominal one.
 

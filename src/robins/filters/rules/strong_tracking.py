@@ -1,4 +1,4 @@
-"""Strong tracking: fade the past when innovations are larger than the filter expects."""
+"""Strong tracking: fading of the prior when innovations are larger than the filter expects."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ Power = Literal["classic", "ewma"]
 class _StrongTrackingMemory(NamedTuple):
     power: dict[str, Array]  # (m,) averaged squares of each sensor's whitened residuals
     begun: dict[str, Array]  # (m,) bool: the average has a first value
-    moved: Array  # (n, 2n + 1) F S and its excess
+    moved: Array  # (n, 2n + 1) factor of F P F' + Omega
     noise: Array  # (n, n) factor of Q
-    fresh: Array  # () bool: nothing has been used since the prediction
+    fresh: Array  # () bool: no measurement has been used since the prediction
 
 
 @value
 class StrongTracking(Rule):
-    """The rule of `strong_tracking`: lambda = max(1, tr N / tr M) times what its form fades."""
+    """Rule of `strong_tracking`: lambda = max(1, tr N / tr M) times the covariance of its form."""
 
     keep: Numbers  # () share of V that is kept
-    beta: Numbers  # ()
+    beta: Numbers  # () weakening factor of R
     sigmas: Numbers | None  # () threshold of V, in standard deviations; None: no test
     limit: Numbers  # () greatest lambda
     weights: Numbers | None  # (n,) a_j, the greatest 1
@@ -111,12 +111,12 @@ def strong_tracking(
         projected  V - beta R           tr H P H'              P + (lambda-1) P H' (H P H')^+ H P
 
     with Lam_j = max(1, a_j lambda). The outside form is that of the paper; lumped fades Q too;
-    projected widens only what the sensor sees, so that nothing else grows without bound. Sigma
+    projected widens only the measured components, so that nothing else grows without bound. Sigma
     points are drawn from the faded prior, which for linear h equals scaling Pxz and Pzz - R. After
-    the first sensor used in a step the outside form fades as lumped does.
+    the first sensor used in a step the outside form is the same as lumped.
 
-    The classic V has keep = rho / (1 + rho) <= 1/2: it averages two samples, and lambda follows
-    noise. ``power="ewma"`` takes keep = rho, starts at R, and fades only when
+    The classic V has keep = rho / (1 + rho) <= 1/2: it averages about two samples, and lambda
+    follows the noise. ``power="ewma"`` has keep = rho, starts at R, and fades only if
     tr V > (1 + threshold sqrt(2 (1 - keep) / ((1 + keep) m))) tr(H P H' + R).
 
     Notes: ``strong_tracking.lambda``, for multiple the greatest. Components missing, refused or
@@ -125,14 +125,14 @@ def strong_tracking(
     Args:
         rho: forgetting factor of V, in (0, 1].
         beta: weakening factor of R, at least 1.
-        form: covariance that is faded.
-        power: average of V.
+        form: covariance that is faded, as in the table.
+        power: "classic" or "ewma" average of V.
         threshold: standard deviations of the test; None is 3 for "ewma", no test for "classic".
         limit: upper bound of lambda, at least 1.
         weights: (n,) a_j >= 0 of the states for "multiple"; None: equal, which is lumped.
 
     Raises:
-        ValueError: an argument is out of its range; by `init`, the weights are not one a state.
+        ValueError: an argument is out of its range; at `init`, weights is not one number per state.
     """
     kept = number("strong_tracking rho must lie in (0, 1]", rho, is_share)
     one_of("strong_tracking form", form, Form)
@@ -157,7 +157,7 @@ def _faded_outside(
     N: Array,
     limit: Numbers,
 ) -> tuple[Array, Array]:
-    """P + (lambda - 1) F P F' = lambda F P F' + Q; after the first update lambda P."""
+    """Factor of P + (lambda - 1) F P F' = lambda F P F' + Q, or lambda P unless fresh; lambda."""
     n = len(S)
     whole = jnp.concatenate([S, jnp.zeros((n, memory.moved.shape[1] - n))], axis=1)
     moved = jnp.where(memory.fresh, memory.moved, whole)

@@ -1,4 +1,4 @@
-"""Noise with heavy tails: the weight of a measurement is estimated with the state."""
+"""Heavy-tailed noise: the weight of a measurement is estimated together with the state."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Whose = Literal["R", "both"]
 
 @value
 class StudentT(Rule):
-    """The rule of `student_t`: covariances c R and b P of Gaussians with a scale of their own."""
+    """Rule of `student_t`: covariances c R and b P of Gaussian scale mixtures."""
 
     dof: Numbers  # () nu
     iterations: int = kind()
@@ -39,7 +39,7 @@ class StudentT(Rule):
         return memory, prior, o.noted("student_t", weight=weight, prior=1.0 / b)
 
     def scales(self, o: Observation, n: int) -> tuple[Array, Array]:
-        """Scales b and c, for a state of n components."""
+        """Scales () b and () c, for a state of n components."""
         of = shares(o)
         noisy = jnp.any(of.noise != 0.0, axis=1)
         m = jnp.sum(noisy).astype(float)
@@ -76,17 +76,17 @@ def student_t(
         c = (nu + E[e' R^-1 e]) / (nu + m),   e ~ N(c R S^-1 r, c R - c R S^-1 c R)
         S = b H P H' + c R,                   b = 1
 
-    iterated from c = 1, in the space of the measurement: m x m. ``whose="both"`` gives the prior
-    such tails too, b = (nu + E[d' P^-1 d]) / (nu + n), d being the correction of the state. On
-    Gaussian data the filter is slightly less efficient; weights below one are common.
+    iterated from c = 1, with m x m matrices only. ``whose="both"`` gives the prior such tails too,
+    b = (nu + E[d' P^-1 d]) / (nu + n), d being the correction of the state. On Gaussian data the
+    filter is slightly less efficient; weights below one are common.
 
     Notes: ``student_t.weight``, 1 / c, 0 if refused (1e-12 or less); ``.prior``, 1 / b; and
     ``.recovered``. Components without noise do not count. The Kalman filter is ``dof=inf``.
 
     Args:
         dof: nu, degrees of freedom of the tails: 3 to 10; 1 is Cauchy.
-        iterations: of c, at least 1.
-        whose: tails of the measurement noise "R" only, or of "both" it and the prior.
+        iterations: number of iterations of c, at least 1.
+        whose: heavy tails of the measurement noise only, "R", or of "both" it and the prior.
         patience: measurements in a row with a weight below 1e-2 before one is used
             (`robins.filters.rules._robust.opening`); None never recovers.
 

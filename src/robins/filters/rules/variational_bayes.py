@@ -1,4 +1,4 @@
-"""Estimate the measurement noise together with the state, by variational Bayes."""
+"""Measurement noise estimated together with the state, by variational Bayes."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from robins.filters.values import Numbers, kind, number, value
 
 
 class InverseGamma(NamedTuple):
-    """Distribution of each variance, as a multiple of its nominal value; mean rate / shape."""
+    """Distribution of each variance over its nominal value; the estimate is rate / shape."""
 
-    shape: Array  # (m,) alpha, half the number of samples it is worth
+    shape: Array  # (m,) alpha, half the equivalent number of samples
     rate: Array  # (m,) beta
-    scale: Array  # (m,) multiple in use; the mean between updates
+    scale: Array  # (m,) multiple in use; between updates rate / shape
 
 
 def _left(factor: Array, residual: Array, noise: Array) -> Array:
-    """(m,) expected square of the posterior residual, by the measurement alone.
+    """(m,) expected square of the posterior residual, from measurement quantities alone.
 
     With S = H P- H' + R,
 
@@ -44,12 +44,12 @@ Known = dict[str, InverseGamma]  # by sensor
 
 @value
 class VariationalBayes(Rule):
-    """The rule of `variational_bayes`: R = diag(b / a), with b of the posterior residual."""
+    """Rule of `variational_bayes`: R = diag(b / a), with b from the posterior residual."""
 
     forgetting: Numbers  # () rho
-    floor: Numbers  # () of a scale
-    ceiling: Numbers  # ()
-    initial_dof: Numbers  # ()
+    floor: Numbers  # () least scale
+    ceiling: Numbers  # () greatest scale
+    initial_dof: Numbers  # () equivalent number of samples of the nominal noise
     iterations: int = kind()
 
     name = "variational_bayes"
@@ -68,7 +68,7 @@ class VariationalBayes(Rule):
         return memory, prior, o._replace(noise=_variances.scaled(o.noise, scale))
 
     def iterated(self, known: InverseGamma, o: Observation) -> Array:
-        """(m,) multiples of the nominal noise for the update, where a component is used."""
+        """(m,) multiples of the nominal variance for the update; unchanged where not used."""
         a, b = self.forgetting * known.shape + 0.5, self.forgetting * known.rate
         scale = jnp.clip(b / a, self.floor, self.ceiling)
         spread, excess, noise, deficit, used = left_out(o._replace(accepted=o.accepted & o.present))
@@ -108,7 +108,7 @@ def variational_bayes(
     floor: Number = 0.01,
     ceiling: Number = 1000.0,
 ) -> Rule:
-    """Measurement noise of unknown size, VB-AKF (Särkkä & Nummenmaa 2009).
+    """Unknown measurement noise by variational Bayes, VB-AKF (Särkkä & Nummenmaa 2009).
 
     State and variances are estimated together, as a Gaussian times inverse gammas: with a-, b- of
     variance i before the sample, in multiples of the nominal one,
@@ -118,22 +118,22 @@ def variational_bayes(
                  b = rho b- + ( (y - H x+)_i^2 + (H P+ H')_ii ) / 2
 
     The update uses the last R, the next sample starts with the last b. With the *posterior*
-    residual and its covariance b is positive. rho b- / a is the first R, so the estimate of one
-    sample is less than its own square; the mean of many is unbiased.
+    residual and its covariance b is positive. rho b- / a is the first R, so the estimate from one
+    sample is less than its square; the mean over many is unbiased.
 
-    Nominal correlations stay: rows of the noise factor are scaled. The nominal noise is that of the
-    model at the step, after the rules before this one. Learning uses the weights of rules after
-    this one: so put gates and weights there, where they judge by the learnt noise. A component that
-    is missing, or refused by any rule, does not change the estimate.
+    Nominal correlations are kept: rows of the noise factor are scaled. The nominal noise is that of
+    the model at the step, after earlier rules. The estimate uses the weights of later rules: so put
+    gates and weights after this rule, where they use the estimated noise. A component that is
+    missing, or refused by any rule, does not change the estimate.
 
-    Notes, a number a component: ``variational_bayes.r_scale.i``, the multiples in use.
+    Notes, one number per component: ``variational_bayes.r_scale.i``, the multiples in use.
     floor = ceiling = 1 is the Kalman filter, bit for bit.
 
     Args:
         forgetting: rho, in (0, 1]: about 1 / (1 - rho) samples are remembered, 1 remembers all.
         iterations: updates per sample, the final one included. A third changes the mean of the
             estimate by one per cent and costs 15 % of a step.
-        initial_dof: samples that the nominal noise is worth at the start.
+        initial_dof: equivalent number of samples of the nominal noise at the start.
         floor: least variance, as a share of the nominal one.
         ceiling: greatest variance, as a multiple of the nominal one.
 

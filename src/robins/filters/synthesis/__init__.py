@@ -1,9 +1,9 @@
-"""Offline design of filters with constant gains, for noise and for the worst case at once.
+"""Offline design of filters with constant gains: mixed H2 / H-infinity.
 
 A plant has two inputs: white noise w and a modelling error n. A design minimises the H2 norm from w
-to the error of the estimate while the H-infinity norm from n to it stays below gamma. NumPy only,
-but for the designs by LMI, which import their solver when called; every answer carries its true
-norms.
+to the estimation error while the H-infinity norm from n to it stays below gamma. Only NumPy and
+SciPy are needed, except for designs by LMI, which import their solver when called; every design
+states its true norms.
 """
 
 from robins.filters.synthesis.closed_form import Isotropic, closed_form, isotropic

@@ -1,14 +1,14 @@
-"""Closed-form design for a scaled rotation with a measured state.
+"""Closed-form design for a plant whose transition is a scaled rotation and whose state is measured.
 
 With A = rho U, U orthogonal, C = I, noise of variance sw^2 in every state and ss^2 in every
 measurement, a gain K = k U leaves the error e(k+1) = f U e + ..., f = rho - k, and
 
     |T_we|_2^2 = |L|_F^2 (sw^2 + k^2 ss^2) / (1 - f^2),    |T_ne|_inf = l b / (1 - f),   0 <= f < 1
 
-b the greatest singular value of Bn and l that of L, whose rows must be orthogonal and of one
-length. (The second is reached where Bn drives an invariant direction of U at full strength, as the
-angular rate does in a quaternion; else it is a bound.) The attitude quaternion of a turning body is
-of this kind at every instant, with rho = 1.
+where b is the greatest singular value of Bn and l that of L, with L'L a multiple of the identity.
+(The second value is attained if Bn drives an invariant direction of U with gain b, as the angular
+rate does in a quaternion; otherwise it is a bound.) The attitude quaternion of a rotating body is
+such a plant at every instant, with rho = 1.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ _SAME = 1e-9  # relative difference of equal numbers
 
 
 class Isotropic(NamedTuple):
-    """Parameters of a plant of this kind."""
+    """Parameters of a plant with a closed-form design (module docstring)."""
 
-    rho: float  # size of A
-    U: np.ndarray  # (n, n) orthogonal
+    rho: float  # |A|_2
+    U: np.ndarray  # (n, n) orthogonal, A / rho
     sw: float  # standard deviation of the noise of each state
-    ss: float  # and of each measurement
+    ss: float  # standard deviation of the noise of each measurement
     b: float  # greatest singular value of Bn
-    weight: float  # that of L
+    weight: float  # greatest singular value of L
     size: float  # |L|_F
 
     def kalman(self) -> float:
-        """K of the Kalman filter, rho p / (p + ss^2), p the variance after a prediction."""
+        """Gain k of the Kalman filter, rho p / (p + ss^2), p the predicted variance."""
         sw2, ss2 = self.sw**2, self.ss**2
         half = 0.5 * (sw2 - ss2 * (1.0 - self.rho**2))
         root = np.hypot(half, self.sw * self.ss)
@@ -48,10 +48,10 @@ class Isotropic(NamedTuple):
         return float(self.rho * p / (p + ss2)) if p + ss2 > 0.0 else self.rho
 
     def gain(self, gamma: Number) -> float:
-        """Least k that meets gamma, but no less than the Kalman filter's.
+        """Least k that meets gamma and is not below that of the Kalman filter.
 
         Raises:
-            Unreachable: k would exceed rho; gamma is below l b.
+            Unreachable: k would exceed rho, since gamma is below l b.
         """
         k = max(self.kalman(), self.rho - 1.0 + self.weight * self.b / gamma)
         if k > self.rho * (1.0 + 1e-12):
@@ -64,20 +64,20 @@ class Isotropic(NamedTuple):
         return min(k, self.rho)
 
     def h2(self, k: Number) -> float:
-        """H2 norm of the gain k."""
+        """H2 norm for the gain k."""
         f = self.rho - k
         return float(self.size * np.sqrt((self.sw**2 + k**2 * self.ss**2) / (1.0 - f**2)))
 
     def hinf(self, k: Number) -> float:
-        """H-infinity norm of the gain k, or a bound of it (module docstring)."""
+        """H-infinity norm for the gain k, or a bound of it (module docstring)."""
         return float(self.weight * self.b / (1.0 - abs(self.rho - k)))
 
 
 def isotropic(plant: Plant) -> Isotropic:
-    """Parameters of a plant of this kind.
+    """Parameters of a plant with a closed-form design.
 
     Raises:
-        ValueError: it is of another kind; the message names the block.
+        ValueError: the plant has no closed form; the message names the block.
     """
     n = len(plant.A)
     size = float(np.linalg.norm(plant.A, ord=2))
@@ -105,8 +105,8 @@ def closed_form(plant: Plant, gamma: Number) -> Design:
     """Gain k U that meets gamma with the least H2 norm; the Kalman filter if gamma is inf.
 
     Raises:
-        Unreachable: gamma is below the least of this form, which the message names.
-        ValueError: the plant is of another kind, or gamma is not positive.
+        Unreachable: gamma is below the least of this form, which the message states.
+        ValueError: the plant has no closed form, or gamma is not positive.
     """
     check_gamma(gamma)
     began = time.perf_counter()

@@ -1,4 +1,4 @@
-"""A designed filter with its true norms, which check every answer of a solver."""
+"""Designed filters with their true norms, by which every answer of a solver is checked."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from robins.filters.synthesis import norms
 from robins.filters.synthesis.plant import ErrorSystem, Plant, error_system
 
 BOUND = 1e-3  # largest relative excess of the true H2 norm over a solver's bound
-GAMMA = 1e-6  # and of the true H-infinity norm over gamma
-_AGREE = 1e-6  # largest relative difference of the two computations of that norm
+GAMMA = 1e-6  # largest relative excess of the true H-infinity norm over gamma
+_AGREE = 1e-6  # largest relative difference of the two computations of the H-infinity norm
 FullOrder = tuple[np.ndarray, np.ndarray, np.ndarray]  # Ah (n, n), Bh (n, m), Gh (r, n)
 
 
 class NotCertified(RobinsError, ValueError):
-    """The true norms of a filter are not what its design promised."""
+    """The true norms of a filter exceed the bounds of its design."""
 
 
 class Unreachable(RobinsError, ValueError):
-    """No filter of the form meets gamma; the message names the least that one can have.
+    """No filter of the form meets gamma; the message states the least feasible gamma.
 
     Attributes:
-        least: that gamma; nan if unknown.
+        least: least feasible gamma; nan if unknown.
     """
 
     def __init__(self, message: str, least: norms.Number = np.nan):
@@ -34,7 +34,7 @@ class Unreachable(RobinsError, ValueError):
 
 
 class Design(NamedTuple):
-    """Filter with constant gains; norms are those of the error z - z^, in units of the plant."""
+    """Filter with constant gains; norms are of the error z - z^, in units of the plant."""
 
     method: str
     gamma: float  # requested bound on the H-infinity norm; inf for none
@@ -43,16 +43,16 @@ class Design(NamedTuple):
     filter: FullOrder | None  # where order is "full"
     bound: float  # the solver's bound on the H2 norm; nan for none
     h2: float  # true, by the Gramian
-    hinf: float  # true, by tests of levels (`hinf_norm`)
-    hinf_sweep: float  # the same, by a sweep of the frequency
-    radius: float  # spectral radius of the error, or of plant and full-order filter together
-    lambda_: float  # variance of n taken as noise; nan where no Riccati equation was solved
+    hinf: float  # true, by level tests (`hinf_norm`)
+    hinf_sweep: float  # true, by a frequency sweep (`peak_gain`)
+    radius: float  # spectral radius of the error system, or of plant and full-order filter together
+    lambda_: float  # variance of n taken as noise; nan if no Riccati equation was solved
     status: str  # of the solver
-    seconds: float  # time of the design; nan where it was not measured
+    seconds: float  # computing time of the design [s]; nan if not measured
 
 
 def certify(plant: Plant, K: Matrix, *, method: str, **fields: Any) -> Design:
-    """Design of an observer gain K (n, m), if its true norms keep the bounds.
+    """Design of an observer gain K (n, m), if its true norms meet the bounds.
 
     `fields` are ``gamma``, ``bound``, ``lambda_``, ``status`` and ``seconds`` of `Design`.
 
@@ -65,7 +65,7 @@ def certify(plant: Plant, K: Matrix, *, method: str, **fields: Any) -> Design:
 
 
 def certify_full(plant: Plant, filter_: FullOrder, *, method: str, **fields: Any) -> Design:
-    """Design of a full-order filter x^(k+1) = Ah x^ + Bh y, z^ = Gh x^, as `certify`.
+    """Design of a full-order filter x^(k+1) = Ah x^ + Bh y, z^ = Gh x^, checked as by `certify`.
 
     Its error depends on the state of the plant, which must therefore be stable.
     """

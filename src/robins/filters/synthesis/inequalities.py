@@ -1,9 +1,9 @@
-"""The linear matrix inequalities of filter designs, in the symbols of their equations.
+"""Linear matrix inequalities of filter designs, in the symbols of their equations.
 
-For a channel of white noise w and one of a modelling error n, numbered as in docs/filters/mixed.md.
-A function takes the module `cvxpy`, which is optional, the plant's matrices by name and the aim; it
-returns the unknowns by symbol and the matrices that must be positive semidefinite. Gains K are
-those of an observer.
+They have a channel of white noise w and one of a modelling error n; equations are numbered as in
+docs/filters/mixed.md. A function takes the optional module `cvxpy`, the plant's matrices by name
+and the aim; it returns the unknowns by symbol and the matrices that must be positive semidefinite.
+Gains K are those of an observer.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ else:
     Expr = Any
 
 Aim = Literal["h2", "mixed"]
-"""Least Trace(H) for w alone, or with a gain of at most 1 from n."""
+"""Least Trace(H) for w alone, or also with a gain from n of at most 1."""
 
 Blocks = Mapping[str, Expr]
 Inequalities = tuple[dict[str, Expr], list[Expr]]
 
 
 def common(cp: ModuleType, plant: Blocks, aim: Aim) -> Inequalities:
-    """(9) and (10): one Lyapunov matrix X for both channels; K = X^-1 Y."""
+    """Inequalities (9) and (10): one Lyapunov matrix X for both channels; K = X^-1 Y."""
     X = cp.Variable(plant["A"].shape, symmetric=True, name="X")
     Y = cp.Variable(plant["C"].T.shape, name="Y")
     H = _trace_matrix(cp, plant)
@@ -38,7 +38,7 @@ def common(cp: ModuleType, plant: Blocks, aim: Aim) -> Inequalities:
 
 
 def slack(cp: ModuleType, plant: Blocks, aim: Aim) -> Inequalities:
-    """(9) and (10) with a Lyapunov matrix a channel, X2 and Xi, joined by G; K = G^-1 Y."""
+    """Inequalities (9), (10) with a Lyapunov matrix per channel, X2, Xi, and G; K = G^-1 Y."""
     A = plant["A"]
     G = cp.Variable(A.shape, name="G")
     Y = cp.Variable(plant["C"].T.shape, name="Y")
@@ -52,7 +52,7 @@ def slack(cp: ModuleType, plant: Blocks, aim: Aim) -> Inequalities:
 
 
 def full(cp: ModuleType, plant: Blocks, aim: Aim) -> Inequalities:
-    """(6) and (7): the full-order filter by R, P, S, Q and U of (8); the aim is always "mixed"."""
+    """Inequalities (6), (7): full-order filter by R, P, S, Q, U of (8); always for aim "mixed"."""
     A, Bw, Bn, C, Dw, Dn, L = (plant[name] for name in Plant._fields)
     R, P = (cp.Variable(A.shape, symmetric=True, name=name) for name in "RP")
     S, Q = cp.Variable(A.shape, name="S"), cp.Variable(C.T.shape, name="Q")
@@ -77,12 +77,12 @@ def _trace_matrix(cp: ModuleType, plant: Blocks) -> Expr:
 
 
 def _noise(cp: ModuleType, plant: Blocks, H: Expr, corner: Expr, X: Expr, Y: Expr) -> Expr:
-    """(9)."""
+    """Inequality (9)."""
     return _symmetric(cp, [H, (X @ plant["Bw"] - Y @ plant["Dw"]).T], [corner])
 
 
 def _energy(cp: ModuleType, plant: Blocks, corner: Expr, X: Expr, G: Expr, Y: Expr) -> Expr:
-    """(10) without the row and the column of n."""
+    """Inequality (10) without the row and the column of n."""
     L = plant["L"]
     return _symmetric(
         cp, [corner, G @ plant["A"] - Y @ plant["C"], 0], [X, L.T], [np.eye(L.shape[0])]
@@ -90,7 +90,7 @@ def _energy(cp: ModuleType, plant: Blocks, corner: Expr, X: Expr, G: Expr, Y: Ex
 
 
 def _gain(cp: ModuleType, plant: Blocks, corner: Expr, X: Expr, G: Expr, Y: Expr) -> Expr:
-    """(10)."""
+    """Inequality (10)."""
     L, Bn = plant["L"], plant["Bn"]
     error, disturbed = G @ plant["A"] - Y @ plant["C"], G @ Bn - Y @ plant["Dn"]
     return _symmetric(
@@ -103,7 +103,7 @@ def _gain(cp: ModuleType, plant: Blocks, corner: Expr, X: Expr, G: Expr, Y: Expr
 
 
 def _symmetric(cp: ModuleType, *rows: Sequence[Any]) -> Expr:
-    """Block matrix by the blocks on and above its diagonal; 0 stands for a zero block."""
+    """Symmetric block matrix from the blocks on and above its diagonal; 0 is a zero block."""
     size = [row[0].shape[0] for row in rows]
     whole: list[list[Any]] = [[None] * len(rows) for _ in rows]
     for i, row in enumerate(rows):

@@ -1,17 +1,18 @@
-"""Least gain from n to the error of any filter, and an observer gain that reaches it.
+"""Least H-infinity norm from n to the error of any filter, and an observer gain that attains it.
 
-Both come from the Riccati recursion of the game in which n is played against the estimate (Hassibi,
-Sayed & Kailath, *Indefinite-Quadratic Estimation and Control*, SIAM 1999, ch. 4), from P = 0:
+Both come from the Riccati recursion of the game of n against the estimator (Hassibi, Sayed &
+Kailath, *Indefinite-Quadratic Estimation and Control*, SIAM 1999, ch. 4), from P = 0:
 
     P~ = P + P L' (g^2 I - L P L')^-1 L P,
     P <- (A - K C) P~ (A - K C)' + (Bn - K Dn)(Bn - K Dn)',  K = (A P~ C' + Bn Dn') R^-1,
     R = C P~ C' + Dn Dn'.
 
-e' P^-1 e is the least energy, net of the past cost of the error, with which n makes the error e
-while y is zero. So if L P L' reaches g^2 at some step, no causal filter, linear or not, has a gain
-below g: that is the proof. If it never does, the K of some step may have less, and its true norms
-decide. Factors of P are propagated, P = S S', and nothing is subtracted. A plant with unstable
-modes that n does not drive may have a greater least gain than is proved.
+e' P^-1 e is the least energy of n, net of the past cost of the error, that causes the error e while
+y is zero. So if the greatest eigenvalue of L P L' reaches g^2 at some step, no causal filter,
+linear or not, has a norm below g: that is the proof. If it never does, the K of some step may have
+a norm below g, which is checked by its true norms. Factors of P are propagated, P = S S', and
+nothing is subtracted. For a plant with unstable modes that n does not drive the least norm may be
+greater than the proved bound.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ from robins.filters.synthesis.plant import Plant
 from robins.filters.synthesis.riccati import kalman_design
 from robins.filters.synthesis.scaling import balanced
 
-_STEPS = 1000  # of a proof at most
-_TRIAL = 200  # of a search for a gain at most
+_STEPS = 1000  # greatest number of steps of a proof
+_TRIAL = 200  # greatest number of steps of a search for a gain
 _SETTLED = 1e-13  # relative growth of P in a step at which the recursion ends
-_NOTHING = 1e-6  # of the unit of gamma: indistinguishable from zero
-_RTOL = 1e-7  # of the refuted gamma
+_NOTHING = 1e-6  # norm in units of scaled gamma that counts as zero
+_RTOL = 1e-7  # relative tolerance of the refuted gamma
 _REACHED = 1e-5  # relative distance to it at which a gain is good enough
-_ROUGHLY = 1e-3  # tolerance of gamma in a search for a gain
+_ROUGHLY = 1e-3  # relative tolerance of gamma in a search for a gain
 _NOISES = (0.0, *(10.0**k for k in range(-9, 0, 2)))  # share of w added to n for stable gains
 _UNSEEN = 1e-14  # relative singular value of y that counts as zero
 
@@ -40,9 +41,9 @@ _UNSEEN = 1e-14  # relative singular value of y that counts as zero
 class LeastGamma(NamedTuple):
     """Bounds of the least gamma, with their proofs."""
 
-    proved: float  # no causal filter has less than this
+    proved: float  # lower bound: no causal filter has a smaller norm
     step: int  # of the recursion that proves it; 0 without a proof
-    reached: float  # the H-infinity norm of `design`; 0 where it is negligible
+    reached: float  # upper bound: H-infinity norm of `design`; 0 if negligible
     design: Design  # certified
 
     def refuse(self, gamma: Number) -> None:
@@ -56,7 +57,7 @@ class LeastGamma(NamedTuple):
             )
 
     def with_(self, design: Design) -> LeastGamma:
-        """Bounds with one more certified design."""
+        """Bounds improved by another certified design, if its norm is less."""
         if design.hinf >= self.reached:
             return self
         return self._replace(reached=design.hinf, design=design)
@@ -68,9 +69,9 @@ class LeastGamma(NamedTuple):
 
 
 def least_gamma(plant: Plant) -> LeastGamma:
-    """Least H-infinity norm of any gain, proved from below and reached from above.
+    """Least H-infinity norm of any gain, with a proved lower and an attained upper bound.
 
-    It needs no solver. The proof holds to the rounding of the plant's numbers.
+    No LMI solver is needed. The proof holds to the rounding of the plant's numbers.
 
     Raises:
         ValueError: the plant has no steady Kalman filter.
@@ -100,7 +101,7 @@ def least_gamma(plant: Plant) -> LeastGamma:
 
 
 def _edge(plant: Plant, low: float, high: float, noise: float = 0.0) -> tuple[float, float, int]:
-    """Greatest gamma (or 0) at which the game ends, least at which it does not, and the step."""
+    """Greatest gamma (or 0) at which the recursion ends, least at which it does not, end step."""
     step = _play(plant, low, noise)[1] if low < high else 0
     if not step:
         return 0.0, low, 0
@@ -115,7 +116,7 @@ def _edge(plant: Plant, low: float, high: float, noise: float = 0.0) -> tuple[fl
 
 
 def _play(plant: Plant, gamma: float, noise: float = 0.0) -> tuple[np.ndarray, int]:
-    """Last gain of the recursion, and the step at which L P L' reached gamma^2, or 0."""
+    """Last gain (n, m) of the recursion, and the step at which L P L' reached gamma^2, or 0."""
     B = np.hstack([plant.Bn, noise * plant.Bw])
     D = np.hstack([plant.Dn, noise * plant.Dw])
     n = len(plant.A)
@@ -139,7 +140,7 @@ def _play(plant: Plant, gamma: float, noise: float = 0.0) -> tuple[np.ndarray, i
 
 
 def _square(S: np.ndarray) -> np.ndarray:
-    """Square factor of S S'."""
+    """(n, n) factor of S S'."""
     n = len(S)
     square = np.zeros((n, n))
     lower = np.asarray(np.linalg.qr(S.T, mode="r")).T

@@ -51,12 +51,12 @@ def _attempt(
 ) -> Design:
     """First certified design: scale, solve, check the true norms, else try other scales.
 
-    The status of the solver is not used. An inaccurate answer is good if its true norms are, an
-    optimal one may be wrong by orders of magnitude where numbers are badly scaled, and infeasible
+    The status of the solver is not used. An "inaccurate" answer is good if its true norms are, an
+    "optimal" one may be wrong by orders of magnitude if numbers are badly scaled, and infeasible
     problems have half a dozen statuses.
 
     Raises:
-        Unreachable: gamma is below the proved least one (`robins.filters.synthesis.least`).
+        Unreachable: gamma is below the proved lower bound (`robins.filters.synthesis.least`).
         NotCertified: no answer passed; the message states each status and the failed test.
     """
     began = time.perf_counter()
@@ -103,10 +103,10 @@ def observer(plant: Plant, gamma: Number, form: ObserverForm = "common") -> Desi
     Args:
         plant: plant of the filter; if made by `current_form`, K is the gain of the correction.
         gamma: bound on the H-infinity norm; inf ignores the modelling error.
-        form: "common" for one Lyapunov matrix, "slack" for one a channel.
+        form: "common" for one Lyapunov matrix, "slack" for one per channel.
 
     Raises:
-        Unreachable: gamma is below the least one, which the message names.
+        Unreachable: gamma is below the least feasible one, which the message states.
         NotCertified: no answer of the solver passed the test of its true norms.
         MissingExtra: cvxpy or Clarabel is not installed.
         ValueError: gamma is not positive, or the form is not known.
@@ -124,15 +124,15 @@ def gain_of(answer: SolverAnswer, scales: Scales) -> np.ndarray:
 
 _WIDER = 1.5  # factor of gamma' from one trial to the next
 _FARTHEST = 1e3  # gamma' over gamma at the end of the search
-_RTOL = 1e-6  # of gamma'
+_RTOL = 1e-6  # relative tolerance of gamma'
 
 
 def retuned(plant: Plant, gamma: Number, form: ObserverForm = "slack") -> Design:
     """Observer of `lmi.observer` for the gamma' >= gamma at which the true norm is gamma.
 
-    LMIs are conservative: the true norm of the answer lies below its gamma, at the cost of H2. A
-    search for gamma' recovers that in some ten solves. If the Kalman filter meets gamma, the result
-    is that filter. Arguments and errors are those of `observer`.
+    LMIs are conservative: the true norm of the answer lies below its gamma, at the cost of a larger
+    H2 norm. A search for gamma' recovers this loss in about ten solves. If the design without bound
+    (the Kalman filter) meets gamma, it is the result. Arguments and errors are those of `observer`.
 
     Returns:
         The best design found that meets gamma. Its `bound` is valid; `status` states gamma'.
@@ -157,7 +157,7 @@ def retuned(plant: Plant, gamma: Number, form: ObserverForm = "slack") -> Design
 
 
 def _search(plant: Plant, gamma: float, form: ObserverForm, tried: list[Design]) -> None:
-    """Append trials, up to a design with true norm gamma."""
+    """Append trials with rising gamma', up to a design with true norm gamma."""
 
     def excess(log: float) -> float:
         tried.append(observer(plant, float(np.exp(log)), form))
@@ -175,26 +175,26 @@ def _search(plant: Plant, gamma: float, form: ObserverForm, tried: list[Design])
 
 
 class FrozenTimeWarning(UserWarning):
-    """A filter designed at every sample carries no guarantee from one sample to the next."""
+    """A filter redesigned at every sample has no guarantee for the time-varying plant."""
 
 
 class EveryStep:
     """Design by `observer` at every sample, for the plant at that sample.
 
-    Some published filters with a transition by a measured rate do this. It is slow, and it
+    Some published filters whose transition depends on a measured rate do this. It is slow, and it
     guarantees nothing: each inequality certifies the filter for a constant plant, and a product of
     stable error transitions need not decay. Prefer one design for the worst plant, or a Kalman
     filter with the modelling error as noise (`channel_inflation`), which follows a varying plant.
-    A full-order design does not exist where A has spectral radius one, as every rotation has.
+    A full-order design does not exist if A has spectral radius one, as every rotation has.
 
     The program is built at the first call. Its scales are those of the first plant until an answer
     fails; with `like` they are those of that plant, and a gain depends only on the plant of its
-    step, to the last bit.
+    step, bit for bit.
 
     Args:
         gamma: bound on the H-infinity norm of the frozen plant.
         form: "common" or "slack".
-        like: a plant whose scales serve at all steps.
+        like: plant whose scales are used at all steps.
 
     Raises:
         ValueError: gamma is not positive, or the form is not known.
@@ -232,7 +232,7 @@ class EveryStep:
         return observer(plant, self.gamma, self.form).gain
 
     def _holds(self, plant: Plant, K: np.ndarray, bound: float) -> bool:
-        """The tests of `certify`, with gamma tested as a level instead of computing the norm."""
+        """True if K passes the tests of `certify`, gamma tested as a level without the norm."""
         e = error_system(plant, K)
         if h2_norm(e.A, e.Bw, e.L) > bound * (1.0 + BOUND):
             return False
@@ -242,19 +242,20 @@ class EveryStep:
 def full(plant: Plant, gamma: Number) -> Design:
     """Full-order filter of least bound on the H2 norm among those that meet gamma by the LMI.
 
-    Nothing ties x^(k+1) = Ah x^ + Bh y, z^ = Gh x^ to the plant, so its error depends on the state
-    of the plant, which must be stable: R - A'RA > 0 is part of the inequality. Every filter found
-    contains an observer with the same bound (docs/filters/mixed.md), so `observer`, which needs no
-    stable plant, loses nothing; this form serves to check published designs.
+    The filter x^(k+1) = Ah x^ + Bh y, z^ = Gh x^ contains no model of the plant, so its error
+    depends on the state of the plant, which must be stable: R - A'RA > 0 is part of the inequality.
+    For every filter found there is an observer with the same bound (docs/filters/mixed.md), so
+    `observer`, which needs no stable plant, loses nothing; this form is for checks of published
+    designs.
 
     (6) and (7) are solved for R, P, S, Q and U; then
 
         Ah = (R - P)^-1 S,   Bh = (R - P)^-1 Q,   Gh = U.                                       (8)
 
-    The optimal R is at the edge of its cone, R -> 0, where solvers stop with some R of 1e-9 of
-    either sign. R - P stays regular, so (8) is well defined, but need not be a filter. If the true
-    norms of plant and filter refute (8), the limit is taken: S = -(P A + Q C), U = L.
-    Arguments and errors are those of `observer`; the spectral radius of A must be below one.
+    The optimal R is on the boundary of its cone, R -> 0, where solvers stop with an R of order 1e-9
+    of either sign. R - P stays regular, so (8) is well defined, but need not give a stable filter.
+    If the true norms refute (8), its limit is used: S = -(P A + Q C), U = L. Arguments and errors
+    are those of `observer`; the spectral radius of A must be below one.
     """
     check_gamma(gamma)
     refuse_unstable(plant)
@@ -263,7 +264,7 @@ def full(plant: Plant, gamma: Number) -> Design:
 
 
 def refuse_unstable(plant: Plant) -> None:
-    """Raise a ValueError where the full-order inequality can have no solution."""
+    """Raise a ValueError if A is not stable: the full-order inequality then has no solution."""
     if (radius := spectral_radius(plant.A)) >= 1.0:
         raise ValueError(
             f"no filter of full order: A has spectral radius {radius:.9g}, and the LMI asks for "
@@ -273,13 +274,13 @@ def refuse_unstable(plant: Plant) -> None:
 
 
 def _of_variables(answer: SolverAnswer, scales: Scales) -> FullOrder:
-    """(8)."""
+    """Full-order filter by (8)."""
     R, P, S, Q, U = (answer.unknowns[name] for name in "RPSQU")
     return scales.full_order(np.linalg.solve(R - P, S), np.linalg.solve(R - P, Q), U)
 
 
 def _in_the_limit(plant: Plant, answer: SolverAnswer, scales: Scales) -> FullOrder:
-    """(8) for R = 0, where (7) is the observer's inequality."""
+    """Full-order filter by (8) for R = 0, where (7) is the observer's inequality."""
     scaled = scales.plant(plant)
     Bh = -np.linalg.solve(answer.unknowns["P"], answer.unknowns["Q"])
     return scales.full_order(scaled.A - Bh @ scaled.C, Bh, scaled.L)

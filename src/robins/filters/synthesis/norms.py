@@ -1,9 +1,9 @@
 """Norms of a discrete-time system x(k+1) = A x + B u, z = C x + D u, and its spectral radius.
 
 The H2 norm is the root mean square of z for white u of unit covariance, the H-infinity norm the
-greatest energy gain from u to z. The latter is computed in two independent ways: `hinf_norm` finds
-crossings of a level by the singular values of the frequency response from an eigenvalue problem,
-`peak_gain` sweeps the frequency. All are inf for an unstable system.
+root of the greatest energy gain from u to z. The latter is computed in two independent ways:
+`hinf_norm` finds the frequencies at which singular values of the frequency response cross a level
+from an eigenvalue problem, `peak_gain` sweeps the frequency. All are inf for an unstable system.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ Number = float | int  # an int is no float at run time
 System = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # A, B, C, D
 
 _CIRCLE = 1e-6  # largest distance of an eigenvalue from the unit circle that may be a crossing
-_RTOL = 1e-11  # of the H-infinity norm by levels
-_STARTS = 65  # even samples of the half circle that begin a search
-_POINTS = 200  # even samples of the half circle in a sweep
-_LARGEST = 1e70  # number with a finite fourth power
-_SQUARINGS = 64  # of A: a radius of 1 - eps needs 58
+_RTOL = 1e-11  # relative tolerance of the H-infinity norm by levels
+_STARTS = 65  # uniform samples of the half circle from which a search starts
+_POINTS = 200  # uniform samples of the half circle in a sweep
+_LARGEST = 1e70  # largest entry of a matrix: its fourth power is finite
+_SQUARINGS = 64  # limit of the squarings of A: a spectral radius of 1 - eps needs 58
 
 
 def _system(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None) -> System:
@@ -32,7 +32,7 @@ def _system(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None) -
 
     Raises:
         TypeError: one is not of real numbers.
-        ValueError: one does not fit the shapes of the others, is not finite or beyond 1e70.
+        ValueError: one does not fit the shapes of the others, is not finite or exceeds 1e70.
     """
     A = square("A", A)
     B, C = matrix("B", B, len(A)), matrix("C", C, None, len(A))
@@ -52,8 +52,8 @@ def spectral_radius(A: np.ndarray) -> float:
 def gramian(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """Covariance P = A P A' + B B' of the state under unit white noise (A must be stable).
 
-    By doubling (Smith 1968): P(2k) = P(k) + A^k P(k) A^k'. Only positive semidefinite terms are
-    added, so that states with small and with large numbers are equally accurate.
+    Computed by doubling (Smith 1968): P(2k) = P(k) + A^k P(k) A^k'. Only positive semidefinite
+    terms are added, so that small and large states are equally accurate.
     """
     power, P = A, B @ B.T
     for squaring in range(_SQUARINGS):
@@ -61,7 +61,7 @@ def gramian(A: np.ndarray, B: np.ndarray) -> np.ndarray:
         P = P + more
         power = power @ power
         grows = np.any(np.diagonal(more) > 1e-17 * np.diagonal(P))
-        if not grows and 2**squaring >= len(A):  # a state may take n steps to be driven
+        if not grows and 2**squaring >= len(A):  # noise may take n steps to reach a state
             break
     return 0.5 * (P + P.T)
 
@@ -79,14 +79,14 @@ def h2_norm(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = 
 def hinf_norm(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = None) -> float:
     """Greatest singular value of C (zI - A)^-1 B + D on the unit circle, by level tests.
 
-    A level is reached where the symplectic pencil of the level has an eigenvalue on the circle
-    (Boyd, Balakrishnan & Kabamba 1989, in discrete time). It is then raised to the highest response
+    A level is reached if its symplectic pencil has an eigenvalue on the unit circle (Boyd,
+    Balakrishnan & Kabamba 1989, in discrete time). It is then raised to the highest response
     between such eigenvalues (Bruinsma & Steinbuch 1990), which converges quadratically; the first
-    level that is not reached is the answer. The search starts from the highest of some responses,
-    below |D| + 2 sum(s) of the Hankel singular values s.
+    level that is not reached is the result. The search starts from the highest response at some
+    frequencies, and is bounded by |D| + 2 sum(s) with the Hankel singular values s.
 
     Returns:
-        The norm, from above and within 1e-11 of a response; inf unless A is stable.
+        The norm from above, within 1e-11 of the highest response; inf unless A is stable.
     """
     A, B, C, D = _system(A, B, C, D)
     if spectral_radius(A) >= 1.0:
@@ -102,7 +102,7 @@ def hinf_norm(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None 
 
 
 class Levels(NamedTuple):
-    """A stable system, scaled, and bounds of the peak of its frequency response."""
+    """Stable system, scaled, with bounds of the peak of its frequency response."""
 
     A: np.ndarray  # (n, n)
     B: np.ndarray  # (n, q)
@@ -124,8 +124,8 @@ class Levels(NamedTuple):
         hankel = np.sqrt(np.maximum(np.linalg.eigvals(product).real, 0.0))
         direct = float(np.linalg.norm(D, ord=2)) if D.size else 0.0
         blocks = A * scale / scale[:, None], B / scale[:, None], C * scale, D
-        # Not the greatest Hankel singular value, which is inaccurate where large numbers cancel;
-        # many responses, for rounding hides the crossings of a flat one.
+        # The lower bound is not the greatest Hankel singular value, which is inaccurate if large
+        # numbers cancel. Many frequencies, since rounding hides the crossings of a flat response.
         angle = np.append(np.angle(np.linalg.eigvals(A)), np.linspace(0.0, np.pi, _STARTS))
         lower = max(direct, float(np.max(_gains(*blocks, np.exp(1j * angle))))) * (1.0 - 1e-9)
         return cls(*blocks, lower, (direct + 2.0 * float(np.sum(hankel))) * (1.0 + 1e-9))
@@ -133,10 +133,10 @@ class Levels(NamedTuple):
     def highest(self, gain: Number) -> float:
         """Highest response at z = 1, -1, where singular values cross this level, and between.
 
-        Below the level if and only if it is not reached anywhere: eigenvalues near the circle are
-        checked by the response, and a response above the level everywhere is so at 1. With
-        z x = A x + B u, g v = C x + D u, and their adjoints l = z (A' l + C' v),
-        g u = B' l + D' v, nothing is inverted.
+        It is below the level if and only if the level is reached nowhere: eigenvalues near the
+        circle are checked by the response, and a response above the level everywhere is so at 1.
+        The eigenvalue problem is z x = A x + B u, g v = C x + D u, with the adjoint equations
+        l = z (A' l + C' v), g u = B' l + D' v, so nothing is inverted.
         """
         n, (r, q) = len(self.A), self.D.shape
         root = np.sqrt(gain)  # scales input and output so that the level is one
@@ -173,9 +173,9 @@ def meets(A: np.ndarray, B: np.ndarray, C: np.ndarray, gamma: Number) -> bool:
 
 
 def peak_gain(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = None) -> float:
-    """Greatest gain found by a sweep of the frequency: never more than the H-infinity norm.
+    """Greatest gain found by a frequency sweep, which never exceeds the H-infinity norm.
 
-    The circle is sampled evenly, more densely about the angle of each eigenvalue, and then
+    The circle is sampled uniformly, more densely about the angle of each eigenvalue, and then
     repeatedly about the highest peaks.
     """
     A, B, C, D = _system(A, B, C, D)

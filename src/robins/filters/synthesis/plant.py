@@ -1,14 +1,14 @@
-"""The plant of a filter design: a linear system with white noise and a modelling error.
+"""Plant of a filter design: a linear system with white noise and a modelling error.
 
     x(k+1) = A x + Bw w + Bn n,     y = C x + Dw w + Dn n,     z = L x
 
 w is white noise of unit covariance, n any signal of finite energy (a modelling error), z the output
-to estimate. A gain K makes the observer ``x^(k+1) = A x^ + K (y - C x^)``, whose error
+to estimate. A gain K defines the observer ``x^(k+1) = A x^ + K (y - C x^)``, whose error
 e = x - x^ obeys
 
     e(k+1) = (A - K C) e + (Bw - K Dw) w + (Bn - K Dn) n.
 
-No result depends on the units of the states.
+Results are independent of the units of the states.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from robins.errors import require
 from robins.filters.checks import Matrix, matrix
 
-_MARGINAL = 1e-7  # eigenvalues of a defective block at 1 may be computed as far inside the circle
+_MARGINAL = 1e-7  # distance inside the circle to which rounding may move a defective eigenvalue
 _UNSEEN = 1e-9  # least singular value of the scaled Popov-Belevitch-Hautus matrix that counts as 0
 
 
@@ -54,14 +54,14 @@ def plant(
     Dn: Matrix | None = None,
     L: Matrix | None = None,
 ) -> Plant:
-    """Plant whose gain K predicts: x^(k+1) = A x^ + K (y - C x^).
+    """Plant with K as predictor gain: x^(k+1) = A x^ + K (y - C x^).
 
-    Arguments are the blocks of `Plant`; Dw and Dn are zero by default, L the whole state.
+    Arguments are the blocks of `Plant`; by default Dw and Dn are zero, and L is the identity.
 
     Raises:
         TypeError: a block is not made of real numbers.
         ValueError: a block is no matrix, has the wrong shape or is not finite, or a mode that does
-            not decay is not observed in y. The message names the block or the mode.
+            not decay is unobservable in y. The message names the block or the mode.
     """
     A, Bw, Bn, C = (matrix(*one) for one in (("A", A), ("Bw", Bw), ("Bn", Bn), ("C", C)))
     n, m = A.shape[0], C.shape[0]
@@ -91,17 +91,15 @@ def current_form(
     L: Matrix | None = None,
     Dn: Matrix | None = None,
 ) -> Plant:
-    """Plant whose gain K corrects: x^ = x- + K (y - C x-), x- = A x^, as navigation filters do.
+    """Plant with K as correction gain, as in navigation: x^ = x- + K (y - C x-), x- = A x^.
 
     The error after the correction obeys e(k+1) = (I - K C)(A e + Bw w + Bn n) - K (Dv v + Dn n),
-    which is the error of a predictor for the plant with C A in the place of C, noise [w, v],
+    which is the error of a predictor for the plant with C A in place of C, noise [w, v],
     Bw = [Bw, 0], Dw = [C Bw, Dv] and Dn = C Bn + Dn. So the K of every design is the gain of the
     correction. (The gain of the predictor would be A K.)
 
     Arguments are those of `plant`, from one measurement to the next, and Dv (m, v), the factor of
-    the measurement noise, independent of w.
-
-    Errors are those of `plant`.
+    the measurement noise v, independent of w. Errors are those of `plant`.
     """
     given = plant(A, Bw, Bn, C, None, Dn, L)
     Dv = matrix("Dv", Dv)
@@ -145,12 +143,12 @@ def _feedthrough(D: Matrix | None, name: str, m: int, B: np.ndarray, signal: str
 
 
 def _refuse_undetectable(A: np.ndarray, C: np.ndarray) -> None:
-    """Raise if a mode with |eigenvalue| >= 1 is not observed in y (Popov-Belevitch-Hautus)."""
+    """Raise if a mode with |eigenvalue| >= 1 is unobservable in y (Popov-Belevitch-Hautus)."""
     values = np.linalg.eigvals(A)
     size = np.linalg.norm(C, axis=1, keepdims=True)
     rows = C / np.where(size > 0.0, size, 1.0)
     for value in values[np.abs(values) >= 1.0 - _MARGINAL]:
-        # The eigenvalues of a defective block scatter, their mean is accurate.
+        # The computed eigenvalues of a defective block scatter, but their mean is accurate.
         cluster = values[np.abs(values - value) < 1e-4 * np.abs(value)]
         for eigenvalue in (complex(value), complex(cluster.mean())):
             if (direction := _unseen(A, rows, eigenvalue)) is not None:
@@ -165,7 +163,7 @@ def _refuse_undetectable(A: np.ndarray, C: np.ndarray) -> None:
 def _unseen(A: np.ndarray, C: np.ndarray, eigenvalue: complex) -> np.ndarray | None:
     """Direction x with A x = eigenvalue x and C x = 0, or None.
 
-    Columns are scaled to length one, so that the unit of a state does not decide.
+    Columns are scaled to unit norm, so that the units of states do not matter.
     """
     test = np.vstack([A - eigenvalue * np.eye(len(A)), C])
     size = np.linalg.norm(test, axis=0)

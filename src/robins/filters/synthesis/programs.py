@@ -1,7 +1,7 @@
-"""Semidefinite programs of filter designs, built once a shape and solved for many plants.
+"""Semidefinite programs of filter designs, built once per shape and solved for many plants.
 
-For a small design cvxpy spends most of its time on the canonical form of expressions. By
-disciplined *parametrised* programming, the plant's matrices being parameters, this happens once.
+For a small design cvxpy spends most of its time on the canonical form of expressions. With
+disciplined *parametrised* programming, the plant's matrices being parameters, this is done once.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 Form = Literal["common", "slack", "full"]
 
-# Where gamma is tight, R and with it the full-order problem are nearly singular; more refinement of
-# each linear solve gains a digit there and costs a tenth more elsewhere.
+# If gamma is tight, R and thus the full-order problem are nearly singular; more refinement of each
+# linear solve gains a digit there and costs a tenth more time elsewhere.
 _CLARABEL = {"iterative_refinement_max_iter": 30, "iterative_refinement_stop_ratio": 2.0}
 _LOCK = Lock()  # a program's parameters belong to one solve at a time
 
@@ -37,7 +37,7 @@ class MissingExtra(RobinsError, ImportError):
 
 
 class SolverAnswer(NamedTuple):
-    """The answer of a solver, unchecked."""
+    """Unchecked answer of a solver."""
 
     status: str
     value: float  # Trace(H); nan without a solution
@@ -45,7 +45,7 @@ class SolverAnswer(NamedTuple):
 
 
 class DesignProgram(NamedTuple):
-    """A problem, the parameters to fill in and the unknowns to read."""
+    """Problem with its parameters to set and its unknowns to read."""
 
     problem: cvxpy.Problem
     parameters: dict[str, cvxpy.Parameter]
@@ -68,7 +68,8 @@ def solve(plant: Plant, form: Form, aim: Aim) -> SolverAnswer:
         for name, parameter in program.parameters.items():
             parameter.value = getattr(plant, name)
         try:
-            # No warnings, for true norms decide; no warm start, which scales by the first plant.
+            # No warnings, since true norms are checked; no warm start, which keeps the scaling of
+            # the first plant.
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 program.problem.solve(solver=cp.CLARABEL, warm_start=False, **_CLARABEL)
@@ -99,7 +100,7 @@ def packages() -> ModuleType:
     """Import the optional module cvxpy, which takes a second.
 
     Raises:
-        MissingExtra: it or Clarabel is not installed.
+        MissingExtra: cvxpy or Clarabel is not installed.
     """
     try:
         import clarabel  # noqa: F401  # pyright: ignore[reportUnusedImport]

@@ -1,4 +1,4 @@
-"""Gains from Riccati equations: the Kalman filter, also with the modelling error n as noise."""
+"""Gains from Riccati equations: Kalman filters, also with the modelling error n as noise."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from robins.filters.synthesis import norms
 from robins.filters.synthesis.design import Design, Unreachable, certify
 from robins.filters.synthesis.plant import Plant, error_system
 
-_DECADES = np.arange(-2.0, 12.1, 0.25)  # of lambda, about the one that makes n as large as w
-_FARTHER, _FARTHEST = 10.0**0.25, 1e12  # factor of lambda in a step beyond the grid, and its end
-_FALLS = 1e-4  # relative decrease of the norm in a step that goes on beyond the grid
-_RTOL = 1e-10  # of lambda
-_STEPS = 60  # of Newton's iteration at most; convergence is quadratic
+_DECADES = np.arange(-2.0, 12.1, 0.25)  # log10 of lambda over that which makes n as large as w
+_FARTHER, _FARTHEST = 10.0**0.25, 1e12  # factor of lambda in a step beyond the grid, and in all
+_FALLS = 1e-4  # least relative decrease of the norm in a step for another one beyond the grid
+_RTOL = 1e-10  # relative tolerance of lambda
+_STEPS = 60  # limit of Newton's iterations; convergence is quadratic
 
 check_gamma = partial(positive, "gamma", of_infinity="no bound")
 
@@ -28,11 +28,11 @@ check_gamma = partial(positive, "gamma", of_infinity="no bound")
 def kalman_gain(plant: Plant) -> np.ndarray:
     """Gain (n, m) of the steady Kalman filter, of least H2 norm; n is ignored.
 
-    The Riccati equation is the one with cross terms, E[Bw w (Dw w)'] = Bw Dw'.
+    The Riccati equation includes the cross-covariance E[Bw w (Dw w)'] = Bw Dw'.
 
     Raises:
         ValueError: there is no steady state: a mode on the unit circle is not driven by w, or a
-            combination of measurements is free of noise, always or at a frequency.
+            combination of measurements is free of noise, at all frequencies or at one.
     """
     return _gain(plant, 0.0)
 
@@ -58,14 +58,14 @@ def inflated_gain(plant: Plant, lambda_: norms.Number) -> np.ndarray:
 def riccati(plant: Plant, gamma: norms.Number) -> Design:
     """Kalman filter for noise [w, sqrt(lambda) n], with the least lambda that meets gamma.
 
-    lambda is the variance of n taken for white noise at which the true H-infinity norm from n to
+    lambda is the variance of n, treated as white noise, at which the true H-infinity norm from n to
     the error is gamma. Run with its own covariance it is the ordinary Kalman filter with
-    Q + lambda Bn Bn' (`channel_inflation`), start and outages included. If n drives measured states
-    it is as good as any gain; if n drives a state that is not measured a better one can exist, and
-    gamma can be out of reach. With gamma = inf it is the Kalman filter.
+    Q + lambda Bn Bn' (`channel_inflation`), also at the start and in outages. If n drives measured
+    states it is as good as any gain; if n drives a state that is not measured, a better gain can
+    exist, and gamma can be infeasible for this form. With gamma = inf it is the Kalman filter.
 
     Raises:
-        Unreachable: no lambda meets gamma; the message names the least gamma that one can.
+        Unreachable: no lambda meets gamma; the message states the least feasible gamma.
         ValueError: gamma is not positive; or as `kalman_gain`.
     """
     check_gamma(gamma)
@@ -167,7 +167,7 @@ def _grid(plant: Plant, K: np.ndarray) -> np.ndarray:
 
 
 def _gain(plant: Plant, lambda_: float, near: np.ndarray | None = None) -> np.ndarray:
-    """Kalman gain for noise [w, sqrt(lambda) n], from a gain that stabilises, if one is given."""
+    """Kalman gain for noise [w, sqrt(lambda) n]; ``near`` is a stabilising initial gain, if any."""
     A, C = plant.A, plant.C
     B = np.hstack([plant.Bw, np.sqrt(lambda_) * plant.Bn])
     D = np.hstack([plant.Dw, np.sqrt(lambda_) * plant.Dn])
@@ -191,7 +191,7 @@ def _stabilising(system: norms.System) -> np.ndarray:
 
 
 def _polished(system: norms.System, K: np.ndarray) -> np.ndarray:
-    """Newton's iteration (Hewer 1971) from a stabilising gain, to the last digits."""
+    """Gain refined to rounding by Newton's iteration (Hewer 1971) from a stabilising one."""
     A, B, C, D = system
     change = np.inf
     for _ in range(_STEPS):
@@ -208,7 +208,7 @@ def _polished(system: norms.System, K: np.ndarray) -> np.ndarray:
 
 
 def _update(system: norms.System, P: np.ndarray) -> np.ndarray:
-    """K = (A P C' + B D') (C P C' + D D')^-1."""
+    """Gain K = (A P C' + B D') (C P C' + D D')^-1."""
     A, B, C, D = system
     S = C @ P @ C.T + D @ D.T
     try:
@@ -220,27 +220,27 @@ def _update(system: norms.System, P: np.ndarray) -> np.ndarray:
 
 
 def _sizes(rows: np.ndarray) -> np.ndarray:
-    """Norms of rows; one for a row of zeros."""
+    """Norms of rows; 1 for a zero row."""
     size = np.linalg.norm(rows, axis=1)
     return np.where(size > 1e-150, size, 1.0)
 
 
-_CIRCLE = 1e-6  # distance from the unit circle of eigenvalues on it
+_CIRCLE = 1e-6  # distance to the unit circle within which an eigenvalue counts as on it
 _RANK = 1e-10  # relative singular value that counts as zero
 _ANYWHERE = (1.7 + 0.0j, 0.6 + 2.1j, -0.3 + 0.4j)  # generic points for the normal rank
 _MEND = "give each measurement noise of its own in Dw (Dv in the current form)"
 
 
 def why_not_steady(system: norms.System) -> str:
-    """Sentence on the violated condition of a steady state; x' = A x + B w, y = C x + D w.
+    """Sentence on the violated condition of a steady state of x' = A x + B w, y = C x + D w.
 
     The Riccati equation has a stabilising solution if (A, C) is detectable and
 
         [A - zI  B;  C  D]
 
     has full row rank for every z on the unit circle (Kailath, Sayed & Hassibi, *Linear Estimation*,
-    2000, app. E): the noise drives every mode there, and reaches every combination of measurements.
-    Numbers must be of order one.
+    2000, app. E): the noise drives every mode there, and enters every combination of measurements.
+    Entries of the matrices must be of order one.
     """
     A, B, C, D = system
     n, m = len(A), len(C)

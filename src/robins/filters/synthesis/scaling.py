@@ -1,9 +1,9 @@
-"""Scaling of a plant to numbers of order one, and the way back.
+"""Scaling of a plant to numbers of order one, and of its design back to the plant's units.
 
 Interior-point solvers stop at absolute tolerances, so a plant in radians, or with an angle in
-arcseconds along with a bias a thousand times smaller, gets a wrong answer in silence. The states
-are balanced as Osborne does (*On pre-conditioning of matrices*, J. ACM 7, 1960): rows and columns
-of a state get equal norms. The result does not depend on the units of the plant.
+arcseconds and a bias a thousand times smaller, gets a wrong answer without warning. The states are
+balanced by Osborne's method (*On pre-conditioning of matrices*, J. ACM 7, 1960): row and column of
+each state get equal norms. The result does not depend on the units of the plant.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from robins.filters.synthesis.design import FullOrder
 from robins.filters.synthesis.norms import Number
 from robins.filters.synthesis.plant import Plant
 
-_SWEEPS = 20
+_SWEEPS = 20  # limit of the sweeps
 _SETTLED = 1e-2  # relative change of the scales that ends the sweeps
 
 
 class Scales(NamedTuple):
-    """Units of the scaled channels in units of the plant, x = diag(x) x'.
+    """Units of the scaled signals in units of the plant: state = x * scaled state, and so on.
 
-    w, n and z are scalars, since their norms count all components alike.
+    w, n and z are scalars, since their norms weigh all components equally.
     """
 
-    x: np.ndarray
-    y: np.ndarray
-    w: float
-    n: float
-    z: float
+    x: np.ndarray  # (n,) state
+    y: np.ndarray  # (m,) measurement
+    w: float  # white noise
+    n: float  # modelling error
+    z: float  # output
 
     def plant(self, plant: Plant) -> Plant:
-        """The plant of the scaled channels."""
+        """Plant of the scaled signals."""
         x, y = self.x, self.y
         return Plant(
             A=plant.A / x[:, None] * x,
@@ -66,7 +66,7 @@ class Scales(NamedTuple):
 def balanced(plant: Plant, gamma: Number = np.inf) -> Scales:
     """Scales under which states, measurements, noise and output are of order one.
 
-    gamma is the bound on the gain from n to z that becomes 1; inf scales n itself to order one.
+    gamma is the bound on the gain from n to z, which is scaled to 1; inf scales n to order one.
     """
     x, y, w, n, z = np.ones(len(plant.A)), np.ones(len(plant.C)), 1.0, 1.0, 1.0
     for _ in range(_SWEEPS):
@@ -89,12 +89,12 @@ def balanced(plant: Plant, gamma: Number = np.inf) -> Scales:
 
 
 def _norms(*blocks: np.ndarray) -> np.ndarray:
-    """Norms of the rows of adjacent blocks."""
+    """(n,) norms of the rows of blocks side by side."""
     return np.sqrt(sum(np.sum(block**2, axis=1) for block in blocks))
 
 
 def _size(*blocks: np.ndarray) -> float:
-    """Root mean square norm of the rows that are not zero; one where all are."""
+    """Root mean square of the norms of nonzero rows; 1 if there is none."""
     squares = np.concatenate([np.sum(block**2, axis=1) for block in blocks])
     rows = np.count_nonzero(squares)
     return float(np.sqrt(squares.sum() / rows)) if rows else 1.0

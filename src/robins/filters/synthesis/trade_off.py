@@ -1,4 +1,4 @@
-"""Price of a bound on the worst case: the true H2 norm against gamma, by every method."""
+"""Cost of a bound on the worst case: true H2 norm against gamma, by every method."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _DESIGNERS: dict[str, Callable[[Plant, float], Design]] = {
     "full-order": lmi.full,
 }
 METHODS = tuple(_DESIGNERS)
-_POINTS = 6  # of a default range
-_DEEPEST = 0.1  # least gamma of a default range over the Kalman filter's own norm
+_POINTS = 6  # number of gammas of the default range
+_DEEPEST = 0.1  # least gamma of the default range over the Kalman filter's norm
 
 Progress = Callable[[int, int, str], None]
 
@@ -39,21 +39,21 @@ class Attempt(NamedTuple):
     method: str
     gamma: float
     design: Design | None
-    why: str  # reason for no design; "" with a design
-    least: float  # gamma of the method, if that is the reason; else nan
+    why: str  # reason why there is no design; "" with a design
+    least: float  # least gamma of the method, if gamma is below it; else nan
 
 
 class TradeOff(NamedTuple):
-    """All methods over all gammas."""
+    """Results of all methods for all gammas."""
 
     kalman: Design  # without bound
     least: LeastGamma  # `reached` includes the designs of `attempts`
-    gammas: tuple[float, ...]  # falling
+    gammas: tuple[float, ...]  # in descending order
     attempts: list[Attempt]  # every method for the first gamma, then for the next
     left_out: dict[str, str]  # inapplicable methods, with reasons
 
     def best(self, gamma: Number) -> Attempt | None:
-        """Attempt of least H2 norm for a gamma; of equals (to 1e-4) by the simplest method."""
+        """Attempt of least H2 norm for a gamma; among equals (to 1e-4) that of the first method."""
         made = [(o, o.design.h2) for o in self.attempts if o.gamma == gamma and o.design]
         least = min((h2 for _, h2 in made), default=np.nan)
         return next((o for o, h2 in made if h2 <= least * (1.0 + 1e-4)), None)
@@ -65,14 +65,14 @@ def trade_off(
     methods: Sequence[str] = METHODS,
     progress: Progress | None = None,
 ) -> TradeOff:
-    """Design by every method for every gamma; the answer includes failures.
+    """Design by every method for every gamma; the result includes failures.
 
-    By default there are six gammas, from nine tenths of the Kalman filter's own norm down to the
-    least, or a tenth of the Kalman filter's. `progress` gets the number done, the total and the
-    name of the next.
+    By default there are six gammas, from nine tenths of the Kalman filter's H-infinity norm down to
+    just above the least gamma, or to a tenth of that norm. `progress` gets the number of designs
+    done, the total and the name of the next.
 
     Raises:
-        Unreachable: all gammas are below the proved least one.
+        Unreachable: all gammas are below the proved lower bound.
         ValueError: a gamma is not positive or finite, a method is not known, or the plant has no
             steady Kalman filter.
     """
@@ -126,11 +126,11 @@ def _why_not(plant: Plant, name: str) -> str:
 
 
 def _range(least: float, own: float) -> tuple[float, ...]:
-    """Gammas from just below the Kalman filter's own norm to just above the least."""
+    """Gammas from just below the Kalman filter's norm ``own`` to just above the least."""
     if own <= 0.0:
         return ()
     low = max(1.02 * least, _DEEPEST * own)
     if low >= 0.9 * own:  # hardly anything to gain
         return (0.5 * (least + own),) if least < own else ()
-    # Rounded for people to read and type.
+    # Rounded, to be easy to read and type.
     return tuple(float(f"{gamma:.4g}") for gamma in np.geomspace(0.9 * own, low, _POINTS))
