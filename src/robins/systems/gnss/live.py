@@ -54,7 +54,7 @@ class RoadNavigation(NamedTuple):
     dof: int = 0  # pseudoranges in it
 
     @property
-    def place(self) -> Geodetic:
+    def geodetic(self) -> Geodetic:
         """Latitude and longitude [rad], and height [m] above the ellipsoid."""
         return Geodetic.from_ecef(jnp.asarray(self.r_e))
 

@@ -1,4 +1,4 @@
-"""A multirotor on the bench, flown by unmodified PX4 or ArduPilot, or by our autopilot.
+"""A multirotor on the bench, flown by PX4 or ArduPilot, unmodified, or by our autopilot.
 
 The craft, its inertial unit with compass and barometer, its GNSS receiver and its autopilot each
 have their own line. The part `autopilot` is ours, or a socket to the SITL of PX4 or ArduPilot.
