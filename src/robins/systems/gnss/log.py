@@ -1,4 +1,4 @@
-"""Recorded pseudoranges and odometry: arranged by epoch, navigated, compared with the truth."""
+"""Recorded pseudoranges and odometry: arrangement by epoch, replay, comparison with the truth."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from robins.systems.replaying import FilterEstimates, LogPiece, PreparedLog, Rep
 from robins.systems.study import StateBlock
 from robins.systems.tables import block_array, place_arrays, track_arrays
 
-LEAST = 4  # satellites of the first fix
+LEAST = 4  # satellites for the first fix
 HEADING = StateBlock("heading", slice(0, 1), "rad", "deg", "NED", ("heading",))
 LETTERS = {1: "G", 2: "S", 4: "R", 8: "E", 16: "J", 32: "C"}
 """Letters of the satellite systems of libRSF, as in RINEX."""
@@ -44,7 +44,7 @@ CAUSES = (
 
 @dataclass(frozen=True, kw_only=True)
 class PreparedRangeLog(LogPiece):
-    """A log by epoch, and where its state has its origin; the world is a `GnssWorld`."""
+    """A log by epoch, with the origin of its state; the world is a `GnssWorld`."""
 
     time_ns: np.ndarray  # (E,)
     place: LocalFrame
@@ -54,10 +54,10 @@ class PreparedRangeLog(LogPiece):
 
 
 def arrange(log: RangeLog, believed: GnssAssumptions) -> PreparedRangeLog:
-    """Every satellite in a column of its own, every time of the receiver an epoch.
+    """Arrange a log by receiver time (rows) and satellite (columns).
 
-    The first epoch is the first with pseudoranges of four satellites and odometry; the filter
-    starts there, and takes a first step of no length to use them.
+    The first epoch is the first with odometry and pseudoranges of four satellites; the filter
+    starts there, and uses them after a first step of zero duration.
 
     Raises:
         ValueError: no epoch has four satellites while there is odometry.
@@ -108,7 +108,7 @@ def arrange(log: RangeLog, believed: GnssAssumptions) -> PreparedRangeLog:
 def _columns(
     ranges: RangeTable, epoch: np.ndarray, column: np.ndarray, shape: tuple[int, int]
 ) -> tuple[np.ndarray, Sky, np.ndarray, np.ndarray]:
-    """Pseudoranges, satellites, elevations and C/N0 by epoch and satellite; NaN where none is.
+    """Pseudoranges, `Sky`, elevations and C/N0 by epoch and satellite; NaN where not measured.
 
     Raises:
         ValueError: a satellite has two pseudoranges at one time.
@@ -117,7 +117,7 @@ def _columns(
         raise ValueError("a satellite has two pseudoranges at one time; leave one signal of each")
     y, elevation, cn0 = (np.full(shape, np.nan) for _ in range(3))
     satellite, sigma = np.zeros((*shape, 3)), np.ones(shape)
-    satellite[:] = ranges.satellite_e[0]  # read, and not used, where there is none
+    satellite[:] = ranges.satellite_e[0]  # a placeholder where nothing is measured
     y[epoch, column], sigma[epoch, column] = ranges.range_m, ranges.sigma_m
     satellite[epoch, column] = ranges.satellite_e
     elevation[epoch, column], cn0[epoch, column] = ranges.elevation_rad, ranges.cn0_dbhz
@@ -125,7 +125,7 @@ def _columns(
 
 
 def _filled(x: np.ndarray) -> np.ndarray:
-    """The last value of each column; before its first that one, and 0 of a column without any."""
+    """Fill each column forward, and backward before its first value; 0 in an empty column."""
     rows = np.arange(len(x))[:, None]
     there = np.isfinite(x)
     last = np.maximum.accumulate(np.where(there, rows, -1), axis=0)
@@ -134,15 +134,15 @@ def _filled(x: np.ndarray) -> np.ndarray:
 
 
 def _travel(odometry: OdometryTable, time_ns: np.ndarray) -> tuple[MotionStep, np.ndarray]:
-    """The steps between epochs, without delays, and the way (E,) [m] from the first on.
+    """Steps between epochs, without delays, and the distance travelled (E,) [m] since the first.
 
-    Speed and yaw rate are straight lines between their samples; a step has their means.
+    Speed and yaw rate are interpolated linearly; a step has their means.
     """
     t = (odometry.time_ns - time_ns[0]) * 1e-9
     epoch_s = (time_ns - time_ns[0]) * 1e-9
 
     def integral(rate: np.ndarray) -> np.ndarray:
-        """(E,) from the first sample to each epoch."""
+        """Integral (E,) of a rate from the first sample to each epoch, by trapezoids."""
         whole = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t))])
         k = np.clip(np.searchsorted(t, epoch_s, "right") - 1, 0, len(t) - 1)
         here = np.interp(epoch_s, t, rate)
@@ -161,7 +161,7 @@ def _travel(odometry: OdometryTable, time_ns: np.ndarray) -> tuple[MotionStep, n
 
 
 def recorded(log: RangeLog, parameters: GnssReplay) -> PreparedLog:
-    """The log as its filters take it, see `System.recorded`.
+    """The log prepared for its filters, see `System.recorded`.
 
     Raises:
         ValueError: the log cannot be navigated; the message gives the reason.
@@ -179,10 +179,10 @@ def replay(
     """Navigate a log with the named filters, and report their quality.
 
     Args:
-        log: pseudoranges, odometry, and true places where they are known.
-        parameters: what the file does not contain.
+        log: pseudoranges, odometry, and true positions if known.
+        parameters: assumptions that the file does not contain.
         filters: names such as "delays", "huber+rts"; by default those of the parameters.
-        progress: called with the share done and what is being done.
+        progress: called with the fraction done and the current task.
 
     Raises:
         ValueError: the log cannot be navigated; the message gives the reason.
@@ -225,7 +225,7 @@ def replay(
 
 
 def truth_at(truth: PlaceTable, given: PreparedRangeLog) -> np.ndarray:
-    """(E, 3) true places [m, NED] at the epochs, by straight lines; NaN beyond the truth."""
+    """True positions (E, 3) [m, NED] at the epochs, interpolated; NaN outside the reference."""
     local = np.asarray(given.place.local(truth.r_e))
     t, epochs = (x - given.time_ns[0] for x in (truth.time_ns, given.time_ns))
     out = np.stack([np.interp(epochs, t, x) for x in local.T], axis=1)
@@ -233,7 +233,10 @@ def truth_at(truth: PlaceTable, given: PreparedRangeLog) -> np.ndarray:
 
 
 def accuracy(answer: FilterEstimates, true: np.ndarray) -> dict[str, float | int]:
-    """Horizontal and vertical errors, and the NEES of the horizontal place over its two axes."""
+    """Horizontal and vertical errors, and the mean NEES of the horizontal position per axis.
+
+    The NEES uses the two sigmas alone, without their correlation.
+    """
     error = true - np.asarray(answer.mean.position)
     known = np.all(np.isfinite(error), axis=1)
     error, sigma = error[known], np.asarray(answer.sigma)[known]
